@@ -1,0 +1,101 @@
+//! Which addresses a memory has: its four areas, and the range of each.
+
+use crate::error::LayoutError;
+
+/// One of the four areas of the Modbus data model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Area {
+    Coils,
+    DiscreteInputs,
+    HoldingRegisters,
+    InputRegisters,
+}
+
+impl Area {
+    pub const ALL: [Area; 4] =
+        [Area::Coils, Area::DiscreteInputs, Area::HoldingRegisters, Area::InputRegisters];
+
+    /// The name used in configurations and messages.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Area::Coils => "coils",
+            Area::DiscreteInputs => "discrete_inputs",
+            Area::HoldingRegisters => "holding_registers",
+            Area::InputRegisters => "input_registers",
+        }
+    }
+
+    pub fn from_name(name: &str) -> Option<Area> {
+        Area::ALL.into_iter().find(|area| area.name() == name)
+    }
+
+    /// Whether an item of this area is one bit (else it is a 16-bit register).
+    pub const fn is_bits(self) -> bool {
+        matches!(self, Area::Coils | Area::DiscreteInputs)
+    }
+
+    /// How many bytes `count` items take: bits are packed eight to a byte.
+    pub const fn byte_len(self, count: usize) -> usize {
+        if self.is_bits() { count.div_ceil(8) } else { count * 2 }
+    }
+
+    pub(crate) const fn index(self) -> usize {
+        self as usize
+    }
+}
+
+/// The addresses of one area: `start`, `start + 1`, … `start + size - 1`. An area of size 0 does
+/// not exist: every access to it is out of range.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Span {
+    start: u16,
+    size: u32,
+}
+
+impl Span {
+    /// The number of addresses that a 16-bit address can tell apart.
+    pub const MAX_SIZE: u32 = 65_536;
+
+    /// # Errors
+    /// [`LayoutError`] when `start + size` is beyond 65,536.
+    pub fn new(start: u16, size: u32) -> Result<Span, LayoutError> {
+        match u32::from(start).checked_add(size) {
+            Some(end) if end <= Span::MAX_SIZE => Ok(Span { start, size }),
+            _ => Err(LayoutError::TooLarge { start, size }),
+        }
+    }
+
+    pub const fn start(self) -> u16 {
+        self.start
+    }
+
+    pub const fn size(self) -> u32 {
+        self.size
+    }
+
+    /// The offset of `address` from the start, when all of `address .. address + count` is inside.
+    pub(crate) fn offset(self, address: u16, count: usize) -> Option<usize> {
+        let offset = usize::from(address.checked_sub(self.start)?);
+        let end = offset.checked_add(count)?;
+        (end <= self.size as usize).then_some(offset)
+    }
+}
+
+/// The four spans of a memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Layout {
+    spans: [Span; 4],
+}
+
+impl Layout {
+    /// This layout, with `span` as the addresses of `area`.
+    #[must_use]
+    pub fn with(mut self, area: Area, span: Span) -> Layout {
+        self.spans[area.index()] = span;
+        self
+    }
+
+    pub const fn span(&self, area: Area) -> Span {
+        self.spans[area.index()]
+    }
+}

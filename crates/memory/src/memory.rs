@@ -1,0 +1,327 @@
+//! The memory itself: reads and writes under one lock, and the seal.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+
+use crate::area::{Area, Layout, Span};
+use crate::bits;
+use crate::error::{LayoutError, Refusal, Refused};
+
+/// On whose behalf memory is touched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// A reader or writer bound by the seal, who never changes the gate bit.
+    Client,
+    /// A source of data: passes the seal, and may open it.
+    Ingest,
+}
+
+/// When a seal opens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GateMode {
+    /// The first ingest that leaves the gate bit at 1 opens the memory for good.
+    Once,
+    /// The memory is sealed whenever the gate bit is 0.
+    Level,
+}
+
+/// The bit that opens a sealed memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Gate {
+    pub area: Area,
+    pub address: u16,
+    pub mode: GateMode,
+}
+
+/// A range of at least one item to read, and where to: `out` has exactly `area.byte_len(count)` bytes.
+#[derive(Debug)]
+pub struct Read<'a> {
+    pub area: Area,
+    pub address: u16,
+    pub count: usize,
+    pub out: &'a mut [u8],
+}
+
+/// A range of at least one item to write, and its new content: `bytes` has exactly `area.byte_len(count)` bytes,
+/// registers big-endian, bits packed least significant bit first. Bits beyond `count` in the last
+/// byte are ignored.
+#[derive(Debug, Clone, Copy)]
+pub struct Write<'a> {
+    pub area: Area,
+    pub address: u16,
+    pub count: usize,
+    pub bytes: &'a [u8],
+}
+
+/// Four areas of fixed size behind one lock.
+#[derive(Debug)]
+pub struct Memory {
+    /// The order in which locks of several memories are taken, so that two writers never wait for
+    /// each other.
+    rank: u64,
+    layout: Layout,
+    gate: Option<Gate>,
+    content: RwLock<Content>,
+}
+
+#[derive(Debug)]
+struct Content {
+    areas: [Box<[u8]>; 4],
+    sealed: bool,
+}
+
+static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
+
+impl Memory {
+    /// All items 0; sealed when there is a gate.
+    ///
+    /// # Errors
+    /// [`LayoutError`] when the gate is not a bit of this memory.
+    pub fn new(layout: Layout, gate: Option<Gate>) -> Result<Memory, LayoutError> {
+        if let Some(Gate { area, address, .. }) = gate {
+            if !area.is_bits() {
+                return Err(LayoutError::GateNotABit);
+            }
+            if layout.span(area).offset(address, 1).is_none() {
+                return Err(LayoutError::GateOutside { address });
+            }
+        }
+        let areas = Area::ALL.map(|area| {
+            vec![0; area.byte_len(layout.span(area).size() as usize)].into_boxed_slice()
+        });
+        Ok(Memory {
+            rank: NEXT_RANK.fetch_add(1, Ordering::Relaxed),
+            layout,
+            gate,
+            content: RwLock::new(Content { areas, sealed: gate.is_some() }),
+        })
+    }
+
+    pub const fn span(&self, area: Area) -> Span {
+        self.layout.span(area)
+    }
+
+    pub const fn gate(&self) -> Option<Gate> {
+        self.gate
+    }
+
+    pub fn sealed(&self) -> bool {
+        self.shared().sealed
+    }
+
+    /// Reads one range.
+    ///
+    /// # Errors
+    /// [`Refusal::Sealed`] (to a client), then `WrongLength`, `OutOfRange`; `out` is then as it was.
+    pub fn read(&self, access: Access, read: Read<'_>) -> Result<(), Refusal> {
+        let offset = self.readable(&read);
+        let content = self.shared();
+        content.admit(access)?;
+        content.copy_out(offset?, read);
+        Ok(())
+    }
+
+    /// Reads several ranges of one moment: no write falls between them.
+    ///
+    /// # Errors
+    /// As [`Memory::read`], with the index of the first range that was refused.
+    pub fn read_many(&self, access: Access, reads: &mut [Read<'_>]) -> Result<(), Refused> {
+        let content = self.shared();
+        content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
+        for (index, read) in reads.iter().enumerate() {
+            self.readable(read).map_err(|refusal| Refused { index, refusal })?;
+        }
+        for read in reads {
+            let Read { area, address, count, ref mut out } = *read;
+            let offset = usize::from(address - self.span(area).start());
+            content.copy_out(offset, Read { area, address, count, out });
+        }
+        Ok(())
+    }
+
+    /// Writes one range as one step.
+    ///
+    /// # Errors
+    /// [`Refusal::Sealed`] (to a client), then `WrongLength`, `OutOfRange`, `GateBit`; nothing has changed.
+    pub fn write(&self, access: Access, write: Write<'_>) -> Result<(), Refusal> {
+        self.write_many(access, &[write]).map_err(|refused| refused.refusal)
+    }
+
+    /// Writes several ranges, of any areas, as one step; a later one wins where two overlap.
+    ///
+    /// # Errors
+    /// As [`Memory::write`], with the index of the first write that was refused.
+    pub fn write_many(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
+        let valid = self.writable(access, writes);
+        let mut content = self.exclusive();
+        content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
+        valid?;
+        self.apply(access, &mut content, writes);
+        Ok(())
+    }
+
+    /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, as one step.
+    ///
+    /// # Errors
+    /// [`Refusal::Sealed`] (to a client), then `NotRegisters`, `OutOfRange`.
+    pub fn mask_write(
+        &self,
+        access: Access,
+        area: Area,
+        address: u16,
+        and_mask: u16,
+        or_mask: u16,
+    ) -> Result<(), Refusal> {
+        let offset = match self.span(area).offset(address, 1) {
+            _ if area.is_bits() => Err(Refusal::NotRegisters),
+            offset => offset.ok_or(Refusal::OutOfRange),
+        };
+        let mut content = self.exclusive();
+        content.admit(access)?;
+        let offset = offset? * 2;
+        let register = &mut content.areas[area.index()][offset..offset + 2];
+        let now = u16::from_be_bytes([register[0], register[1]]);
+        register.copy_from_slice(&((now & and_mask) | (or_mask & !and_mask)).to_be_bytes());
+        Ok(())
+    }
+
+    /// Writes one range, then reads one, as one step.
+    ///
+    /// # Errors
+    /// As [`Memory::write`], then as [`Memory::read`]: when either is refused, nothing has changed.
+    pub fn write_then_read(
+        &self,
+        access: Access,
+        write: Write<'_>,
+        read: Read<'_>,
+    ) -> Result<(), Refusal> {
+        let writes = [write];
+        let valid = self.writable(access, &writes);
+        let offset = self.readable(&read);
+        let mut content = self.exclusive();
+        content.admit(access)?;
+        valid.map_err(|refused| refused.refusal)?;
+        let offset = offset?;
+        self.apply(access, &mut content, &writes);
+        content.copy_out(offset, read);
+        Ok(())
+    }
+
+    /// Checks a read. What needs no lock is judged before the lock is taken.
+    fn readable(&self, read: &Read<'_>) -> Result<usize, Refusal> {
+        if read.count == 0 || read.out.len() != read.area.byte_len(read.count) {
+            return Err(Refusal::WrongLength);
+        }
+        self.span(read.area).offset(read.address, read.count).ok_or(Refusal::OutOfRange)
+    }
+
+    /// Checks writes. What needs no lock is judged before the lock is taken.
+    fn writable(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
+        for (index, write) in writes.iter().enumerate() {
+            let fits = write.count > 0 && write.bytes.len() == write.area.byte_len(write.count);
+            let refusal = if !fits {
+                Refusal::WrongLength
+            } else if self.span(write.area).offset(write.address, write.count).is_none() {
+                Refusal::OutOfRange
+            } else if access == Access::Client && self.gate.is_some_and(|gate| write.covers(gate)) {
+                Refusal::GateBit
+            } else {
+                continue;
+            };
+            return Err(Refused { index, refusal });
+        }
+        Ok(())
+    }
+
+    /// Carries out writes that have been checked, then moves the seal.
+    fn apply(&self, access: Access, content: &mut Content, writes: &[Write<'_>]) {
+        for write in writes {
+            self.copy_in(content, write);
+        }
+        self.settle(access, content);
+    }
+
+    fn copy_in(&self, content: &mut Content, write: &Write<'_>) {
+        let offset = usize::from(write.address - self.span(write.area).start());
+        let area = &mut content.areas[write.area.index()];
+        if write.area.is_bits() {
+            bits::copy_in(area, offset, write.count, write.bytes);
+        } else {
+            area[offset * 2..(offset + write.count) * 2].copy_from_slice(write.bytes);
+        }
+    }
+
+    /// Judges the gate bit as the whole of an ingest left it.
+    fn settle(&self, access: Access, content: &mut Content) {
+        if let (Access::Ingest, Some(gate)) = (access, self.gate) {
+            let offset = usize::from(gate.address - self.span(gate.area).start());
+            let open = bits::get(&content.areas[gate.area.index()], offset);
+            content.sealed = match gate.mode {
+                GateMode::Once => content.sealed && !open,
+                GateMode::Level => !open,
+            };
+        }
+    }
+
+    // Nothing that runs under the lock can panic half-way through a write: ranges and lengths are
+    // checked before. So a poisoned lock still guards whole content.
+    fn shared(&self) -> RwLockReadGuard<'_, Content> {
+        self.content.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn exclusive(&self) -> RwLockWriteGuard<'_, Content> {
+        self.content.write().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Content {
+    fn admit(&self, access: Access) -> Result<(), Refusal> {
+        if self.sealed && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
+    }
+
+    fn copy_out(&self, offset: usize, read: Read<'_>) {
+        let area = &self.areas[read.area.index()];
+        if read.area.is_bits() {
+            bits::copy_out(area, offset, read.count, read.out);
+        } else {
+            read.out.copy_from_slice(&area[offset * 2..(offset + read.count) * 2]);
+        }
+    }
+}
+
+impl Write<'_> {
+    fn covers(&self, gate: Gate) -> bool {
+        let start = usize::from(self.address);
+        self.area == gate.area && (start..start + self.count).contains(&usize::from(gate.address))
+    }
+}
+
+/// Writes to several memories as one step: no reader of any of them sees a part, and when one
+/// write is refused none is carried out. A memory may be named more than once.
+///
+/// # Errors
+/// As [`Memory::write_many`]; the index is that of the first refused write in `writes`.
+pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
+    for (index, (memory, write)) in writes.iter().enumerate() {
+        memory
+            .writable(access, std::slice::from_ref(write))
+            .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
+    }
+    let mut memories: Vec<&Memory> = writes.iter().map(|(memory, _)| *memory).collect();
+    memories.sort_unstable_by_key(|memory| memory.rank);
+    memories.dedup_by_key(|memory| memory.rank);
+    let mut locked: Vec<_> = memories.iter().map(|memory| memory.exclusive()).collect();
+    let position = |memory: &Memory| {
+        memories.binary_search_by_key(&memory.rank, |other| other.rank).unwrap_or_default()
+    };
+    for (index, (memory, _)) in writes.iter().enumerate() {
+        locked[position(memory)].admit(access).map_err(|refusal| Refused { index, refusal })?;
+    }
+    for (memory, write) in writes {
+        memory.copy_in(&mut locked[position(memory)], write);
+    }
+    for (memory, content) in memories.iter().zip(&mut locked) {
+        memory.settle(access, content);
+    }
+    Ok(())
+}

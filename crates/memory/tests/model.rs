@@ -1,0 +1,329 @@
+//! The memory against a model that keeps one value an address: whatever is done to both, both say
+//! the same, refusals included.
+
+use std::collections::BTreeMap;
+
+use holdfast_memory::{
+    Access, Area, Gate, GateMode, Layout, Memory, Read, Refusal, Span, Write, write_across,
+};
+use proptest::prelude::*;
+
+/// One value an address; an address that is missing is outside the area.
+#[derive(Debug, Clone, PartialEq, Default)]
+struct Model {
+    areas: [BTreeMap<u16, u16>; 4],
+    gate: Option<Gate>,
+    sealed: bool,
+}
+
+#[derive(Debug, Clone)]
+enum Step {
+    Read(Access, Area, u16, usize),
+    Write(Access, Vec<Values>),
+    Mask(Access, Area, u16, u16, u16),
+    WriteThenRead(Access, Values, (Area, u16, usize)),
+}
+
+#[derive(Debug, Clone)]
+struct Values {
+    area: Area,
+    address: u16,
+    values: Vec<u16>,
+}
+
+impl Values {
+    fn pack(&self) -> Vec<u8> {
+        if !self.area.is_bits() {
+            return self.values.iter().flat_map(|value| value.to_be_bytes()).collect();
+        }
+        let mut bytes = vec![0; self.values.len().div_ceil(8)];
+        for (index, value) in self.values.iter().enumerate() {
+            bytes[index / 8] |= ((value & 1) as u8) << (index % 8);
+        }
+        // Stray bits beyond the last one must not reach memory.
+        if let (Some(last), used @ 1..) = (bytes.last_mut(), self.values.len() % 8) {
+            *last |= 0xFF << used;
+        }
+        bytes
+    }
+}
+
+fn unpack(area: Area, count: usize, bytes: &[u8]) -> Vec<u16> {
+    if area.is_bits() {
+        assert!((count..bytes.len() * 8).all(|bit| bytes[bit / 8] >> (bit % 8) & 1 == 0));
+        (0..count).map(|bit| u16::from(bytes[bit / 8] >> (bit % 8) & 1)).collect()
+    } else {
+        bytes.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect()
+    }
+}
+
+impl Model {
+    fn new(layout: &Layout, gate: Option<Gate>) -> Model {
+        let areas = Area::ALL.map(|area| {
+            let span = layout.span(area);
+            let end = u32::from(span.start()) + span.size();
+            (u32::from(span.start())..end).map(|address| (address as u16, 0)).collect()
+        });
+        Model { areas, gate, sealed: gate.is_some() }
+    }
+
+    fn addresses(&self, area: Area, address: u16, count: usize) -> Result<Vec<u16>, Refusal> {
+        let addresses = (0..count).map(|index| u16::try_from(usize::from(address) + index));
+        let addresses: Result<Vec<u16>, _> = addresses.collect();
+        let addresses = addresses.map_err(|_| Refusal::OutOfRange)?;
+        let known = &self.areas[area as usize];
+        let inside = addresses.iter().all(|address| known.contains_key(address));
+        if inside { Ok(addresses) } else { Err(Refusal::OutOfRange) }
+    }
+
+    fn admit(&self, access: Access) -> Result<(), Refusal> {
+        if self.sealed && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
+    }
+
+    fn read(
+        &self,
+        access: Access,
+        area: Area,
+        address: u16,
+        count: usize,
+    ) -> Result<Vec<u16>, Refusal> {
+        self.admit(access)?;
+        let addresses = self.addresses(area, address, count)?;
+        Ok(addresses.iter().map(|address| self.areas[area as usize][address]).collect())
+    }
+
+    fn write(&mut self, access: Access, writes: &[Values]) -> Result<(), Refusal> {
+        self.admit(access)?;
+        for write in writes {
+            let addresses = self.addresses(write.area, write.address, write.values.len())?;
+            let hits_gate = self
+                .gate
+                .is_some_and(|gate| gate.area == write.area && addresses.contains(&gate.address));
+            if hits_gate && access == Access::Client {
+                return Err(Refusal::GateBit);
+            }
+        }
+        for Values { area, address, values } in writes {
+            for (index, value) in values.iter().enumerate() {
+                let value = if area.is_bits() { value & 1 } else { *value };
+                self.areas[*area as usize].insert(address + index as u16, value);
+            }
+        }
+        if let (Access::Ingest, Some(gate)) = (access, self.gate) {
+            let open = self.areas[gate.area as usize][&gate.address] == 1;
+            self.sealed = !open && (gate.mode == GateMode::Level || self.sealed);
+        }
+        Ok(())
+    }
+}
+
+const LAYOUT: [(Area, u16, u32); 3] =
+    [(Area::Coils, 3, 40), (Area::DiscreteInputs, 0, 21), (Area::HoldingRegisters, 65_500, 36)];
+
+fn layout() -> Layout {
+    LAYOUT.iter().fold(Layout::default(), |layout, &(area, start, size)| {
+        layout.with(area, Span::new(start, size).unwrap())
+    })
+}
+
+fn read(
+    memory: &Memory,
+    access: Access,
+    area: Area,
+    address: u16,
+    count: usize,
+) -> Result<Vec<u16>, Refusal> {
+    let mut out = vec![0xAA; area.byte_len(count)];
+    memory.read(access, Read { area, address, count, out: &mut out })?;
+    Ok(unpack(area, count, &out))
+}
+
+fn contents(memory: &Memory) -> Vec<Vec<u16>> {
+    LAYOUT
+        .iter()
+        .map(|&(area, start, size)| {
+            read(memory, Access::Ingest, area, start, size as usize).unwrap()
+        })
+        .collect()
+}
+
+fn a_range() -> impl Strategy<Value = (Area, u16, usize)> {
+    let area = prop::sample::select(Area::ALL.to_vec());
+    let address = prop_oneof![4 => 0..45u16, 4 => 65_495..=65_535u16, 1 => any::<u16>()];
+    (area, address, 1..42usize)
+}
+
+fn an_access() -> impl Strategy<Value = Access> {
+    prop_oneof![Just(Access::Client), Just(Access::Ingest)]
+}
+
+fn some_values() -> impl Strategy<Value = Values> {
+    a_range().prop_flat_map(|(area, address, count)| {
+        prop::collection::vec(any::<u16>(), count).prop_map(move |values| Values {
+            area,
+            address,
+            values,
+        })
+    })
+}
+
+fn a_step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        (an_access(), a_range())
+            .prop_map(|(access, (area, address, count))| Step::Read(access, area, address, count)),
+        (an_access(), prop::collection::vec(some_values(), 1..4))
+            .prop_map(|(access, writes)| Step::Write(access, writes)),
+        (an_access(), a_range(), any::<u16>(), any::<u16>()).prop_map(
+            |(access, (area, address, _), and, or)| Step::Mask(access, area, address, and, or)
+        ),
+        (an_access(), some_values(), a_range())
+            .prop_map(|(access, write, read)| Step::WriteThenRead(access, write, read)),
+    ]
+}
+
+fn a_gate() -> impl Strategy<Value = Option<Gate>> {
+    let mode = prop_oneof![Just(GateMode::Once), Just(GateMode::Level)];
+    prop::option::of((0..21u16, mode).prop_map(|(address, mode)| Gate {
+        area: Area::DiscreteInputs,
+        address,
+        mode,
+    }))
+}
+
+fn take(memory: &Memory, model: &mut Model, step: Step) {
+    match step {
+        Step::Read(access, area, address, count) => {
+            assert_eq!(
+                read(memory, access, area, address, count),
+                model.read(access, area, address, count)
+            );
+        }
+        Step::Write(access, writes) => {
+            let packed: Vec<Vec<u8>> = writes.iter().map(Values::pack).collect();
+            let borrowed: Vec<Write> = writes
+                .iter()
+                .zip(&packed)
+                .map(|(write, bytes)| Write {
+                    area: write.area,
+                    address: write.address,
+                    count: write.values.len(),
+                    bytes,
+                })
+                .collect();
+            let done = memory.write_many(access, &borrowed).map_err(|refused| refused.refusal);
+            assert_eq!(done, model.write(access, &writes));
+        }
+        Step::Mask(access, area, address, and, or) => {
+            let done = memory.mask_write(access, area, address, and, or);
+            let expected = model.admit(access).and_then(|()| {
+                if area.is_bits() {
+                    return Err(Refusal::NotRegisters);
+                }
+                let now = model.read(access, area, address, 1)?[0];
+                let values = vec![(now & and) | (or & !and)];
+                model.write(access, &[Values { area, address, values }])
+            });
+            assert_eq!(done, expected);
+        }
+        Step::WriteThenRead(access, write, (area, address, count)) => {
+            let mut out = vec![0; area.byte_len(count)];
+            let bytes = write.pack();
+            let done = memory
+                .write_then_read(
+                    access,
+                    Write {
+                        area: write.area,
+                        address: write.address,
+                        count: write.values.len(),
+                        bytes: &bytes,
+                    },
+                    Read { area, address, count, out: &mut out },
+                )
+                .map(|()| unpack(area, count, &out));
+            let mut after = model.clone();
+            let expected = after.write(access, std::slice::from_ref(&write)).and_then(|()| {
+                // What opens or closes the seal in this step does not bind its own read.
+                after.read(Access::Ingest, area, address, count)
+            });
+            if expected.is_ok() {
+                *model = after;
+            }
+            assert_eq!(done, expected);
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn memory_and_model_agree(
+        gate in a_gate(),
+        steps in prop::collection::vec(a_step(), 1..60),
+    ) {
+        let memory = Memory::new(layout(), gate).unwrap();
+        let mut model = Model::new(&layout(), gate);
+        for step in steps {
+            take(&memory, &mut model, step);
+            prop_assert_eq!(memory.sealed(), model.sealed);
+        }
+        let expected: Vec<Vec<u16>> = LAYOUT
+            .iter()
+            .map(|&(area, ..)| model.areas[area as usize].values().copied().collect())
+            .collect();
+        prop_assert_eq!(contents(&memory), expected);
+    }
+
+    #[test]
+    fn a_batch_over_several_memories_is_written_whole_or_not_at_all(
+        batch in prop::collection::vec((0..3usize, some_values()), 1..6),
+    ) {
+        let memories: Vec<Memory> = (0..3).map(|_| Memory::new(layout(), None).unwrap()).collect();
+        let mut models: Vec<Model> = (0..3).map(|_| Model::new(&layout(), None)).collect();
+        let packed: Vec<Vec<u8>> = batch.iter().map(|(_, write)| write.pack()).collect();
+        let writes: Vec<(&Memory, Write)> = batch.iter().zip(&packed).map(|((which, write), bytes)| {
+            let count = write.values.len();
+            (&memories[*which], Write { area: write.area, address: write.address, count, bytes })
+        }).collect();
+        let before = models.clone();
+        let expected = batch.iter().position(|(which, write)| {
+            models[*which].write(Access::Ingest, std::slice::from_ref(write)).is_err()
+        });
+        if expected.is_some() {
+            models = before;
+        }
+        let done = write_across(Access::Ingest, &writes);
+        prop_assert_eq!(done.err().map(|refused| refused.index), expected);
+        for (memory, model) in memories.iter().zip(&models) {
+            let expected: Vec<Vec<u16>> = LAYOUT
+                .iter()
+                .map(|&(area, ..)| model.areas[area as usize].values().copied().collect())
+                .collect();
+            prop_assert_eq!(contents(memory), expected);
+        }
+    }
+}
+
+#[test]
+fn a_range_without_items_is_refused() {
+    let memory = Memory::new(layout(), None).unwrap();
+    let area = Area::Coils;
+    let read = Read { area, address: 3, count: 0, out: &mut [] };
+    assert_eq!(memory.read(Access::Client, read), Err(Refusal::WrongLength));
+    let write = Write { area, address: 3, count: 0, bytes: &[] };
+    assert_eq!(memory.write(Access::Client, write), Err(Refusal::WrongLength));
+}
+
+#[test]
+fn a_span_beyond_the_last_address_is_refused() {
+    assert!(Span::new(65_535, 1).is_ok());
+    assert!(Span::new(0, 65_536).is_ok());
+    assert!(Span::new(1, 65_536).is_err());
+    assert!(Span::new(0, u32::MAX).is_err());
+}
+
+#[test]
+fn a_gate_outside_its_area_is_refused() {
+    let gate = |area, address| Some(Gate { area, address, mode: GateMode::Once });
+    assert!(Memory::new(layout(), gate(Area::Coils, 2)).is_err());
+    assert!(Memory::new(layout(), gate(Area::HoldingRegisters, 65_500)).is_err());
+    assert!(Memory::new(layout(), gate(Area::Coils, 42)).is_ok());
+}

@@ -1,0 +1,19 @@
+//! Modbus as bytes in, bytes out: no socket, no clock, no allocation.
+//!
+//! The rules this crate keeps:
+//!
+//! * One codec for both sides. A [`pdu::Request`] is what a server parses and what a client
+//!   encodes; a [`pdu::Response`] is what a client parses and what [`pdu::reply`] writes.
+//! * Requests and responses borrow from the frame. Replies are written in place, into the buffer
+//!   that is sent.
+//! * Bytes from outside can't make it panic: every length is checked, every conversion is total.
+//! * What depends on a memory (addresses) or on a policy (units, rights) is not judged here. A
+//!   quantity that no memory could serve is.
+//!
+//! Specifications: Modbus Application Protocol V1.1b3 (`pdu`), Messaging on TCP/IP Implementation
+//! Guide V1.0b (`frame::mbap`), Modbus over Serial Line V1.02 (`frame::rtu`, `frame::ascii`).
+
+#![forbid(unsafe_code)]
+
+pub mod frame;
+pub mod pdu;

@@ -1,0 +1,82 @@
+//! Function codes and exception codes (V1.1b3, 5.1 and 7).
+
+use thiserror::Error;
+
+macro_rules! codes {
+    ($(#[$meta:meta])* $name:ident { $($variant:ident = $code:literal, $text:literal;)* }) => {
+        $(#[$meta])*
+        #[repr(u8)]
+        pub enum $name { $($variant = $code,)* }
+
+        impl $name {
+            pub const fn from_code(code: u8) -> Option<$name> {
+                match code {
+                    $($code => Some($name::$variant),)*
+                    _ => None,
+                }
+            }
+
+            pub const fn code(self) -> u8 {
+                self as u8
+            }
+
+            /// The standard's name.
+            pub const fn name(self) -> &'static str {
+                match self { $($name::$variant => $text,)* }
+            }
+        }
+    };
+}
+
+codes! {
+    /// A function that this crate can encode and decode.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+    Function {
+        ReadCoils = 1, "Read Coils";
+        ReadDiscreteInputs = 2, "Read Discrete Inputs";
+        ReadHoldingRegisters = 3, "Read Holding Registers";
+        ReadInputRegisters = 4, "Read Input Registers";
+        WriteSingleCoil = 5, "Write Single Coil";
+        WriteSingleRegister = 6, "Write Single Register";
+        Diagnostics = 8, "Diagnostics";
+        GetCommEventCounter = 11, "Get Comm Event Counter";
+        WriteMultipleCoils = 15, "Write Multiple Coils";
+        WriteMultipleRegisters = 16, "Write Multiple Registers";
+        ReportServerId = 17, "Report Server ID";
+        MaskWriteRegister = 22, "Mask Write Register";
+        ReadWriteMultipleRegisters = 23, "Read/Write Multiple Registers";
+        EncapsulatedInterface = 43, "Encapsulated Interface Transport";
+    }
+}
+
+impl Function {
+    /// Whether the function changes coils or registers.
+    pub const fn is_write(self) -> bool {
+        matches!(
+            self,
+            Function::WriteSingleCoil
+                | Function::WriteSingleRegister
+                | Function::WriteMultipleCoils
+                | Function::WriteMultipleRegisters
+                | Function::MaskWriteRegister
+                | Function::ReadWriteMultipleRegisters
+        )
+    }
+}
+
+codes! {
+    /// Why a server refused a request.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
+    #[error("exception {:#04x} ({})", self.code(), self.name())]
+    ExceptionCode {
+        IllegalFunction = 1, "Illegal Function";
+        IllegalDataAddress = 2, "Illegal Data Address";
+        IllegalDataValue = 3, "Illegal Data Value";
+        ServerDeviceFailure = 4, "Server Device Failure";
+        Acknowledge = 5, "Acknowledge";
+        ServerDeviceBusy = 6, "Server Device Busy";
+        MemoryParityError = 8, "Memory Parity Error";
+        GatewayPathUnavailable = 10, "Gateway Path Unavailable";
+        GatewayTargetFailedToRespond = 11, "Gateway Target Device Failed To Respond";
+    }
+}

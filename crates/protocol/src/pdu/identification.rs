@@ -1,0 +1,193 @@
+//! Function 43 / MEI type 14, Read Device Identification (V1.1b3, 6.21).
+
+use thiserror::Error;
+
+use super::{Buffer, ExceptionCode, Function};
+
+pub(super) const MEI_TYPE: u8 = 14;
+
+/// Individual and stream access to all three categories.
+const CONFORMITY_LEVEL: u8 = 0x83;
+
+/// Function, MEI type, read code, conformity, more follows, next object, number of objects.
+const HEAD_LEN: usize = 7;
+
+/// The longest value that fits a reply of its own, in bytes.
+pub const MAX_VALUE_LEN: usize = super::MAX_LEN - HEAD_LEN - 2;
+
+/// Which objects are asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum ReadCode {
+    /// Objects 0x00 to 0x02, as a stream.
+    Basic = 1,
+    /// Objects 0x00 to 0x7F, as a stream.
+    Regular = 2,
+    /// All objects, as a stream.
+    Extended = 3,
+    /// One object.
+    Individual = 4,
+}
+
+impl ReadCode {
+    const fn from_code(code: u8) -> Option<ReadCode> {
+        match code {
+            1 => Some(ReadCode::Basic),
+            2 => Some(ReadCode::Regular),
+            3 => Some(ReadCode::Extended),
+            4 => Some(ReadCode::Individual),
+            _ => None,
+        }
+    }
+
+    pub const fn code(self) -> u8 {
+        self as u8
+    }
+
+    const fn last_object(self) -> u8 {
+        match self {
+            ReadCode::Basic => 0x02,
+            ReadCode::Regular => 0x7F,
+            ReadCode::Extended | ReadCode::Individual => 0xFF,
+        }
+    }
+}
+
+/// Objects that no device can have.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum ObjectError {
+    #[error("object {0:#04x} is named twice")]
+    Twice(u8),
+    #[error("object {id:#04x} has {len} bytes, at most {MAX_VALUE_LEN} are allowed")]
+    TooLong { id: u8, len: usize },
+    #[error("object {0:#04x} is mandatory")]
+    Missing(u8),
+    #[error("object {0:#04x} is reserved")]
+    Reserved(u8),
+}
+
+/// The identification of one device: objects by id, 0x00 to 0x02 among them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Objects(Box<[(u8, Box<[u8]>)]>);
+
+impl Objects {
+    /// # Errors
+    /// [`ObjectError`] when an id comes twice, is reserved (0x07 to 0x7F), a mandatory one is
+    /// missing or a value is longer than [`MAX_VALUE_LEN`].
+    pub fn new(objects: impl IntoIterator<Item = (u8, Box<[u8]>)>) -> Result<Objects, ObjectError> {
+        let mut objects: Vec<_> = objects.into_iter().collect();
+        objects.sort_by_key(|(id, _)| *id);
+        for pair in objects.windows(2) {
+            if let [(id, _), (next, _)] = pair
+                && id == next
+            {
+                return Err(ObjectError::Twice(*id));
+            }
+        }
+        for (id, value) in &objects {
+            match (*id, value.len()) {
+                (0x07..=0x7F, _) => return Err(ObjectError::Reserved(*id)),
+                (id, len) if len > MAX_VALUE_LEN => return Err(ObjectError::TooLong { id, len }),
+                _ => {}
+            }
+        }
+        for id in 0x00..=0x02 {
+            if !objects.iter().any(|(known, _)| *known == id) {
+                return Err(ObjectError::Missing(id));
+            }
+        }
+        Ok(Objects(objects.into_boxed_slice()))
+    }
+
+    pub fn get(&self, id: u8) -> Option<&[u8]> {
+        self.0.iter().find(|(known, _)| *known == id).map(|(_, value)| value.as_ref())
+    }
+
+    /// Writes the reply. A stream holds as many objects as fit, and says whether and where more
+    /// follow; one that starts at an unknown object starts at the first.
+    ///
+    /// # Errors
+    /// [`ExceptionCode::IllegalDataAddress`] for an individual object that is not there.
+    pub fn reply(
+        &self,
+        code: ReadCode,
+        object_id: u8,
+        pdu: &mut Buffer,
+    ) -> Result<usize, ExceptionCode> {
+        let from = self.0.iter().position(|(id, _)| *id == object_id && *id <= code.last_object());
+        let (from, most) = match (code, from) {
+            (ReadCode::Individual, None) => return Err(ExceptionCode::IllegalDataAddress),
+            (ReadCode::Individual, Some(from)) => (from, 1),
+            (_, from) => (from.unwrap_or(0), self.0.len()),
+        };
+        let asked = self.0.iter().skip(from).take(most);
+        let mut asked = asked.take_while(|(id, _)| *id <= code.last_object());
+        let (mut len, mut count, mut next) = (HEAD_LEN, 0, None);
+        for (id, value) in asked.by_ref() {
+            let Some(out) = pdu.get_mut(len..len + 2 + value.len()) else {
+                next = Some(*id);
+                break;
+            };
+            out[0] = *id;
+            out[1] = value.len() as u8;
+            out[2..].copy_from_slice(value);
+            len += out.len();
+            count += 1;
+        }
+        let more = if next.is_some() { 0xFF } else { 0x00 };
+        let function = Function::EncapsulatedInterface.code();
+        let head =
+            [function, MEI_TYPE, code.code(), CONFORMITY_LEVEL, more, next.unwrap_or(0), count];
+        pdu[..HEAD_LEN].copy_from_slice(&head);
+        Ok(len)
+    }
+}
+
+pub(super) fn parse_request(body: &[u8]) -> Result<(ReadCode, u8), ExceptionCode> {
+    match body {
+        [MEI_TYPE, code, object_id] => {
+            let code = ReadCode::from_code(*code).ok_or(ExceptionCode::IllegalDataValue)?;
+            Ok((code, *object_id))
+        }
+        [MEI_TYPE, ..] | [] => Err(ExceptionCode::IllegalDataValue),
+        _ => Err(ExceptionCode::IllegalFunction),
+    }
+}
+
+/// What a device answered: some of its objects, and where the rest begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Answer<'a> {
+    pub conformity_level: u8,
+    /// The object to ask for next, when there are more.
+    pub next: Option<u8>,
+    objects: &'a [u8],
+}
+
+impl<'a> Answer<'a> {
+    /// Parses the body of a reply, behind the function code. `None` when it is not well formed.
+    pub(super) fn parse(asked: ReadCode, body: &'a [u8]) -> Option<Answer<'a>> {
+        let [MEI_TYPE, code, conformity_level, more, next, count, objects @ ..] = body else {
+            return None;
+        };
+        let next = match more {
+            0x00 => None,
+            0xFF => Some(*next),
+            _ => return None,
+        };
+        let answer = Answer { conformity_level: *conformity_level, next, objects };
+        let whole = answer.iter().map(|(_, value)| value.len() + 2).sum::<usize>() == objects.len();
+        let counted = answer.iter().count() == usize::from(*count);
+        (*code == asked.code() && whole && counted).then_some(answer)
+    }
+
+    /// The objects: id and value.
+    pub fn iter(&self) -> impl Iterator<Item = (u8, &'a [u8])> + use<'a> {
+        let mut rest = self.objects;
+        std::iter::from_fn(move || {
+            let [id, len, tail @ ..] = rest else { return None };
+            let (value, tail) = tail.split_at_checked(usize::from(*len))?;
+            rest = tail;
+            Some((*id, value))
+        })
+    }
+}

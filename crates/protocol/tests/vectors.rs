@@ -1,0 +1,93 @@
+//! The shared vectors, as far as they can be judged without a memory.
+
+use std::path::Path;
+
+use holdfast_protocol::frame::{ascii, mbap, rtu};
+use holdfast_protocol::pdu::{self, ExceptionCode, Request, ResponseError};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Vectors<T> {
+    cases: Vec<T>,
+}
+
+#[derive(Deserialize)]
+struct FrameCase {
+    unit: u8,
+    pdu: String,
+    mbap: String,
+    rtu: String,
+    ascii: String,
+}
+
+#[derive(Deserialize)]
+struct PduCase {
+    name: String,
+    request: String,
+    response: String,
+}
+
+fn cases<T: for<'de> Deserialize<'de>>(name: &str) -> Vec<T> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/vectors").join(name);
+    let vectors: Vectors<T> = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+    assert!(!vectors.cases.is_empty());
+    vectors.cases
+}
+
+fn unhex(text: &str) -> Vec<u8> {
+    (0..text.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap())
+        .collect()
+}
+
+#[test]
+fn frames_encode_and_decode_as_the_vectors_say() {
+    for case in cases::<FrameCase>("frames.json") {
+        let (unit, pdu) = (case.unit, unhex(&case.pdu));
+
+        let frame = unhex(&case.mbap);
+        let header = mbap::header(0x1A2B, unit, pdu.len());
+        assert_eq!([&header[..], &pdu].concat(), frame);
+        let expected = mbap::Next::Frame {
+            transaction_id: 0x1A2B,
+            unit_id: unit,
+            pdu: &pdu,
+            len: frame.len(),
+        };
+        assert_eq!(mbap::next(&frame), expected);
+
+        let mut buffer = [0; rtu::MAX_LEN];
+        let len = rtu::encode(unit, &pdu, &mut buffer).unwrap();
+        assert_eq!(buffer[..len], unhex(&case.rtu));
+        assert_eq!(rtu::decode(&buffer[..len]), Ok((unit, &pdu[..])));
+
+        let mut buffer = [0; ascii::MAX_LEN];
+        let len = ascii::encode(unit, &pdu, &mut buffer).unwrap();
+        assert_eq!(&buffer[..len], case.ascii.as_bytes());
+        assert_eq!(ascii::decode(&buffer[..len], &mut [0; 255]), Ok((unit, &pdu[..])));
+    }
+}
+
+#[test]
+fn requests_parse_encode_and_answer_as_the_vectors_say() {
+    for case in cases::<PduCase>("pdu.json") {
+        let (request, response) = (unhex(&case.request), unhex(&case.response));
+        let parsed = Request::parse(&request);
+        match (response[0] & 0x80 != 0).then(|| ExceptionCode::from_code(response[1]).unwrap()) {
+            None => {
+                let parsed = parsed.unwrap_or_else(|error| panic!("{}: {error}", case.name));
+                let mut buffer = [0; pdu::MAX_LEN];
+                let len = parsed.encode(&mut buffer).unwrap();
+                assert_eq!(buffer[..len], request, "{}", case.name);
+                assert!(parsed.response(&response).is_ok(), "{}", case.name);
+            }
+            // Whether an address is there is for a memory to say.
+            Some(code @ ExceptionCode::IllegalDataAddress) => {
+                let answer = parsed.unwrap().response(&response);
+                assert_eq!(answer, Err(ResponseError::Exception(code)), "{}", case.name);
+            }
+            Some(code) => assert_eq!(parsed, Err(code), "{}", case.name),
+        }
+    }
+}
