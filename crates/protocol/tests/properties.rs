@@ -194,12 +194,13 @@ proptest! {
         let mut frame = [0; rtu::MAX_LEN];
         let len = rtu::encode(unit, &pdu, &mut frame).unwrap();
         prop_assert_eq!(rtu::decode(&frame[..len]), Ok((unit, &pdu[..])));
-        frame[flip.index(len)] ^= 1 << bit;
+        frame[flip.index(len)] ^= 1u8 << bit;
         prop_assert!(rtu::decode(&frame[..len]).is_err());
 
         let mut frame = [0; ascii::MAX_LEN];
         let len = ascii::encode(unit, &pdu, &mut frame).unwrap();
-        prop_assert_eq!(ascii::decode(&frame[..len], &mut [0; 255]), Ok((unit, &pdu[..])));
+        let mut body = [0; 255];
+        prop_assert_eq!(ascii::decode(&frame[..len], &mut body), Ok((unit, &pdu[..])));
         let digit = 1 + flip.index(len - 3);
         frame[digit] = if frame[digit] == b'0' { b'1' } else { b'0' };
         prop_assert!(ascii::decode(&frame[..len], &mut [0; 255]).is_err());

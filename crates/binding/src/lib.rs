@@ -1,0 +1,24 @@
+//! `holdfast._core`: the native parts as Python sees them.
+//!
+//! This crate converts and forwards, and holds no logic. The interpreter is released around
+//! everything that can wait.
+
+mod engine;
+mod memory;
+
+use pyo3::prelude::*;
+
+#[pymodule(gil_used = false)]
+mod _core {
+    use super::{Bound, PyModule, PyModuleMethods, PyResult};
+
+    #[pymodule_export]
+    use super::engine::{Engine, Listener, Rule};
+    #[pymodule_export]
+    use super::memory::{Memory, OutOfRange};
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+}

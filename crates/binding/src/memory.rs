@@ -1,0 +1,286 @@
+//! `Memory`: Python values in, bytes in memory, and back.
+
+use std::sync::Arc;
+
+use holdfast_memory::{
+    Access, Area, Gate, GateMode, Layout, Memory as Core, Read, Refusal, Span, Write,
+};
+use pyo3::exceptions::{PyIndexError, PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyList, PyString};
+
+pyo3::create_exception!(holdfast, OutOfRange, PyIndexError, "A range outside its area.");
+
+/// A size from address 0, or a start and a size.
+#[derive(FromPyObject)]
+enum Extent {
+    Size(u32),
+    From(u16, u32),
+}
+
+#[derive(FromPyObject)]
+enum Seal {
+    Once(String, u16),
+    Mode(String, u16, String),
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Memory {
+    pub core: Arc<Core>,
+}
+
+#[pymethods]
+impl Memory {
+    #[new]
+    #[pyo3(signature = (*, coils=None, discrete_inputs=None, holding_registers=None, input_registers=None, seal=None))]
+    fn new(
+        coils: Option<Extent>,
+        discrete_inputs: Option<Extent>,
+        holding_registers: Option<Extent>,
+        input_registers: Option<Extent>,
+        seal: Option<Seal>,
+    ) -> PyResult<Memory> {
+        let extents = [coils, discrete_inputs, holding_registers, input_registers];
+        let mut layout = Layout::default();
+        for (area, extent) in Area::ALL.into_iter().zip(extents) {
+            let (start, size) = match extent {
+                None => continue,
+                Some(Extent::Size(size)) => (0, size),
+                Some(Extent::From(start, size)) => (start, size),
+            };
+            let span = Span::new(start, size)
+                .map_err(|error| PyValueError::new_err(format!("{}: {error}", area.name())))?;
+            layout = layout.with(area, span);
+        }
+        let gate = seal.map(gate).transpose()?;
+        let core = Core::new(layout, gate)
+            .map_err(|error| PyValueError::new_err(format!("seal: {error}")))?;
+        Ok(Memory { core: Arc::new(core) })
+    }
+
+    #[getter]
+    fn areas<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let areas = PyDict::new(py);
+        for area in Area::ALL {
+            let span = self.core.span(area);
+            if span.size() > 0 {
+                let end = u32::from(span.start()) + span.size();
+                let range = py.get_type::<pyo3::types::PyRange>().call1((span.start(), end))?;
+                areas.set_item(area.name(), range)?;
+            }
+        }
+        Ok(areas)
+    }
+
+    #[getter]
+    fn sealed(&self, py: Python<'_>) -> bool {
+        py.detach(|| self.core.sealed())
+    }
+
+    fn read<'py>(
+        &self,
+        py: Python<'py>,
+        area: &str,
+        address: i64,
+        count: i64,
+    ) -> PyResult<Bound<'py, PyList>> {
+        let mut range = Range::new(&self.core, area, address, count)?;
+        py.detach(|| self.core.read(Access::Ingest, range.reading()))
+            .map_err(|refusal| range.refused(&self.core, refusal))?;
+        range.values(py)
+    }
+
+    fn read_many<'py>(
+        &self,
+        py: Python<'py>,
+        ranges: Vec<(String, i64, i64)>,
+    ) -> PyResult<Vec<Bound<'py, PyList>>> {
+        let ranges = ranges
+            .iter()
+            .map(|(area, address, count)| Range::new(&self.core, area, *address, *count));
+        let mut ranges = ranges.collect::<PyResult<Vec<Range>>>()?;
+        py.detach(|| {
+            let mut reads: Vec<Read> = ranges.iter_mut().map(Range::reading).collect();
+            self.core.read_many(Access::Ingest, &mut reads)
+        })
+        .map_err(|refused| ranges[refused.index].refused(&self.core, refused.refusal))?;
+        ranges.iter().map(|range| range.values(py)).collect()
+    }
+
+    fn write(
+        &self,
+        py: Python<'_>,
+        area: &str,
+        address: i64,
+        values: &Bound<'_, PyAny>,
+    ) -> PyResult<()> {
+        let range = Range::packed(&self.core, area, address, values)?;
+        py.detach(|| self.core.write(Access::Ingest, range.writing()))
+            .map_err(|refusal| range.refused(&self.core, refusal))
+    }
+
+    fn write_many(
+        &self,
+        py: Python<'_>,
+        writes: Vec<(String, i64, Bound<'_, PyAny>)>,
+    ) -> PyResult<()> {
+        let ranges = writes
+            .iter()
+            .map(|(area, address, values)| Range::packed(&self.core, area, *address, values));
+        let ranges = ranges.collect::<PyResult<Vec<Range>>>()?;
+        py.detach(|| {
+            let writes: Vec<Write> = ranges.iter().map(Range::writing).collect();
+            self.core.write_many(Access::Ingest, &writes)
+        })
+        .map_err(|refused| ranges[refused.index].refused(&self.core, refused.refusal))
+    }
+
+    fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
+        let areas = self.areas(py)?;
+        let areas = areas.iter().map(|(name, range)| format!("{name}={range}"));
+        Ok(format!("<Memory {}>", areas.collect::<Vec<_>>().join(" ")))
+    }
+}
+
+/// A range inside an area, and its bytes.
+struct Range {
+    area: Area,
+    address: u16,
+    count: usize,
+    bytes: Vec<u8>,
+}
+
+impl Range {
+    /// A range whose bytes are yet to be read.
+    fn new(memory: &Core, area: &str, address: i64, count: i64) -> PyResult<Range> {
+        let area = named(area)?;
+        if count < 1 {
+            return Err(PyValueError::new_err(format!("count is {count}, at least 1 is allowed")));
+        }
+        let inside = u16::try_from(address).ok().zip(usize::try_from(count).ok());
+        let (address, count) = inside
+            .filter(|(_, count)| *count <= Span::MAX_SIZE as usize)
+            .ok_or_else(|| out_of_range(memory, area, address, count))?;
+        Ok(Range { area, address, count, bytes: vec![0; area.byte_len(count)] })
+    }
+
+    /// A range with the bytes that `values` stand for.
+    fn packed(
+        memory: &Core,
+        area: &str,
+        address: i64,
+        values: &Bound<'_, PyAny>,
+    ) -> PyResult<Range> {
+        let items = numbers(named(area)?, values)?;
+        let mut range = Range::new(memory, area, address, items.len() as i64).map_err(|error| {
+            if items.is_empty() { PyValueError::new_err("values are empty") } else { error }
+        })?;
+        if range.area.is_bits() {
+            for (index, bit) in items.iter().enumerate() {
+                range.bytes[index / 8] |= (*bit as u8) << (index % 8);
+            }
+        } else {
+            for (pair, register) in range.bytes.chunks_exact_mut(2).zip(&items) {
+                pair.copy_from_slice(&register.to_be_bytes());
+            }
+        }
+        Ok(range)
+    }
+
+    fn reading(&mut self) -> Read<'_> {
+        Read { area: self.area, address: self.address, count: self.count, out: &mut self.bytes }
+    }
+
+    fn writing(&self) -> Write<'_> {
+        Write { area: self.area, address: self.address, count: self.count, bytes: &self.bytes }
+    }
+
+    fn values<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        if self.area.is_bits() {
+            let bit = |index: usize| self.bytes[index / 8] >> (index % 8) & 1;
+            PyList::new(py, (0..self.count).map(bit))
+        } else {
+            let registers = self.bytes.chunks_exact(2);
+            PyList::new(py, registers.map(|pair| u16::from_be_bytes([pair[0], pair[1]])))
+        }
+    }
+
+    fn refused(&self, memory: &Core, refusal: Refusal) -> PyErr {
+        match refusal {
+            Refusal::OutOfRange => {
+                out_of_range(memory, self.area, i64::from(self.address), self.count as i64)
+            }
+            other => PyValueError::new_err(other.to_string()),
+        }
+    }
+}
+
+fn named(area: &str) -> PyResult<Area> {
+    Area::from_name(area).ok_or_else(|| {
+        let known = Area::ALL.map(Area::name).join(", ");
+        PyValueError::new_err(format!("unknown area {area:?}, allowed are {known}"))
+    })
+}
+
+fn gate(seal: Seal) -> PyResult<Gate> {
+    let (area, address, mode) = match seal {
+        Seal::Once(area, address) => (area, address, GateMode::Once),
+        Seal::Mode(area, address, mode) => match mode.as_str() {
+            "once" => (area, address, GateMode::Once),
+            "level" => (area, address, GateMode::Level),
+            _ => {
+                let message = format!("unknown seal mode {mode:?}, allowed are once, level");
+                return Err(PyValueError::new_err(message));
+            }
+        },
+    };
+    Ok(Gate { area: named(&area)?, address, mode })
+}
+
+fn out_of_range(memory: &Core, area: Area, address: i64, count: i64) -> PyErr {
+    let span = memory.span(area);
+    let name = area.name();
+    let found = format!("{count} from address {address}");
+    OutOfRange::new_err(match span.size() {
+        0 => format!("{name}: {found}, but this memory has no {name}"),
+        size => {
+            let last = u32::from(span.start()) + size - 1;
+            format!("{name}: {found}, allowed are addresses {} to {last}", span.start())
+        }
+    })
+}
+
+/// The integers of a Python sequence, each one checked.
+fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
+    let text = values.is_instance_of::<PyString>()
+        || values.is_instance_of::<PyBytes>()
+        || values.is_instance_of::<PyByteArray>();
+    if text {
+        let found = values.get_type().name()?;
+        return Err(PyTypeError::new_err(format!(
+            "values are {found}, not a sequence of integers"
+        )));
+    }
+    let mut numbers = Vec::with_capacity(values.len().unwrap_or(0).min(Span::MAX_SIZE as usize));
+    for (index, value) in values.try_iter()?.enumerate() {
+        numbers.push(number(area, index, &value?)?);
+    }
+    Ok(numbers)
+}
+
+fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
+    let (most, allowed) =
+        if area.is_bits() { (1, "0, 1, False, True") } else { (u16::MAX, "integers 0 to 65535") };
+    let is_bool = value.is_instance_of::<PyBool>();
+    let number = if is_bool && !area.is_bits() { None } else { value.extract::<i128>().ok() };
+    match number.map(|number| u16::try_from(number).ok().filter(|number| *number <= most)) {
+        Some(Some(number)) => Ok(number),
+        out_of_bounds => {
+            let message = format!("values[{index}] is {}, allowed are {allowed}", value.repr()?);
+            Err(match out_of_bounds {
+                Some(None) => PyValueError::new_err(message),
+                _ => PyTypeError::new_err(message),
+            })
+        }
+    }
+}

@@ -1,0 +1,301 @@
+//! One Modbus TCP connection: bytes in, all complete requests answered in order, bytes out.
+//!
+//! A worker thread has one pair of buffers for all of its connections ([`Scratch`]): between a read
+//! and the write that answers it nothing is awaited. What is left over is kept by the connection
+//! itself, and is small: the beginning of a request, or replies that a slow peer does not take.
+//! While replies wait, no more requests are read.
+
+use std::cell::RefCell;
+use std::future::poll_fn;
+use std::io::{self, ErrorKind, Read, Write};
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+
+use holdfast_protocol::frame::mbap::{self, Next};
+use holdfast_protocol::pdu;
+use tokio::io::{AsyncRead, ReadBuf};
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::time::{Instant, Sleep, sleep_until, timeout};
+
+use crate::admission::Ticket;
+use crate::event::Kind;
+use crate::policy::Grant;
+use crate::station::Station;
+
+/// Bytes taken from a socket at once.
+const INPUT: usize = 4096;
+
+/// The shortest frame: a header and a function code.
+const SHORTEST: usize = mbap::HEADER_LEN + 1;
+
+/// Room for the replies to all the requests that one input can hold.
+const OUTPUT: usize = (INPUT / SHORTEST + 1) * mbap::MAX_LEN;
+
+/// How often the rest of the input is read before a connection ends.
+const LAST_READS: usize = 64;
+
+/// What "no deadline" means to a timer.
+const FAR: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
+
+struct Scratch {
+    input: Box<[u8]>,
+    output: Box<[u8]>,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::new(Scratch {
+        input: vec![0; INPUT].into_boxed_slice(),
+        output: vec![0; OUTPUT].into_boxed_slice(),
+    });
+}
+
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Timeouts {
+    /// Without a request; `None` keeps the connection.
+    pub(crate) idle: Option<Duration>,
+    /// From the first byte of a request to its last, and for a peer to take its replies.
+    pub(crate) request: Duration,
+}
+
+pub(crate) struct Connection {
+    stream: TcpStream,
+    session: Session,
+    timeouts: Timeouts,
+    ticket: Ticket,
+    /// Replies that the peer did not take yet.
+    unsent: Vec<u8>,
+    last_request: Instant,
+    /// When the request that is not complete yet began.
+    begun: Option<Instant>,
+}
+
+/// What the answers of a connection depend on.
+struct Session {
+    station: Arc<Station>,
+    grant: Arc<Grant>,
+    /// The beginning of a request.
+    partial: [u8; mbap::MAX_LEN],
+    partial_len: usize,
+}
+
+/// What became of some input.
+struct Answered {
+    /// Bytes of output.
+    len: usize,
+    requests: usize,
+    /// Bytes of whole frames.
+    consumed: usize,
+    /// A frame could not be trusted: nothing behind it was looked at.
+    broken: bool,
+}
+
+impl Connection {
+    pub(crate) fn new(
+        stream: TcpStream,
+        station: Arc<Station>,
+        grant: Arc<Grant>,
+        timeouts: Timeouts,
+        ticket: Ticket,
+    ) -> Connection {
+        let session = Session { station, grant, partial: [0; mbap::MAX_LEN], partial_len: 0 };
+        let last_request = Instant::now();
+        Connection {
+            stream,
+            session,
+            timeouts,
+            ticket,
+            unsent: Vec::new(),
+            last_request,
+            begun: None,
+        }
+    }
+
+    /// Serves until the connection ends, and says why.
+    pub(crate) async fn run(mut self, mut stop: watch::Receiver<bool>) -> Kind {
+        let mut stopping = pin!(stop.wait_for(|stop| *stop));
+        let mut alarm = pin!(sleep_until(self.last_request + FAR));
+        loop {
+            if let Err(end) = self.send_unsent().await {
+                return end;
+            }
+            self.set(alarm.as_mut());
+            let step = tokio::select! {
+                biased;
+                step = poll_fn(|context| self.poll(context)) => step,
+                () = &mut alarm => self.overdue(),
+                _ = &mut stopping => return self.finish(),
+            };
+            if let Err(end) = step {
+                return end;
+            }
+        }
+    }
+
+    /// Reads once, answers all that is complete, and writes once.
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            let kept = self.session.restore(input);
+            let mut buffer = ReadBuf::new(&mut input[kept..]);
+            let read = ready!(Pin::new(&mut self.stream).poll_read(context, &mut buffer));
+            let len = buffer.filled().len();
+            if read.is_err() || len == 0 {
+                return Poll::Ready(Err(Kind::Closed));
+            }
+            let answered = self.session.answer(&input[..kept + len], output);
+            self.note(&answered);
+            let output = &output[..answered.len];
+            match if output.is_empty() { Ok(0) } else { self.stream.try_write(output) } {
+                Ok(sent) => self.unsent.extend_from_slice(&output[sent..]),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                    self.unsent.extend_from_slice(output);
+                }
+                Err(_) => return Poll::Ready(Err(Kind::Closed)),
+            }
+            Poll::Ready(if answered.broken { Err(Kind::BrokenFrame) } else { Ok(()) })
+        })
+    }
+
+    /// Keeps the times that the deadlines hang on.
+    fn note(&mut self, answered: &Answered) {
+        let now = Instant::now();
+        if answered.requests > 0 {
+            self.last_request = now;
+            self.ticket.touch(now.into_std());
+        }
+        if self.session.partial_len == 0 {
+            self.begun = None;
+        } else if answered.consumed > 0 || self.begun.is_none() {
+            self.begun = Some(now);
+        }
+    }
+
+    /// Waits for the peer to take the replies it is owed.
+    async fn send_unsent(&mut self) -> Result<(), Kind> {
+        let mut sent = 0;
+        while sent < self.unsent.len() {
+            match timeout(self.timeouts.request, self.stream.writable()).await {
+                Err(_) => return Err(Kind::SlowReader),
+                Ok(Err(_)) => return Err(Kind::Closed),
+                Ok(Ok(())) => {}
+            }
+            match self.stream.try_write(&self.unsent[sent..]) {
+                Ok(len) => sent += len,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+                Err(_) => return Err(Kind::Closed),
+            }
+        }
+        if sent > 0 {
+            // A slow peer's buffer is given back: most connections never need one.
+            self.unsent = Vec::new();
+        }
+        Ok(())
+    }
+
+    fn deadline(&self) -> (Instant, Kind) {
+        match (self.begun, self.timeouts.idle) {
+            (Some(begun), _) => (begun + self.timeouts.request, Kind::RequestTimeout),
+            (None, Some(idle)) => (self.last_request + idle, Kind::Idle),
+            (None, None) => (self.last_request + FAR, Kind::Idle),
+        }
+    }
+
+    /// Sets the alarm to an earlier time. A later one waits until it rings: requests come much more
+    /// often than alarms.
+    fn set(&self, alarm: Pin<&mut Sleep>) {
+        let (deadline, _) = self.deadline();
+        if deadline < alarm.deadline() || alarm.is_elapsed() {
+            alarm.reset(deadline);
+        }
+    }
+
+    fn overdue(&self) -> Result<(), Kind> {
+        let (deadline, kind) = self.deadline();
+        if Instant::now() < deadline { Ok(()) } else { Err(kind) }
+    }
+
+    /// Answers what the system has received already, then ends.
+    fn finish(mut self) -> Kind {
+        if let Ok(mut stream) = self.stream.into_std() {
+            // A peer whose buffers are full, or who is gone, loses what it does not take.
+            let _ = self.session.drain(&mut stream, &self.unsent);
+        }
+        self.unsent.clear();
+        Kind::Closed
+    }
+}
+
+impl Session {
+    /// Puts the beginning of a request in front of what will be read; its length.
+    fn restore(&self, input: &mut [u8]) -> usize {
+        input[..self.partial_len].copy_from_slice(&self.partial[..self.partial_len]);
+        self.partial_len
+    }
+
+    /// Answers the complete requests of `input` and keeps the incomplete one behind them.
+    fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
+        let mut answered = Answered { len: 0, requests: 0, consumed: 0, broken: false };
+        let mut rest = input;
+        loop {
+            match mbap::next(rest) {
+                Next::Frame { transaction_id, unit_id, pdu, len } => {
+                    rest = &rest[len..];
+                    answered.requests += 1;
+                    answered.len +=
+                        self.reply(transaction_id, unit_id, pdu, &mut output[answered.len..]);
+                }
+                Next::Foreign { len, .. } => {
+                    rest = &rest[len..];
+                    self.station.counters.frames.foreign.add();
+                }
+                Next::Broken { .. } => {
+                    self.station.counters.frames.broken.add();
+                    answered.broken = true;
+                    break;
+                }
+                Next::Incomplete => break,
+            }
+        }
+        answered.consumed = input.len() - rest.len();
+        // An incomplete frame is shorter than the longest one.
+        let kept = rest.len().min(self.partial.len());
+        self.partial[..kept].copy_from_slice(&rest[..kept]);
+        self.partial_len = kept;
+        answered
+    }
+
+    /// Writes one framed reply at the start of `output`; its length, 0 when none is due.
+    #[inline]
+    fn reply(&self, transaction_id: u16, unit_id: u8, pdu: &[u8], output: &mut [u8]) -> usize {
+        let Some((header, rest)) = output.split_first_chunk_mut::<{ mbap::HEADER_LEN }>() else {
+            return 0;
+        };
+        let Some(buffer) = rest.first_chunk_mut::<{ pdu::MAX_LEN }>() else {
+            return 0;
+        };
+        let Some(len) = self.station.answer(&self.grant, unit_id, pdu, buffer) else {
+            return 0;
+        };
+        *header = mbap::header(transaction_id, unit_id, len);
+        header.len() + len
+    }
+
+    /// Sends `unsent`, then reads, answers and sends until nothing more is there, without waiting.
+    fn drain(&mut self, stream: &mut std::net::TcpStream, unsent: &[u8]) -> io::Result<()> {
+        stream.write_all(unsent)?;
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            for _ in 0..LAST_READS {
+                let kept = self.restore(input);
+                let len = stream.read(&mut input[kept..])?;
+                let answered = self.answer(&input[..kept + len], output);
+                stream.write_all(&output[..answered.len])?;
+                if len == 0 || answered.broken {
+                    break;
+                }
+            }
+            Ok(())
+        })
+    }
+}

@@ -1,0 +1,151 @@
+//! What a listener counts. Counting never waits, and reading never stops the counting.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use holdfast_protocol::pdu::ExceptionCode;
+
+/// A number that only grows.
+#[derive(Debug, Default)]
+pub struct Counter(AtomicU64);
+
+impl Counter {
+    #[inline]
+    pub fn add(&self) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub fn get(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// The counters of one listener, since it was started.
+#[derive(Debug)]
+pub struct Counters {
+    requests: [Counter; 256],
+    exceptions: [Counter; 16],
+    /// Requests carried out, those for the event counter itself not among them (V1.1b3, 6.9).
+    pub events: Counter,
+    /// Requests to a unit that is in listen only mode.
+    pub unanswered: Counter,
+    pub frames: FrameCounters,
+    pub connections: ConnectionCounters,
+    cleared: Mutex<Bus>,
+}
+
+/// Frames that are no requests.
+#[derive(Debug, Default)]
+pub struct FrameCounters {
+    /// With a protocol id other than 0: discarded.
+    pub foreign: Counter,
+    /// With a length that no frame has: the connection is closed.
+    pub broken: Counter,
+}
+
+#[derive(Debug, Default)]
+pub struct ConnectionCounters {
+    pub accepted: Counter,
+    /// No rule names the peer.
+    pub refused_source: Counter,
+    /// `max_connections` or `max_connections_per_source` was reached.
+    pub refused_full: Counter,
+    /// Closed in favour of a new connection.
+    pub evicted: Counter,
+    /// Closed after `idle_timeout`.
+    pub idle: Counter,
+    /// Closed because a request did not arrive within `request_timeout`.
+    pub request_timeout: Counter,
+    /// Closed because the peer did not take its replies within `request_timeout`.
+    pub slow_reader: Counter,
+    /// The system could not accept a connection.
+    pub accept_errors: Counter,
+}
+
+/// The counters of Diagnostics (V1.1b3, 6.8.1), since they were cleared.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Bus {
+    pub messages: u64,
+    pub communication_errors: u64,
+    pub exceptions: u64,
+    pub server_messages: u64,
+    pub no_response: u64,
+    pub busy: u64,
+    pub events: u64,
+}
+
+impl Default for Counters {
+    fn default() -> Counters {
+        Counters {
+            requests: [const { Counter(AtomicU64::new(0)) }; 256],
+            exceptions: [const { Counter(AtomicU64::new(0)) }; 16],
+            events: Counter::default(),
+            unanswered: Counter::default(),
+            frames: FrameCounters::default(),
+            connections: ConnectionCounters::default(),
+            cleared: Mutex::default(),
+        }
+    }
+}
+
+impl Counters {
+    #[inline]
+    pub fn request(&self, function_code: u8) {
+        self.requests[usize::from(function_code)].add();
+    }
+
+    pub fn exception(&self, code: ExceptionCode) {
+        self.exceptions[usize::from(code.code()) & 0x0F].add();
+    }
+
+    /// Requests by function code, codes never asked for left out.
+    pub fn requests(&self) -> impl Iterator<Item = (u8, u64)> {
+        nonzero(&self.requests)
+    }
+
+    /// Exceptions by code, codes never sent left out.
+    pub fn exceptions(&self) -> impl Iterator<Item = (u8, u64)> {
+        nonzero(&self.exceptions)
+    }
+
+    /// The counters of Diagnostics.
+    pub fn bus(&self) -> Bus {
+        let (now, cleared) =
+            (self.total(), *self.cleared.lock().unwrap_or_else(PoisonError::into_inner));
+        Bus {
+            messages: now.messages.saturating_sub(cleared.messages),
+            communication_errors: now
+                .communication_errors
+                .saturating_sub(cleared.communication_errors),
+            exceptions: now.exceptions.saturating_sub(cleared.exceptions),
+            server_messages: now.server_messages.saturating_sub(cleared.server_messages),
+            no_response: now.no_response.saturating_sub(cleared.no_response),
+            busy: now.busy.saturating_sub(cleared.busy),
+            events: now.events.saturating_sub(cleared.events),
+        }
+    }
+
+    /// Starts the counters of Diagnostics again at 0; all others go on.
+    pub fn clear_bus(&self) {
+        *self.cleared.lock().unwrap_or_else(PoisonError::into_inner) = self.total();
+    }
+
+    fn total(&self) -> Bus {
+        let requests: u64 = self.requests.iter().map(Counter::get).sum();
+        let errors = self.frames.foreign.get() + self.frames.broken.get();
+        Bus {
+            messages: requests + errors,
+            communication_errors: errors,
+            exceptions: self.exceptions.iter().map(Counter::get).sum(),
+            server_messages: requests,
+            no_response: self.unanswered.get(),
+            busy: self.exceptions[usize::from(ExceptionCode::ServerDeviceBusy.code())].get(),
+            events: self.events.get(),
+        }
+    }
+}
+
+fn nonzero(counters: &[Counter]) -> impl Iterator<Item = (u8, u64)> {
+    let all = counters.iter().enumerate().map(|(code, counter)| (code as u8, counter.get()));
+    all.filter(|(_, count)| *count > 0)
+}

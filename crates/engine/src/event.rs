@@ -1,0 +1,120 @@
+//! What happened to connections, for a log: sent without waiting, dropped and counted when nobody
+//! takes them.
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+/// Events that wait to be taken.
+const CAPACITY: usize = 1024;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    Opened,
+    /// The peer ended the connection, or it broke.
+    Closed,
+    /// Closed after `idle_timeout`.
+    Idle,
+    /// A request did not arrive within `request_timeout`.
+    RequestTimeout,
+    /// The peer did not take its replies.
+    SlowReader,
+    /// A length that no frame has.
+    BrokenFrame,
+    /// Closed in favour of a new connection.
+    Evicted,
+    RefusedSource,
+    RefusedFull,
+    AcceptError,
+}
+
+impl Kind {
+    /// Whether this is the ordinary course of a connection.
+    const fn is_ordinary(self) -> bool {
+        matches!(self, Kind::Opened | Kind::Closed | Kind::Idle)
+    }
+
+    pub const fn name(self) -> &'static str {
+        match self {
+            Kind::Opened => "opened",
+            Kind::Closed => "closed",
+            Kind::Idle => "idle",
+            Kind::RequestTimeout => "request_timeout",
+            Kind::SlowReader => "slow_reader",
+            Kind::BrokenFrame => "broken_frame",
+            Kind::Evicted => "evicted",
+            Kind::RefusedSource => "refused_source",
+            Kind::RefusedFull => "refused_full",
+            Kind::AcceptError => "accept_error",
+        }
+    }
+}
+
+/// Something that happened on a listener.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Event {
+    pub listener: Arc<str>,
+    pub kind: Kind,
+    pub peer: Option<SocketAddr>,
+}
+
+/// Which events are sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verbosity {
+    Nothing,
+    /// Refusals and faults.
+    Refusals,
+    /// Every connection too.
+    All,
+}
+
+/// The sending side.
+#[derive(Debug, Clone)]
+pub(crate) struct Reporter {
+    verbosity: Verbosity,
+    sender: SyncSender<Event>,
+    lost: Arc<AtomicU64>,
+}
+
+/// The receiving side.
+#[derive(Debug)]
+pub(crate) struct Events {
+    receiver: Mutex<Receiver<Event>>,
+    lost: Arc<AtomicU64>,
+}
+
+pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
+    let (sender, receiver) = sync_channel(CAPACITY);
+    let lost = Arc::new(AtomicU64::new(0));
+    let reporter = Reporter { verbosity, sender, lost: Arc::clone(&lost) };
+    (reporter, Events { receiver: Mutex::new(receiver), lost })
+}
+
+impl Reporter {
+    pub(crate) fn report(&self, listener: &Arc<str>, kind: Kind, peer: Option<SocketAddr>) {
+        let wanted = match self.verbosity {
+            Verbosity::Nothing => false,
+            Verbosity::Refusals => !kind.is_ordinary(),
+            Verbosity::All => true,
+        };
+        if wanted
+            && self.sender.try_send(Event { listener: Arc::clone(listener), kind, peer }).is_err()
+        {
+            self.lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Events {
+    /// The next event; `None` when there is none for `timeout`, or no more will come.
+    pub(crate) fn next(&self, timeout: Duration) -> Option<Event> {
+        self.receiver.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout).ok()
+    }
+
+    /// How many events found no place.
+    pub(crate) fn lost(&self) -> u64 {
+        self.lost.load(Ordering::Relaxed)
+    }
+}

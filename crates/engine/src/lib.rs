@@ -1,0 +1,28 @@
+//! The data plane: Modbus listeners over memories, on threads of its own.
+//!
+//! The rules this crate keeps:
+//!
+//! * A connection's rights are settled once, when it is accepted: its source address picks one rule
+//!   ([`policy`]), and the rule is two tables. A request costs two look-ups.
+//! * All that arrived together is answered together, in order, with one write ([`connection`]). The
+//!   way from request to reply ([`station`]) allocates nothing.
+//! * One peer can't hold up another: every buffer has a bound, every wait has a deadline, and no
+//!   code on a worker thread waits for anything but its sockets.
+//! * It says what happened in counters and events, and never waits for whoever reads them.
+//!
+//! It knows no Python, no JSON, and no type wider than a bit or a register.
+
+#![forbid(unsafe_code)]
+
+mod admission;
+mod connection;
+pub mod counters;
+mod engine;
+pub mod event;
+pub mod identity;
+mod listener;
+pub mod policy;
+pub mod station;
+
+pub use engine::{Engine, Settings, StartError};
+pub use listener::{ListenerSettings, WhenFull};

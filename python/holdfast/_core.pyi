@@ -1,0 +1,177 @@
+"""The native core: memory and Modbus engine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal, TypeAlias, TypedDict, final
+
+Access: TypeAlias = Literal["read-only", "read-write"]
+Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
+Bind: TypeAlias = str
+Extent: TypeAlias = int | tuple[int, int]
+Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
+
+__version__: str
+
+class OutOfRange(IndexError):
+    """A range that is not inside its area; nothing was read or written."""
+
+class ConnectionCounters(TypedDict):
+    """Connections of one listener: how many are `open`, and what became of the others."""
+
+    accepted: int
+    refused_source: int
+    refused_full: int
+    evicted: int
+    idle: int
+    request_timeout: int
+    slow_reader: int
+    accept_errors: int
+    open: int
+
+class FrameCounters(TypedDict):
+    """Frames that are no requests: with a protocol id other than 0, with an impossible length."""
+
+    foreign: int
+    broken: int
+
+class ListenerCounters(TypedDict):
+    """What one listener counted: requests by function code, exceptions by exception code."""
+
+    requests: dict[int, int]
+    exceptions: dict[int, int]
+    unanswered: int
+    connections: ConnectionCounters
+    frames: FrameCounters
+
+@final
+class Memory:
+    """Four areas of bits and 16-bit registers, of fixed size, all 0 at first.
+
+    An area is given by its size (addresses from 0), or by start and size; one that is left out does
+    not exist. `start + size` is at most 65536. Every read sees all of a write or none of it,
+    whoever writes, and a write that is refused changes nothing. Any thread may call any method.
+
+    `seal` names the gate bit, in coils or discrete inputs: Modbus clients are answered with
+    exception 06 until a write from here leaves that bit at 1: for good (`once`), or as long as it
+    is 1 (`level`).
+
+    Raises `ValueError` for a size or gate that can't be.
+    """
+
+    def __new__(
+        cls,
+        *,
+        coils: Extent | None = None,
+        discrete_inputs: Extent | None = None,
+        holding_registers: Extent | None = None,
+        input_registers: Extent | None = None,
+        seal: Seal | None = None,
+    ) -> Memory: ...
+    @property
+    def areas(self) -> dict[Area, range]:
+        """The addresses of each area that exists."""
+
+    @property
+    def sealed(self) -> bool:
+        """Whether Modbus clients are refused for now."""
+
+    def read(self, area: Area, address: int, count: int) -> list[int]:
+        """`count` bits (0 or 1) or registers (0 to 65535) from `address`, of one moment.
+
+        Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1.
+        """
+
+    def read_many(self, ranges: Sequence[tuple[Area, int, int]]) -> list[list[int]]:
+        """Several ranges of one moment, each as area, address and count; raises as `read`."""
+
+    def write(self, area: Area, address: int, values: Iterable[int]) -> None:
+        """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) as one step.
+
+        Raises `OutOfRange` outside the area, `ValueError` for no values, a value too large or an
+        unknown area, `TypeError` for a value of another type; nothing has changed then.
+        """
+
+    def write_many(self, writes: Sequence[tuple[Area, int, Iterable[int]]]) -> None:
+        """Several writes of any areas as one step, each as area, address and values.
+
+        A later one wins where two overlap. Raises as `write`; when one is refused, none is done.
+        """
+
+@final
+class Rule:
+    """What peers from some networks may do.
+
+    `units` maps unit ids, 0 to 255, to memories; `sources` are networks or addresses, IPv4 or IPv6
+    (an IPv4 address mapped into IPv6 is that IPv4 address). `functions` is a list of the function
+    codes that are allowed, `deny` of those that are not; both exclude each other.
+
+    Raises `ValueError` for a source or access that can't be.
+    """
+
+    def __new__(
+        cls,
+        units: Mapping[int, Memory],
+        *,
+        sources: Sequence[str],
+        access: Access,
+        functions: Sequence[int] | None = None,
+        deny: Sequence[int] | None = None,
+    ) -> Rule: ...
+
+@final
+class Listener:
+    """The settings of a Modbus TCP listener; times in seconds, `idle_timeout` 0 is for ever.
+
+    Raises `ValueError` for an address, limit or time that can't be.
+    """
+
+    def __new__(
+        cls,
+        name: str,
+        bind: Bind,
+        rules: Sequence[Rule],
+        *,
+        max_connections: int = 256,
+        max_connections_per_source: int | None = None,
+        when_full: Literal["refuse", "evict"] = "refuse",
+        idle_timeout: float = 300.0,
+        request_timeout: float = 10.0,
+    ) -> Listener: ...
+
+@final
+class Engine:
+    """Listeners on native threads, served from construction to `stop`.
+
+    `identity` holds identification objects by id, 0 to 2 among them; `events` says which of the
+    listeners' events are kept for `next_event`.
+
+    Raises `OSError` when a listener can't be bound (then none is), `ValueError` for an identity
+    that can't be served.
+    """
+
+    def __new__(
+        cls,
+        listeners: Sequence[Listener],
+        *,
+        identity: Sequence[tuple[int, str]],
+        unit_names: Sequence[tuple[int, str]] | None = None,
+        workers: int = 1,
+        events: Literal["nothing", "refusals", "all"] = "nothing",
+    ) -> Engine: ...
+    @property
+    def addresses(self) -> list[tuple[str, int]]:
+        """Where each listener listens, in the order they were given."""
+
+    def counters(self) -> dict[str, ListenerCounters]:
+        """The counters of each listener by name, since the start."""
+
+    def next_event(self, timeout: float) -> tuple[str, str, str | None] | None:
+        """Listener, kind and peer of the next event, if one comes within `timeout` seconds."""
+
+    @property
+    def lost_events(self) -> int:
+        """Events that were lost because nobody took them."""
+
+    def stop(self) -> None:
+        """Answers what was received and ends; returns within a second. From any thread."""

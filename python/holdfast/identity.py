@@ -1,0 +1,44 @@
+"""What a server says of itself: functions 17 and 43/14 (Modbus V1.1b3, 6.13 and 6.21)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from holdfast._core import __version__
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identity:
+    """The identification objects of all units, and names of single ones.
+
+    Texts are sent as UTF-8, at most 244 bytes each; an empty one that is not mandatory is left out.
+    `unit_names` by unit id, 0 to 255, take the place of `user_application_name`; `extended` are
+    private objects by id, 128 to 255.
+    """
+
+    vendor_name: str = "Holdfast"
+    product_code: str = "HF"
+    revision: str = __version__
+    vendor_url: str = ""
+    product_name: str = ""
+    model_name: str = ""
+    user_application_name: str = ""
+    unit_names: Mapping[int, str] = field(default_factory=dict)
+    extended: Mapping[int, str] = field(default_factory=dict)
+
+    def objects(self) -> list[tuple[int, str]]:
+        """Object ids and texts, the three mandatory ones first."""
+        mandatory = [self.vendor_name, self.product_code, self.revision]
+        optional = [
+            self.vendor_url,
+            self.product_name,
+            self.model_name,
+            self.user_application_name,
+        ]
+        regular = [(index, text) for index, text in enumerate(optional, start=3) if text]
+        return [*enumerate(mandatory), *regular, *self.extended.items()]
+
+    def names(self) -> list[tuple[int, str]]:
+        """Unit ids and names."""
+        return list(self.unit_names.items())

@@ -1,0 +1,162 @@
+"""What tests stand on: memories, servers on a free port, connections, and servers in a process
+of their own.
+
+Nothing here leaves the loopback interface, and everything that is started is stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Protocol
+
+import holdfast
+import pytest
+import wire
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
+
+SERVE_UNTIL_STDIN_ENDS = """
+import json, resource, sys
+import holdfast
+hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+memory = holdfast.Memory(
+    coils=1000, discrete_inputs=1000, holding_registers=1000, input_registers=1000
+)
+with holdfast.Server({1: memory}, **json.loads(sys.argv[1])) as server:
+    print(*server.address, flush=True)
+    sys.stdin.read()
+"""
+
+
+def missing(what: str) -> None:
+    """Skips a test on a developer's machine; in CI, where everything is installed, fails it."""
+    if os.environ.get("CI") == "true":
+        pytest.fail(f"{what} is missing, and this is CI")
+    pytest.skip(f"{what} is missing")
+
+
+def tool(name: str) -> str:
+    """The path of an external program."""
+    path = shutil.which(name)
+    if path is None:
+        missing(f"the program {name}")
+    return str(path)
+
+
+class Serve(Protocol):
+    """Starts a server that is stopped when the test ends."""
+
+    def __call__(self, units: Mapping[int, holdfast.Memory], **options: Any) -> holdfast.Server: ...
+
+
+class Connect(Protocol):
+    """Opens a connection that is closed when the test ends."""
+
+    def __call__(
+        self, to: holdfast.Server | tuple[str, int], **options: Any
+    ) -> wire.Connection: ...
+
+
+class ServerProcess:
+    """A server apart: its file descriptors and its memory are not those of the test."""
+
+    def __init__(self, **options: Any) -> None:
+        settings = {"bind": "127.0.0.1:0", "access": "read-write"} | options
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", SERVE_UNTIL_STDIN_ENDS, json.dumps(settings)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.pid = self._process.pid
+        assert self._process.stdout is not None
+        try:
+            host, port = self._process.stdout.readline().split()
+        except ValueError:
+            self.stop()
+            raise RuntimeError("the server process did not start") from None
+        self.address = (host, int(port))
+
+    def stop(self) -> None:
+        try:
+            self._process.communicate(timeout=wire.DEADLINE)
+        finally:
+            self._process.kill()
+            self._process.wait()
+
+
+class Process(Protocol):
+    """Starts a server process that is stopped when the test ends."""
+
+    def __call__(self, **options: Any) -> ServerProcess: ...
+
+
+@pytest.fixture
+def memory() -> holdfast.Memory:
+    """Every area with the addresses 0 to 999, all zero."""
+    return holdfast.Memory(
+        coils=1000, discrete_inputs=1000, holding_registers=1000, input_registers=1000
+    )
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    with ExitStack() as running:
+
+        def start(units: Mapping[int, holdfast.Memory], **options: Any) -> holdfast.Server:
+            settings = {"bind": "127.0.0.1:0", "access": "read-write"} | options
+            return running.enter_context(holdfast.Server(dict(units), **settings))
+
+        yield start
+
+
+@pytest.fixture
+def server(memory: holdfast.Memory, serve: Serve) -> holdfast.Server:
+    """Unit 1 is `memory`, to read and to write."""
+    return serve({1: memory})
+
+
+@pytest.fixture
+def connect() -> Iterator[Connect]:
+    with ExitStack() as opened:
+
+        def open_connection(
+            to: holdfast.Server | tuple[str, int], **options: Any
+        ) -> wire.Connection:
+            address = to if isinstance(to, tuple) else to.address
+            return opened.enter_context(wire.Connection(address, **options))
+
+        yield open_connection
+
+
+@pytest.fixture
+def client(server: holdfast.Server, connect: Connect) -> wire.Connection:
+    """A connection to `server`."""
+    return connect(server)
+
+
+@pytest.fixture
+def server_process() -> Iterator[Process]:
+    with ExitStack() as running:
+
+        def start(**options: Any) -> ServerProcess:
+            process = ServerProcess(**options)
+            running.callback(process.stop)
+            return process
+
+        yield start
+
+
+def content(memory: holdfast.Memory) -> dict[str, list[int]]:
+    """All four areas of a memory whose areas start at 0 and have 1000 items."""
+    ranges = [(area, 0, 1000) for area in AREAS]
+    return dict(zip(AREAS, memory.read_many(ranges), strict=True))
