@@ -2,7 +2,7 @@
 # a release build of the native core. Needs Python 3.11+, a C compiler and Rust.
 
 PYTHON ?= python3
-BIN := .venv/bin
+BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 RUST := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name Cargo.toml)
 CRATES := --workspace --exclude holdfast-binding
 
@@ -58,5 +58,5 @@ clean:
 	@touch $@
 
 .venv/core.stamp: $(RUST) pyproject.toml .venv/run.stamp
-	$(BIN)/python -m maturin develop --release --locked --quiet
+	PIP_QUIET=1 $(BIN)/python -m maturin develop --release --locked --quiet
 	@touch $@

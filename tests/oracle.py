@@ -226,7 +226,7 @@ class Oracle:
             require(data == b"\x00\x00", ILLEGAL_VALUE)
 
         def carry_out() -> bytes | None:
-            require(sub_function not in COUNTERS, 0xFF)
+            assert sub_function not in COUNTERS, "counters are not modelled"
             if sub_function == 4:
                 self.listen_only = True
                 return None

@@ -156,3 +156,70 @@ impl Drop for Ticket {
         self.admission.table().remove(self.id);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn peer(last: u8, port: u16) -> SocketAddr {
+        SocketAddr::from(([127, 0, 0, last], port))
+    }
+
+    fn task(runtime: &tokio::runtime::Runtime) -> AbortHandle {
+        runtime.spawn(std::future::pending::<()>()).abort_handle()
+    }
+
+    #[test]
+    fn a_place_is_free_again_when_its_ticket_is_dropped() {
+        let admission = Arc::new(Admission::new(1, None, WhenFull::Refuse));
+        let (ticket, _) = admission.admit(peer(1, 1)).unwrap();
+        assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
+        drop(ticket);
+        assert!(admission.admit(peer(1, 2)).is_ok());
+    }
+
+    #[test]
+    fn the_limit_of_a_source_counts_mapped_addresses_as_the_same() {
+        let admission = Arc::new(Admission::new(9, Some(1), WhenFull::Refuse));
+        let mapped: SocketAddr = "[::ffff:127.0.0.1]:2".parse().unwrap();
+        let held = admission.admit(peer(1, 1)).unwrap();
+        assert_eq!(admission.admit(mapped).unwrap_err(), Full);
+        assert!(admission.admit(peer(2, 1)).is_ok());
+        drop(held);
+        assert!(admission.admit(mapped).is_ok());
+    }
+
+    #[test]
+    fn the_connection_that_is_idle_longest_is_evicted() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = Arc::new(Admission::new(3, None, WhenFull::Evict));
+        let tickets = [1, 2, 3].map(|port| {
+            let (ticket, evicted) = admission.admit(peer(1, port)).unwrap();
+            assert_eq!(evicted, None);
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket
+        });
+        let later = Instant::now() + Duration::from_secs(1);
+        for (seconds, index) in [(3, 0), (1, 1), (2, 2)] {
+            tickets[index].touch(later + Duration::from_secs(seconds));
+        }
+        let (_fourth, evicted) = admission.admit(peer(1, 4)).unwrap();
+        assert_eq!(evicted, Some(peer(1, 2)));
+        assert_eq!(admission.open(), 3);
+    }
+
+    #[test]
+    fn a_source_at_its_limit_evicts_only_its_own() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = Arc::new(Admission::new(9, Some(1), WhenFull::Evict));
+        let _held = [(1, 1), (2, 2)].map(|(last, port)| {
+            let (ticket, _) = admission.admit(peer(last, port)).unwrap();
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket
+        });
+        let (_third, evicted) = admission.admit(peer(2, 3)).unwrap();
+        assert_eq!(evicted, Some(peer(2, 2)));
+    }
+}

@@ -299,3 +299,107 @@ impl Session {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use holdfast_memory::{Area, Layout, Memory, Span};
+
+    use super::*;
+    use crate::identity::Identity;
+    use crate::policy::{Functions, Rights, Rule};
+
+    fn session() -> Session {
+        let span = Span::new(0, 2000).unwrap();
+        let layout =
+            Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
+        let rule = Rule {
+            sources: Vec::new(),
+            units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
+            rights: Rights::ReadWrite,
+            functions: Functions::All,
+        };
+        let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+        Session {
+            station: Arc::new(Station::new(Identity::new(&objects, &[]).unwrap())),
+            grant: Arc::new(Grant::new(&rule)),
+            partial: [0; mbap::MAX_LEN],
+            partial_len: 0,
+        }
+    }
+
+    fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        [&mbap::header(7, unit_id, pdu.len())[..], pdu].concat()
+    }
+
+    /// One request of each function, and some that are refused.
+    fn requests() -> Vec<u8> {
+        let write = [&[16, 0, 0, 0, 123, 246][..], &[0; 246]].concat();
+        let pdus: [&[u8]; 17] = [
+            &[1, 0, 3, 7, 0xD0 - 3],
+            &[2, 0, 0, 0, 9],
+            &[3, 0, 0, 0, 125],
+            &[4, 0, 1, 0, 2],
+            &[5, 0, 9, 0xFF, 0],
+            &[6, 0, 9, 1, 2],
+            &[8, 0, 0, 1, 2],
+            &[8, 0, 0x0B, 0, 0],
+            &[11],
+            &[15, 0, 3, 0, 9, 2, 0xFF, 1],
+            &write,
+            &[17],
+            &[22, 0, 4, 0, 0xF2, 0, 0x25],
+            &[23, 0, 0, 0, 2, 0, 1, 0, 1, 2, 0xBE, 0xEF],
+            &[43, 14, 3, 0],
+            &[3, 0xFF, 0xFF, 0, 2],
+            &[99],
+        ];
+        pdus.iter().flat_map(|pdu| frame(1, pdu)).collect()
+    }
+
+    #[test]
+    fn the_way_from_request_to_reply_allocates_nothing() {
+        let (mut session, input, mut output) = (session(), requests(), vec![0; OUTPUT]);
+        session.answer(&input, &mut output);
+        let mut requests = 0;
+        let allocations = allocation_counter::measure(|| {
+            requests = session.answer(&input, &mut output).requests;
+        });
+        assert_eq!(requests, 17);
+        assert_eq!(allocations.count_total, 0);
+    }
+
+    #[test]
+    fn requests_cut_anywhere_get_the_replies_they_get_whole() {
+        let input = requests();
+        let mut whole = vec![0; OUTPUT];
+        let len = session().answer(&input, &mut whole).len;
+        for cut in 0..input.len() {
+            let (mut session, mut buffer, mut output) =
+                (session(), vec![0; INPUT], vec![0; OUTPUT]);
+            let mut replies = Vec::new();
+            for part in [&input[..cut], &input[cut..]] {
+                let kept = session.restore(&mut buffer);
+                buffer[kept..kept + part.len()].copy_from_slice(part);
+                let answered = session.answer(&buffer[..kept + part.len()], &mut output);
+                replies.extend_from_slice(&output[..answered.len]);
+            }
+            assert!(replies == whole[..len], "cut at {cut}");
+        }
+    }
+
+    #[test]
+    fn the_output_has_room_for_the_replies_to_any_input() {
+        let shortest = frame(1, &[17]);
+        let input = shortest.repeat(INPUT / shortest.len());
+        let answered = session().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!(answered.requests, INPUT / SHORTEST);
+        assert!(answered.requests * mbap::MAX_LEN <= OUTPUT);
+    }
+
+    #[test]
+    fn what_is_in_front_of_a_broken_frame_is_answered_and_nothing_behind_it() {
+        let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
+        let answered = session().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!((answered.requests, answered.broken), (1, true));
+    }
+}

@@ -2,7 +2,6 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -96,9 +95,7 @@ impl Engine {
         mut stopping: watch::Receiver<bool>,
     ) -> Result<(), StartError> {
         let stop = Arc::clone(&self.stop);
-        let (started, running) = channel();
         let body = move || {
-            let _ = started.send(());
             runtime.block_on(async move {
                 let _ = stopping.wait_for(|stop| *stop).await;
                 drop(stopping);
@@ -109,7 +106,6 @@ impl Engine {
         let name = format!("holdfast-io-{index}");
         let thread = thread::Builder::new().name(name).spawn(body).map_err(StartError::Worker)?;
         self.workers.lock().unwrap_or_else(PoisonError::into_inner).push(thread);
-        let _ = running.recv();
         Ok(())
     }
 

@@ -1,0 +1,59 @@
+//! Which rule a peer gets, and what it grants.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use holdfast_engine::policy::{Functions, Policy, Rights, Rule};
+use holdfast_memory::{Layout, Memory};
+
+fn rule(sources: &[&str], unit: u8, rights: Rights, functions: Functions) -> Rule {
+    Rule {
+        sources: sources.iter().map(|source| source.parse().unwrap()).collect(),
+        units: vec![(unit, Arc::new(Memory::new(Layout::default(), None).unwrap()))],
+        rights,
+        functions,
+    }
+}
+
+fn peer(text: &str) -> IpAddr {
+    text.parse().unwrap()
+}
+
+#[test]
+fn the_first_rule_that_names_a_peer_holds() {
+    let policy = Policy::new(vec![
+        rule(&["10.0.0.0/24", "fd00::/64"], 1, Rights::ReadWrite, Functions::All),
+        rule(&["10.0.0.0/8"], 2, Rights::ReadOnly, Functions::All),
+    ]);
+    for (address, unit) in [("10.0.0.255", 1), ("10.0.1.0", 2), ("fd00::ffff", 1)] {
+        let grant = policy.grant(peer(address)).unwrap();
+        assert!(grant.memory(unit).is_some(), "{address}");
+        assert!(grant.memory(3 - unit).is_none(), "{address}");
+    }
+    for stranger in ["11.0.0.1", "fd00:0:0:1::1", "::1", "127.0.0.1"] {
+        assert!(policy.grant(peer(stranger)).is_none(), "{stranger}");
+    }
+}
+
+#[test]
+fn a_mapped_address_is_the_ipv4_address_it_maps() {
+    let rules = vec![rule(&["10.0.0.0/24"], 1, Rights::ReadOnly, Functions::All)];
+    assert!(Policy::new(rules).grant(peer("::ffff:10.0.0.7")).is_some());
+    let rules = vec![rule(&["::/0"], 1, Rights::ReadOnly, Functions::All)];
+    assert!(Policy::new(rules).grant(peer("::ffff:10.0.0.7")).is_none());
+}
+
+#[test]
+fn functions_are_those_known_allowed_and_fit_for_the_rights() {
+    let allowed = |rights, functions| -> Vec<u8> {
+        let policy = Policy::new(vec![rule(&["::/0"], 1, rights, functions)]);
+        let grant = policy.grant(peer("::1")).unwrap();
+        (0..=255).filter(|code| grant.allows(*code)).collect()
+    };
+    let all = [1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43];
+    assert_eq!(allowed(Rights::ReadWrite, Functions::All), all);
+    assert_eq!(allowed(Rights::ReadOnly, Functions::All), [1, 2, 3, 4, 8, 11, 17, 43]);
+    assert_eq!(allowed(Rights::ReadOnly, Functions::Only(vec![3, 6, 99])), [3]);
+    assert_eq!(allowed(Rights::ReadWrite, Functions::Only(vec![3, 6, 99])), [3, 6]);
+    assert_eq!(allowed(Rights::ReadOnly, Functions::Except(vec![3, 43])), [1, 2, 4, 8, 11, 17]);
+}
