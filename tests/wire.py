@@ -7,6 +7,7 @@ not hang it.
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 import struct
@@ -137,7 +138,9 @@ class Connection:
         self.send(frame(pdu, unit, self._transaction))
         reply = self.receive()
         if (reply.transaction, reply.unit) != (self._transaction, unit):
-            raise AssertionError(f"the header is not that of transaction {self._transaction}: {reply}")
+            raise AssertionError(
+                f"the header is not that of transaction {self._transaction}: {reply}"
+            )
         return reply.pdu
 
     def ask_many(self, pdus: Iterable[bytes], unit: int = 1) -> list[bytes]:
@@ -168,18 +171,26 @@ class Connection:
             if len(got) >= count and not unsent:
                 self._keep(got[count:])
                 return got[:count]
-            wanted = [self.socket]
-            patience = max(0.0, deadline - time.monotonic())
-            readable, writable, _ = select.select(wanted, wanted if unsent else [], [], patience)
-            if writable:
-                unsent = unsent[self.socket.send(unsent[:65536], socket.MSG_DONTWAIT) :]
-            if readable:
-                piece = self.socket.recv(262144, socket.MSG_DONTWAIT)
-                if not piece:
-                    raise ConnectionError(f"closed after {len(got)} of {count} replies")
-                self._received += piece
-            if not readable and not writable:
+            patience = deadline - time.monotonic()
+            if patience <= 0:
                 raise TimeoutError(f"{len(got)} of {count} replies within {self.deadline} s")
+            if not unsent:
+                self._receive(patience)
+                continue
+            self.socket.setblocking(False)
+            readable, writable, _ = select.select([self.socket], [self.socket], [], patience)
+            if writable:
+                unsent = unsent[self.socket.send(unsent[:65536]) :]
+            if readable:
+                self._receive(patience)
+
+    def _receive(self, patience: float) -> None:
+        self.socket.settimeout(patience)
+        with contextlib.suppress(TimeoutError):
+            piece = self.socket.recv(262144)
+            if not piece:
+                raise ConnectionError("closed before all replies have come")
+            self._received += piece
 
     def _keep(self, more: list[Frame]) -> None:
         kept = b"".join(frame(pdu, unit, transaction) for transaction, unit, pdu in more)

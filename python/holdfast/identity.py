@@ -13,8 +13,8 @@ class Identity:
     """The identification objects of all units, and names of single ones.
 
     Texts are sent as UTF-8, at most 244 bytes each; an empty one that is not mandatory is left out.
-    `unit_names` by unit id, 0 to 255, take the place of `user_application_name`; `extended` are
-    private objects by id, 128 to 255.
+    `unit_names` by unit id, 0 to 255, take the place of `user_application_name`; `private_objects`
+    are those by id, 128 to 255.
     """
 
     vendor_name: str = "Holdfast"
@@ -25,7 +25,7 @@ class Identity:
     model_name: str = ""
     user_application_name: str = ""
     unit_names: Mapping[int, str] = field(default_factory=dict)
-    extended: Mapping[int, str] = field(default_factory=dict)
+    private_objects: Mapping[int, str] = field(default_factory=dict)
 
     def objects(self) -> list[tuple[int, str]]:
         """Object ids and texts, the three mandatory ones first."""
@@ -37,7 +37,7 @@ class Identity:
             self.user_application_name,
         ]
         regular = [(index, text) for index, text in enumerate(optional, start=3) if text]
-        return [*enumerate(mandatory), *regular, *self.extended.items()]
+        return [*enumerate(mandatory), *regular, *self.private_objects.items()]
 
     def names(self) -> list[tuple[int, str]]:
         """Unit ids and names."""

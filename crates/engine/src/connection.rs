@@ -115,11 +115,16 @@ impl Connection {
 
     /// Serves until the connection ends, and says why.
     pub(crate) async fn run(mut self, mut stop: watch::Receiver<bool>) -> Kind {
+        // A peer that never pauses never lets the wait for a stop have its turn.
+        let flooded = stop.clone();
         let mut stopping = pin!(stop.wait_for(|stop| *stop));
         let mut alarm = pin!(sleep_until(self.last_request + FAR));
         loop {
             if let Err(end) = self.send_unsent().await {
                 return end;
+            }
+            if flooded.has_changed().unwrap_or(true) {
+                return self.finish();
             }
             self.set(alarm.as_mut());
             let step = tokio::select! {

@@ -1,0 +1,45 @@
+"""The command line: `holdfast COMMAND`, one command a file.
+
+A command is imported when it is used, so that none waits for what another needs. Commands must hold
+no logic that another caller would need.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+from holdfast import __version__
+
+COMMANDS = {
+    "check": "holdfast.cli.check:check",
+    "run": "holdfast.cli.run:run",
+    "schema": "holdfast.cli.schema:schema",
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """The names of all commands."""
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """The command of that name, if there is one."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, name = COMMANDS[cmd_name].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), name)
+        return command
+
+
+@click.group(
+    cls=LazyGroup,
+    epilog="Example: holdfast run plant.yaml",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+@click.version_option(__version__, prog_name="holdfast", message="%(prog)s %(version)s")
+def main() -> None:
+    """A Modbus memory that many writers fill and many readers read."""

@@ -1,0 +1,40 @@
+"""`holdfast check`: is a configuration right, and what does it come to with all defaults?"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from holdfast.cli.configuration import WRONG, load_or_exit
+from holdfast.config import ConfigError, load
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+def check(file: Path, as_json: bool) -> None:
+    """Check the configuration FILE without starting anything.
+
+    Prints the effective configuration, every default filled in. When something is wrong, prints
+    every problem with its line and exits with 2.
+
+    \b
+    Example:
+      holdfast check plant.yaml
+      holdfast check --json plant.yaml
+    """
+    if not as_json:
+        click.echo(load_or_exit(file).dump(), nl=False)
+        return
+    try:
+        config = load(file)
+    except ConfigError as error:
+        problems = [dataclasses.asdict(problem) for problem in error.problems]
+        click.echo(json.dumps({"ok": False, "problems": problems}, indent=2))
+        sys.exit(WRONG)
+    answer = {"ok": True, "problems": [], "config": config.effective()}
+    click.echo(json.dumps(answer, indent=2))

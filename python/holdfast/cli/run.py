@@ -1,0 +1,158 @@
+"""`holdfast run`: the appliance, until a signal ends it."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import shlex
+import shutil
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast import logs
+from holdfast.appliance import Appliance
+from holdfast.cli.configuration import load_or_exit
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from holdfast.appliance import Endpoint
+    from holdfast.config import Config
+
+# How long a signal may wait until it is noticed, in seconds.
+PATIENCE = 0.2
+
+# Open files beside the connections: listeners, worker threads, the interpreter's own.
+OTHER_FILES = 64
+
+# The number that mbpoll gives each area.
+MBPOLL_TYPES = {
+    "holding_registers": 4,
+    "input_registers": 3,
+    "coils": 0,
+    "discrete_inputs": 1,
+}
+
+
+@click.command(epilog="Example: holdfast run examples/plant.yaml")
+@click.argument("file", type=click.Path(path_type=Path))
+def run(file: Path) -> None:
+    """Run the appliance that FILE describes.
+
+    Prints what listens where, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped by a
+    signal, 1 a listener could not be bound, 2 the configuration has errors.
+    """
+    config = load_or_exit(file)
+    logs.configure(config.log.level, config.log.format)
+    _allow_open_files(config)
+    signals = Signals()
+    appliance = Appliance(config)
+    try:
+        appliance.start()
+    except OSError as error:
+        click.echo(f"holdfast: {_explained(error)}", err=True)
+        sys.exit(1)
+    try:
+        click.echo(_greeting(appliance, file))
+        while not signals.received:
+            appliance.log_events(timeout=PATIENCE)
+    finally:
+        appliance.stop()
+
+
+def _allow_open_files(config: Config) -> None:
+    """Lets this process hold all the connections that its listeners may have."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit.
+        return
+    listeners = config.listeners.values()
+    needed = sum(listener.max_connections for listener in listeners) + OTHER_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    if allowed < needed:
+        logs.write(logging.WARNING, "too_few_open_files", needed=needed, allowed=allowed)
+
+
+class Signals:
+    """Notes that SIGINT or SIGTERM came; a second one ends the process at once."""
+
+    def __init__(self) -> None:
+        self.received = False
+        signal.signal(signal.SIGINT, self._note)
+        signal.signal(signal.SIGTERM, self._note)
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self.received = True
+        signal.signal(number, signal.SIG_DFL)
+
+
+def _explained(error: OSError) -> str:
+    text = error.strerror or str(error)
+    if error.errno == errno.EACCES:
+        text += " (ports below 1024 need a privilege, on Linux CAP_NET_BIND_SERVICE)"
+    return text
+
+
+def _greeting(appliance: Appliance, file: Path) -> str:
+    endpoints = appliance.endpoints()
+    width = max(len(endpoint.name) for endpoint in endpoints)
+    lines = [f"{file} is served:", ""]
+    for endpoint in endpoints:
+        address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
+        lines.append(f"  {endpoint.name:{width}}  {endpoint.settings.type}  {address}")
+        for rule in endpoint.settings.rules:
+            units = ", ".join(f"{unit} = {memory}" for unit, memory in rule.units.items())
+            sources = ", ".join(str(source) for source in rule.sources)
+            lines.append(f"  {'':{width}}    units {units}; {rule.access} for {sources}")
+    lines += ["", "Try:", ""]
+    lines += [f"  {command}" for command in _suggestions(appliance, endpoints, file)]
+    return "\n".join([*lines, "", "Ctrl-C stops it."])
+
+
+def _suggestions(appliance: Appliance, endpoints: list[Endpoint], file: Path) -> list[str]:
+    """Commands that work on this appliance: a read, a write where one is allowed, the check."""
+    check = f"{_program()} check {shlex.quote(str(file))}"
+    for endpoint in endpoints:
+        for rule in endpoint.settings.rules:
+            unit, name = next(iter(rule.units.items()))
+            areas = appliance.memories[name].areas
+            area, addresses = next(iter(areas.items()))
+            for preferred in MBPOLL_TYPES:
+                if preferred in areas:
+                    area, addresses = preferred, areas[preferred]
+                    break
+            command = (
+                f"mbpoll -m tcp -p {endpoint.port} -a {unit} -0 -t {MBPOLL_TYPES[area]}"
+                f" -r {addresses.start}"
+            )
+            host = _reachable(endpoint.host)
+            read = f"{command} -c {min(len(addresses), 5)} -1 {host}"
+            writable = rule.access == "read-write" and area in ("holding_registers", "coils")
+            return [read, f"{command} {host} 1", check] if writable else [read, check]
+    return [check]
+
+
+def _program() -> str:
+    """How this program was called, or its path where a shell would not find it."""
+    name = click.get_current_context().find_root().info_name or "holdfast"
+    if name == "holdfast" and shutil.which(name) is None:
+        return shlex.quote(os.path.relpath(sys.argv[0]))
+    return name
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _reachable(host: str) -> str:
+    """An address that a client on this machine can connect to."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)

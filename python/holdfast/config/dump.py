@@ -1,0 +1,77 @@
+"""The effective configuration as YAML that people read and `load` accepts.
+
+It writes plain data and knows no models.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.representer import RoundTripRepresenter
+from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+
+from holdfast.config.source import scalar
+
+NULL_IS_SAID = frozenset({"max_connections_per_source"})
+"""Keys whose absence is written as null; the others are left out."""
+
+
+def effective(model: dict[Any, Any]) -> dict[Any, Any]:
+    """The data of a model as YAML and JSON have it, without keys that hold nothing."""
+    return {
+        key: _plain(value)
+        for key, value in model.items()
+        if value is not None or key in NULL_IS_SAID
+    }
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return effective(value)
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def to_yaml(data: dict[str, Any]) -> str:
+    """The text of a mapping; what is small and deep inside is on one line."""
+    yaml = YAML()
+    yaml.Representer = _Representer
+    yaml.width = 100
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    out = io.StringIO()
+    yaml.dump({key: _styled(value, depth=1) for key, value in data.items()}, out)
+    return out.getvalue()
+
+
+class _Representer(RoundTripRepresenter):
+    def represent_null(self, data: None) -> ScalarNode:  # noqa: ARG002
+        return self.represent_scalar("tag:yaml.org,2002:null", "null")
+
+
+_Representer.add_representer(type(None), _Representer.represent_null)
+
+
+def _styled(value: object, depth: int) -> object:
+    if isinstance(value, str):
+        return value if scalar(value) == value else DoubleQuotedScalarString(value)
+    if isinstance(value, dict):
+        mapping = CommentedMap((_styled(k, 0), _styled(v, depth + 1)) for k, v in value.items())
+        return _on_one_line(mapping, value.values(), depth)
+    if isinstance(value, list):
+        return _on_one_line(CommentedSeq(_styled(v, depth + 1) for v in value), value, depth)
+    return value
+
+
+def _on_one_line(
+    node: CommentedMap | CommentedSeq, items: Iterable[object], depth: int
+) -> CommentedMap | CommentedSeq:
+    if depth > 1 and not any(isinstance(item, dict | list) for item in items):
+        node.fa.set_flow_style()
+    return node

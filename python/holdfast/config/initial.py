@@ -1,0 +1,182 @@
+"""Initial values of a memory: a file beside the configuration, checked like any write.
+
+CSV has a line `area,address,value` for each value; YAML has `area: {address: value}`, where a list
+of values fills the addresses from there on. Large sets belong in CSV, which is read much faster.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from holdfast.config import source
+from holdfast.config.problems import ConfigError, Problem
+from holdfast.config.values import AREAS, BIT_AREAS, Area
+from holdfast.config.words import guess, listing, show
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+KINDS = (".csv", ".yaml", ".yml")
+HEADER = ["area", "address", "value"]
+
+Cell: TypeAlias = tuple[str, int]
+
+
+class InitialRun(NamedTuple):
+    """Neighbouring values of one area, from `address` on."""
+
+    area: Area
+    address: int
+    values: tuple[int, ...]
+
+
+class _Given(NamedTuple):
+    """One value as a file gives it, not yet judged; `key` says where a YAML file has it."""
+
+    line: int
+    column: int
+    key: str
+    area: object
+    address: object
+    value: object
+
+
+def parse(
+    text: str, file: str, areas: Mapping[Area, range | None], gate: Cell | None
+) -> tuple[tuple[InitialRun, ...], list[Problem]]:
+    """The values of a file in runs, and what is wrong with it.
+
+    `areas` are those of the memory; where the addresses are `None`, any is taken. `gate` is the
+    bit that must stay 0.
+    """
+    judge = _Judge(file, areas, gate)
+    try:
+        for given in (
+            _csv(text, judge) if Path(file).suffix.lower() == ".csv" else _yaml(text, judge)
+        ):
+            judge.take(given)
+    except ConfigError as error:
+        judge.problems += error.problems
+    return tuple(judge.runs()), judge.problems
+
+
+def extent(addresses: range) -> str:
+    """Addresses in words."""
+    return f"{addresses.start} to {addresses.stop - 1}"
+
+
+@dataclass
+class _Judge:
+    """Checks values one by one and keeps those that are right."""
+
+    file: str
+    areas: Mapping[Area, range | None]
+    gate: Cell | None
+    problems: list[Problem] = field(default_factory=list)
+    kept: dict[Area, dict[int, tuple[int, int]]] = field(default_factory=dict)
+
+    def refuse(self, line: int, column: int | None, key: str, message: str) -> None:
+        """Notes a problem of this file."""
+        self.problems.append(Problem(self.file, line, column, key, message))
+
+    def take(self, given: _Given) -> None:
+        """Keeps a value and its line, or says why not."""
+        try:
+            area, address, value = self._judged(given)
+        except ValueError as error:
+            self.refuse(given.line, given.column, given.key, str(error))
+        else:
+            self.kept.setdefault(area, {})[address] = (value, given.line)
+
+    def _judged(self, given: _Given) -> tuple[Area, int, int]:
+        area = next((area for area in self.areas if area == given.area), None)
+        if area is None:
+            lacking = ", which this memory does not have" if given.area in AREAS else ""
+            near = "" if lacking else guess(given.area, AREAS)
+            allowed = f"allowed: {listing(self.areas)}{near}"
+            raise ValueError(f"found area {show(given.area)}{lacking}, {allowed}")
+        addresses, address = self.areas[area] or range(65536), given.address
+        if not isinstance(address, int) or address not in addresses:
+            allowed = f"allowed in {area}: {extent(addresses)}"
+            raise ValueError(f"found address {show(address)}, {allowed}")
+        value = self._value(area, address, given.value)
+        if address in self.kept.get(area, {}):
+            line = self.kept[area][address][1]
+            raise ValueError(f"{area} {address} comes twice, first in line {line}")
+        return area, address, value
+
+    def _value(self, area: Area, address: int, value: object) -> int:
+        most, to = (1, "or") if area in BIT_AREAS else (65535, "to")
+        if type(value) is not int or not 0 <= value <= most:
+            raise ValueError(f"found {show(value)}, allowed in {area}: 0 {to} {most}")
+        if (area, address) == self.gate and value == 1:
+            raise ValueError("found 1 in the gate bit of the seal, allowed: 0")
+        return value
+
+    def runs(self) -> Iterator[InitialRun]:
+        """What was kept, neighbours together, in the order of the addresses."""
+        for area, cells in self.kept.items():
+            first, values = 0, list[int]()
+            for address in sorted(cells):
+                if values and address != first + len(values):
+                    yield InitialRun(area, first, tuple(values))
+                    values = []
+                first = first if values else address
+                values.append(cells[address][0])
+            yield InitialRun(area, first, tuple(values))
+
+
+def _csv(text: str, judge: _Judge) -> Iterator[_Given]:
+    header_may_come = True
+    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        fields = [part.strip() for part in line.split(",")]
+        is_header = header_may_come and [part.lower() for part in fields] == HEADER
+        header_may_come = False
+        if is_header:
+            continue
+        if len(fields) != len(HEADER):
+            judge.refuse(number, 1, "", f"found {show(line)}, allowed: area,address,value")
+            continue
+        area, address, value = fields
+        yield _Given(number, 1, "", area, _integer(address), _integer(value))
+
+
+def _integer(text: str) -> int | str:
+    return int(text) if re.fullmatch("-?[0-9]{1,10}", text, re.ASCII) else text
+
+
+def _yaml(text: str, judge: _Judge) -> Iterator[_Given]:
+    document, problems = source.parse(text, judge.file)
+    judge.problems += problems
+    if document.data is None:
+        return
+    if not isinstance(document.data, dict):
+        message = f"found {show(document.data)}, allowed: area: {{address: value}}"
+        judge.refuse(1, 1, "", message)
+        return
+    for area, cells in document.data.items():
+        if not isinstance(cells, dict):
+            place = document.place((area,), of_key=True)
+            message = f"found {show(cells)}, allowed: {{address: value}}"
+            judge.refuse(place.line, place.column, document.spell((area,)), message)
+            continue
+        for address, values in cells.items():
+            yield from _cells(document, area, address, values)
+
+
+def _cells(
+    document: source.Document, area: source.Key, address: source.Key, values: object
+) -> Iterator[_Given]:
+    many = isinstance(values, list) and isinstance(address, int)
+    for index, value in enumerate(values if many and isinstance(values, list) else [values]):
+        path = (area, address, index) if many else (area, address)
+        place = document.place(path)
+        at = address + index if isinstance(address, int) else address
+        yield _Given(place.line, place.column, document.spell(path), area, at, value)

@@ -1,0 +1,112 @@
+"""What the keys of the memories must keep together: areas, seals, ids and initial values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from pydantic import TypeAdapter
+
+from holdfast.config import initial, source
+from holdfast.config.model import Extent, Span
+from holdfast.config.problems import ConfigError
+from holdfast.config.tolerance import fitting, integer, mapping
+from holdfast.config.values import AREAS, BIT_AREAS, Area
+from holdfast.config.words import listing, show
+
+if TYPE_CHECKING:
+    from holdfast.config.problems import Problem, Report
+    from holdfast.config.source import KeyPath
+
+_EXTENT: TypeAdapter[Span | None] = TypeAdapter(Extent)
+
+Layout: TypeAlias = dict[Area, range | None]
+"""The addresses of the areas that are there; `None` where they are not known for a mistake."""
+
+
+@dataclass
+class MemoryChecks:
+    """Checks the memories of one file, and reads the files with their initial values."""
+
+    folder: Path
+    report: Report
+
+    def __post_init__(self) -> None:
+        self.values: dict[Path, tuple[initial.InitialRun, ...]] = {}
+        self.problems_elsewhere: list[Problem] = []
+
+    def check(self, memories: object) -> None:
+        """Reports what is wrong; afterwards `values` holds the initial values by file."""
+        for name, memory in mapping(memories).items():
+            if isinstance(memory, dict):
+                self._memory(("memories", name), memory)
+        self._ids(mapping(memories))
+
+    def _memory(self, path: KeyPath, memory: dict[Any, Any]) -> None:
+        layout: Layout = {
+            area: self._addresses((*path, area), memory[area]) for area in AREAS if area in memory
+        }
+        if not layout:
+            message = f"no area, allowed: at least one of {listing(AREAS)}"
+            self.report.add(path, message, of_key=True)
+        gate = self._gate((*path, "seal"), mapping(memory.get("seal")), layout)
+        if isinstance(memory.get("initial"), str) and memory["initial"]:
+            self._initial((*path, "initial"), memory["initial"], layout, gate)
+
+    def _addresses(self, path: KeyPath, extent: object) -> range | None:
+        span = fitting(_EXTENT, extent)
+        if span is None:
+            return None
+        if span.start + span.size <= 65536:
+            return span.addresses
+        message = f"found start {span.start} and size {span.size}, allowed: a sum up to 65536"
+        self.report.add(path, message)
+        return None
+
+    def _gate(self, path: KeyPath, seal: dict[Any, Any], layout: Layout) -> initial.Cell | None:
+        area, address = seal.get("area"), integer(seal.get("address"), 0, 65535)
+        if area not in BIT_AREAS:
+            return None
+        if area not in layout:
+            there = [area for area in BIT_AREAS if area in layout]
+            allowed = f"allowed: {listing(there)}" if there else "which needs one"
+            message = f"found {show(area)}, an area that this memory does not have, {allowed}"
+            self.report.add((*path, "area"), message)
+            return None
+        addresses = layout[area]
+        if address is None or addresses is None:
+            return None
+        if address not in addresses:
+            message = f"found {address}, allowed in {area}: {initial.extent(addresses)}"
+            self.report.add((*path, "address"), message)
+            return None
+        return area, address
+
+    def _initial(self, path: KeyPath, file: str, layout: Layout, gate: initial.Cell | None) -> None:
+        if Path(file).suffix.lower() not in initial.KINDS:
+            allowed = listing(initial.KINDS)
+            self.report.add(path, f"found {show(file)}, allowed: a file of the kinds {allowed}")
+            return
+        shown = str(Path(self.report.document.file).parent / file)
+        try:
+            text = source.read_text(self.folder / file, shown)
+        except ConfigError as error:
+            self.report.add(path, f"found {show(file)}, which {error.problems[0].message}")
+            return
+        runs, problems = initial.parse(text, shown, layout, gate)
+        self.values[self.folder / file] = runs
+        self.problems_elsewhere += problems
+
+    def _ids(self, memories: dict[Any, Any]) -> None:
+        first: dict[int, KeyPath] = {}
+        for name, memory in memories.items():
+            path = ("memories", name, "id")
+            number = integer(mapping(memory).get("id"), 0, 65535)
+            if number in first:
+                other = first[number]
+                line = self.report.line(other)
+                message = f"found {number}, which is the id of {other[1]} in line {line}"
+                self.report.add(path, f"{message}, allowed: an id of its own")
+            elif number is not None:
+                first[number] = path

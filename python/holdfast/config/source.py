@@ -1,0 +1,264 @@
+"""YAML 1.2 text to plain data, and the place of every key and value in it.
+
+Only the core schema's types exist here: null, booleans, integers, floats, text, lists and mappings,
+whatever a `%YAML` line says. Keys are text or integers, and no key comes twice. Nothing here knows
+what the keys mean.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
+
+from holdfast.config.problems import ConfigError, Problem
+from holdfast.config.words import show
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ruamel.yaml.nodes import Node
+
+Key: TypeAlias = str | int
+KeyPath: TypeAlias = tuple[Key, ...]
+
+MOST_VALUES = 1_000_000
+"""Values of one file, counted as often as an alias repeats them."""
+
+_TAG = "tag:yaml.org,2002:"
+_WORDS: Final[dict[str, bool | None]] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+_INTEGER = re.compile(r"[-+]?[0-9]{1,400}|0o[0-7]{1,400}|0x[0-9a-fA-F]{1,400}", re.ASCII)
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
+_SPECIAL = re.compile(r"(?P<inf>[-+]?\.(inf|Inf|INF))|\.(nan|NaN|NAN)")
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A line and a column, both from 1."""
+
+    line: int
+    column: int
+
+
+@dataclass(slots=True)
+class _Spot:
+    """Where one value is, and what is inside it: by key, or by place in a list."""
+
+    place: Place
+    children: dict[Key, tuple[Place, _Spot]] = field(default_factory=dict)
+    is_list: bool = False
+    is_scalar: bool = False
+    values: int = 1
+
+
+@dataclass(frozen=True)
+class Document:
+    """The data of one file; `root` says where each of its values is."""
+
+    file: str
+    data: Any
+    root: _Spot
+
+    def place(self, path: KeyPath, *, of_key: bool = False) -> Place:
+        """Of a single value its own place, of a list or mapping that of its key.
+
+        A path that leads out of the file ends at the last key that is there.
+        """
+        spot, found = self.root, self.root.place
+        for part in path:
+            if part not in spot.children:
+                return found
+            key_place, spot = spot.children[part]
+            found = spot.place if spot.is_scalar and not of_key else key_place
+        return found
+
+    def holds(self, path: KeyPath) -> bool:
+        """Whether there is a value at `path`."""
+        spot = self.root
+        for part in path:
+            if part not in spot.children:
+                return False
+            spot = spot.children[part][1]
+        return True
+
+    def spell(self, path: KeyPath) -> str:
+        """A path as people write it: `rules[0].units.1`."""
+        text, spot = "", self.root
+        for part in path:
+            word = str(part) if re.fullmatch(r"[\w-]+", str(part)) else repr(part)
+            dot = "." if text else ""
+            text += f"[{part}]" if spot.is_list else f"{dot}{word}"
+            spot = spot.children[part][1] if part in spot.children else _Spot(spot.place)
+        return text
+
+
+def read_text(path: Path, file: str) -> str:
+    """The text of a file; `file` is how messages name it. Raises `ConfigError`."""
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        message = "this is not UTF-8, allowed: YAML or CSV in UTF-8"
+        raise ConfigError(file, [Problem(file, line, None, "", message)]) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        message = f"can't be read: {reason}"
+        raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
+
+
+def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
+    """The document, and problems that left it readable; raises `ConfigError` where it is not."""
+    try:
+        reader = _Reader()
+        data, spot = reader.value(_compose(text), ())
+    except ReaderError as error:
+        line = text[: error.position].count("\n") + 1
+        message = f"the character U+{error.character:04X} is not allowed in YAML"
+        raise ConfigError(file, [Problem(file, line, None, "", message)]) from None
+    except MarkedYAMLError as error:
+        raise ConfigError(file, [_syntax(error, file)]) from None
+    except YAMLError as error:
+        message = f"not YAML: {error}"
+        raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
+    except RecursionError:
+        message = "not a configuration: values inside values without end"
+        raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
+    if spot.values > MOST_VALUES:
+        message = f"found {spot.values} values, aliases repeated, allowed: {MOST_VALUES}"
+        raise ConfigError(file, [Problem(file, 1, 1, "", message)])
+    document = Document(file, data, spot)
+    return document, [
+        Problem(file, place.line, place.column, document.spell(path), message)
+        for place, path, message in reader.mistakes
+    ]
+
+
+def _compose(text: str) -> Node | None:
+    yaml = YAML(typ="safe", pure=True)
+    yaml.composer.warn_double_anchors = False
+    node: Node | None = yaml.compose(text)
+    return node
+
+
+def _syntax(error: MarkedYAMLError, file: str) -> Problem:
+    mark = error.problem_mark or error.context_mark
+    line, column = (mark.line + 1, mark.column + 1) if mark else (None, None)
+    reason = error.problem or error.context or "it can't be understood"
+    if error.context and reason.startswith("but "):
+        reason = f"{error.context}, {reason}"
+    start = error.context_mark
+    if error.context and start and mark and start.line != mark.line:
+        reason += f", {error.context} that starts in line {start.line + 1}"
+    return Problem(file, line, column, "", f"not YAML: {reason}")
+
+
+class _Reader:
+    """Turns nodes into data. A node that aliases name again is read once."""
+
+    def __init__(self) -> None:
+        self.mistakes: list[tuple[Place, KeyPath, str]] = []
+        self._done: dict[int, tuple[Any, _Spot]] = {}
+        self._open: set[int] = set()
+
+    def value(self, node: Node | None, path: KeyPath) -> tuple[Any, _Spot]:
+        if node is None:
+            return None, _Spot(Place(1, 1), is_scalar=True)
+        if id(node) in self._open:
+            self._add(node, path, "an alias inside the value that it repeats")
+            return None, _Spot(_place(node), is_scalar=True)
+        if id(node) not in self._done:
+            self._open.add(id(node))
+            self._done[id(node)] = self._read(node, path)
+            self._open.discard(id(node))
+        return self._done[id(node)]
+
+    def _read(self, node: Node, path: KeyPath) -> tuple[Any, _Spot]:
+        kind = str(node.tag).removeprefix(_TAG)
+        if isinstance(node, MappingNode) and kind == "map":
+            return self._mapping(node, path)
+        if isinstance(node, SequenceNode) and kind == "seq":
+            return self._list(node, path)
+        spot = _Spot(_place(node), is_scalar=True)
+        if isinstance(node, ScalarNode):
+            try:
+                return scalar(node.value, kind), spot
+            except ValueError as error:
+                self._add(node, path, str(error))
+                return None, spot
+        self._add(node, path, f"the tag {node.tag!r} is not allowed")
+        return None, spot
+
+    def _list(self, node: SequenceNode, path: KeyPath) -> tuple[Any, _Spot]:
+        spot = _Spot(_place(node), is_list=True)
+        data = []
+        for index, item in enumerate(node.value):
+            value, child = self.value(item, (*path, index))
+            data.append(value)
+            spot.children[index] = (_place(item), child)
+            spot.values += child.values
+        return data, spot
+
+    def _mapping(self, node: MappingNode, path: KeyPath) -> tuple[Any, _Spot]:
+        spot = _Spot(_place(node))
+        data: dict[Key, Any] = {}
+        for key_node, value_node in node.value:
+            key = self._key(key_node, path)
+            if key is None:
+                continue
+            if key in data:
+                first = spot.children[key][0].line
+                name = str(key) if isinstance(key, int) else show(key)
+                self._add(key_node, path, f"the key {name} comes twice, first in line {first}")
+                continue
+            data[key], child = self.value(value_node, (*path, key))
+            spot.children[key] = (_place(key_node), child)
+            spot.values += child.values
+        return data, spot
+
+    def _key(self, node: Node, path: KeyPath) -> Key | None:
+        key = self._read(node, path)[0] if isinstance(node, ScalarNode) else ()
+        if isinstance(key, str) or type(key) is int:
+            return key
+        found = (
+            f"the key {node.value}" if isinstance(node, ScalarNode) else "a key of several parts"
+        )
+        self._add(
+            node, path, f"found {found}, allowed: text or an integer; quote it to make it text"
+        )
+        return None
+
+    def _add(self, node: Node, path: KeyPath, message: str) -> None:
+        self.mistakes.append((_place(node), path, message))
+
+
+def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
+    """The value of a scalar, by the core schema; `kind` is `str` for what is text in any case.
+
+    Raises `ValueError` for a kind that does not exist here.
+    """
+    if kind == "str":
+        return text
+    if kind not in ("", "null", "bool", "int", "float", "timestamp", "merge", "value"):
+        raise ValueError(f"the tag {kind!r} is not allowed")
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INTEGER.fullmatch(text):
+        return int(text, 10 if text[:2] not in ("0o", "0x") else 0)
+    if _FLOAT.fullmatch(text):
+        return float(text)
+    if special := _SPECIAL.fullmatch(text):
+        return float(text.replace(".", "")) if special["inf"] else float("nan")
+    return text
+
+
+def _place(node: Node) -> Place:
+    return Place(node.start_mark.line + 1, node.start_mark.column + 1)

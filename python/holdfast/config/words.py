@@ -1,0 +1,45 @@
+"""How a message names values: what was found, and lists of what is allowed.
+
+Text only; nothing here knows what a configuration is.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+LONGEST = 60
+
+
+def show(value: object) -> str:
+    """A value as a message prints it: text in quotes, the shape of what is larger than a value."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "a mapping" if value else "an empty mapping"
+    if isinstance(value, list | tuple):
+        return "a list" if value else "an empty list"
+    text = repr(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+
+
+def choice(values: Sequence[object]) -> str:
+    """`a`, `a or b`, `a, b or c`."""
+    *most, last = [str(value) for value in values]
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def listing(values: Iterable[object]) -> str:
+    """`a, b, c`."""
+    return ", ".join(str(value) for value in values)
+
+
+def guess(word: object, known: Iterable[str]) -> str:
+    """`; did you mean 'x'?` when a known word is close, else nothing."""
+    close = difflib.get_close_matches(str(word), list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""

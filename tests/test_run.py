@@ -1,0 +1,170 @@
+"""`holdfast run` as a user has it: a process, its output, its signals, its exit codes."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+import wire
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+CONFIGURATION = """
+memories:
+  plant: {{holding_registers: 100, coils: 8, initial: values.csv}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: {bind}
+    rules:
+      - {{sources: [{sources}], units: {{1: plant}}, access: read-write}}
+{more}
+"""
+
+READ_TWO = bytes.fromhex("0300000002")
+
+
+class Run:
+    """A running `holdfast run`, and where its first listener listens."""
+
+    def __init__(self, file: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "holdfast", "run", str(file)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.greeting = ""
+
+    def wait_until_it_serves(self) -> tuple[str, int]:
+        assert self.process.stdout is not None
+        while "Ctrl-C stops it." not in self.greeting:
+            line = self.process.stdout.readline()
+            assert line, self.process.communicate()
+            self.greeting += line
+        match = re.search(r"scada +modbus-tcp +([0-9.]+):([0-9]+)", self.greeting)
+        assert match, self.greeting
+        return match[1], int(match[2])
+
+    def end(self, number: signal.Signals) -> tuple[int, str]:
+        """Exit code and log, after a signal."""
+        self.process.send_signal(number)
+        _, log = self.process.communicate(timeout=wire.DEADLINE)
+        return self.process.returncode, log
+
+
+@pytest.fixture
+def configure(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a configuration, in a folder whose name has a space."""
+
+    def write(*, bind: str = "127.0.0.1:0", sources: str = "127.0.0.0/8", more: str = "") -> Path:
+        folder = tmp_path / "a plant"
+        folder.mkdir(exist_ok=True)
+        (folder / "values.csv").write_text("holding_registers,1,7\n")
+        file = folder / "plant.yaml"
+        file.write_text(CONFIGURATION.format(bind=bind, sources=sources, more=more))
+        return file
+
+    return write
+
+
+@pytest.fixture
+def run() -> Iterator[Callable[[Path], Run]]:
+    started: list[Run] = []
+
+    def start(file: Path) -> Run:
+        started.append(Run(file))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.process.kill()
+        each.process.communicate()
+
+
+def test_it_says_what_listens_where_and_what_to_try(
+    configure: Callable[..., Path], run: Callable[[Path], Run]
+) -> None:
+    running = run(configure())
+    _, port = running.wait_until_it_serves()
+    assert "units 1 = plant; read-write for 127.0.0.0/8" in running.greeting
+    read, write, check = running.greeting.split("Try:")[1].splitlines()[2:5]
+    assert read == f"  mbpoll -m tcp -p {port} -a 1 -0 -t 4 -r 0 -c 5 -1 127.0.0.1"
+    assert write == f"  mbpoll -m tcp -p {port} -a 1 -0 -t 4 -r 0 127.0.0.1 1"
+    assert check.endswith("plant.yaml'")
+    assert " check '" in check
+
+
+def test_it_serves_the_initial_values(
+    configure: Callable[..., Path], run: Callable[[Path], Run]
+) -> None:
+    with wire.Connection(run(configure()).wait_until_it_serves()) as client:
+        assert client.ask(READ_TWO) == bytes.fromhex("030400000007")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_exit_code_0(
+    configure: Callable[..., Path], run: Callable[[Path], Run], number: signal.Signals
+) -> None:
+    running = run(configure())
+    with wire.Connection(running.wait_until_it_serves()) as client:
+        assert client.ask(READ_TWO)
+        code, log = running.end(number)
+    assert code == 0
+    assert "stopped" in log
+    assert "Traceback" not in log
+
+
+def test_a_port_that_is_taken_is_one_line_that_names_listener_and_port(
+    configure: Callable[..., Path], run: Callable[[Path], Run]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        process = run(configure(bind=f"127.0.0.1:{port}")).process
+        out, log = process.communicate(timeout=wire.DEADLINE)
+    assert process.returncode == 1
+    assert out == ""
+    assert log.count("\n") == 1
+    assert "listener scada" in log
+    assert f"127.0.0.1:{port}" in log
+
+
+def test_a_wrong_configuration_is_all_its_errors_and_exit_code_2(
+    configure: Callable[..., Path], run: Callable[[Path], Run]
+) -> None:
+    file = configure(bind="localhost", sources="10.0.0.1/8", more="worker: 2")
+    process = run(file).process
+    out, log = process.communicate(timeout=wire.DEADLINE)
+    assert process.returncode == 2
+    assert out == ""
+    for line, key in [(7, "bind"), (9, "sources"), (10, "worker")]:
+        assert re.search(rf"plant\.yaml:{line}\b.*{key}", log), log
+
+
+def test_a_stranger_is_closed_and_logged_with_listener_and_address(
+    configure: Callable[..., Path], run: Callable[[Path], Run]
+) -> None:
+    running = run(configure(sources="127.0.0.2", more="log: {format: json}"))
+    address = running.wait_until_it_serves()
+    with socket.create_connection(address, timeout=wire.DEADLINE) as stranger:
+        peer = f"127.0.0.1:{stranger.getsockname()[1]}"
+        assert stranger.recv(1) == b""
+        # A listener's refusals are logged in the order they come, and before the process ends.
+        assert running.process.stderr is not None
+        entries = [json.loads(running.process.stderr.readline()) for _ in range(2)]
+    assert entries[1] == {
+        "time": entries[1]["time"],
+        "level": "warning",
+        "event": "refused_source",
+        "listener": "scada",
+        "peer": peer,
+    }
