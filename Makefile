@@ -22,6 +22,7 @@ lint: .venv/core.stamp .venv/dev.stamp
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/python -m mypy.stubtest holdfast._core
 
 format: .venv/dev.stamp
 	cargo fmt

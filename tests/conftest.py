@@ -6,11 +6,14 @@ Nothing here leaves the loopback interface, and everything that is started is st
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
 
@@ -23,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
     from typing import Unpack
 
-    from holdfast._core import Access, Area
     from holdfast.identity import Identity
+    from holdfast.types import Access, Area
 
 AREAS: tuple[Area, ...] = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 
@@ -196,3 +199,14 @@ def content(memory: holdfast.Memory) -> dict[Area, list[int]]:
     """All four areas of a memory whose areas start at 0 and have 1000 items."""
     ranges: list[tuple[Area, int, int]] = [(area, 0, 1000) for area in AREAS]
     return dict(zip(AREAS, memory.read_many(ranges), strict=True))
+
+
+def rounds(enough: threading.Event, least: int = 1) -> Iterator[int]:
+    """Counts rounds until there are enough: on a slow machine threads meet later, not never."""
+    deadline = time.monotonic() + 3 * wire.DEADLINE
+    for number in itertools.count():
+        if number >= least and enough.is_set():
+            return
+        if time.monotonic() > deadline:
+            raise AssertionError(f"the threads did not meet in {number} rounds")
+        yield number

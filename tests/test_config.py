@@ -316,7 +316,7 @@ def test_every_dump_loads_as_an_equal_configuration(
     assert again.dump() == config.dump()
 
 
-def properties(schema: dict[str, Any], path: str = "") -> dict[str, dict[str, Any]]:
+def properties(schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
     found = {}
     for name, node in {"Config": schema, **schema["$defs"]}.items():
         for key, value in node.get("properties", {}).items():

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from typing import Literal, TypeAlias
 
     from conftest import Connect, Serve
-    from holdfast._core import Area
+    from holdfast.types import Area
 
     Refused: TypeAlias = Callable[[bytes], tuple[int, int]]
 

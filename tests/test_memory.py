@@ -6,17 +6,18 @@ import random
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 
 import holdfast
-from conftest import AREAS, content
+from conftest import AREAS, content, rounds
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
-    from holdfast._core import Area
+    from holdfast.types import Area
 
 Wrong: TypeAlias = Any
 """What a type checker would refuse, passed on purpose."""
@@ -268,6 +269,18 @@ def test_an_iterable_that_raises_changes_nothing(memory: holdfast.Memory) -> Non
     assert memory.read("holding_registers", 0, 2) == [0, 0]
 
 
+def test_an_iterable_may_read_the_memory_that_it_is_written_to(memory: holdfast.Memory) -> None:
+    memory.write("holding_registers", 0, [1, 2, 3])
+
+    memory.write(
+        "holding_registers",
+        0,
+        (memory.read("holding_registers", address, 1)[0] + 10 for address in range(3)),
+    )
+
+    assert memory.read("holding_registers", 0, 3) == [11, 12, 13]
+
+
 # Batches
 
 
@@ -432,16 +445,56 @@ def impatient() -> Iterator[None]:
     sys.setswitchinterval(interval)
 
 
+class Readers:
+    """Threads that read until they are told, and note when all have seen enough changes."""
+
+    CHANGES = 5
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.enough = threading.Event()
+        self.over = threading.Event()
+        self._lock = threading.Lock()
+        self._to_come = number
+
+    def run(self, look: Callable[[], int]) -> None:
+        """Looks again and again; `look` checks what it read and tells its value."""
+        changes, last = 0, -1
+        while not self.over.is_set():
+            value = look()
+            if value != last:
+                changes, last = changes + 1, value
+                if changes == self.CHANGES:
+                    self._satisfied()
+
+    def against(self, look: Callable[[], int], *writers: Callable[[], None]) -> None:
+        """Runs the readers until all writers have ended."""
+        with ThreadPoolExecutor(self.number + len(writers)) as threads:
+            readers = [threads.submit(self.run, look) for _ in range(self.number)]
+            writing = [threads.submit(writer) for writer in writers]
+            try:
+                for writer in writing:
+                    writer.result()
+            finally:
+                self.over.set()
+            for reader in readers:
+                reader.result()
+
+    def _satisfied(self) -> None:
+        with self._lock:
+            self._to_come -= 1
+            if self._to_come == 0:
+                self.enough.set()
+
+
 @pytest.mark.usefixtures("impatient")
 def test_no_reader_sees_a_part_of_a_batch(memory: holdfast.Memory) -> None:
-    done = threading.Event()
-    start = threading.Barrier(6)
+    readers = Readers(3)
 
     def write(value: int) -> None:
-        start.wait()
-        for turn in range(400):
-            number = value * 1000 + turn
-            bit = turn % 2
+        for turn in rounds(readers.enough, least=300):
+            number = value * 10_000 + turn % 10_000
+            bit = number % 2
             memory.write_many(
                 [
                     ("holding_registers", 0, [number] * 1000),
@@ -451,51 +504,30 @@ def test_no_reader_sees_a_part_of_a_batch(memory: holdfast.Memory) -> None:
                 ]
             )
 
-    def read() -> int:
-        start.wait()
-        seen = set()
-        while not done.is_set():
-            holding, inputs, coils, discrete = memory.read_many(
-                [
-                    ("holding_registers", 0, 1000),
-                    ("input_registers", 0, 1000),
-                    ("coils", 0, 1000),
-                    ("discrete_inputs", 0, 1000),
-                ]
-            )
-            assert len({*holding, *inputs}) == 1
-            assert len({*coils, *discrete}) == 1
-            assert holding[0] % 1000 % 2 == coils[0]
-            seen.add(holding[0])
-        return len(seen)
+    def look() -> int:
+        ranges: list[tuple[Area, int, int]] = [(area, 0, 1000) for area in AREAS]
+        coils, discrete, holding, inputs = memory.read_many(ranges)
+        assert len({*holding, *inputs}) == 1
+        assert {*coils, *discrete} == {holding[0] % 2}
+        return holding[0]
 
-    with ThreadPoolExecutor(6) as threads:
-        readers = [threads.submit(read) for _ in range(3)]
-        writers = [threads.submit(write, value) for value in (1, 2, 3)]
-        for writer in writers:
-            writer.result()
-        done.set()
-        seen = [reader.result() for reader in readers]
-
-    assert max(seen) > 1, "no reader ran while a writer did"
+    readers.against(look, *[partial(write, value) for value in (1, 2, 3)])
 
 
 @pytest.mark.usefixtures("impatient")
 def test_no_reader_sees_a_part_of_one_large_write() -> None:
     memory = holdfast.Memory(holding_registers=65536)
-    done = threading.Event()
+    readers = Readers(2)
 
-    def read() -> None:
-        while not done.is_set():
-            first, last = memory.read_many(
-                [("holding_registers", 0, 10), ("holding_registers", 65526, 10)]
-            )
-            assert len({*first, *last}) == 1
+    def write() -> None:
+        for turn in rounds(readers.enough, least=50):
+            memory.write("holding_registers", 0, [turn & 0xFFFF] * 65536)
 
-    with ThreadPoolExecutor(3) as threads:
-        readers = [threads.submit(read) for _ in range(3)]
-        for value in range(100):
-            memory.write("holding_registers", 0, [value] * 65536)
-        done.set()
-        for reader in readers:
-            reader.result()
+    def look() -> int:
+        first, last = memory.read_many(
+            [("holding_registers", 0, 10), ("holding_registers", 65526, 10)]
+        )
+        assert len({*first, *last}) == 1
+        return first[0]
+
+    readers.against(look, write)

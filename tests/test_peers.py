@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     import holdfast
     from conftest import Serve
-    from holdfast._core import Area
+    from holdfast.types import Area
 
 BITS = [1, 0, 1, 1, 0, 0, 1, 1, 1, 0, 1]
 REGISTERS = [0, 1, 255, 256, 32767, 32768, 65535]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from conftest import Connect, Process, Serve
-    from holdfast._core import Access, Area
+    from holdfast.types import Access, Area
 
 SEED = 20251121
 READ = bytes.fromhex("0300000002")
@@ -248,16 +248,16 @@ def test_a_connection_without_a_request_ends_after_the_idle_timeout(
 def test_the_idle_timeout_begins_again_with_each_request(
     memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
-    client = connect(serve({1: memory}, idle_timeout=0.5))
+    client = connect(serve({1: memory}, idle_timeout=0.8))
     began = time.monotonic()
-    while time.monotonic() - began < 1.2:
+    while time.monotonic() - began < 1.7:
         client.ask(READ)
         ended, _, _ = select.select([client.socket], [], [], 0.1)
         assert not ended
     last = time.monotonic()
 
     assert client.rest() == b""
-    assert 0.3 <= time.monotonic() - last < 5
+    assert 0.5 <= time.monotonic() - last < 5
 
 
 def test_foreign_frames_do_not_put_off_the_idle_timeout(
@@ -327,7 +327,7 @@ def test_peers_that_do_not_read_hold_up_nobody_and_cost_little_memory(
 def test_a_slow_reader_gets_every_reply_when_it_reads_at_last(
     server: holdfast.Server, connect: Connect
 ) -> None:
-    client = connect(server, receive_buffer=4096)
+    client = connect(server, receive_buffer=4096, deadline=60)
     requests = wire.frames([LONGEST_READ] * 1000)
     sent = send_until_blocked(client, requests, 64_000_000)
     size = len(requests) // 1000
@@ -363,7 +363,7 @@ def test_garbage_on_many_connections_leaves_the_server_well(
             try:
                 noisy.send(chance.randbytes(chance.randrange(1, 3000)))
                 noisy.finish()
-            except (ConnectionResetError, BrokenPipeError, OSError):
+            except OSError:
                 continue
             noisy.rest()
 

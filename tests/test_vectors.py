@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     import holdfast
     from conftest import Connect, Serve
-    from holdfast._core import Area
+    from holdfast.types import Area
 
 VECTORS = Path(__file__).parent / "vectors"
 

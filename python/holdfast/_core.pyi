@@ -3,46 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal, TypeAlias, TypedDict, final
+from typing import Literal, final
 
-Access: TypeAlias = Literal["read-only", "read-write"]
-Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
-Bind: TypeAlias = str
-Extent: TypeAlias = int | tuple[int, int]
-Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
+from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
+
+__all__ = ["Engine", "Listener", "Memory", "OutOfRange", "Rule", "__version__"]
 
 __version__: str
 
 class OutOfRange(IndexError):
     """A range that is not inside its area; nothing was read or written."""
-
-class ConnectionCounters(TypedDict):
-    """Connections of one listener: how many are `open`, and what became of the others."""
-
-    accepted: int
-    refused_source: int
-    refused_full: int
-    evicted: int
-    idle: int
-    request_timeout: int
-    slow_reader: int
-    accept_errors: int
-    open: int
-
-class FrameCounters(TypedDict):
-    """Frames that are no requests: with a protocol id other than 0, with an impossible length."""
-
-    foreign: int
-    broken: int
-
-class ListenerCounters(TypedDict):
-    """What one listener counted: requests by function code, exceptions by exception code."""
-
-    requests: dict[int, int]
-    exceptions: dict[int, int]
-    unanswered: int
-    connections: ConnectionCounters
-    frames: FrameCounters
 
 @final
 class Memory:
@@ -129,12 +99,12 @@ class Listener:
     def __new__(
         cls,
         name: str,
-        bind: Bind,
+        bind: str,
         rules: Sequence[Rule],
         *,
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
-        when_full: Literal["refuse", "evict"] = "refuse",
+        when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
     ) -> Listener: ...

@@ -6,7 +6,7 @@ An appliance with several listeners is `holdfast.appliance`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Self
 
 from holdfast import _core
 from holdfast.identity import Identity
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from types import TracebackType
 
-    from holdfast._core import Access, ListenerCounters, Memory, Rule
+    from holdfast._core import Memory, Rule
+    from holdfast.types import Access, ListenerCounters, WhenFull
 
 LOOPBACK = ("127.0.0.0/8", "::1/128")
 
@@ -51,7 +52,7 @@ class Server:
         rules: Sequence[Rule] | None = None,
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
-        when_full: Literal["refuse", "evict"] = "refuse",
+        when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
         identity: Identity | None = None,

@@ -13,7 +13,7 @@ from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.config import ConfigError, load
 
 
-@click.command()
+@click.command(epilog="Example: holdfast check plant.yaml")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
 def check(file: Path, as_json: bool) -> None:
@@ -21,11 +21,6 @@ def check(file: Path, as_json: bool) -> None:
 
     Prints the effective configuration, every default filled in. When something is wrong, prints
     every problem with its line and exits with 2.
-
-    \b
-    Example:
-      holdfast check plant.yaml
-      holdfast check --json plant.yaml
     """
     if not as_json:
         click.echo(load_or_exit(file).dump(), nl=False)

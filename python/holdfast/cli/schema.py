@@ -9,15 +9,11 @@ import click
 from holdfast.config import json_schema
 
 
-@click.command()
+@click.command(epilog="Example: holdfast schema > holdfast.schema.json")
 def schema() -> None:
-    """Print the JSON Schema of a configuration, so that editors check and complete it.
+    """Print the JSON Schema of a configuration, for editors.
 
-    \b
-    Example:
-      holdfast schema > holdfast.schema.json
-
-    With the YAML language server, a file then begins with:
-      # yaml-language-server: $schema=holdfast.schema.json
+    With the YAML language server, a configuration then begins with the line
+    `# yaml-language-server: $schema=holdfast.schema.json`.
     """
     click.echo(json.dumps(json_schema(), indent=2))

@@ -153,10 +153,10 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     mark = error.problem_mark or error.context_mark
     line, column = (mark.line + 1, mark.column + 1) if mark else (None, None)
     reason = error.problem or error.context or "it can't be understood"
+    start = error.context_mark
     if error.context and reason.startswith("but "):
         reason = f"{error.context}, {reason}"
-    start = error.context_mark
-    if error.context and start and mark and start.line != mark.line:
+    elif error.context and start and mark and start.line != mark.line:
         reason += f", {error.context} that starts in line {start.line + 1}"
     return Problem(file, line, column, "", f"not YAML: {reason}")
 
@@ -187,7 +187,7 @@ class _Reader:
             return self._mapping(node, path)
         if isinstance(node, SequenceNode) and kind == "seq":
             return self._list(node, path)
-        spot = _Spot(_place(node), is_scalar=True)
+        spot = _Spot(_place(node), is_scalar=not _is_empty(node))
         if isinstance(node, ScalarNode):
             try:
                 return scalar(node.value, kind), spot
@@ -258,6 +258,11 @@ def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
     if special := _SPECIAL.fullmatch(text):
         return float(text.replace(".", "")) if special["inf"] else float("nan")
     return text
+
+
+def _is_empty(node: Node) -> bool:
+    """Whether nothing is written: the place of that is anywhere behind the key."""
+    return isinstance(node, ScalarNode) and node.style is None and node.value == ""
 
 
 def _place(node: Node) -> Place:

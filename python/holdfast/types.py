@@ -1,0 +1,46 @@
+"""The types of arguments and answers, for annotations."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias, TypedDict
+
+Access: TypeAlias = Literal["read-only", "read-write"]
+Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
+WhenFull: TypeAlias = Literal["refuse", "evict"]
+
+Extent: TypeAlias = int | tuple[int, int]
+"""The addresses of an area: a size from 0, or start and size."""
+
+Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
+"""The gate bit of a memory: area (of bits), address, and when it opens."""
+
+
+class ConnectionCounters(TypedDict):
+    """Connections of one listener: how many are `open`, and what became of the others."""
+
+    accepted: int
+    refused_source: int
+    refused_full: int
+    evicted: int
+    idle: int
+    request_timeout: int
+    slow_reader: int
+    accept_errors: int
+    open: int
+
+
+class FrameCounters(TypedDict):
+    """Frames that are no requests: with a protocol id other than 0, with an impossible length."""
+
+    foreign: int
+    broken: int
+
+
+class ListenerCounters(TypedDict):
+    """What one listener counted: requests by function code, exceptions by exception code."""
+
+    requests: dict[int, int]
+    exceptions: dict[int, int]
+    unanswered: int
+    connections: ConnectionCounters
+    frames: FrameCounters

@@ -1,0 +1,139 @@
+"""`holdfast check` and `holdfast schema`, as people and programs use them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+
+import holdfast
+from holdfast.cli import COMMANDS, main
+from holdfast.cli.configuration import load_or_exit
+from holdfast.config import json_schema, load
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+GOOD = """\
+memories: {plant: {coils: 8}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:5020
+    rules: [{sources: [127.0.0.1], units: {1: plant}, access: read-only}]
+"""
+BAD = GOOD.replace("read-only", "rw").replace("{1: plant}", "{1: plan}")
+PROBLEMS = [
+    "listeners.scada.rules[0].units.1: found 'plan', allowed: plant; did you mean 'plant'?",
+    "listeners.scada.rules[0].access: found 'rw', allowed: read-only or read-write",
+]
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    path = tmp_path / "good.yaml"
+    path.write_text(GOOD, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> Path:
+    path = tmp_path / "bad.yaml"
+    path.write_text(BAD, encoding="utf-8")
+    return path
+
+
+def test_check_prints_the_effective_configuration(good: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(good)])
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == load(good).dump()
+
+
+def test_check_prints_every_problem_and_their_number(bad: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(bad)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    lines = [f"{bad}:6: {problem}" for problem in PROBLEMS]
+    assert result.stderr.splitlines() == [*lines, "2 problems"]
+
+
+def test_check_counts_a_single_problem(tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(tmp_path / "none.yaml")])
+    assert result.exit_code == 2
+    assert result.stderr.splitlines() == [
+        f"{tmp_path}/none.yaml: can't be read: No such file or directory",
+        "1 problem",
+    ]
+
+
+def test_check_gives_programs_the_configuration(good: Path) -> None:
+    result = CliRunner().invoke(main, ["check", "--json", str(good)])
+    answer = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert (answer["ok"], answer["problems"]) == (True, [])
+    assert answer["config"]["listeners"]["scada"]["max_connections"] == 256
+
+
+def test_check_gives_programs_the_problems(bad: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(bad), "--json"])
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, result.stderr, answer["ok"]) == (2, "", False)
+    assert answer["problems"][1] == {
+        "file": str(bad),
+        "line": 6,
+        "column": BAD.splitlines()[5].index("rw") + 1,
+        "key": "listeners.scada.rules[0].access",
+        "message": "found 'rw', allowed: read-only or read-write",
+    }
+
+
+def test_check_needs_a_file() -> None:
+    result = CliRunner().invoke(main, ["check"])
+    assert result.exit_code == 2
+    assert "Missing argument 'FILE'" in result.stderr
+
+
+def test_a_command_gets_its_configuration(good: Path) -> None:
+    assert load_or_exit(good) == load(good)
+
+
+def test_a_command_ends_with_2_on_a_wrong_configuration(
+    bad: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        load_or_exit(bad)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith("2 problems\n")
+
+
+def test_schema_prints_the_schema() -> None:
+    result = CliRunner().invoke(main, ["schema"])
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) == json_schema()
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+def test_every_help_has_an_example(command: list[str]) -> None:
+    result = CliRunner().invoke(main, [*command, "--help"])
+    assert result.exit_code == 0
+    assert "Example: holdfast " in result.stdout
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    result = CliRunner().invoke(main, ["--version"])
+    assert result.stdout == f"holdfast {holdfast.__version__}\n"
+
+
+def test_an_unknown_command_is_wrong_usage() -> None:
+    assert CliRunner().invoke(main, ["fly"]).exit_code == 2
+
+
+def test_check_works_as_a_process(bad: Path) -> None:
+    command = [sys.executable, "-m", "holdfast", "check", str(bad)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.splitlines()[-1] == "2 problems"
+    assert "Traceback" not in result.stderr
