@@ -5,4 +5,4 @@ from __future__ import annotations
 from holdfast.cli import main
 
 if __name__ == "__main__":
-    main(prog_name="holdfast")
+    main(prog_name="python -m holdfast")
