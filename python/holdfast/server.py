@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from holdfast._core import Memory, Rule
     from holdfast.types import Access, ListenerCounters, WhenFull
 
+MAX_WORKERS = 64
 LOOPBACK = ("127.0.0.0/8", "::1/128")
 
 
@@ -71,6 +72,8 @@ class Server:
             rules = [rule]
         elif units is not None or access is not None:
             raise TypeError("a server has units and access, or rules, not both")
+        if not 1 <= workers <= MAX_WORKERS:
+            raise ValueError(f"workers is {workers}, allowed are 1 to {MAX_WORKERS}")
         self._listener = _core.Listener(
             "server",
             bind,

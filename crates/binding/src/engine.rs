@@ -1,6 +1,7 @@
 //! `Rule`, `Listener` and `Engine`: settings in, addresses, counters and events out.
 
 use std::net::{IpAddr, SocketAddr};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -27,8 +28,8 @@ impl Rule {
         units: &Bound<'_, PyMapping>,
         sources: Vec<String>,
         access: &str,
-        functions: Option<Vec<u8>>,
-        deny: Option<Vec<u8>>,
+        functions: Option<Vec<i128>>,
+        deny: Option<Vec<i128>>,
     ) -> PyResult<Rule> {
         let sources = sources.iter().map(|text| network(text)).collect::<PyResult<_>>()?;
         let rights = match access {
@@ -36,7 +37,12 @@ impl Rule {
             "read-write" => Rights::ReadWrite,
             _ => return Err(unknown("access", access, "read-only, read-write")),
         };
-        let functions = match (functions, deny) {
+        let codes = |codes: Option<Vec<i128>>| {
+            let codes =
+                codes.map(|codes| codes.into_iter().map(|code| byte("function code", code)));
+            codes.map(Iterator::collect::<PyResult<Vec<u8>>>).transpose()
+        };
+        let functions = match (codes(functions)?, codes(deny)?) {
             (None, None) => Functions::All,
             (Some(codes), None) => Functions::Only(codes),
             (None, Some(codes)) => Functions::Except(codes),
@@ -46,8 +52,8 @@ impl Rule {
         };
         let mut mapped: Vec<(u8, Arc<_>)> = Vec::new();
         for item in units.items()?.iter() {
-            let (unit, memory): (u8, PyRef<'_, Memory>) = item.extract()?;
-            mapped.push((unit, Arc::clone(&memory.core)));
+            let (unit, memory): (i128, PyRef<'_, Memory>) = item.extract()?;
+            mapped.push((byte("unit id", unit)?, Arc::clone(&memory.core)));
         }
         Ok(Rule { core: CoreRule { sources, units: mapped, rights, functions } })
     }
@@ -67,8 +73,8 @@ impl Listener {
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, Rule>>,
-        max_connections: usize,
-        max_connections_per_source: Option<usize>,
+        max_connections: i128,
+        max_connections_per_source: Option<i128>,
         when_full: &str,
         idle_timeout: f64,
         request_timeout: f64,
@@ -81,9 +87,10 @@ impl Listener {
             "evict" => WhenFull::Evict,
             _ => return Err(unknown("when_full", when_full, "refuse, evict")),
         };
-        if max_connections == 0 || max_connections_per_source == Some(0) {
-            return Err(PyValueError::new_err("a limit of connections is at least 1"));
-        }
+        let max_connections = within("max_connections", max_connections, 1..=65_535)?;
+        let max_connections_per_source = max_connections_per_source
+            .map(|most| within("max_connections_per_source", most, 1..=65_535))
+            .transpose()?;
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
         let request_timeout = seconds("request_timeout", request_timeout)?;
         if request_timeout.is_zero() {
@@ -118,9 +125,10 @@ impl Engine {
         listeners: Vec<PyRef<'_, Listener>>,
         identity: Vec<(u8, String)>,
         unit_names: Option<Vec<(u8, String)>>,
-        workers: usize,
+        workers: i128,
         events: &str,
     ) -> PyResult<Engine> {
+        let workers = within("workers", workers, 1..=64)?;
         let events = match events {
             "nothing" => Verbosity::Nothing,
             "refusals" => Verbosity::Refusals,
@@ -214,6 +222,18 @@ fn by_code<'py>(
         all.set_item(code, count)?;
     }
     Ok(all)
+}
+
+/// An integer of a range that a `usize` holds.
+fn within(what: &str, found: i128, allowed: RangeInclusive<usize>) -> PyResult<usize> {
+    usize::try_from(found).ok().filter(|number| allowed.contains(number)).ok_or_else(|| {
+        let (least, most) = (allowed.start(), allowed.end());
+        PyValueError::new_err(format!("{what} is {found}, allowed are {least} to {most}"))
+    })
+}
+
+fn byte(what: &str, found: i128) -> PyResult<u8> {
+    Ok(within(what, found, 0..=255)? as u8)
 }
 
 fn unknown(what: &str, found: &str, allowed: &str) -> PyErr {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use holdfast_memory::{
     Access, Area, Gate, GateMode, Layout, Memory as Core, Read, Refusal, Span, Write,
 };
-use pyo3::exceptions::{PyIndexError, PyTypeError, PyValueError};
+use pyo3::exceptions::{PyIndexError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyList, PyString};
 
@@ -81,10 +81,10 @@ impl Memory {
         &self,
         py: Python<'py>,
         area: &str,
-        address: i64,
-        count: i64,
+        address: &Bound<'_, PyAny>,
+        count: &Bound<'_, PyAny>,
     ) -> PyResult<Bound<'py, PyList>> {
-        let mut range = Range::new(&self.core, area, address, count)?;
+        let mut range = Range::new(&self.core, area, integer(address)?, integer(count)?)?;
         py.detach(|| self.core.read(Access::Ingest, range.reading()))
             .map_err(|refusal| range.refused(&self.core, refusal))?;
         range.values(py)
@@ -93,11 +93,11 @@ impl Memory {
     fn read_many<'py>(
         &self,
         py: Python<'py>,
-        ranges: Vec<(String, i64, i64)>,
+        ranges: Vec<(String, Bound<'py, PyAny>, Bound<'py, PyAny>)>,
     ) -> PyResult<Vec<Bound<'py, PyList>>> {
-        let ranges = ranges
-            .iter()
-            .map(|(area, address, count)| Range::new(&self.core, area, *address, *count));
+        let ranges = ranges.iter().map(|(area, address, count)| {
+            Range::new(&self.core, area, integer(address)?, integer(count)?)
+        });
         let mut ranges = ranges.collect::<PyResult<Vec<Range>>>()?;
         py.detach(|| {
             let mut reads: Vec<Read> = ranges.iter_mut().map(Range::reading).collect();
@@ -111,10 +111,10 @@ impl Memory {
         &self,
         py: Python<'_>,
         area: &str,
-        address: i64,
+        address: &Bound<'_, PyAny>,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<()> {
-        let range = Range::packed(&self.core, area, address, values)?;
+        let range = Range::packed(&self.core, area, integer(address)?, values)?;
         py.detach(|| self.core.write(Access::Ingest, range.writing()))
             .map_err(|refusal| range.refused(&self.core, refusal))
     }
@@ -122,11 +122,11 @@ impl Memory {
     fn write_many(
         &self,
         py: Python<'_>,
-        writes: Vec<(String, i64, Bound<'_, PyAny>)>,
+        writes: Vec<(String, Bound<'_, PyAny>, Bound<'_, PyAny>)>,
     ) -> PyResult<()> {
-        let ranges = writes
-            .iter()
-            .map(|(area, address, values)| Range::packed(&self.core, area, *address, values));
+        let ranges = writes.iter().map(|(area, address, values)| {
+            Range::packed(&self.core, area, integer(address)?, values)
+        });
         let ranges = ranges.collect::<PyResult<Vec<Range>>>()?;
         py.detach(|| {
             let writes: Vec<Write> = ranges.iter().map(Range::writing).collect();
@@ -152,7 +152,7 @@ struct Range {
 
 impl Range {
     /// A range whose bytes are yet to be read.
-    fn new(memory: &Core, area: &str, address: i64, count: i64) -> PyResult<Range> {
+    fn new(memory: &Core, area: &str, address: i128, count: i128) -> PyResult<Range> {
         let area = named(area)?;
         if count < 1 {
             return Err(PyValueError::new_err(format!("count is {count}, at least 1 is allowed")));
@@ -168,13 +168,14 @@ impl Range {
     fn packed(
         memory: &Core,
         area: &str,
-        address: i64,
+        address: i128,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Range> {
         let items = numbers(named(area)?, values)?;
-        let mut range = Range::new(memory, area, address, items.len() as i64).map_err(|error| {
-            if items.is_empty() { PyValueError::new_err("values are empty") } else { error }
-        })?;
+        let mut range =
+            Range::new(memory, area, address, items.len() as i128).map_err(|error| {
+                if items.is_empty() { PyValueError::new_err("values are empty") } else { error }
+            })?;
         if range.area.is_bits() {
             for (index, bit) in items.iter().enumerate() {
                 range.bytes[index / 8] |= (*bit as u8) << (index % 8);
@@ -208,7 +209,7 @@ impl Range {
     fn refused(&self, memory: &Core, refusal: Refusal) -> PyErr {
         match refusal {
             Refusal::OutOfRange => {
-                out_of_range(memory, self.area, i64::from(self.address), self.count as i64)
+                out_of_range(memory, self.area, i128::from(self.address), self.count as i128)
             }
             other => PyValueError::new_err(other.to_string()),
         }
@@ -237,7 +238,7 @@ fn gate(seal: Seal) -> PyResult<Gate> {
     Ok(Gate { area: named(&area)?, address, mode })
 }
 
-fn out_of_range(memory: &Core, area: Area, address: i64, count: i64) -> PyErr {
+fn out_of_range(memory: &Core, area: Area, address: i128, count: i128) -> PyErr {
     let span = memory.span(area);
     let name = area.name();
     let found = format!("{count} from address {address}");
@@ -248,6 +249,17 @@ fn out_of_range(memory: &Core, area: Area, address: i64, count: i64) -> PyErr {
             format!("{name}: {found}, allowed are addresses {} to {last}", span.start())
         }
     })
+}
+
+/// A Python integer; one that 128 bits do not hold becomes the nearest that they do, which no
+/// address, count or value is either.
+fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
+    match value.extract::<i128>() {
+        Err(error) if error.is_instance_of::<PyOverflowError>(value.py()) => {
+            Ok(if value.lt(0)? { i128::MIN } else { i128::MAX })
+        }
+        extracted => extracted,
+    }
 }
 
 /// The integers of a Python sequence, each one checked.
@@ -272,7 +284,7 @@ fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     let (most, allowed) =
         if area.is_bits() { (1, "0, 1, False, True") } else { (u16::MAX, "integers 0 to 65535") };
     let is_bool = value.is_instance_of::<PyBool>();
-    let number = if is_bool && !area.is_bits() { None } else { value.extract::<i128>().ok() };
+    let number = if is_bool && !area.is_bits() { None } else { integer(value).ok() };
     match number.map(|number| u16::try_from(number).ok().filter(|number| *number <= most)) {
         Some(Some(number)) => Ok(number),
         out_of_bounds => {

@@ -113,28 +113,45 @@ impl Connection {
         }
     }
 
-    /// Serves until the connection ends, and says why.
-    pub(crate) async fn run(mut self, mut stop: watch::Receiver<bool>) -> Kind {
+    /// Serves until the connection ends, and says why. What ended it is counted before the peer can
+    /// see it.
+    pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) -> Kind {
+        let Some(end) = self.serve(stop).await else {
+            self.finish();
+            return Kind::Closed;
+        };
+        let counters = &self.session.station.counters.connections;
+        match end {
+            Kind::Idle => counters.idle.add(),
+            Kind::RequestTimeout => counters.request_timeout.add(),
+            Kind::SlowReader => counters.slow_reader.add(),
+            _ => {}
+        }
+        end
+    }
+
+    /// Serves until the connection ends; `None` when all are to stop.
+    async fn serve(&mut self, mut stop: watch::Receiver<bool>) -> Option<Kind> {
         // A peer that never pauses never lets the wait for a stop have its turn.
         let flooded = stop.clone();
         let mut stopping = pin!(stop.wait_for(|stop| *stop));
         let mut alarm = pin!(sleep_until(self.last_request + FAR));
         loop {
             if let Err(end) = self.send_unsent().await {
-                return end;
+                return Some(end);
             }
             if flooded.has_changed().unwrap_or(true) {
-                return self.finish();
+                return None;
             }
             self.set(alarm.as_mut());
             let step = tokio::select! {
                 biased;
                 step = poll_fn(|context| self.poll(context)) => step,
                 () = &mut alarm => self.overdue(),
-                _ = &mut stopping => return self.finish(),
+                _ = &mut stopping => return None,
             };
             if let Err(end) = step {
-                return end;
+                return Some(end);
             }
         }
     }
@@ -222,13 +239,11 @@ impl Connection {
     }
 
     /// Answers what the system has received already, then ends.
-    fn finish(mut self) -> Kind {
+    fn finish(mut self) {
         if let Ok(mut stream) = self.stream.into_std() {
             // A peer whose buffers are full, or who is gone, loses what it does not take.
             let _ = self.session.drain(&mut stream, &self.unsent);
         }
-        self.unsent.clear();
-        Kind::Closed
     }
 }
 

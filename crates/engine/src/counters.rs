@@ -125,9 +125,13 @@ impl Counters {
         }
     }
 
-    /// Starts the counters of Diagnostics again at 0; all others go on.
-    pub fn clear_bus(&self) {
-        *self.cleared.lock().unwrap_or_else(PoisonError::into_inner) = self.total();
+    /// Starts the counters of Diagnostics again at 0; all others go on. `owed` is what the request
+    /// that asks for it will still be counted as.
+    pub fn clear_bus(&self, owed: Bus) {
+        let mut now = self.total();
+        now.events += owed.events;
+        now.no_response += owed.no_response;
+        *self.cleared.lock().unwrap_or_else(PoisonError::into_inner) = now;
     }
 
     fn total(&self) -> Bus {

@@ -159,13 +159,6 @@ impl Listener {
     async fn serve(&self, connection: Connection, peer: SocketAddr, stop: watch::Receiver<bool>) {
         self.report(Kind::Opened, Some(peer));
         let end = connection.run(stop).await;
-        let counters = &self.station.counters.connections;
-        match end {
-            Kind::Idle => counters.idle.add(),
-            Kind::RequestTimeout => counters.request_timeout.add(),
-            Kind::SlowReader => counters.slow_reader.add(),
-            _ => {}
-        }
         self.report(end, Some(peer));
     }
 

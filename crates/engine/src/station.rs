@@ -12,7 +12,7 @@ use holdfast_protocol::pdu::{
     Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
 
-use crate::counters::Counters;
+use crate::counters::{Bus, Counters};
 use crate::identity::Identity;
 use crate::policy::Grant;
 
@@ -73,7 +73,7 @@ impl Station {
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
-        if !grant.allows(function_code) || denied(grant, &request) {
+        if !grant.allows(function_code) || denied(grant, pdu, &request) {
             return Err(ExceptionCode::IllegalFunction);
         }
         let memory = grant.memory(unit_id).ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
@@ -156,13 +156,9 @@ impl Station {
         if let Ok(Request::Diagnostics(Diagnostics { sub_function, .. })) = request
             && *sub_function == SubFunction::RestartCommunications
         {
-            self.restart(unit_id);
+            self.silent[usize::from(unit_id)].store(false, Ordering::Relaxed);
+            self.counters.clear_bus(Bus { no_response: 1, ..Bus::default() });
         }
-    }
-
-    fn restart(&self, unit_id: u8) {
-        self.silent[usize::from(unit_id)].store(false, Ordering::Relaxed);
-        self.counters.clear_bus();
     }
 
     /// Function 8. The counters are the listener's, their low 16 bits are sent.
@@ -178,17 +174,13 @@ impl Station {
             SubFunction::ReturnQueryData | SubFunction::ChangeAsciiInputDelimiter => {
                 return Some(reply::echo(pdu, reply));
             }
-            SubFunction::RestartCommunications => {
-                self.restart(unit_id);
+            SubFunction::RestartCommunications | SubFunction::ClearCounters => {
+                self.counters.clear_bus(Bus { events: 1, ..Bus::default() });
                 return Some(reply::echo(pdu, reply));
             }
             SubFunction::ForceListenOnlyMode => {
                 self.silent[usize::from(unit_id)].store(true, Ordering::Relaxed);
                 return None;
-            }
-            SubFunction::ClearCounters => {
-                self.counters.clear_bus();
-                return Some(reply::echo(pdu, reply));
             }
             // Nothing here overruns or refuses with a negative acknowledge.
             SubFunction::ClearOverrunCounter => return Some(reply::echo(pdu, reply)),
@@ -206,13 +198,16 @@ impl Station {
     }
 }
 
-/// Whether a sub-function is unknown, or one that a read-only peer may not use.
-fn denied(grant: &Grant, request: &Result<Request<'_>, ExceptionCode>) -> bool {
-    match request {
-        Err(code) => *code == ExceptionCode::IllegalFunction,
-        Ok(Request::Diagnostics(asked)) => grant.read_only() && asked.sub_function.changes_state(),
-        Ok(_) => false,
+/// Whether a sub-function is unknown, or one that a read-only peer may not use: judged, like the
+/// function, before anything else of the request.
+fn denied(grant: &Grant, pdu: &[u8], request: &Result<Request<'_>, ExceptionCode>) -> bool {
+    if *request == Err(ExceptionCode::IllegalFunction) {
+        return true;
     }
+    let diagnostics = pdu.first() == Some(&Function::Diagnostics.code());
+    diagnostics
+        && grant.read_only()
+        && Diagnostics::sub_function(pdu).is_some_and(SubFunction::changes_state)
 }
 
 fn byte_len(area: Area, range: Range) -> u8 {

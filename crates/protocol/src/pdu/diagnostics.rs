@@ -71,6 +71,12 @@ pub struct Diagnostics<'a> {
 }
 
 impl<'a> Diagnostics<'a> {
+    /// The sub-function of a PDU of function 8, whatever its data field.
+    pub fn sub_function(pdu: &[u8]) -> Option<SubFunction> {
+        let high_low = pdu.get(1..)?.first_chunk::<2>()?;
+        SubFunction::from_code(u16::from_be_bytes(*high_low))
+    }
+
     pub(super) fn parse(body: &'a [u8]) -> Result<Diagnostics<'a>, ExceptionCode> {
         let [high, low, data @ ..] = body else {
             return Err(ExceptionCode::IllegalDataValue);

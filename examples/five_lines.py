@@ -1,4 +1,4 @@
-"""A Modbus server in five lines: `python examples/server.py`, then read it with any client."""
+"""A Modbus server in five lines: `python examples/five_lines.py`, then read it with any client."""
 
 from __future__ import annotations
 
