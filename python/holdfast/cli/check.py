@@ -6,11 +6,17 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.config import ConfigError, load
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.config import Problem
 
 
 @click.command(epilog="Example: holdfast check plant.yaml")
@@ -28,8 +34,16 @@ def check(file: Path, as_json: bool) -> None:
     try:
         config = load(file)
     except ConfigError as error:
-        problems = [dataclasses.asdict(problem) for problem in error.problems]
-        click.echo(json.dumps({"ok": False, "problems": problems}, indent=2))
+        click.echo(json.dumps({"ok": False, "problems": _plain(error.problems)}, indent=2))
         sys.exit(WRONG)
-    answer = {"ok": True, "problems": [], "config": config.effective()}
+    answer = {
+        "ok": True,
+        "problems": [],
+        "warnings": _plain(config.warnings),
+        "config": config.effective(),
+    }
     click.echo(json.dumps(answer, indent=2))
+
+
+def _plain(problems: Iterable[Problem]) -> list[dict[str, object]]:
+    return [dataclasses.asdict(problem) for problem in problems]

@@ -17,12 +17,18 @@ WRONG = 2
 
 
 def load_or_exit(path: Path | str) -> Config:
-    """The configuration; when it is wrong, prints every problem and exits with 2."""
+    """The configuration; when it is wrong, prints every problem and exits with 2.
+
+    What is right but has no effect is told on standard error, as a warning.
+    """
     try:
-        return load(path)
+        config = load(path)
     except ConfigError as error:
         show_problems(error)
         sys.exit(WRONG)
+    for warning in config.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    return config
 
 
 def show_problems(error: ConfigError) -> None:

@@ -6,6 +6,7 @@ It writes plain data and knows no models.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from holdfast.config.source import scalar
 
 NULL_IS_SAID = frozenset({"max_connections_per_source"})
 """Keys whose absence is written as null; the others are left out."""
+
+PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", re.ASCII)
+"""Text that means itself anywhere in YAML; whatever else is quoted."""
 
 
 def effective(model: dict[Any, Any]) -> dict[Any, Any]:
@@ -60,7 +64,8 @@ _Representer.add_representer(type(None), _Representer.represent_null)
 
 def _styled(value: object, depth: int) -> object:
     if isinstance(value, str):
-        return value if scalar(value) == value else DoubleQuotedScalarString(value)
+        plain = PLAIN.fullmatch(value) is not None and scalar(value) == value
+        return value if plain else DoubleQuotedScalarString(value)
     if isinstance(value, dict):
         mapping = CommentedMap((_styled(k, 0), _styled(v, depth + 1)) for k, v in value.items())
         return _on_one_line(mapping, value.values(), depth)

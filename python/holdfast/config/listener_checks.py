@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.addresses import Bind, Network, covers, parse_bind, parse_source
 from holdfast.config.model import ModbusTcpListener
 from holdfast.config.tolerance import entries, integer, mapping, parsed
-from holdfast.config.values import FUNCTIONS, WRITES
+from holdfast.config.values import WRITES
 from holdfast.config.words import guess, listing, show
 
 if TYPE_CHECKING:
@@ -56,8 +56,8 @@ class ListenerChecks:
         most = integer(listener.get("max_connections", _MOST), 1, 65535)
         of_source = integer(listener.get("max_connections_per_source"), 1, 65535)
         if most is not None and of_source is not None and of_source > most:
-            message = f"found {of_source}, allowed: up to {most}, which is max_connections"
-            self.report.add((*path, "max_connections_per_source"), message)
+            message = f"{of_source} has no effect: max_connections is {most}"
+            self.report.doubt((*path, "max_connections_per_source"), message)
 
     def _rules(self, path: KeyPath, rules: list[Any]) -> None:
         earlier: list[tuple[KeyPath, list[Network]]] = []
@@ -84,8 +84,8 @@ class ListenerChecks:
             for rule, networks in earlier
             if any(covers(networks, s) or any(covers([s], n) for n in networks) for s in sources)
         ]
-        message = f"can never match: all its sources belong to {' and '.join(taking)}"
-        self.report.add(path, f"{message}, allowed: some that no earlier rule has")
+        message = f"never matches: all its sources belong to {' and '.join(taking)}"
+        self.report.doubt(path, message)
 
 
 @dataclass
@@ -123,8 +123,7 @@ class RuleCheck:
                 self.report.add((*self.path, key, index), f"found {code} again, allowed: once")
 
     def _writes(self) -> None:
-        reading = [code for code in FUNCTIONS if code not in WRITES]
         for index, code in enumerate(entries(self.rule.get("functions"))):
             if integer(code, 0, 255) in WRITES:
-                message = f"found {code}, which writes, allowed under read-only: {listing(reading)}"
-                self.report.add((*self.path, "functions", index), message)
+                message = f"{code} has no effect: it writes, and access is read-only"
+                self.report.doubt((*self.path, "functions", index), message)

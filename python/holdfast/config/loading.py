@@ -21,7 +21,10 @@ from holdfast.config.words import show
 
 
 def load(path: Path | str) -> Config:
-    """Reads a configuration; raises `ConfigError` with every problem that it has."""
+    """Reads a configuration; raises `ConfigError` with every problem that it has.
+
+    What is right but has no effect is in `Config.warnings`.
+    """
     file = str(path)
     document, problems = source.parse(source.read_text(Path(path), file), file)
     if not isinstance(document.data, dict):
@@ -40,4 +43,4 @@ def load(path: Path | str) -> Config:
     problems += [*report.problems, *memories.problems_elsewhere]
     if config is None or problems:
         raise ConfigError(file, problems)
-    return config
+    return config.with_warnings(report.doubts)

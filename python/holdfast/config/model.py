@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -41,6 +41,11 @@ from holdfast.config.values import (
     Text,
     UnitId,
 )
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.config.problems import Problem
 
 Size = Annotated[int, Field(ge=1, le=65536)]
 Register = Annotated[int, Field(ge=0, le=65535)]
@@ -219,6 +224,18 @@ class Config(_Model):
     """What is told to those who run it."""
     workers: Annotated[int, Field(ge=1, le=64)] = 1
     """Threads that serve connections."""
+
+    _warnings: tuple[Problem, ...] = PrivateAttr(default=())
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """What is right but has no effect, such as a rule that never matches."""
+        return self._warnings
+
+    def with_warnings(self, warnings: Iterable[Problem]) -> Self:
+        """This configuration, with these warnings."""
+        self._warnings = tuple(warnings)
+        return self
 
     def dump(self) -> str:
         """The effective configuration as YAML, all defaults filled in; it loads as an equal one."""

@@ -48,10 +48,11 @@ class ConfigError(Exception):
 
 @dataclass
 class Report:
-    """The problems found so far in one document, each once."""
+    """The problems found so far in one document, each once, and what is right but has no effect."""
 
     document: Document
     found: dict[Problem, None] = field(default_factory=dict)
+    doubts: list[Problem] = field(default_factory=list)
 
     @property
     def problems(self) -> list[Problem]:
@@ -60,9 +61,16 @@ class Report:
 
     def add(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
         """Adds a problem of the value at `path`, or of the key itself."""
+        self.found[self._at(path, message, of_key)] = None
+
+    def doubt(self, path: KeyPath, message: str) -> None:
+        """Adds what is allowed at `path` but can't be what was meant."""
+        self.doubts.append(self._at(path, message, of_key=False))
+
+    def _at(self, path: KeyPath, message: str, of_key: bool) -> Problem:
         place = self.document.place(path, of_key=of_key)
         key = self.document.spell(path)
-        self.found[Problem(self.document.file, place.line, place.column, key, message)] = None
+        return Problem(self.document.file, place.line, place.column, key, message)
 
     def line(self, path: KeyPath) -> int:
         """The line of the key at `path`."""
