@@ -15,8 +15,6 @@ from holdfast import _core, logs
 from holdfast.identity import Identity
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from holdfast.config import (
         Config,
         IdentityConfig,
@@ -133,12 +131,7 @@ class Appliance:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
 

@@ -13,7 +13,6 @@ from holdfast.identity import Identity
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
-    from types import TracebackType
 
     from holdfast._core import Memory, Rule
     from holdfast.types import Access, ListenerCounters, WhenFull
@@ -129,10 +128,5 @@ class Server:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()

@@ -2,54 +2,29 @@
 
 use super::ExceptionCode;
 
-/// A sub-function of Diagnostics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[repr(u16)]
-pub enum SubFunction {
-    ReturnQueryData = 0x00,
-    RestartCommunications = 0x01,
-    ReturnDiagnosticRegister = 0x02,
-    ChangeAsciiInputDelimiter = 0x03,
-    ForceListenOnlyMode = 0x04,
-    ClearCounters = 0x0A,
-    ReturnBusMessageCount = 0x0B,
-    ReturnBusCommunicationErrorCount = 0x0C,
-    ReturnBusExceptionErrorCount = 0x0D,
-    ReturnServerMessageCount = 0x0E,
-    ReturnServerNoResponseCount = 0x0F,
-    ReturnServerNakCount = 0x10,
-    ReturnServerBusyCount = 0x11,
-    ReturnBusCharacterOverrunCount = 0x12,
-    ClearOverrunCounter = 0x14,
+codes! {
+    /// A sub-function of Diagnostics.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+    SubFunction: u16 {
+        ReturnQueryData = 0x00, "Return Query Data";
+        RestartCommunications = 0x01, "Restart Communications Option";
+        ReturnDiagnosticRegister = 0x02, "Return Diagnostic Register";
+        ChangeAsciiInputDelimiter = 0x03, "Change ASCII Input Delimiter";
+        ForceListenOnlyMode = 0x04, "Force Listen Only Mode";
+        ClearCounters = 0x0A, "Clear Counters and Diagnostic Register";
+        ReturnBusMessageCount = 0x0B, "Return Bus Message Count";
+        ReturnBusCommunicationErrorCount = 0x0C, "Return Bus Communication Error Count";
+        ReturnBusExceptionErrorCount = 0x0D, "Return Bus Exception Error Count";
+        ReturnServerMessageCount = 0x0E, "Return Server Message Count";
+        ReturnServerNoResponseCount = 0x0F, "Return Server No Response Count";
+        ReturnServerNakCount = 0x10, "Return Server NAK Count";
+        ReturnServerBusyCount = 0x11, "Return Server Busy Count";
+        ReturnBusCharacterOverrunCount = 0x12, "Return Bus Character Overrun Count";
+        ClearOverrunCounter = 0x14, "Clear Overrun Counter and Flag";
+    }
 }
 
 impl SubFunction {
-    const ALL: [SubFunction; 15] = [
-        SubFunction::ReturnQueryData,
-        SubFunction::RestartCommunications,
-        SubFunction::ReturnDiagnosticRegister,
-        SubFunction::ChangeAsciiInputDelimiter,
-        SubFunction::ForceListenOnlyMode,
-        SubFunction::ClearCounters,
-        SubFunction::ReturnBusMessageCount,
-        SubFunction::ReturnBusCommunicationErrorCount,
-        SubFunction::ReturnBusExceptionErrorCount,
-        SubFunction::ReturnServerMessageCount,
-        SubFunction::ReturnServerNoResponseCount,
-        SubFunction::ReturnServerNakCount,
-        SubFunction::ReturnServerBusyCount,
-        SubFunction::ReturnBusCharacterOverrunCount,
-        SubFunction::ClearOverrunCounter,
-    ];
-
-    pub fn from_code(code: u16) -> Option<SubFunction> {
-        SubFunction::ALL.into_iter().find(|sub_function| sub_function.code() == code)
-    }
-
-    pub const fn code(self) -> u16 {
-        self as u16
-    }
-
     /// Whether it changes how the server behaves or what it counts, not only what it answers.
     pub const fn changes_state(self) -> bool {
         matches!(

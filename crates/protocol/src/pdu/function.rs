@@ -2,36 +2,10 @@
 
 use thiserror::Error;
 
-macro_rules! codes {
-    ($(#[$meta:meta])* $name:ident { $($variant:ident = $code:literal, $text:literal;)* }) => {
-        $(#[$meta])*
-        #[repr(u8)]
-        pub enum $name { $($variant = $code,)* }
-
-        impl $name {
-            pub const fn from_code(code: u8) -> Option<$name> {
-                match code {
-                    $($code => Some($name::$variant),)*
-                    _ => None,
-                }
-            }
-
-            pub const fn code(self) -> u8 {
-                self as u8
-            }
-
-            /// The standard's name.
-            pub const fn name(self) -> &'static str {
-                match self { $($name::$variant => $text,)* }
-            }
-        }
-    };
-}
-
 codes! {
     /// A function that this crate can encode and decode.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-    Function {
+    Function: u8 {
         ReadCoils = 1, "Read Coils";
         ReadDiscreteInputs = 2, "Read Discrete Inputs";
         ReadHoldingRegisters = 3, "Read Holding Registers";
@@ -68,7 +42,7 @@ codes! {
     /// Why a server refused a request.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
     #[error("exception {:#04x} ({})", self.code(), self.name())]
-    ExceptionCode {
+    ExceptionCode: u8 {
         IllegalFunction = 1, "Illegal Function";
         IllegalDataAddress = 2, "Illegal Data Address";
         IllegalDataValue = 3, "Illegal Data Value";

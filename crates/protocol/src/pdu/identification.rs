@@ -15,35 +15,18 @@ const HEAD_LEN: usize = 7;
 /// The longest value that fits a reply of its own, in bytes.
 pub const MAX_VALUE_LEN: usize = super::MAX_LEN - HEAD_LEN - 2;
 
-/// Which objects are asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u8)]
-pub enum ReadCode {
-    /// Objects 0x00 to 0x02, as a stream.
-    Basic = 1,
-    /// Objects 0x00 to 0x7F, as a stream.
-    Regular = 2,
-    /// All objects, as a stream.
-    Extended = 3,
-    /// One object.
-    Individual = 4,
+codes! {
+    /// Which objects are asked for: those up to 0x02, 0x7F or 0xFF as a stream, or one.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    ReadCode: u8 {
+        Basic = 1, "basic device identification";
+        Regular = 2, "regular device identification";
+        Extended = 3, "extended device identification";
+        Individual = 4, "one specific identification object";
+    }
 }
 
 impl ReadCode {
-    const fn from_code(code: u8) -> Option<ReadCode> {
-        match code {
-            1 => Some(ReadCode::Basic),
-            2 => Some(ReadCode::Regular),
-            3 => Some(ReadCode::Extended),
-            4 => Some(ReadCode::Individual),
-            _ => None,
-        }
-    }
-
-    pub const fn code(self) -> u8 {
-        self as u8
-    }
-
     const fn last_object(self) -> u8 {
         match self {
             ReadCode::Basic => 0x02,
