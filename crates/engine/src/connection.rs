@@ -10,7 +10,7 @@ use std::future::poll_fn;
 use std::io::{self, ErrorKind, Read, Write};
 use std::pin::{Pin, pin};
 use std::sync::Arc;
-use std::task::{Context, Poll, ready};
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use holdfast_protocol::frame::mbap::{self, Next};
@@ -18,6 +18,7 @@ use holdfast_protocol::pdu;
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::sync::watch;
+use tokio::task::yield_now;
 use tokio::time::{Instant, Sleep, sleep_until, timeout};
 
 use crate::admission::Ticket;
@@ -33,6 +34,9 @@ const SHORTEST: usize = mbap::HEADER_LEN + 1;
 
 /// Room for the replies to all the requests that one input can hold.
 const OUTPUT: usize = (INPUT / SHORTEST + 1) * mbap::MAX_LEN;
+
+/// How often a connection is read before the others, and the sockets of all, have their turn.
+const TURNS: u32 = 4;
 
 /// How often the rest of the input is read before a connection ends.
 const LAST_READS: usize = 64;
@@ -70,6 +74,8 @@ pub(crate) struct Connection {
     last_request: Instant,
     /// When the request that is not complete yet began.
     begun: Option<Instant>,
+    /// Reads without a pause.
+    turns: u32,
 }
 
 /// What the answers of a connection depend on.
@@ -110,6 +116,7 @@ impl Connection {
             unsent: Vec::new(),
             last_request,
             begun: None,
+            turns: 0,
         }
     }
 
@@ -153,6 +160,10 @@ impl Connection {
             if let Err(end) = step {
                 return Some(end);
             }
+            if self.turns == TURNS {
+                self.turns = 0;
+                yield_now().await;
+            }
         }
     }
 
@@ -161,7 +172,12 @@ impl Connection {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let kept = self.session.restore(input);
             let mut buffer = ReadBuf::new(&mut input[kept..]);
-            let read = ready!(Pin::new(&mut self.stream).poll_read(context, &mut buffer));
+            let Poll::Ready(read) = Pin::new(&mut self.stream).poll_read(context, &mut buffer)
+            else {
+                self.turns = 0;
+                return Poll::Pending;
+            };
+            self.turns += 1;
             let len = buffer.filled().len();
             if read.is_err() || len == 0 {
                 return Poll::Ready(Err(Kind::Closed));
