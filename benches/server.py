@@ -22,6 +22,7 @@ from typing import TypeAlias
 ROOT = Path(__file__).parent.parent
 TARGET = ROOT / "target" / "release"
 SERVERS = ("holdfast", "bare", "pymodbus")
+FLOOD = (2, 3000)
 SCENARIOS = [(connections, in_flight) for connections in (1, 64) for in_flight in (1, 16)]
 REQUEST = bytes.fromhex("123400000006010300000000")
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -71,10 +72,14 @@ def main() -> None:
         results = {
             scenario: measure(servers, scenario, options, cores[-1]) for scenario in SCENARIOS
         }
+        beside = beside_a_flood(servers[0], options, cores[-1])
     print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()};")
     print(f"{options.rounds} rounds of {options.seconds} s, {options.quantity} registers a read.")
     for scenario, rounds in results.items():
         show(scenario, rounds)
+    print("\nholdfast, 1 connection with 1 in flight, alone and beside two that flood it:")
+    for name, result in beside.items():
+        print(f"  {name:6}  p50 {result['p50']:,.0f} us, p99 {result['p99']:,.0f} us")
     if options.json:
         flat = [
             {"connections": connections, "in_flight": in_flight, "rounds": rounds}
@@ -136,31 +141,48 @@ def measure(
 def load(
     server: Server, scenario: tuple[int, int], options: argparse.Namespace, core: int
 ) -> Result:
+    before = server.cpu()
+    done = start_load(server, scenario, options.seconds, options.quantity, core)
+    out, error = done.communicate(timeout=options.seconds + 30)
+    if done.returncode != 0:
+        raise RuntimeError(f"{server.name}, {scenario}: {error.strip()}")
+    result: Result = json.loads(out)
+    # The load warms up before it counts: the server works for that time too.
+    share = options.seconds / (options.seconds + 0.3)
+    result["server_us"] = (server.cpu() - before) * share / max(1, result["requests"]) * 1e6
+    return result
+
+
+def beside_a_flood(server: Server, options: argparse.Namespace, core: int) -> dict[str, Result]:
+    """What one polite client sees, alone and beside clients that never pause. All share a core."""
+    alone = load(server, (1, 1), options, core)
+    flood = start_load(server, FLOOD, options.seconds + 2, options.quantity, core)
+    try:
+        return {"alone": alone, "beside": load(server, (1, 1), options, core)}
+    finally:
+        flood.kill()
+        flood.communicate()
+
+
+def start_load(
+    server: Server, scenario: tuple[int, int], seconds: float, quantity: int, core: int
+) -> subprocess.Popen[str]:
     connections, in_flight = scenario
     command = [
         str(TARGET / "load"),
         *("--address", server.address),
         *("--connections", str(connections)),
         *("--in-flight", str(in_flight)),
-        *("--quantity", str(options.quantity)),
-        *("--seconds", str(options.seconds)),
+        *("--quantity", str(quantity)),
+        *("--seconds", str(seconds)),
     ]
-    before = server.cpu()
-    done = subprocess.run(
+    return subprocess.Popen(
         command,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=options.seconds + 30,
-        check=False,
         preexec_fn=lambda: os.sched_setaffinity(0, {core}),
     )
-    if done.returncode != 0:
-        raise RuntimeError(f"{server.name}, {scenario}: {done.stderr.strip()}")
-    result: Result = json.loads(done.stdout)
-    # The load warms up before it counts: the server works for that time too.
-    share = options.seconds / (options.seconds + 0.3)
-    result["server_us"] = (server.cpu() - before) * share / max(1, result["requests"]) * 1e6
-    return result
 
 
 def show(scenario: tuple[int, int], rounds: list[dict[str, Result]]) -> None:
