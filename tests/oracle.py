@@ -1,7 +1,7 @@
-"""What a Modbus server answers, written from the contract as plainly as can be.
+"""What a Modbus server answers, written from docs/modbus.md as plainly as can be.
 
 It shares nothing with the library: values are integers in dictionaries, checks are in the order in
-which the contract names them. It is slow and has no transport. Counters are not modelled.
+which that page names them. It is slow and has no transport. Counters are not modelled.
 """
 
 from __future__ import annotations
