@@ -1,5 +1,8 @@
 //! The limit: a server that answers the same bytes without looking at the request. It only counts
 //! bytes, to know how many requests there were.
+//!
+//! A write may block: what a closed-loop load has in flight fits into the buffers of its sockets, so
+//! it never does while the load reads.
 
 use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write};
@@ -53,7 +56,7 @@ fn serve(
     let mut gone = Vec::new();
     loop {
         let mut accepting = false;
-        for number in poller.wait()? {
+        for number in poller.wait(None)? {
             let Some(peer) = peers.get_mut(&number) else {
                 accepting = true;
                 continue;

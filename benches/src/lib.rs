@@ -11,8 +11,9 @@ pub mod load;
 
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
+use std::time::Duration;
 
-use rustix::event::epoll;
+use rustix::event::{Timespec, epoll};
 
 /// Something went wrong that makes a measurement worthless.
 pub type Failure = Box<dyn std::error::Error>;
@@ -34,11 +35,19 @@ impl Poller {
         Ok(epoll::add(&self.epoll, source, data, epoll::EventFlags::IN)?)
     }
 
-    /// Waits until something can be read, and says what.
-    fn wait(&mut self) -> io::Result<impl Iterator<Item = usize> + '_> {
+    /// Waits until something can be read, and says what: nothing, when `patience` ends first.
+    fn wait(
+        &mut self,
+        patience: Option<Duration>,
+    ) -> io::Result<impl ExactSizeIterator<Item = usize> + '_> {
         self.events.clear();
+        let patience = patience.map(|patience| Timespec {
+            tv_sec: patience.as_secs().try_into().unwrap_or(i64::MAX),
+            tv_nsec: patience.subsec_nanos().into(),
+        });
         loop {
-            match epoll::wait(&self.epoll, rustix::buffer::spare_capacity(&mut self.events), None) {
+            let room = rustix::buffer::spare_capacity(&mut self.events);
+            match epoll::wait(&self.epoll, room, patience.as_ref()) {
                 Ok(_) => break,
                 Err(rustix::io::Errno::INTR) => {}
                 Err(error) => return Err(error.into()),
