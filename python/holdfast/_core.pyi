@@ -7,7 +7,7 @@ from typing import Literal, final
 
 from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
 
-__all__ = ["Engine", "Listener", "Memory", "OutOfRange", "Rule", "__version__"]
+__all__ = ["Engine", "Listener", "Memory", "OutOfRange", "Rule", "__version__", "write_across"]
 
 __version__: str
 
@@ -46,6 +46,10 @@ class Memory:
     def sealed(self) -> bool:
         """Whether Modbus clients are refused for now."""
 
+    @property
+    def seal_changes(self) -> tuple[int, int]:
+        """How often the seal opened, and how often it closed again."""
+
     def read(self, area: Area, address: int, count: int) -> list[int]:
         """`count` bits (0 or 1) or registers (0 to 65535) from `address`, of one moment.
 
@@ -67,6 +71,13 @@ class Memory:
 
         A later one wins where two overlap. Raises as `write`; when one is refused, none is done.
         """
+
+def write_across(writes: Sequence[tuple[Memory, Area, int, Iterable[int]]]) -> None:
+    """Writes to several memories as one step, each with memory, area, address and values.
+
+    No reader of any of them sees a part. Raises as `Memory.write`; when one is refused, none is
+    done.
+    """
 
 @final
 class Rule:

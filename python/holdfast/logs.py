@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import threading
 import time
 from typing import Literal
 
@@ -28,13 +29,31 @@ def write(level: int, event: str, **fields: object) -> None:
     LOGGER.log(level, event, extra={"fields": fields})
 
 
+def refused(event: str, *, kind: object, **fields: object) -> None:
+    """A refusal: of one kind only so many are logged in a time, see `Throttle`."""
+    admitted, held_back = _REFUSALS.admit((event, kind), time.monotonic())
+    if admitted:
+        more = {"held_back": held_back} if held_back else {}
+        write(logging.WARNING, event, **fields, **more)
+
+
+def problem(event: str, **fields: object) -> None:
+    """A fault, with the exception that is being handled; throttled as refusals are."""
+    admitted, held_back = _REFUSALS.admit((event, "fault"), time.monotonic())
+    if admitted:
+        more = {"held_back": held_back} if held_back else {}
+        LOGGER.error(event, extra={"fields": fields | more}, exc_info=True)
+
+
 class TextFormatter(logging.Formatter):
     """`2026-01-31T12:00:00.000Z warning refused_source listener=scada peer=10.0.0.9:51200`."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, without its end."""
         fields = "".join(f" {key}={_quoted(value)}" for key, value in _fields(record).items())
-        return f"{_timestamp(record)} {record.levelname.lower()} {record.getMessage()}{fields}"
+        return (
+            f"{timestamp(record.created)} {record.levelname.lower()} {record.getMessage()}{fields}"
+        )
 
 
 class JsonFormatter(logging.Formatter):
@@ -43,7 +62,7 @@ class JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The line, without its end."""
         head = {
-            "time": _timestamp(record),
+            "time": timestamp(record.created),
             "level": record.levelname.lower(),
             "event": record.getMessage(),
         }
@@ -63,9 +82,10 @@ def _quoted(value: object) -> str:
     return text if plain else json.dumps(text)
 
 
-def _timestamp(record: logging.LogRecord) -> str:
-    moment = time.gmtime(record.created)
-    return f"{time.strftime('%Y-%m-%dT%H:%M:%S', moment)}.{int(record.msecs):03d}Z"
+def timestamp(seconds: float) -> str:
+    """A time since 1970 as logs write it: UTC, to the millisecond."""
+    moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
+    return f"{moment}.{int(seconds % 1 * 1000):03d}Z"
 
 
 class Throttle:
@@ -79,13 +99,18 @@ class Throttle:
         self._burst = burst
         self._window = window
         self._seen: dict[object, tuple[float, int]] = {}
+        self._lock = threading.Lock()
 
     def admit(self, kind: object, now: float) -> tuple[bool, int]:
         """Whether to log an event of this kind at this time, and how many were held back before."""
-        began, count = self._seen.get(kind, (now, 0))
-        held_back = 0
-        if now - began >= self._window:
-            held_back = max(0, count - self._burst)
-            began, count = now, 0
-        self._seen[kind] = (began, count + 1)
-        return count < self._burst, held_back
+        with self._lock:
+            began, count = self._seen.get(kind, (now, 0))
+            held_back = 0
+            if now - began >= self._window:
+                held_back = max(0, count - self._burst)
+                began, count = now, 0
+            self._seen[kind] = (began, count + 1)
+            return count < self._burst, held_back
+
+
+_REFUSALS = Throttle()

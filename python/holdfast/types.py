@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias, TypedDict
+from typing import Literal, TypeAlias, TypedDict, get_args
 
 Access: TypeAlias = Literal["read-only", "read-write"]
 Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
+AREAS: tuple[Area, ...] = get_args(Area)
+BIT_AREAS = AREAS[:2]
+
 WhenFull: TypeAlias = Literal["refuse", "evict"]
 
 Extent: TypeAlias = int | tuple[int, int]

@@ -15,7 +15,7 @@ mod _core {
     #[pymodule_export]
     use super::engine::{Engine, Listener, Rule};
     #[pymodule_export]
-    use super::memory::{Memory, OutOfRange};
+    use super::memory::{Memory, OutOfRange, write_across};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -7,7 +7,7 @@ use holdfast_memory::{
 };
 use pyo3::exceptions::{PyIndexError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyList, PyString};
+use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
 
 pyo3::create_exception!(holdfast, OutOfRange, PyIndexError, "A range outside its area.");
 
@@ -77,6 +77,11 @@ impl Memory {
         py.detach(|| self.core.sealed())
     }
 
+    #[getter]
+    fn seal_changes(&self, py: Python<'_>) -> (u64, u64) {
+        py.detach(|| self.core.seal_changes())
+    }
+
     fn read<'py>(
         &self,
         py: Python<'py>,
@@ -140,6 +145,29 @@ impl Memory {
         let areas = areas.iter().map(|(name, range)| format!("{name}={range}"));
         Ok(format!("<Memory {}>", areas.collect::<Vec<_>>().join(" ")))
     }
+}
+
+/// Writes to several memories as one step: each a memory, an area, an address and values.
+#[pyfunction]
+pub fn write_across(
+    py: Python<'_>,
+    writes: Vec<(PyRef<'_, Memory>, String, Bound<'_, PyAny>, Bound<'_, PyAny>)>,
+) -> PyResult<()> {
+    let packed = writes.iter().map(|(memory, area, address, values)| {
+        let range = Range::packed(&memory.core, area, integer(address)?, values)?;
+        Ok((Arc::clone(&memory.core), range))
+    });
+    let packed = packed.collect::<PyResult<Vec<(Arc<Core>, Range)>>>()?;
+    drop(writes);
+    py.detach(|| {
+        let writes: Vec<(&Core, Write)> =
+            packed.iter().map(|(memory, range)| (&**memory, range.writing())).collect();
+        holdfast_memory::write_across(Access::Ingest, &writes)
+    })
+    .map_err(|refused| {
+        let (memory, range) = &packed[refused.index];
+        range.refused(memory, refused.refusal)
+    })
 }
 
 /// A range inside an area, and its bytes.
@@ -264,6 +292,9 @@ fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
 
 /// The integers of a Python sequence, each one checked.
 fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
+    if let Ok(list) = values.cast_exact::<PyList>() {
+        return list.iter().enumerate().map(|(index, value)| number(area, index, &value)).collect();
+    }
     let text = values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>();
@@ -281,6 +312,12 @@ fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
 }
 
 fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
+    if !area.is_bits()
+        && let Ok(register) = value.cast_exact::<PyInt>()
+        && let Ok(register) = register.extract::<u16>()
+    {
+        return Ok(register);
+    }
     let (most, allowed) =
         if area.is_bits() { (1, "0, 1, False, True") } else { (u16::MAX, "integers 0 to 65535") };
     let is_bool = value.is_instance_of::<PyBool>();

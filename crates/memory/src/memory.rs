@@ -68,6 +68,8 @@ pub struct Memory {
 struct Content {
     areas: [Box<[u8]>; 4],
     sealed: bool,
+    /// How often the seal opened, and how often it closed again.
+    seal_changes: (u64, u64),
 }
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
@@ -93,7 +95,7 @@ impl Memory {
             rank: NEXT_RANK.fetch_add(1, Ordering::Relaxed),
             layout,
             gate,
-            content: RwLock::new(Content { areas, sealed: gate.is_some() }),
+            content: RwLock::new(Content { areas, sealed: gate.is_some(), seal_changes: (0, 0) }),
         })
     }
 
@@ -107,6 +109,11 @@ impl Memory {
 
     pub fn sealed(&self) -> bool {
         self.shared().sealed
+    }
+
+    /// How often the seal opened, and how often it closed again.
+    pub fn seal_changes(&self) -> (u64, u64) {
+        self.shared().seal_changes
     }
 
     /// Reads one range.
@@ -256,10 +263,16 @@ impl Memory {
         if let (Access::Ingest, Some(gate)) = (access, self.gate) {
             let offset = usize::from(gate.address - self.span(gate.area).start());
             let open = bits::get(&content.areas[gate.area.index()], offset);
-            content.sealed = match gate.mode {
+            let sealed = match gate.mode {
                 GateMode::Once => content.sealed && !open,
                 GateMode::Level => !open,
             };
+            match (content.sealed, sealed) {
+                (true, false) => content.seal_changes.0 += 1,
+                (false, true) => content.seal_changes.1 += 1,
+                _ => {}
+            }
+            content.sealed = sealed;
         }
     }
 

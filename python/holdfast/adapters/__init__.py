@@ -1,0 +1,81 @@
+"""Adapters: ways into memory in Python, each supervised for itself.
+
+An adapter is made by a factory, `factory(context) -> Adapter`, and lives in a thread of its own:
+`run` works until it is stopped. When it raises, or ends by itself, it is logged and made anew after
+a pause; the others don't notice. Adapters must never reach past their door to memory.
+
+`rest`, `mqtt` and `metrics` are built in. Others are found by the entry point group
+`holdfast.adapters`, see docs/adapters.md.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from holdfast.ingest import Counts, Door, Grant, Refused, Written
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+__all__ = ["Adapter", "Context", "Counts", "Door", "Grant", "Refused", "Stop", "Written"]
+
+ENTRY_POINTS = "holdfast.adapters"
+
+
+class Stop:
+    """Says that an adapter is to end. From any thread."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self._lock = threading.Lock()
+        self._then: list[Callable[[], object]] = []
+
+    def set(self) -> None:
+        """Tells the adapter."""
+        with self._lock:
+            self._event.set()
+            then, self._then = self._then, []
+        for callback in then:
+            callback()
+
+    def is_set(self) -> bool:
+        """Whether the adapter is to end."""
+        return self._event.is_set()
+
+    def wait(self, seconds: float | None = None) -> bool:
+        """Waits until the adapter is to end, at most `seconds`; whether it is."""
+        return self._event.wait(seconds)
+
+    def then(self, callback: Callable[[], object]) -> None:
+        """Calls `callback` when the adapter is to end: at once, when it is already."""
+        with self._lock:
+            if not self._event.is_set():
+                self._then.append(callback)
+                return
+        callback()
+
+
+class Adapter(Protocol):
+    """What the appliance runs."""
+
+    def run(self, stop: Stop) -> None:
+        """Works until `stop`. Called once, in a thread of its own."""
+
+    def status(self) -> Mapping[str, object]:
+        """What diagnostics show of it, from any thread: plain data, nothing secret."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What an adapter is given."""
+
+    name: str
+    """Its name in the configuration."""
+    door: Door
+    """Its way to memory."""
+    grant: Grant
+    """What the configuration lets it do."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Its own part of the configuration."""

@@ -1,0 +1,58 @@
+"""What an appliance says of itself while it runs: one snapshot for REST, metrics and logs."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast._core import Engine, Memory
+    from holdfast.adapters.supervisor import Supervisor
+    from holdfast.audit import Audit
+    from holdfast.ingest import Door
+
+
+class Diagnostics:
+    """Looks at the parts of a running appliance, from any thread, and changes nothing."""
+
+    def __init__(self, memories: Mapping[str, Memory], engine: Engine) -> None:
+        self._memories = memories
+        self._engine = engine
+        self._began = time.monotonic()
+        self.adapters: dict[str, tuple[Supervisor, Door | None]] = {}
+        self.audit: Audit | None = None
+
+    def memories(self) -> dict[str, Any]:
+        """Each memory: its areas with start and size, sealed or not, how often it opened."""
+        return {
+            name: {
+                "areas": {
+                    area: {"start": addresses.start, "size": len(addresses)}
+                    for area, addresses in memory.areas.items()
+                },
+                "sealed": memory.sealed,
+                "opened": memory.seal_changes[0],
+                "closed": memory.seal_changes[1],
+            }
+            for name, memory in self._memories.items()
+        }
+
+    def stats(self) -> dict[str, Any]:
+        """Every counter, since the start: of the listeners, the adapters, the log and the audit."""
+        return {
+            "uptime": round(time.monotonic() - self._began, 3),
+            "listeners": self._engine.counters(),
+            "adapters": {name: self.adapter(name) for name in self.adapters},
+            "events_lost": self._engine.lost_events,
+            "audit": None if self.audit is None else self.audit.counts(),
+        }
+
+    def adapter(self, name: str) -> dict[str, Any] | None:
+        """How one adapter does, and what came in by its door; `None` when there is none."""
+        if name not in self.adapters:
+            return None
+        supervisor, door = self.adapters[name]
+        counts = {} if door is None else door.counts()
+        return {**supervisor.status(), **counts}
