@@ -3,7 +3,10 @@
 //! This crate converts and forwards, and holds no logic. The interpreter is released around
 //! everything that can wait.
 
+mod arguments;
+mod audit;
 mod engine;
+mod listener;
 mod memory;
 
 use pyo3::prelude::*;
@@ -13,7 +16,9 @@ mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult};
 
     #[pymodule_export]
-    use super::engine::{Engine, Listener, Rule};
+    use super::engine::Engine;
+    #[pymodule_export]
+    use super::listener::{Listener, RawRule, Rule};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, write_across};
 

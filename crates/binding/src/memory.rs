@@ -147,12 +147,12 @@ impl Memory {
     }
 }
 
-/// Writes to several memories as one step: each a memory, an area, an address and values.
+/// A memory, an area, an address and values.
+type AcrossWrite<'py> = (PyRef<'py, Memory>, String, Bound<'py, PyAny>, Bound<'py, PyAny>);
+
+/// Writes to several memories as one step.
 #[pyfunction]
-pub fn write_across(
-    py: Python<'_>,
-    writes: Vec<(PyRef<'_, Memory>, String, Bound<'_, PyAny>, Bound<'_, PyAny>)>,
-) -> PyResult<()> {
+pub fn write_across(py: Python<'_>, writes: Vec<AcrossWrite<'_>>) -> PyResult<()> {
     let packed = writes.iter().map(|(memory, area, address, values)| {
         let range = Range::packed(&memory.core, area, integer(address)?, values)?;
         Ok((Arc::clone(&memory.core), range))
@@ -244,7 +244,7 @@ impl Range {
     }
 }
 
-fn named(area: &str) -> PyResult<Area> {
+pub fn named(area: &str) -> PyResult<Area> {
     Area::from_name(area).ok_or_else(|| {
         let known = Area::ALL.map(Area::name).join(", ");
         PyValueError::new_err(format!("unknown area {area:?}, allowed are {known}"))

@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use tokio::task::AbortHandle;
 
-use crate::listener::WhenFull;
+use crate::listener::{Limits, WhenFull};
 
 #[derive(Debug)]
 pub(crate) struct Admission {
@@ -47,14 +47,11 @@ pub(crate) struct Ticket {
 }
 
 impl Admission {
-    pub(crate) fn new(
-        max_connections: usize,
-        max_per_source: Option<usize>,
-        when_full: WhenFull,
-    ) -> Admission {
+    pub(crate) fn new(limits: Limits) -> Admission {
+        let Limits { max_connections, max_connections_per_source, when_full } = limits;
         Admission {
             max_connections,
-            max_per_source: max_per_source.unwrap_or(max_connections),
+            max_per_source: max_connections_per_source.unwrap_or(max_connections),
             when_full,
             epoch: Instant::now(),
             table: Mutex::default(),
@@ -167,13 +164,21 @@ mod tests {
         SocketAddr::from(([127, 0, 0, last], port))
     }
 
+    fn admission(
+        max_connections: usize,
+        max_connections_per_source: Option<usize>,
+        when_full: WhenFull,
+    ) -> Arc<Admission> {
+        Arc::new(Admission::new(Limits { max_connections, max_connections_per_source, when_full }))
+    }
+
     fn task(runtime: &tokio::runtime::Runtime) -> AbortHandle {
         runtime.spawn(std::future::pending::<()>()).abort_handle()
     }
 
     #[test]
     fn a_place_is_free_again_when_its_ticket_is_dropped() {
-        let admission = Arc::new(Admission::new(1, None, WhenFull::Refuse));
+        let admission = admission(1, None, WhenFull::Refuse);
         let (ticket, _) = admission.admit(peer(1, 1)).unwrap();
         assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
         drop(ticket);
@@ -182,7 +187,7 @@ mod tests {
 
     #[test]
     fn the_limit_of_a_source_counts_mapped_addresses_as_the_same() {
-        let admission = Arc::new(Admission::new(9, Some(1), WhenFull::Refuse));
+        let admission = admission(9, Some(1), WhenFull::Refuse);
         let mapped: SocketAddr = "[::ffff:127.0.0.1]:2".parse().unwrap();
         let held = admission.admit(peer(1, 1)).unwrap();
         assert_eq!(admission.admit(mapped).unwrap_err(), Full);
@@ -194,7 +199,7 @@ mod tests {
     #[test]
     fn the_connection_that_is_idle_longest_is_evicted() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let admission = Arc::new(Admission::new(3, None, WhenFull::Evict));
+        let admission = admission(3, None, WhenFull::Evict);
         let tickets = [1, 2, 3].map(|port| {
             let (ticket, evicted) = admission.admit(peer(1, port)).unwrap();
             assert_eq!(evicted, None);
@@ -213,7 +218,7 @@ mod tests {
     #[test]
     fn a_source_at_its_limit_evicts_only_its_own() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let admission = Arc::new(Admission::new(9, Some(1), WhenFull::Evict));
+        let admission = admission(9, Some(1), WhenFull::Evict);
         let _held = [(1, 1), (2, 2)].map(|(last, port)| {
             let (ticket, _) = admission.admit(peer(last, port)).unwrap();
             attach(&admission, ticket.id(), task(&runtime));

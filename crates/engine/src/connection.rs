@@ -1,4 +1,4 @@
-//! One Modbus TCP connection: bytes in, all complete requests answered in order, bytes out.
+//! One Modbus connection over TCP: bytes in, all complete requests answered in order, bytes out.
 //!
 //! A worker thread has one pair of buffers for all of its connections ([`Scratch`]): between a read
 //! and the write that answers it nothing is awaited. What is left over is kept by the connection
@@ -8,12 +8,14 @@
 use std::cell::RefCell;
 use std::future::poll_fn;
 use std::io::{self, ErrorKind, Read, Write};
+use std::marker::PhantomData;
+use std::net::SocketAddr;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use holdfast_protocol::frame::mbap::{self, Next};
+use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
@@ -23,17 +25,25 @@ use tokio::time::{Instant, Sleep, sleep_until, timeout};
 
 use crate::admission::Ticket;
 use crate::event::Kind;
+use crate::framing::{Framing, Mbap, Next, Rtu};
+use crate::listener::Front;
 use crate::policy::Grant;
 use crate::station::Station;
 
 /// Bytes taken from a socket at once.
 const INPUT: usize = 4096;
 
-/// The shortest frame: a header and a function code.
-const SHORTEST: usize = mbap::HEADER_LEN + 1;
+/// The longest frame of any framing.
+const LONGEST: usize = mbap::MAX_LEN;
 
 /// Room for the replies to all the requests that one input can hold.
-const OUTPUT: usize = (INPUT / SHORTEST + 1) * mbap::MAX_LEN;
+const OUTPUT: usize = output::<Mbap>(output::<Rtu>(0));
+
+const fn output<F: Framing>(least: usize) -> usize {
+    assert!(F::MAX_LEN <= LONGEST);
+    let len = (INPUT / F::SHORTEST + 1) * F::MAX_LEN;
+    if len > least { len } else { least }
+}
 
 /// How often a connection is read before the others, and the sockets of all, have their turn.
 const TURNS: u32 = 4;
@@ -64,9 +74,9 @@ pub(crate) struct Timeouts {
     pub(crate) request: Duration,
 }
 
-pub(crate) struct Connection {
+pub(crate) struct Connection<F> {
     stream: TcpStream,
-    session: Session,
+    session: Session<F>,
     timeouts: Timeouts,
     ticket: Ticket,
     /// Replies that the peer did not take yet.
@@ -79,12 +89,15 @@ pub(crate) struct Connection {
 }
 
 /// What the answers of a connection depend on.
-struct Session {
+struct Session<F> {
+    front: Arc<Front>,
+    peer: SocketAddr,
     station: Arc<Station>,
     grant: Arc<Grant>,
     /// The beginning of a request.
-    partial: [u8; mbap::MAX_LEN],
+    partial: [u8; LONGEST],
     partial_len: usize,
+    framing: PhantomData<F>,
 }
 
 /// What became of some input.
@@ -98,15 +111,16 @@ struct Answered {
     broken: bool,
 }
 
-impl Connection {
+impl<F: Framing> Connection<F> {
     pub(crate) fn new(
-        stream: TcpStream,
+        front: Arc<Front>,
         station: Arc<Station>,
+        (stream, peer): (TcpStream, SocketAddr),
         grant: Arc<Grant>,
         timeouts: Timeouts,
         ticket: Ticket,
-    ) -> Connection {
-        let session = Session { station, grant, partial: [0; mbap::MAX_LEN], partial_len: 0 };
+    ) -> Connection<F> {
+        let session = Session::new(front, peer, station, grant);
         let last_request = Instant::now();
         Connection {
             stream,
@@ -120,21 +134,16 @@ impl Connection {
         }
     }
 
-    /// Serves until the connection ends, and says why. What ended it is counted before the peer can
-    /// see it.
-    pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) -> Kind {
-        let Some(end) = self.serve(stop).await else {
-            self.finish();
-            return Kind::Closed;
-        };
-        let counters = &self.session.station.counters.connections;
-        match end {
-            Kind::Idle => counters.idle.add(),
-            Kind::RequestTimeout => counters.request_timeout.add(),
-            Kind::SlowReader => counters.slow_reader.add(),
-            _ => {}
+    /// Serves until the connection ends. What ended it is counted before the peer can see it.
+    pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
+        let (front, peer) = (Arc::clone(&self.session.front), self.session.peer);
+        match self.serve(stop).await {
+            Some(end) => front.ended(end, peer),
+            None => {
+                self.finish();
+                front.ended(Kind::Closed, peer);
+            }
         }
-        end
     }
 
     /// Serves until the connection ends; `None` when all are to stop.
@@ -263,7 +272,17 @@ impl Connection {
     }
 }
 
-impl Session {
+impl<F: Framing> Session<F> {
+    fn new(
+        front: Arc<Front>,
+        peer: SocketAddr,
+        station: Arc<Station>,
+        grant: Arc<Grant>,
+    ) -> Session<F> {
+        let partial = [0; LONGEST];
+        Session { front, peer, station, grant, partial, partial_len: 0, framing: PhantomData }
+    }
+
     /// Puts the beginning of a request in front of what will be read; its length.
     fn restore(&self, input: &mut [u8]) -> usize {
         input[..self.partial_len].copy_from_slice(&self.partial[..self.partial_len]);
@@ -275,18 +294,21 @@ impl Session {
         let mut answered = Answered { len: 0, requests: 0, consumed: 0, broken: false };
         let mut rest = input;
         loop {
-            match mbap::next(rest) {
-                Next::Frame { transaction_id, unit_id, pdu, len } => {
+            match F::next(rest) {
+                Next::Request { tag, unit_id, pdu, len } => {
                     rest = &rest[len..];
                     answered.requests += 1;
-                    answered.len +=
-                        self.reply(transaction_id, unit_id, pdu, &mut output[answered.len..]);
+                    answered.len += self.reply(tag, unit_id, pdu, &mut output[answered.len..]);
                 }
-                Next::Foreign { len, .. } => {
+                Next::Foreign { len } => {
                     rest = &rest[len..];
                     self.station.counters.frames.foreign.add();
                 }
-                Next::Broken { .. } => {
+                Next::Damaged { len } => {
+                    rest = &rest[len..];
+                    self.station.counters.frames.damaged.add();
+                }
+                Next::Broken => {
                     self.station.counters.frames.broken.add();
                     answered.broken = true;
                     break;
@@ -304,18 +326,17 @@ impl Session {
 
     /// Writes one framed reply at the start of `output`; its length, 0 when none is due.
     #[inline]
-    fn reply(&self, transaction_id: u16, unit_id: u8, pdu: &[u8], output: &mut [u8]) -> usize {
-        let Some((header, rest)) = output.split_first_chunk_mut::<{ mbap::HEADER_LEN }>() else {
+    fn reply(&self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
+        let room = output.get_mut(F::HEADER_LEN..);
+        let Some(buffer) = room.and_then(<[u8]>::first_chunk_mut::<{ pdu::MAX_LEN }>) else {
             return 0;
         };
-        let Some(buffer) = rest.first_chunk_mut::<{ pdu::MAX_LEN }>() else {
-            return 0;
-        };
-        let Some(len) = self.station.answer(&self.grant, unit_id, pdu, buffer) else {
-            return 0;
-        };
-        *header = mbap::header(transaction_id, unit_id, len);
-        header.len() + len
+        let len = self.station.answer(&self.grant, unit_id, request, buffer);
+        if let Some(auditor) = &self.front.auditor {
+            let reply = &buffer[..len.unwrap_or_default()];
+            auditor.note(&self.front.name, Some(self.peer), unit_id, request, reply);
+        }
+        len.map_or(0, |len| F::complete(output, tag, unit_id, len))
     }
 
     /// Sends `unsent`, then reads, answers and sends until nothing more is there, without waiting.
@@ -344,7 +365,7 @@ mod tests {
     use crate::identity::Identity;
     use crate::policy::{Functions, Rights, Rule};
 
-    fn session() -> Session {
+    fn session() -> Session<Mbap> {
         let span = Span::new(0, 2000).unwrap();
         let layout =
             Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
@@ -355,12 +376,12 @@ mod tests {
             functions: Functions::All,
         };
         let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
-        Session {
-            station: Arc::new(Station::new(Identity::new(&objects, &[]).unwrap())),
-            grant: Arc::new(Grant::new(&rule)),
-            partial: [0; mbap::MAX_LEN],
-            partial_len: 0,
-        }
+        Session::new(
+            Arc::new(Front::for_tests()),
+            SocketAddr::from(([127, 0, 0, 1], 1)),
+            Arc::new(Station::new(Identity::new(&objects, &[]).unwrap())),
+            Arc::new(Grant::new(&rule)),
+        )
     }
 
     fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
@@ -428,7 +449,7 @@ mod tests {
         let shortest = frame(1, &[17]);
         let input = shortest.repeat(INPUT / shortest.len());
         let answered = session().answer(&input, &mut vec![0; OUTPUT]);
-        assert_eq!(answered.requests, INPUT / SHORTEST);
+        assert_eq!(answered.requests, INPUT / Mbap::SHORTEST);
         assert!(answered.requests * mbap::MAX_LEN <= OUTPUT);
     }
 

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use holdfast_protocol::pdu::ExceptionCode;
+use holdfast_protocol::raw_ingest::Refusal;
 
 /// A number that only grows.
 #[derive(Debug, Default)]
@@ -12,7 +13,12 @@ pub struct Counter(AtomicU64);
 impl Counter {
     #[inline]
     pub fn add(&self) {
-        self.0.fetch_add(1, Ordering::Relaxed);
+        self.add_many(1);
+    }
+
+    #[inline]
+    pub fn add_many(&self, count: u64) {
+        self.0.fetch_add(count, Ordering::Relaxed);
     }
 
     pub fn get(&self) -> u64 {
@@ -30,7 +36,6 @@ pub struct Counters {
     /// Requests to a unit that is in listen only mode.
     pub unanswered: Counter,
     pub frames: FrameCounters,
-    pub connections: ConnectionCounters,
     cleared: Mutex<Bus>,
 }
 
@@ -39,10 +44,36 @@ pub struct Counters {
 pub struct FrameCounters {
     /// With a protocol id other than 0: discarded.
     pub foreign: Counter,
-    /// With a length that no frame has: the connection is closed.
+    /// With a length that no frame has: a connection is closed, a datagram discarded.
     pub broken: Counter,
+    /// With a wrong CRC or LRC, cut short, or with characters that belong in no frame: discarded.
+    pub damaged: Counter,
+    /// On a serial line, for a unit that is not served here: passed over.
+    pub other_unit: Counter,
 }
 
+/// What became of the packets of a Raw Ingest listener.
+#[derive(Debug, Default)]
+pub struct PacketCounters {
+    pub accepted: Counter,
+    /// Bits and registers that were written.
+    pub values: Counter,
+    refused: [Counter; 13],
+}
+
+impl PacketCounters {
+    pub fn refuse(&self, refusal: Refusal) {
+        self.refused[usize::from(refusal.code())].add();
+    }
+
+    /// Refused packets by reason, reasons that never came up left out.
+    pub fn refused(&self) -> impl Iterator<Item = (Refusal, u64)> {
+        let reasons = nonzero(&self.refused);
+        reasons.filter_map(|(code, count)| Some((Refusal::from_code(code)?, count)))
+    }
+}
+
+/// What became of connections, and of datagrams from peers that no rule names.
 #[derive(Debug, Default)]
 pub struct ConnectionCounters {
     pub accepted: Counter,
@@ -82,7 +113,6 @@ impl Default for Counters {
             events: Counter::default(),
             unanswered: Counter::default(),
             frames: FrameCounters::default(),
-            connections: ConnectionCounters::default(),
             cleared: Mutex::default(),
         }
     }
@@ -136,9 +166,10 @@ impl Counters {
 
     fn total(&self) -> Bus {
         let requests: u64 = self.requests.iter().map(Counter::get).sum();
-        let errors = self.frames.foreign.get() + self.frames.broken.get();
+        let frames = &self.frames;
+        let errors = frames.foreign.get() + frames.broken.get() + frames.damaged.get();
         Bus {
-            messages: requests + errors,
+            messages: requests + errors + frames.other_unit.get(),
             communication_errors: errors,
             exceptions: self.exceptions.iter().map(Counter::get).sum(),
             server_messages: requests,

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -11,11 +12,16 @@ use thiserror::Error;
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
 
-use crate::counters::Counters;
+use crate::audit::{Record, Records, auditing};
+use crate::counters::{ConnectionCounters, Counters, PacketCounters};
 use crate::event::{Event, Events, Verbosity, channel as event_channel};
 use crate::identity::Identity;
-use crate::listener::{Listener, ListenerSettings, bind};
+use crate::listener::{Front, Limits, accept, bind_tcp, bind_udp};
+use crate::modbus_stream::{ModbusStream, StreamSettings};
+use crate::raw_ingest::{RawIngest, RawSettings};
+use crate::serial::{ModbusSerial, SerialSettings};
 use crate::station::Station;
+use crate::udp::{ModbusUdp, UdpSettings};
 
 /// How long connections have to end when the engine stops.
 const GRACE: Duration = Duration::from_millis(500);
@@ -31,12 +37,30 @@ pub struct Settings {
     /// Threads that serve connections, at least 1.
     pub workers: usize,
     pub events: Verbosity,
+    /// Whether writes are kept for an audit log.
+    pub audit: bool,
+}
+
+#[derive(Debug, Clone)]
+pub struct ListenerSettings {
+    pub name: String,
+    pub kind: ListenerKind,
+}
+
+#[derive(Debug, Clone)]
+pub enum ListenerKind {
+    ModbusStream(StreamSettings),
+    ModbusUdp(UdpSettings),
+    ModbusSerial(SerialSettings),
+    RawIngest(RawSettings),
 }
 
 #[derive(Debug, Error)]
 pub enum StartError {
     #[error("listener {listener}: can't listen on {address}: {error}")]
     Bind { listener: String, address: SocketAddr, error: io::Error },
+    #[error("listener {listener}: can't open {device}: {error}")]
+    Open { listener: String, device: String, error: io::Error },
     #[error("identity: {0}")]
     Identity(#[from] ObjectError),
     #[error("can't start a worker thread: {0}")]
@@ -45,11 +69,41 @@ pub enum StartError {
 
 /// Listeners that serve, until it is stopped or dropped.
 pub struct Engine {
-    listeners: Vec<(Arc<Listener>, SocketAddr)>,
+    listeners: Vec<Listener>,
     stop: Arc<watch::Sender<bool>>,
     workers: Mutex<Vec<JoinHandle<()>>>,
     events: Events,
+    records: Option<Records>,
 }
+
+/// A listener that serves.
+struct Listener {
+    front: Arc<Front>,
+    /// `None` on a serial line.
+    address: Option<SocketAddr>,
+    served: Served,
+}
+
+enum Served {
+    Modbus(Arc<Station>),
+    Packets(Arc<RawIngest>),
+}
+
+/// What a listener has counted.
+pub struct ListenerCounters<'e> {
+    pub name: &'e str,
+    pub connections: &'e ConnectionCounters,
+    pub open_connections: usize,
+    pub protocol: ProtocolCounters<'e>,
+}
+
+pub enum ProtocolCounters<'e> {
+    Modbus(&'e Counters),
+    Packets(&'e PacketCounters),
+}
+
+/// A listener's task, to be started when all are bound.
+type Task = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 impl Engine {
     /// Binds every listener, then starts to serve. When one can't be bound, none is served.
@@ -58,29 +112,81 @@ impl Engine {
     /// [`StartError`], with nothing left running.
     pub fn start(settings: Settings) -> Result<Engine, StartError> {
         let (reporter, events) = event_channel(settings.events);
+        let (auditor, records) = settings.audit.then(auditing).unzip();
         let (stop, stopping) = watch::channel(false);
-        let mut sockets = Vec::new();
-        let mut listeners = Vec::new();
-        for listener in settings.listeners {
-            let (name, address) = (listener.name.clone(), listener.bind);
-            let failed = |error| StartError::Bind { listener: name.clone(), address, error };
-            let socket = bind(address).map_err(failed)?;
-            let address = socket.local_addr().map_err(failed)?;
-            let station = Station::new(Identity::new(&settings.identity, &settings.unit_names)?);
-            sockets.push(socket);
-            listeners.push((Arc::new(Listener::new(listener, station, reporter.clone())), address));
-        }
         let runtimes: Vec<Runtime> = (0..settings.workers.max(1))
             .map(|_| Builder::new_current_thread().enable_io().enable_time().build())
             .collect::<Result<_, _>>()
             .map_err(StartError::Worker)?;
         let handles: Vec<Handle> =
             runtimes.iter().map(|runtime| runtime.handle().clone()).collect();
-        for ((listener, _), socket) in listeners.iter().zip(sockets) {
-            let accept = Arc::clone(listener).accept(socket, handles.clone(), stopping.clone());
-            handles[0].spawn(accept);
+        let mut tasks: Vec<Task> = Vec::new();
+        let mut listeners = Vec::new();
+        for ListenerSettings { name, kind } in settings.listeners {
+            let station = || -> Result<Arc<Station>, StartError> {
+                let identity = Identity::new(&settings.identity, &settings.unit_names)?;
+                Ok(Arc::new(Station::new(identity)))
+            };
+            let front = |limits: Option<Limits>| {
+                let (reporter, auditor) = (reporter.clone(), auditor.clone());
+                Arc::new(Front::new(&name, limits, reporter, auditor))
+            };
+            let (workers, stopping) = (handles.clone(), stopping.clone());
+            let listener = match kind {
+                ListenerKind::ModbusStream(stream) => {
+                    let (socket, address) = bound(&name, stream.bind, bind_tcp)?;
+                    let (front, station) = (front(Some(stream.limits)), station()?);
+                    let service = Arc::new(ModbusStream::new(&stream, Arc::clone(&station)));
+                    tasks.push(Box::pin(accept(
+                        Arc::clone(&front),
+                        service,
+                        socket,
+                        workers,
+                        stopping,
+                    )));
+                    Listener { front, address: Some(address), served: Served::Modbus(station) }
+                }
+                ListenerKind::RawIngest(raw) => {
+                    let (socket, address) = bound(&name, raw.bind, bind_tcp)?;
+                    let front = front(Some(raw.limits));
+                    let service = Arc::new(RawIngest::new(&raw));
+                    tasks.push(Box::pin(accept(
+                        Arc::clone(&front),
+                        Arc::clone(&service),
+                        socket,
+                        workers,
+                        stopping,
+                    )));
+                    Listener { front, address: Some(address), served: Served::Packets(service) }
+                }
+                ListenerKind::ModbusUdp(udp) => {
+                    let (socket, address) = bound(&name, udp.bind, bind_udp)?;
+                    let (front, station) = (front(None), station()?);
+                    let service = ModbusUdp::new(&udp, Arc::clone(&station));
+                    tasks.push(Box::pin(service.serve(Arc::clone(&front), socket, stopping)));
+                    Listener { front, address: Some(address), served: Served::Modbus(station) }
+                }
+                ListenerKind::ModbusSerial(serial) => {
+                    let _context = handles[0].enter();
+                    let device = serial.line.device.clone();
+                    let port = serial.line.open().map_err(|error| StartError::Open {
+                        listener: name.clone(),
+                        device,
+                        error,
+                    })?;
+                    let (front, station) = (front(None), station()?);
+                    let service = ModbusSerial::new(serial, Arc::clone(&station));
+                    tasks.push(Box::pin(service.serve(Arc::clone(&front), port, stopping)));
+                    Listener { front, address: None, served: Served::Modbus(station) }
+                }
+            };
+            listeners.push(listener);
         }
-        let engine = Engine { listeners, stop: Arc::new(stop), workers: Mutex::default(), events };
+        for task in tasks {
+            handles[0].spawn(task);
+        }
+        let engine =
+            Engine { listeners, stop: Arc::new(stop), workers: Mutex::default(), events, records };
         for (index, runtime) in runtimes.into_iter().enumerate() {
             engine.work(index, runtime, stopping.clone())?;
         }
@@ -109,16 +215,32 @@ impl Engine {
         Ok(())
     }
 
-    /// Where each listener listens, in the order of the settings.
-    pub fn addresses(&self) -> Vec<SocketAddr> {
-        self.listeners.iter().map(|(_, address)| *address).collect()
+    /// Where each listener listens, in the order of the settings; `None` for serial lines.
+    pub fn addresses(&self) -> Vec<Option<SocketAddr>> {
+        self.listeners.iter().map(|listener| listener.address).collect()
     }
 
-    /// Each listener's name, counters and number of open connections.
-    pub fn counters(&self) -> impl Iterator<Item = (&str, &Counters, usize)> {
-        self.listeners.iter().map(|(listener, _)| {
-            (&*listener.name, &listener.station.counters, listener.admission.open())
+    /// What each listener has counted, in the order of the settings.
+    pub fn counters(&self) -> impl Iterator<Item = ListenerCounters<'_>> {
+        self.listeners.iter().map(|Listener { front, served, .. }| ListenerCounters {
+            name: &front.name,
+            connections: &front.connections,
+            open_connections: front.admission.open(),
+            protocol: match served {
+                Served::Modbus(station) => ProtocolCounters::Modbus(&station.counters),
+                Served::Packets(service) => ProtocolCounters::Packets(&service.packets),
+            },
         })
+    }
+
+    /// Up to `most` writes for the audit log: waits up to `timeout` for the first.
+    pub fn next_writes(&self, timeout: Duration, most: usize) -> Vec<Record> {
+        self.records.as_ref().map_or_else(Vec::new, |records| records.take(timeout, most))
+    }
+
+    /// Writes that the audit log missed because nobody took them.
+    pub fn lost_writes(&self) -> u64 {
+        self.records.as_ref().map_or(0, Records::lost)
     }
 
     /// The next event, if one comes within `timeout`.
@@ -139,6 +261,37 @@ impl Engine {
         for worker in workers.drain(..) {
             let _ = worker.join();
         }
+    }
+}
+
+/// A socket, and the address that it got.
+fn bound<S: BoundSocket>(
+    listener: &str,
+    address: SocketAddr,
+    bind: impl Fn(SocketAddr) -> io::Result<S>,
+) -> Result<(S, SocketAddr), StartError> {
+    let socket = bind(address).and_then(|socket| Ok((socket.address()?, socket)));
+    let (address, socket) = socket.map_err(|error| StartError::Bind {
+        listener: listener.to_owned(),
+        address,
+        error,
+    })?;
+    Ok((socket, address))
+}
+
+trait BoundSocket {
+    fn address(&self) -> io::Result<SocketAddr>;
+}
+
+impl BoundSocket for std::net::TcpListener {
+    fn address(&self) -> io::Result<SocketAddr> {
+        self.local_addr()
+    }
+}
+
+impl BoundSocket for std::net::UdpSocket {
+    fn address(&self) -> io::Result<SocketAddr> {
+        self.local_addr()
     }
 }
 

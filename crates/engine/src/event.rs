@@ -7,6 +7,8 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use holdfast_protocol::raw_ingest::Refusal;
+
 /// Events that wait to be taken.
 const CAPACITY: usize = 1024;
 
@@ -28,6 +30,12 @@ pub enum Kind {
     RefusedSource,
     RefusedFull,
     AcceptError,
+    /// A Raw Ingest packet was not written.
+    PacketRefused(Refusal),
+    /// A serial device was lost; it is opened again.
+    LineLost,
+    /// A serial device is there again.
+    LineBack,
 }
 
 impl Kind {
@@ -48,6 +56,17 @@ impl Kind {
             Kind::RefusedSource => "refused_source",
             Kind::RefusedFull => "refused_full",
             Kind::AcceptError => "accept_error",
+            Kind::PacketRefused(_) => "packet_refused",
+            Kind::LineLost => "line_lost",
+            Kind::LineBack => "line_back",
+        }
+    }
+
+    /// Why, where the name does not say it.
+    pub const fn reason(self) -> Option<&'static str> {
+        match self {
+            Kind::PacketRefused(refusal) => Some(refusal.name()),
+            _ => None,
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The data plane: Modbus listeners over memories, on threads of its own.
+//! The data plane: Modbus and Raw Ingest listeners over memories, on threads of its own.
 //!
 //! The rules this crate keeps:
 //!
@@ -15,14 +15,27 @@
 #![forbid(unsafe_code)]
 
 mod admission;
+pub mod audit;
 mod connection;
 pub mod counters;
 mod engine;
 pub mod event;
+mod framing;
 pub mod identity;
 mod listener;
+mod modbus_stream;
 pub mod policy;
+mod raw_ingest;
+mod serial;
 pub mod station;
+mod udp;
 
-pub use engine::{Engine, Settings, StartError};
-pub use listener::{ListenerSettings, WhenFull};
+pub use engine::{
+    Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
+    StartError,
+};
+pub use listener::{Limits, WhenFull};
+pub use modbus_stream::{StreamFraming, StreamSettings};
+pub use raw_ingest::{RawRule, RawSettings};
+pub use serial::{Line, LineMode, LineParity, SerialSettings};
+pub use udp::UdpSettings;

@@ -1,7 +1,7 @@
-//! A Modbus TCP listener: its socket, and the loop that accepts connections.
+//! What every listener has: a name, a socket, connections that are admitted, counted and reported.
 
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,11 +10,10 @@ use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 
-use crate::admission::{Admission, Full, attach};
-use crate::connection::{Connection, Timeouts};
+use crate::admission::{Admission, Full, Ticket, attach};
+use crate::audit::Auditor;
+use crate::counters::ConnectionCounters;
 use crate::event::{Kind, Reporter};
-use crate::policy::{Policy, Rule};
-use crate::station::Station;
 
 /// Connections that the system holds until they are accepted.
 const BACKLOG: i32 = 1024;
@@ -34,157 +33,217 @@ pub enum WhenFull {
     Evict,
 }
 
-/// A Modbus TCP listener.
-#[derive(Debug, Clone)]
-pub struct ListenerSettings {
-    pub name: String,
-    /// Port 0 lets the system pick one. `[::]` takes IPv4 connections too.
-    pub bind: SocketAddr,
-    pub rules: Vec<Rule>,
+/// How many connections there may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
     pub max_connections: usize,
     pub max_connections_per_source: Option<usize>,
     pub when_full: WhenFull,
-    /// How long a connection may be without a request; `None` keeps it.
-    pub idle_timeout: Option<Duration>,
-    /// From the first byte of a request to its last, and for a peer to take its replies.
-    pub request_timeout: Duration,
 }
 
-/// A listener that is bound, and all that its connections share.
-pub(crate) struct Listener {
+impl Limits {
+    /// Of a listener that has no connections.
+    const NONE: Limits = Limits {
+        max_connections: 0,
+        max_connections_per_source: None,
+        when_full: WhenFull::Refuse,
+    };
+}
+
+/// The outer side of a listener: all that does not depend on its protocol.
+#[derive(Debug)]
+pub(crate) struct Front {
     pub(crate) name: Arc<str>,
-    pub(crate) station: Arc<Station>,
     pub(crate) admission: Arc<Admission>,
-    policy: Policy,
-    timeouts: Timeouts,
+    pub(crate) connections: ConnectionCounters,
+    pub(crate) auditor: Option<Auditor>,
     reporter: Reporter,
 }
 
-impl Listener {
+impl Front {
     pub(crate) fn new(
-        settings: ListenerSettings,
-        station: Station,
+        name: &str,
+        limits: Option<Limits>,
         reporter: Reporter,
-    ) -> Listener {
-        let admission = Admission::new(
-            settings.max_connections,
-            settings.max_connections_per_source,
-            settings.when_full,
-        );
-        Listener {
-            name: settings.name.into(),
-            station: Arc::new(station),
-            admission: Arc::new(admission),
-            policy: Policy::new(settings.rules),
-            timeouts: Timeouts { idle: settings.idle_timeout, request: settings.request_timeout },
+        auditor: Option<Auditor>,
+    ) -> Front {
+        Front {
+            name: name.into(),
+            admission: Arc::new(Admission::new(limits.unwrap_or(Limits::NONE))),
+            connections: ConnectionCounters::default(),
+            auditor,
             reporter,
         }
     }
 
-    /// Accepts until `stop`, and gives the connections to the workers in turn.
-    pub(crate) async fn accept(
-        self: Arc<Self>,
-        socket: std::net::TcpListener,
-        workers: Vec<Handle>,
-        mut stop: watch::Receiver<bool>,
-    ) {
-        let Ok(socket) = tokio::net::TcpListener::from_std(socket) else {
-            return;
-        };
-        loop {
-            let accepted = tokio::select! {
-                biased;
-                _ = stop.wait_for(|stop| *stop) => return,
-                accepted = socket.accept() => accepted,
-            };
-            match accepted {
-                Ok((stream, peer)) => self.admit(stream, peer, &workers, &stop),
-                Err(error) if is_of_one_peer(&error) => {}
-                Err(_) => {
-                    self.station.counters.connections.accept_errors.add();
-                    self.report(Kind::AcceptError, None);
-                    tokio::time::sleep(ACCEPT_PAUSE).await;
-                }
-            }
-        }
+    #[cfg(test)]
+    pub(crate) fn for_tests() -> Front {
+        let (reporter, _) = crate::event::channel(crate::event::Verbosity::Nothing);
+        Front::new("test", None, reporter, None)
     }
 
-    /// Settles what a new connection may do, and starts to serve it.
-    fn admit(
-        self: &Arc<Self>,
-        stream: TcpStream,
-        peer: SocketAddr,
-        workers: &[Handle],
-        stop: &watch::Receiver<bool>,
-    ) {
-        let counters = &self.station.counters.connections;
-        let Some(grant) = self.policy.grant(peer.ip()) else {
-            counters.refused_source.add();
-            return self.report(Kind::RefusedSource, Some(peer));
-        };
-        let (ticket, evicted) = match self.admission.admit(peer) {
-            Ok(admitted) => admitted,
-            Err(Full) => {
-                counters.refused_full.add();
-                return self.report(Kind::RefusedFull, Some(peer));
-            }
-        };
-        if evicted.is_some() {
-            counters.evicted.add();
-            self.report(Kind::Evicted, evicted);
-        }
-        counters.accepted.add();
-        let id = ticket.id();
-        let (listener, grant, stop) = (Arc::clone(self), Arc::clone(grant), stop.clone());
-        let station = Arc::clone(&self.station);
-        let timeouts = self.timeouts;
-        let task = if let [worker] = workers {
-            set_options(&stream);
-            let connection = Connection::new(stream, station, grant, timeouts, ticket);
-            worker.spawn(async move { listener.serve(connection, peer, stop).await })
-        } else {
-            let Ok(stream) = stream.into_std() else { return };
-            let worker = &workers[id as usize % workers.len()];
-            worker.spawn(async move {
-                // The socket belongs to the worker that serves it: it is registered there.
-                let Ok(stream) = TcpStream::from_std(stream) else { return };
-                set_options(&stream);
-                let connection = Connection::new(stream, station, grant, timeouts, ticket);
-                listener.serve(connection, peer, stop).await;
-            })
-        };
-        attach(&self.admission, id, task.abort_handle());
-    }
-
-    async fn serve(&self, connection: Connection, peer: SocketAddr, stop: watch::Receiver<bool>) {
-        self.report(Kind::Opened, Some(peer));
-        let end = connection.run(stop).await;
-        self.report(end, Some(peer));
-    }
-
-    fn report(&self, kind: Kind, peer: Option<SocketAddr>) {
+    pub(crate) fn report(&self, kind: Kind, peer: Option<SocketAddr>) {
         self.reporter.report(&self.name, kind, peer);
+    }
+
+    /// Counts and reports the end of a connection.
+    pub(crate) fn ended(&self, kind: Kind, peer: SocketAddr) {
+        match kind {
+            Kind::Idle => self.connections.idle.add(),
+            Kind::RequestTimeout => self.connections.request_timeout.add(),
+            Kind::SlowReader => self.connections.slow_reader.add(),
+            _ => {}
+        }
+        self.report(kind, Some(peer));
+    }
+
+    pub(crate) fn refuse_source(&self, peer: SocketAddr) {
+        self.connections.refused_source.add();
+        self.report(Kind::RefusedSource, Some(peer));
     }
 }
 
-/// A socket that listens, not yet known to any runtime.
-pub(crate) fn bind(address: SocketAddr) -> io::Result<std::net::TcpListener> {
-    let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
-    if address.is_ipv6() {
-        socket.set_only_v6(false)?;
+/// A connection that was admitted.
+pub(crate) struct Admitted<G> {
+    pub(crate) stream: TcpStream,
+    pub(crate) peer: SocketAddr,
+    pub(crate) grant: Arc<G>,
+    /// Bytes that have been read already.
+    pub(crate) received: Vec<u8>,
+    pub(crate) ticket: Ticket,
+}
+
+/// What a listener does with its connections.
+pub(crate) trait Service: Send + Sync + Sized + 'static {
+    type Grant: Send + Sync + 'static;
+
+    fn grant(&self, peer: IpAddr) -> Option<&Arc<Self::Grant>>;
+
+    /// Serves a connection to its end if that can be done without waiting; else gives it back.
+    fn serve_at_once(
+        &self,
+        _front: &Front,
+        connection: Admitted<Self::Grant>,
+    ) -> Option<Admitted<Self::Grant>> {
+        Some(connection)
     }
+
+    /// Serves a connection to its end.
+    fn serve(
+        self: Arc<Self>,
+        front: Arc<Front>,
+        connection: Admitted<Self::Grant>,
+        stop: watch::Receiver<bool>,
+    ) -> impl Future<Output = ()> + Send;
+}
+
+/// Accepts until `stop`, and gives the connections to the workers in turn.
+pub(crate) async fn accept<S: Service>(
+    front: Arc<Front>,
+    service: Arc<S>,
+    socket: std::net::TcpListener,
+    workers: Vec<Handle>,
+    mut stop: watch::Receiver<bool>,
+) {
+    let Ok(socket) = tokio::net::TcpListener::from_std(socket) else {
+        return;
+    };
+    loop {
+        let accepted = tokio::select! {
+            biased;
+            _ = stop.wait_for(|stop| *stop) => return,
+            accepted = socket.accept() => accepted,
+        };
+        match accepted {
+            Ok((stream, peer)) => admit(&front, &service, stream, peer, &workers, &stop),
+            Err(error) if is_of_one_peer(&error) => {}
+            Err(_) => {
+                front.connections.accept_errors.add();
+                front.report(Kind::AcceptError, None);
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+/// Settles what a new connection may do, and starts to serve it.
+fn admit<S: Service>(
+    front: &Arc<Front>,
+    service: &Arc<S>,
+    stream: TcpStream,
+    peer: SocketAddr,
+    workers: &[Handle],
+    stop: &watch::Receiver<bool>,
+) {
+    let Some(grant) = service.grant(peer.ip()) else {
+        return front.refuse_source(peer);
+    };
+    let (ticket, evicted) = match front.admission.admit(peer) {
+        Ok(admitted) => admitted,
+        Err(Full) => {
+            front.connections.refused_full.add();
+            return front.report(Kind::RefusedFull, Some(peer));
+        }
+    };
+    if evicted.is_some() {
+        front.connections.evicted.add();
+        front.report(Kind::Evicted, evicted);
+    }
+    front.connections.accepted.add();
+    front.report(Kind::Opened, Some(peer));
+    let id = ticket.id();
+    let grant = Arc::clone(grant);
+    let connection = Admitted { stream, peer, grant, received: Vec::new(), ticket };
+    let Some(connection) = service.serve_at_once(front, connection) else {
+        return;
+    };
+    let (front, service, stop) = (Arc::clone(front), Arc::clone(service), stop.clone());
+    let admission = Arc::clone(&front.admission);
+    let task = if let [worker] = workers {
+        worker.spawn(service.serve(front, connection, stop))
+    } else {
+        let Admitted { stream, peer, grant, received, ticket } = connection;
+        let Ok(stream) = stream.into_std() else { return };
+        let worker = &workers[id as usize % workers.len()];
+        worker.spawn(async move {
+            // The socket belongs to the worker that serves it: it is registered there.
+            let Ok(stream) = TcpStream::from_std(stream) else { return };
+            let connection = Admitted { stream, peer, grant, received, ticket };
+            service.serve(front, connection, stop).await;
+        })
+    };
+    attach(&admission, id, task.abort_handle());
+}
+
+/// A socket that listens, not yet known to any runtime.
+pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+    let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
     // Elsewhere the option lets two programs take the same port.
     #[cfg(unix)]
     socket.set_reuse_address(true)?;
-    socket.bind(&address.into())?;
+    bind(&socket, address)?;
     socket.listen(BACKLOG)?;
-    socket.set_nonblocking(true)?;
     Ok(socket.into())
+}
+
+/// A socket that receives datagrams, not yet known to any runtime.
+pub(crate) fn bind_udp(address: SocketAddr) -> io::Result<std::net::UdpSocket> {
+    let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+    bind(&socket, address)?;
+    Ok(socket.into())
+}
+
+fn bind(socket: &Socket, address: SocketAddr) -> io::Result<()> {
+    if address.is_ipv6() {
+        socket.set_only_v6(false)?;
+    }
+    socket.bind(&address.into())?;
+    socket.set_nonblocking(true)
 }
 
 /// Replies leave at once, and a peer that is gone is noticed. Where the system refuses an option,
 /// the connection works without it.
-fn set_options(stream: &TcpStream) {
+pub(crate) fn set_options(stream: &TcpStream) {
     let (time, retries, interval) = KEEPALIVE;
     let keepalive = TcpKeepalive::new().with_time(time).with_interval(interval);
     #[cfg(not(target_os = "windows"))]

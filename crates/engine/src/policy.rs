@@ -33,27 +33,31 @@ pub struct Rule {
 
 /// The rules of a listener: the first whose sources hold a peer settles what it may do.
 #[derive(Debug)]
-pub struct Policy {
-    rules: Vec<(Vec<IpNet>, Arc<Grant>)>,
+pub struct Policy<G> {
+    rules: Vec<(Vec<IpNet>, Arc<G>)>,
 }
 
-impl Policy {
-    pub fn new(rules: Vec<Rule>) -> Policy {
-        let compiled = rules.into_iter().map(|rule| {
-            let grant = Arc::new(Grant::new(&rule));
-            (rule.sources, grant)
-        });
-        Policy { rules: compiled.collect() }
+impl<G> Policy<G> {
+    /// Rules as the sources that each holds, and what it grants them.
+    pub fn new(rules: impl IntoIterator<Item = (Vec<IpNet>, G)>) -> Policy<G> {
+        let rules = rules.into_iter().map(|(sources, grant)| (sources, Arc::new(grant)));
+        Policy { rules: rules.collect() }
     }
 
     /// What a peer is granted; `None` for one that no rule names. An IPv4 address mapped into IPv6
     /// is that IPv4 address.
-    pub fn grant(&self, peer: IpAddr) -> Option<&Arc<Grant>> {
+    pub fn grant(&self, peer: IpAddr) -> Option<&Arc<G>> {
         let peer = peer.to_canonical();
         let mut rules = self.rules.iter();
         rules
             .find(|(sources, _)| sources.iter().any(|network| network.contains(&peer)))
             .map(|(_, grant)| grant)
+    }
+}
+
+impl Policy<Grant> {
+    pub fn of(rules: &[Rule]) -> Policy<Grant> {
+        Policy::new(rules.iter().map(|rule| (rule.sources.clone(), Grant::new(rule))))
     }
 }
 
@@ -90,6 +94,18 @@ impl Grant {
     #[inline]
     pub fn memory(&self, unit_id: u8) -> Option<&Memory> {
         self.units[usize::from(unit_id)].as_deref()
+    }
+
+    /// Every memory that some unit id maps, each once.
+    pub fn memories(&self) -> impl Iterator<Item = (u8, &Arc<Memory>)> {
+        let units = self.units.iter().enumerate();
+        let mapped = units.filter_map(|(unit, memory)| Some((unit as u8, memory.as_ref()?)));
+        mapped.filter(|(unit, memory)| {
+            !self.units[..usize::from(*unit)]
+                .iter()
+                .flatten()
+                .any(|other| Arc::ptr_eq(other, memory))
+        })
     }
 
     /// Whether a function code is known and allowed.

@@ -5,7 +5,7 @@
 //! (02). A denied function is answered before the unit is looked up, so that a stranger can't learn
 //! which units there are.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use holdfast_memory::{Access, Area, Memory, Read, Refusal, Write};
 use holdfast_protocol::pdu::{
@@ -26,12 +26,20 @@ pub struct Station {
     identity: Identity,
     /// Units in listen only mode (V1.1b3, 6.8.1, sub-function 04).
     silent: [AtomicBool; 256],
+    /// The last character of an ASCII frame (V1.1b3, 6.8.1, sub-function 03).
+    ascii_delimiter: AtomicU8,
 }
 
 impl Station {
     pub fn new(identity: Identity) -> Station {
         let silent = [const { AtomicBool::new(false) }; 256];
-        Station { counters: Counters::default(), identity, silent }
+        let ascii_delimiter = AtomicU8::new(b'\n');
+        Station { counters: Counters::default(), identity, silent, ascii_delimiter }
+    }
+
+    /// The character that ends an ASCII frame, behind a carriage return.
+    pub fn ascii_delimiter(&self) -> u8 {
+        self.ascii_delimiter.load(Ordering::Relaxed)
     }
 
     /// Carries out a request and writes the reply; its length, or `None` when no reply is due.
@@ -171,7 +179,10 @@ impl Station {
     ) -> Option<usize> {
         let bus = self.counters.bus();
         let count = match asked.sub_function {
-            SubFunction::ReturnQueryData | SubFunction::ChangeAsciiInputDelimiter => {
+            SubFunction::ReturnQueryData => return Some(reply::echo(pdu, reply)),
+            SubFunction::ChangeAsciiInputDelimiter => {
+                let delimiter = asked.data.first().copied().unwrap_or(b'\n');
+                self.ascii_delimiter.store(delimiter, Ordering::Relaxed);
                 return Some(reply::echo(pdu, reply));
             }
             SubFunction::RestartCommunications | SubFunction::ClearCounters => {

@@ -21,7 +21,7 @@ fn peer(text: &str) -> IpAddr {
 
 #[test]
 fn the_first_rule_that_names_a_peer_holds() {
-    let policy = Policy::new(vec![
+    let policy = Policy::of(&[
         rule(&["10.0.0.0/24", "fd00::/64"], 1, Rights::ReadWrite, Functions::All),
         rule(&["10.0.0.0/8"], 2, Rights::ReadOnly, Functions::All),
     ]);
@@ -38,15 +38,15 @@ fn the_first_rule_that_names_a_peer_holds() {
 #[test]
 fn a_mapped_address_is_the_ipv4_address_it_maps() {
     let rules = vec![rule(&["10.0.0.0/24"], 1, Rights::ReadOnly, Functions::All)];
-    assert!(Policy::new(rules).grant(peer("::ffff:10.0.0.7")).is_some());
+    assert!(Policy::of(&rules).grant(peer("::ffff:10.0.0.7")).is_some());
     let rules = vec![rule(&["::/0"], 1, Rights::ReadOnly, Functions::All)];
-    assert!(Policy::new(rules).grant(peer("::ffff:10.0.0.7")).is_none());
+    assert!(Policy::of(&rules).grant(peer("::ffff:10.0.0.7")).is_none());
 }
 
 #[test]
 fn functions_are_those_known_allowed_and_fit_for_the_rights() {
     let allowed = |rights, functions| -> Vec<u8> {
-        let policy = Policy::new(vec![rule(&["::/0"], 1, rights, functions)]);
+        let policy = Policy::of(&[rule(&["::/0"], 1, rights, functions)]);
         let grant = policy.grant(peer("::1")).unwrap();
         (0..=255).filter(|code| grant.allows(*code)).collect()
     };

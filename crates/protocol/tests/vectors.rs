@@ -4,6 +4,7 @@ use std::path::Path;
 
 use holdfast_protocol::frame::{ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, ExceptionCode, Request, ResponseError};
+use holdfast_protocol::raw_ingest::{Format, Refusal};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -88,6 +89,77 @@ fn requests_parse_encode_and_answer_as_the_vectors_say() {
                 assert_eq!(answer, Err(ResponseError::Exception(code)), "{}", case.name);
             }
             Some(code) => assert_eq!(parsed, Err(code), "{}", case.name),
+        }
+    }
+}
+
+#[derive(Deserialize)]
+struct RawCases {
+    accepted: Vec<RawCase>,
+    refused: Vec<RawCase>,
+}
+
+#[derive(Deserialize)]
+struct RawCase {
+    name: String,
+    v1: Option<String>,
+    crc: Option<String>,
+}
+
+fn raw_cases() -> RawCases {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/vectors/raw_ingest.json");
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+fn raw_packets(case: &RawCase) -> impl Iterator<Item = (Format, Vec<u8>)> {
+    let crc = Format::Crc { required: true };
+    let packets = [(Format::V1, &case.v1), (crc, &case.crc)];
+    packets.into_iter().filter_map(|(format, hex)| Some((format, unhex(hex.as_ref()?))))
+}
+
+#[test]
+fn raw_packets_decode_and_encode_as_the_vectors_say() {
+    for case in raw_cases().accepted {
+        for (format, packet) in raw_packets(&case) {
+            let header = format.header(&packet).unwrap().unwrap();
+            let payload = format.payload(&header, &packet).unwrap();
+            let mut encoded = Vec::new();
+            format.encode(&header, payload, &mut encoded);
+            assert_eq!(encoded, packet, "{}", case.name);
+            for cut in 0..packet.len() {
+                let header = format.header(&packet[..cut]).unwrap();
+                let whole = header.map(|header| format.payload(&header, &packet[..cut]));
+                assert!(matches!(whole, None | Some(Err(Refusal::Short))), "{}", case.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn raw_packets_are_refused_as_the_vectors_say() {
+    for case in raw_cases().refused {
+        for (format, packet) in raw_packets(&case) {
+            let found = match format.header(&packet) {
+                Ok(Some(header)) => format.payload(&header, &packet).err(),
+                Ok(None) => Some(Refusal::Short),
+                Err(refusal) => Some(refusal),
+            };
+            let expected = match case.name.as_str() {
+                "magic" => Some(Refusal::Magic),
+                "version 2" => Some(Refusal::Version),
+                "area 0" | "area 5" => Some(Refusal::Area),
+                "count 0" => Some(Refusal::Count),
+                "payload one byte short" | "header cut" | "nothing at all" => Some(Refusal::Short),
+                "one byte too many" | "payload length field, as old senders had it" => {
+                    Some(Refusal::Extra)
+                }
+                "the other format" if format == Format::V1 => Some(Refusal::Area),
+                "the other format" | "flags not zero" | "reserved not zero" => Some(Refusal::Flags),
+                "wrong CRC" => Some(Refusal::Crc),
+                // What only a listener can judge: units, memories, ranges.
+                _ => None,
+            };
+            assert_eq!(found, expected, "{} {format:?}", case.name);
         }
     }
 }

@@ -50,3 +50,77 @@ const TABLE: [u16; 256] = {
     }
     table
 };
+
+/// What stands at the start of a stream of requests, as RTU over TCP carries them.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Next<'a> {
+    /// Not a whole frame yet.
+    Incomplete,
+    /// A frame of `len` bytes.
+    Frame { unit_id: u8, pdu: &'a [u8], len: usize },
+    /// A frame of `len` bytes with a wrong CRC: to be discarded.
+    Damaged { len: usize },
+    /// Longer than any frame: where the next one starts can't be known.
+    Broken,
+}
+
+/// Looks at the start of `bytes`, which may end anywhere. A stream has no silence between frames:
+/// the length of a request follows from its function code. Of an unknown function it is not known;
+/// there the frame ends where the CRC first fits.
+pub fn next_request(bytes: &[u8]) -> Next<'_> {
+    let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
+        return Next::Incomplete;
+    };
+    let len = match request_data_len(function_code, data) {
+        DataLen::Known(len) => 2 + len + 2,
+        DataLen::Incomplete => return Next::Incomplete,
+        DataLen::Unknown => return first_fit(bytes),
+    };
+    match bytes.get(..len) {
+        _ if len > MAX_LEN => Next::Broken,
+        None => Next::Incomplete,
+        Some(frame) => match decode(frame) {
+            Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
+            Err(_) => Next::Damaged { len },
+        },
+    }
+}
+
+enum DataLen {
+    Known(usize),
+    /// More bytes will tell.
+    Incomplete,
+    Unknown,
+}
+
+/// Bytes between function code and CRC (V1.1b3, 6).
+fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
+    let counted = |at: usize| {
+        data.get(at)
+            .map_or(DataLen::Incomplete, |count| DataLen::Known(at + 1 + usize::from(*count)))
+    };
+    match function_code {
+        1..=6 | 8 => DataLen::Known(4),
+        7 | 11 | 12 | 17 => DataLen::Known(0),
+        15 | 16 => counted(4),
+        20 | 21 => counted(0),
+        22 => DataLen::Known(6),
+        23 => counted(8),
+        24 => DataLen::Known(2),
+        43 => match data.first() {
+            None => DataLen::Incomplete,
+            Some(14) => DataLen::Known(3),
+            Some(_) => DataLen::Unknown,
+        },
+        _ => DataLen::Unknown,
+    }
+}
+
+fn first_fit(bytes: &[u8]) -> Next<'_> {
+    for len in 4..=bytes.len().min(MAX_LEN) {
+        if let Ok((unit_id, pdu)) = decode(&bytes[..len]) {
+            return Next::Frame { unit_id, pdu, len };
+        }
+    }
+    if bytes.len() >= MAX_LEN { Next::Broken } else { Next::Incomplete }
+}

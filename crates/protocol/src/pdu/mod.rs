@@ -1,32 +1,5 @@
 //! Protocol data units: a function code and its data, the same on every transport (V1.1b3, 4).
 
-/// An enum of codes of the standard, each with its name there.
-macro_rules! codes {
-    ($(#[$meta:meta])* $name:ident: $int:ident { $($variant:ident = $code:literal, $text:literal;)* }) => {
-        $(#[$meta])*
-        #[repr($int)]
-        pub enum $name { $($variant = $code,)* }
-
-        impl $name {
-            pub const fn from_code(code: $int) -> Option<$name> {
-                match code {
-                    $($code => Some($name::$variant),)*
-                    _ => None,
-                }
-            }
-
-            pub const fn code(self) -> $int {
-                self as $int
-            }
-
-            /// The standard's name.
-            pub const fn name(self) -> &'static str {
-                match self { $($name::$variant => $text,)* }
-            }
-        }
-    };
-}
-
 mod diagnostics;
 mod function;
 pub mod identification;

@@ -1,0 +1,54 @@
+//! Arguments from Python, checked: each error names what was found and what is allowed.
+
+use std::net::{IpAddr, SocketAddr};
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use ipnet::IpNet;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// An integer of a range that a `usize` holds.
+pub fn within(what: &str, found: i128, allowed: RangeInclusive<usize>) -> PyResult<usize> {
+    usize::try_from(found).ok().filter(|number| allowed.contains(number)).ok_or_else(|| {
+        let (least, most) = (allowed.start(), allowed.end());
+        PyValueError::new_err(format!("{what} is {found}, allowed are {least} to {most}"))
+    })
+}
+
+pub fn byte(what: &str, found: i128) -> PyResult<u8> {
+    Ok(within(what, found, 0..=255)? as u8)
+}
+
+pub fn unknown(what: &str, found: &str, allowed: &str) -> PyErr {
+    PyValueError::new_err(format!("{what} is {found:?}, allowed are {allowed}"))
+}
+
+/// A network, or one address.
+pub fn network(text: &str) -> PyResult<IpNet> {
+    let network = text.parse::<IpNet>().ok();
+    network.or_else(|| text.parse::<IpAddr>().ok().map(IpNet::from)).ok_or_else(|| {
+        unknown("source", text, "addresses and networks as in 10.0.0.0/8 or fd00::/64")
+    })
+}
+
+pub fn seconds(what: &str, seconds: f64) -> PyResult<Duration> {
+    Duration::try_from_secs_f64(seconds)
+        .ok()
+        .filter(|duration| duration.as_secs() <= 366 * 24 * 3600)
+        .ok_or_else(|| unknown(what, &seconds.to_string(), "0 to 31622400 seconds"))
+}
+
+pub fn address(text: &str) -> PyResult<SocketAddr> {
+    let form = "address:port as in 127.0.0.1:502 or [::1]:502";
+    text.parse().map_err(|_| unknown("bind", text, form))
+}
+
+/// One of some words.
+pub fn word<T: Copy>(what: &str, found: &str, allowed: &[(&str, T)]) -> PyResult<T> {
+    let named = allowed.iter().find(|(name, _)| *name == found);
+    named.map(|(_, value)| *value).ok_or_else(|| {
+        let names: Vec<&str> = allowed.iter().map(|(name, _)| *name).collect();
+        unknown(what, found, &names.join(", "))
+    })
+}

@@ -1,0 +1,95 @@
+//! Writes as Python's audit log has them: a dictionary each.
+
+use holdfast_engine::audit::{Record, Written};
+use holdfast_memory::Area;
+use holdfast_protocol::pdu::{ExceptionCode, Range, Request};
+use holdfast_protocol::raw_ingest::{Format, Header};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::engine::canonical;
+
+pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
+    let line = PyDict::new(py);
+    line.set_item("listener", &*record.listener)?;
+    line.set_item("peer", record.peer.map(canonical))?;
+    match &record.write {
+        Written::Modbus { unit_id, pdu, refused } => {
+            line.set_item("unit", unit_id)?;
+            line.set_item("function", pdu.first())?;
+            request(&line, pdu)?;
+            line.set_item("outcome", refused.map_or_else(|| "done".into(), exception))?;
+        }
+        Written::Packet { format, header, payload, refused } => {
+            line.set_item("function", "raw-ingest")?;
+            if let Some(header) = header {
+                packet(&line, *format, header, payload)?;
+            }
+            line.set_item("outcome", refused.map_or("done", |refusal| refusal.name()))?;
+        }
+    }
+    Ok(line)
+}
+
+/// What a Modbus request was to write, as far as it was understood.
+fn request(line: &Bound<'_, PyDict>, pdu: &[u8]) -> PyResult<()> {
+    let (area, address, values) = match Request::parse(pdu) {
+        Ok(Request::WriteSingleCoil { address, value }) => {
+            (Area::Coils, address, vec![u16::from(value)])
+        }
+        Ok(Request::WriteSingleRegister { address, value }) => {
+            (Area::HoldingRegisters, address, vec![value])
+        }
+        Ok(Request::WriteMultipleCoils { range: Range { address, quantity }, bits: packed }) => {
+            (Area::Coils, address, bits(packed, quantity))
+        }
+        Ok(Request::WriteMultipleRegisters { range, registers: packed }) => {
+            (Area::HoldingRegisters, range.address, registers(packed))
+        }
+        Ok(Request::ReadWriteMultipleRegisters { write, registers: packed, .. }) => {
+            (Area::HoldingRegisters, write.address, registers(packed))
+        }
+        Ok(Request::MaskWriteRegister { address, and_mask, or_mask }) => {
+            line.set_item("area", Area::HoldingRegisters.name())?;
+            line.set_item("address", address)?;
+            line.set_item("and_mask", and_mask)?;
+            return line.set_item("or_mask", or_mask);
+        }
+        _ => return Ok(()),
+    };
+    line.set_item("area", area.name())?;
+    line.set_item("address", address)?;
+    line.set_item("values", values)
+}
+
+fn packet(
+    line: &Bound<'_, PyDict>,
+    format: Format,
+    header: &Header,
+    payload: &[u8],
+) -> PyResult<()> {
+    let area = Area::ALL[usize::from(header.area) - 1];
+    let target = if format == Format::V1 { "unit" } else { "memory_id" };
+    line.set_item(target, header.target)?;
+    line.set_item("area", area.name())?;
+    line.set_item("address", header.address)?;
+    if payload.is_empty() {
+        return line.set_item("count", header.count);
+    }
+    let values = if area.is_bits() { bits(payload, header.count) } else { registers(payload) };
+    line.set_item("values", values)
+}
+
+fn bits(packed: &[u8], count: u16) -> Vec<u16> {
+    let bit = |index: usize| packed.get(index / 8).map(|byte| u16::from(byte >> (index % 8) & 1));
+    (0..usize::from(count)).filter_map(bit).collect()
+}
+
+fn registers(packed: &[u8]) -> Vec<u16> {
+    packed.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect()
+}
+
+/// The exception as a word: `illegal_data_address`.
+fn exception(code: ExceptionCode) -> String {
+    code.name().to_lowercase().replace(' ', "_")
+}

@@ -1,0 +1,216 @@
+//! `Rule`, `RawRule` and `Listener`: what listeners are to be.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use holdfast_engine::policy::{Functions, Rights, Rule as CoreRule};
+use holdfast_engine::{
+    Limits, Line, LineMode, LineParity, ListenerKind, ListenerSettings, RawRule as CoreRawRule,
+    RawSettings, SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
+};
+use holdfast_memory::Memory as CoreMemory;
+use holdfast_protocol::raw_ingest::Format;
+use ipnet::IpNet;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyMapping;
+
+use crate::arguments::{address, byte, network, seconds, within, word};
+use crate::memory::{Memory, named};
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Rule {
+    core: CoreRule,
+}
+
+#[pymethods]
+impl Rule {
+    #[new]
+    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None))]
+    fn new(
+        units: &Bound<'_, PyMapping>,
+        sources: Vec<String>,
+        access: &str,
+        functions: Option<Vec<i128>>,
+        deny: Option<Vec<i128>>,
+    ) -> PyResult<Rule> {
+        let allowed = [("read-only", Rights::ReadOnly), ("read-write", Rights::ReadWrite)];
+        let rights = word("access", access, &allowed)?;
+        let codes = |codes: Option<Vec<i128>>| {
+            let codes =
+                codes.map(|codes| codes.into_iter().map(|code| byte("function code", code)));
+            codes.map(Iterator::collect::<PyResult<Vec<u8>>>).transpose()
+        };
+        let functions = match (codes(functions)?, codes(deny)?) {
+            (None, None) => Functions::All,
+            (Some(codes), None) => Functions::Only(codes),
+            (None, Some(codes)) => Functions::Except(codes),
+            (Some(_), Some(_)) => {
+                return Err(PyValueError::new_err("functions and deny exclude each other"));
+            }
+        };
+        let units = targets(units)?;
+        let units = units.into_iter().map(|(unit, memory)| Ok((byte("unit id", unit)?, memory)));
+        let units = units.collect::<PyResult<_>>()?;
+        Ok(Rule { core: CoreRule { sources: networks(&sources)?, units, rights, functions } })
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct RawRule {
+    core: CoreRawRule,
+}
+
+#[pymethods]
+impl RawRule {
+    #[new]
+    #[pyo3(signature = (targets, *, sources, areas))]
+    fn new(
+        targets: &Bound<'_, PyMapping>,
+        sources: Vec<String>,
+        areas: Vec<String>,
+    ) -> PyResult<RawRule> {
+        let targets = self::targets(targets)?.into_iter().map(|(target, memory)| {
+            Ok((within("unit or memory id", target, 0..=65_535)? as u16, memory))
+        });
+        let targets = targets.collect::<PyResult<_>>()?;
+        let areas = areas.iter().map(|area| named(area)).collect::<PyResult<_>>()?;
+        Ok(RawRule { core: CoreRawRule { sources: networks(&sources)?, targets, areas } })
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Listener {
+    pub core: ListenerSettings,
+}
+
+#[pymethods]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+impl Listener {
+    #[new]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0))]
+    fn new(
+        name: String,
+        bind: &str,
+        rules: Vec<PyRef<'_, Rule>>,
+        framing: &str,
+        max_connections: i128,
+        max_connections_per_source: Option<i128>,
+        when_full: &str,
+        idle_timeout: f64,
+        request_timeout: f64,
+    ) -> PyResult<Listener> {
+        let idle_timeout = seconds("idle_timeout", idle_timeout)?;
+        let framings = [("mbap", StreamFraming::Mbap), ("rtu", StreamFraming::Rtu)];
+        let kind = ListenerKind::ModbusStream(StreamSettings {
+            bind: address(bind)?,
+            framing: word("framing", framing, &framings)?,
+            rules: cores(&rules),
+            limits: limits(max_connections, max_connections_per_source, when_full)?,
+            idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
+            request_timeout: time_to_wait("request_timeout", request_timeout)?,
+        });
+        Ok(Listener { core: ListenerSettings { name, kind } })
+    }
+
+    #[staticmethod]
+    fn udp(name: String, bind: &str, rules: Vec<PyRef<'_, Rule>>) -> PyResult<Listener> {
+        let udp = UdpSettings { bind: address(bind)?, rules: cores(&rules) };
+        Ok(Listener { core: ListenerSettings { name, kind: ListenerKind::ModbusUdp(udp) } })
+    }
+
+    #[staticmethod]
+    #[pyo3(signature = (name, device, rule, *, mode, baud, parity, stop_bits, data_bits, silence=None))]
+    fn serial(
+        name: String,
+        device: String,
+        rule: PyRef<'_, Rule>,
+        mode: &str,
+        baud: i128,
+        parity: &str,
+        stop_bits: i128,
+        data_bits: i128,
+        silence: Option<f64>,
+    ) -> PyResult<Listener> {
+        let silence = silence.map(|silence| time_to_wait("silence", silence)).transpose()?;
+        let modes = [("rtu", LineMode::Rtu { silence }), ("ascii", LineMode::Ascii)];
+        let parities =
+            [("none", LineParity::None), ("even", LineParity::Even), ("odd", LineParity::Odd)];
+        let line = Line {
+            device,
+            baud: within("baud", baud, 50..=4_000_000)? as u32,
+            parity: word("parity", parity, &parities)?,
+            stop_bits: within("stop_bits", stop_bits, 1..=2)? as u8,
+            data_bits: within("data_bits", data_bits, 7..=8)? as u8,
+            mode: word("mode", mode, &modes)?,
+        };
+        let kind = ListenerKind::ModbusSerial(SerialSettings { line, rule: rule.core.clone() });
+        Ok(Listener { core: ListenerSettings { name, kind } })
+    }
+
+    #[staticmethod]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", max_connections=256, max_connections_per_source=None, request_timeout=10.0))]
+    fn raw_ingest(
+        name: String,
+        bind: &str,
+        rules: Vec<PyRef<'_, RawRule>>,
+        format: &str,
+        crc: &str,
+        max_connections: i128,
+        max_connections_per_source: Option<i128>,
+        request_timeout: f64,
+    ) -> PyResult<Listener> {
+        let required = word("crc", crc, &[("required", true), ("none", false)])?;
+        let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
+        let kind = ListenerKind::RawIngest(RawSettings {
+            bind: address(bind)?,
+            format: word("format", format, &formats)?,
+            rules: rules.iter().map(|rule| rule.core.clone()).collect(),
+            limits: limits(max_connections, max_connections_per_source, "refuse")?,
+            request_timeout: time_to_wait("request_timeout", request_timeout)?,
+        });
+        Ok(Listener { core: ListenerSettings { name, kind } })
+    }
+}
+
+fn cores(rules: &[PyRef<'_, Rule>]) -> Vec<CoreRule> {
+    rules.iter().map(|rule| rule.core.clone()).collect()
+}
+
+fn networks(sources: &[String]) -> PyResult<Vec<IpNet>> {
+    sources.iter().map(|text| network(text)).collect()
+}
+
+/// Ids and the memories behind them.
+fn targets(mapping: &Bound<'_, PyMapping>) -> PyResult<Vec<(i128, Arc<CoreMemory>)>> {
+    let mut targets = Vec::new();
+    for item in mapping.items()?.iter() {
+        let (id, memory): (i128, PyRef<'_, Memory>) = item.extract()?;
+        targets.push((id, Arc::clone(&memory.core)));
+    }
+    Ok(targets)
+}
+
+fn limits(
+    max_connections: i128,
+    max_connections_per_source: Option<i128>,
+    when_full: &str,
+) -> PyResult<Limits> {
+    let allowed = [("refuse", WhenFull::Refuse), ("evict", WhenFull::Evict)];
+    let of_source = max_connections_per_source
+        .map(|most| within("max_connections_per_source", most, 1..=65_535))
+        .transpose()?;
+    Ok(Limits {
+        max_connections: within("max_connections", max_connections, 1..=65_535)?,
+        max_connections_per_source: of_source,
+        when_full: word("when_full", when_full, &allowed)?,
+    })
+}
+
+fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {
+    let time = seconds(what, time)?;
+    if time.is_zero() {
+        return Err(PyValueError::new_err(format!("{what} is 0, more is allowed")));
+    }
+    Ok(time)
+}

@@ -1,0 +1,126 @@
+//! Writes, for an audit log: sent without waiting, dropped and counted when nobody takes them.
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use holdfast_protocol::pdu::{ExceptionCode, Function};
+use holdfast_protocol::raw_ingest;
+
+/// Bytes that may wait to be taken.
+const CAPACITY: usize = 32 << 20;
+
+/// What a record takes beside its bytes.
+const OVERHEAD: usize = 128;
+
+/// A write, done or refused.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Record {
+    pub listener: Arc<str>,
+    /// `None` on a serial line.
+    pub peer: Option<SocketAddr>,
+    pub write: Written,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Written {
+    /// A request, as it came.
+    Modbus { unit_id: u8, pdu: Vec<u8>, refused: Option<ExceptionCode> },
+    /// A packet: its header, where it has one, and the payload of one that was written.
+    Packet {
+        format: raw_ingest::Format,
+        header: Option<raw_ingest::Header>,
+        payload: Vec<u8>,
+        refused: Option<raw_ingest::Refusal>,
+    },
+}
+
+/// The sending side.
+#[derive(Debug, Clone)]
+pub(crate) struct Auditor {
+    sender: Sender<Record>,
+    shared: Arc<Shared>,
+}
+
+/// The receiving side.
+#[derive(Debug)]
+pub(crate) struct Records {
+    receiver: Mutex<Receiver<Record>>,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    waiting: AtomicUsize,
+    lost: AtomicU64,
+}
+
+pub(crate) fn auditing() -> (Auditor, Records) {
+    let (sender, receiver) = channel();
+    let shared = Arc::new(Shared::default());
+    let auditor = Auditor { sender, shared: Arc::clone(&shared) };
+    (auditor, Records { receiver: Mutex::new(receiver), shared })
+}
+
+impl Auditor {
+    /// Notes a Modbus request if it is one that writes. `reply` is its reply, empty when none is due.
+    pub(crate) fn note(
+        &self,
+        listener: &Arc<str>,
+        peer: Option<SocketAddr>,
+        unit_id: u8,
+        request: &[u8],
+        reply: &[u8],
+    ) {
+        let function = request.first().copied().and_then(Function::from_code);
+        if !function.is_some_and(Function::is_write) {
+            return;
+        }
+        let refused = match reply {
+            [code, exception, ..] if code & 0x80 != 0 => ExceptionCode::from_code(*exception),
+            _ => None,
+        };
+        let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused };
+        self.send(Record { listener: Arc::clone(listener), peer, write });
+    }
+
+    pub(crate) fn send(&self, record: Record) {
+        let size = record.size();
+        if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > CAPACITY
+            || self.sender.send(record).is_err()
+        {
+            self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
+            self.shared.lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Record {
+    fn size(&self) -> usize {
+        OVERHEAD
+            + match &self.write {
+                Written::Modbus { pdu, .. } => pdu.len(),
+                Written::Packet { payload, .. } => payload.len(),
+            }
+    }
+}
+
+impl Records {
+    /// Up to `most` records: waits up to `timeout` for the first, and for no other.
+    pub(crate) fn take(&self, timeout: Duration, most: usize) -> Vec<Record> {
+        let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
+        let first = receiver.recv_timeout(timeout).ok();
+        let records: Vec<Record> =
+            first.into_iter().chain(receiver.try_iter()).take(most).collect();
+        let size = records.iter().map(Record::size).sum();
+        self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
+        records
+    }
+
+    /// How many records found no place.
+    pub(crate) fn lost(&self) -> u64 {
+        self.shared.lost.load(Ordering::Relaxed)
+    }
+}

@@ -1,0 +1,95 @@
+//! How a stream of bytes carries requests and replies: Modbus TCP, or RTU over TCP.
+
+use holdfast_protocol::frame::{mbap, rtu};
+use holdfast_protocol::pdu;
+
+/// What stands at the start of received bytes.
+pub(crate) enum Next<'a> {
+    Incomplete,
+    /// `tag` goes back with the reply.
+    Request {
+        tag: u16,
+        unit_id: u8,
+        pdu: &'a [u8],
+        len: usize,
+    },
+    /// No Modbus frame: to be discarded.
+    Foreign {
+        len: usize,
+    },
+    /// A frame with a wrong check sum: to be discarded.
+    Damaged {
+        len: usize,
+    },
+    /// The stream can't be trusted any more.
+    Broken,
+}
+
+pub(crate) trait Framing: Send + Sync + 'static {
+    /// Bytes of a frame before the PDU, and behind it.
+    const HEADER_LEN: usize;
+    const TRAILER_LEN: usize;
+    /// The shortest request.
+    const SHORTEST: usize;
+
+    const MAX_LEN: usize = Self::HEADER_LEN + pdu::MAX_LEN + Self::TRAILER_LEN;
+
+    fn next(bytes: &[u8]) -> Next<'_>;
+
+    /// Completes a frame whose PDU of `pdu_len` bytes is in place; its length.
+    fn complete(frame: &mut [u8], tag: u16, unit_id: u8, pdu_len: usize) -> usize;
+}
+
+/// Frames with an MBAP header.
+pub(crate) struct Mbap;
+
+impl Framing for Mbap {
+    const HEADER_LEN: usize = mbap::HEADER_LEN;
+    const TRAILER_LEN: usize = 0;
+    const SHORTEST: usize = mbap::HEADER_LEN + 1;
+
+    #[inline]
+    fn next(bytes: &[u8]) -> Next<'_> {
+        match mbap::next(bytes) {
+            mbap::Next::Incomplete => Next::Incomplete,
+            mbap::Next::Frame { transaction_id, unit_id, pdu, len } => {
+                Next::Request { tag: transaction_id, unit_id, pdu, len }
+            }
+            mbap::Next::Foreign { len, .. } => Next::Foreign { len },
+            mbap::Next::Broken { .. } => Next::Broken,
+        }
+    }
+
+    #[inline]
+    fn complete(frame: &mut [u8], tag: u16, unit_id: u8, pdu_len: usize) -> usize {
+        let header = mbap::header(tag, unit_id, pdu_len);
+        frame[..header.len()].copy_from_slice(&header);
+        header.len() + pdu_len
+    }
+}
+
+/// RTU frames one behind the other.
+pub(crate) struct Rtu;
+
+impl Framing for Rtu {
+    const HEADER_LEN: usize = 1;
+    const TRAILER_LEN: usize = 2;
+    const SHORTEST: usize = 4;
+
+    fn next(bytes: &[u8]) -> Next<'_> {
+        match rtu::next_request(bytes) {
+            rtu::Next::Incomplete => Next::Incomplete,
+            rtu::Next::Frame { unit_id, pdu, len } => Next::Request { tag: 0, unit_id, pdu, len },
+            rtu::Next::Damaged { len } => Next::Damaged { len },
+            rtu::Next::Broken => Next::Broken,
+        }
+    }
+
+    fn complete(frame: &mut [u8], _tag: u16, unit_id: u8, pdu_len: usize) -> usize {
+        frame[0] = unit_id;
+        let body = 1 + pdu_len;
+        let crc = rtu::crc(&frame[..body]);
+        frame[body..body + 2].copy_from_slice(&crc.to_le_bytes());
+        body + 2
+    }
+}
