@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
-import json
 from ipaddress import ip_network
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from config_folder import written
+from configurations import configurations
 from holdfast.config import (
+    AuditConfig,
     Config,
     InitialRun,
+    Listener,
+    ModbusAsciiListener,
+    ModbusRtuListener,
+    ModbusRtuOverTcpListener,
+    ModbusTcpListener,
+    ModbusUdpListener,
+    MqttConfig,
+    RawIngestListener,
+    RestConfig,
+    RtuSerialConfig,
     Seal,
+    SerialRuleConfig,
     Span,
+    TokenConfig,
     json_schema,
     load,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+L = TypeVar("L")
 
 SMALL = """\
 memories:
@@ -50,6 +65,12 @@ def loaded(tmp_path: Path) -> Callable[..., Config]:
     return write_and_load
 
 
+def scada_of(config: Config) -> ModbusTcpListener:
+    listener = config.listeners["scada"]
+    assert isinstance(listener, ModbusTcpListener)
+    return listener
+
+
 def test_a_size_is_an_area_from_0(loaded: Callable[..., Config]) -> None:
     assert loaded().memories["plant"].coils == Span(start=0, size=8)
 
@@ -67,7 +88,7 @@ def test_an_area_that_is_left_out_does_not_exist(loaded: Callable[..., Config]) 
 
 
 def test_a_listener_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
-    scada = loaded().listeners["scada"]
+    scada = scada_of(loaded())
     assert (scada.max_connections, scada.max_connections_per_source) == (256, None)
     assert (scada.when_full, scada.idle_timeout, scada.request_timeout) == ("refuse", 300, 10)
 
@@ -80,7 +101,7 @@ def test_the_appliance_has_the_documented_defaults(loaded: Callable[..., Config]
 
 
 def test_a_rule_holds_networks_units_and_access(loaded: Callable[..., Config]) -> None:
-    (rule,) = loaded().listeners["scada"].rules
+    (rule,) = scada_of(loaded()).rules
     assert rule.sources == (ip_network("10.0.0.7"), ip_network("fd00::/64"))
     assert rule.units == {1: "plant", 16: "plant"}
     assert (rule.access, rule.functions, rule.deny) == ("read-only", None, None)
@@ -93,7 +114,7 @@ def test_a_rule_holds_networks_units_and_access(loaded: Callable[..., Config]) -
 def test_a_bind_is_an_address_and_a_port(
     loaded: Callable[..., Config], text: str, host: str, port: int
 ) -> None:
-    bind = loaded((SMALL % "").replace("127.0.0.1:5020", f'"{text}"')).listeners["scada"].bind
+    bind = scada_of(loaded((SMALL % "").replace("127.0.0.1:5020", f'"{text}"'))).bind
     assert (bind.host, bind.port, str(bind)) == (host, port, text)
 
 
@@ -128,6 +149,193 @@ def test_a_rule_below_a_narrower_one_can_match(loaded: Callable[..., Config]) ->
 def test_a_seal_opens_once_unless_it_says_otherwise(loaded: Callable[..., Config]) -> None:
     plant = loaded(SMALL % ", seal: {area: coils, address: 7}").memories["plant"]
     assert plant.seal == Seal(area="coils", address=7, mode="once")
+
+
+SERVED = """\
+memories: {plant: {id: 1, coils: 8}}
+"""
+GRANT = "memories: [plant], areas: [coils]"
+RULE = "{sources: [10.0.0.7], units: {1: plant}, access: read-only}"
+LINE = "{units: {247: plant}, access: read-only}"
+
+
+def listener_of(loaded: Callable[..., Config], text: str, kind: type[L]) -> L:
+    listener = loaded(f"{SERVED}listeners:\n  a: {{{text}}}\n").listeners["a"]
+    assert isinstance(listener, kind)
+    return listener
+
+
+def test_rtu_over_tcp_is_set_like_modbus_tcp(loaded: Callable[..., Config]) -> None:
+    text = f"type: modbus-rtu-over-tcp, bind: '127.0.0.1:1', rules: [{RULE}]"
+    listener = listener_of(loaded, text, ModbusRtuOverTcpListener)
+    assert not isinstance(listener, ModbusTcpListener)
+    assert (listener.max_connections, listener.idle_timeout, listener.when_full) == (
+        256,
+        300,
+        "refuse",
+    )
+
+
+def test_a_udp_listener_has_a_bind_and_rules(loaded: Callable[..., Config]) -> None:
+    text = f"type: modbus-udp, bind: '127.0.0.1:1', rules: [{RULE}]"
+    listener = listener_of(loaded, text, ModbusUdpListener)
+    assert (listener.bind.port, listener.rules[0].units) == (1, {1: "plant"})
+
+
+def test_an_rtu_line_has_the_defaults_of_the_standard(loaded: Callable[..., Config]) -> None:
+    text = f"type: modbus-rtu, serial: {{device: COM3}}, rules: [{LINE}]"
+    listener = listener_of(loaded, text, ModbusRtuListener)
+    assert listener.serial == RtuSerialConfig(
+        device="COM3", baud=19200, parity="even", stop_bits=1, data_bits=8
+    )
+    assert listener.rules == (SerialRuleConfig(units={247: "plant"}, access="read-only"),)
+
+
+def test_an_ascii_line_has_the_defaults_of_the_standard(loaded: Callable[..., Config]) -> None:
+    text = f"type: modbus-ascii, serial: {{device: COM3}}, rules: [{LINE}]"
+    listener = listener_of(loaded, text, ModbusAsciiListener)
+    assert (listener.serial.parity, listener.serial.data_bits) == ("even", 7)
+
+
+@pytest.mark.parametrize(
+    ("settings", "bits"),
+    [
+        ("parity: none", 2),
+        ("parity: odd", 1),
+        ("parity: even", 1),
+        ("parity: none, stop_bits: 1", 1),
+        ("parity: even, stop_bits: 2", 2),
+    ],
+)
+def test_stop_bits_follow_parity_unless_they_are_given(
+    loaded: Callable[..., Config], settings: str, bits: int
+) -> None:
+    text = f"type: modbus-rtu, serial: {{device: a, {settings}}}, rules: [{LINE}]"
+    assert listener_of(loaded, text, ModbusRtuListener).serial.stop_bits == bits
+
+
+def test_raw_ingest_speaks_v1_unless_it_says_otherwise(loaded: Callable[..., Config]) -> None:
+    rule = "{sources: [10.0.0.7], units: {65535: plant}, areas: [coils]}"
+    text = f"type: raw-ingest, bind: '127.0.0.1:1', rules: [{rule}]"
+    listener = listener_of(loaded, text, RawIngestListener)
+    assert (listener.format, listener.crc) == ("v1", None)
+    assert (listener.max_connections, listener.max_connections_per_source) == (256, None)
+    assert (listener.rules[0].units, listener.rules[0].memories) == ({65535: "plant"}, ())
+
+
+@pytest.mark.parametrize(("written", "crc"), [("", "required"), ("crc: none, ", "none")])
+def test_raw_ingest_of_format_crc_needs_the_crc_unless_it_says_otherwise(
+    loaded: Callable[..., Config], written: str, crc: str
+) -> None:
+    rule = f"{{sources: [10.0.0.7], {GRANT}}}"
+    text = f"type: raw-ingest, format: crc, {written}bind: '127.0.0.1:1', rules: [{rule}]"
+    listener = listener_of(loaded, text, RawIngestListener)
+    assert listener.crc == crc
+    assert (listener.rules[0].units, listener.rules[0].memories) == ({}, ("plant",))
+
+
+def rest_of(loaded: Callable[..., Config], tokens: str) -> RestConfig:
+    rest = f"rest: {{bind: '[::1]:80', sources: [10.0.0.7], tokens: {tokens}}}\n"
+    config = loaded(SERVED + rest)
+    assert config.listeners == {}
+    assert config.rest is not None
+    return config.rest
+
+
+def test_rest_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
+    rest = rest_of(loaded, "none")
+    assert (rest.max_body, rest.max_connections, rest.request_timeout) == (8388608, 64, 10)
+    assert rest.tokens == "none"
+
+
+def test_the_hash_of_a_token_is_kept_in_small_letters(loaded: Callable[..., Config]) -> None:
+    token = f"{{name: a, sha256: {'aB' * 32}, {GRANT}, access: read-only}}"
+    assert rest_of(loaded, f"[{token}]").tokens == (
+        TokenConfig(
+            name="a", sha256="ab" * 32, memories=("plant",), areas=("coils",), access="read-only"
+        ),
+    )
+
+
+def mqtt_of(loaded: Callable[..., Config], settings: str, **files: str) -> MqttConfig:
+    topic = f"{{topic: a, {GRANT}}}"
+    text = f"{SERVED}mqtt: {{client_id: a, {settings}, subscriptions: [{topic}]}}\n"
+    mqtt = loaded(text, **files).mqtt
+    assert mqtt is not None
+    return mqtt
+
+
+@pytest.mark.parametrize(
+    ("url", "parts"),
+    [
+        ("mqtt://broker", ("broker", 1883, False)),
+        ("mqtts://broker.example", ("broker.example", 8883, True)),
+        ("mqtt://127.0.0.1:1", ("127.0.0.1", 1, False)),
+        ("mqtts://[fd00::1]:65535", ("fd00::1", 65535, True)),
+        ("mqtt://[::1]", ("::1", 1883, False)),
+    ],
+)
+def test_a_url_says_where_the_broker_is(
+    loaded: Callable[..., Config], url: str, parts: tuple[str, int, bool]
+) -> None:
+    mqtt = mqtt_of(loaded, f"url: '{url}'")
+    assert (mqtt.host, mqtt.port, mqtt.secure) == parts
+
+
+def test_mqtt_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
+    mqtt = mqtt_of(loaded, "url: mqtt://a")
+    assert (mqtt.version, mqtt.keep_alive, mqtt.tls) == ("5", 60, None)
+    assert (mqtt.username, mqtt.password_file, mqtt.subscriptions[0].qos) == (None, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("written", "version"), [("5", "5"), ("'5'", "5"), ("3.1.1", "3.1.1"), ("'3.1.1'", "3.1.1")]
+)
+def test_the_version_of_mqtt_may_be_a_number(
+    loaded: Callable[..., Config], written: str, version: str
+) -> None:
+    assert mqtt_of(loaded, f"url: mqtt://a, version: {written}").version == version
+
+
+def test_files_are_relative_to_the_configuration_and_not_read(
+    loaded: Callable[..., Config], tmp_path: Path
+) -> None:
+    tls = "tls: {cert_file: p.txt, key_file: p.txt}"
+    settings = f"url: mqtts://a, username: a, password_file: p.txt, {tls}"
+    mqtt = mqtt_of(loaded, settings, p_txt="my-secret")
+    assert mqtt.tls is not None
+    assert (mqtt.password_file, mqtt.tls.key_file) == (tmp_path / "p.txt", tmp_path / "p.txt")
+    assert "my-secret" not in repr(mqtt)
+
+
+def test_metrics_are_for_this_machine_unless_they_say_otherwise(
+    loaded: Callable[..., Config],
+) -> None:
+    metrics = loaded((SMALL % "") + "metrics: {bind: '127.0.0.1:1'}\n").metrics
+    assert metrics is not None
+    assert metrics.sources == (ip_network("127.0.0.0/8"), ip_network("::1/128"))
+
+
+def test_an_audit_file_has_the_documented_limits(
+    loaded: Callable[..., Config], tmp_path: Path
+) -> None:
+    audit = loaded((SMALL % "") + "audit: {file: a.log}\n").audit
+    assert audit == AuditConfig(file=tmp_path / "a.log", max_bytes=104857600, keep=10)
+
+
+def test_options_of_an_adapter_are_kept_as_they_are(loaded: Callable[..., Config]) -> None:
+    adapter = (
+        f"{{type: b, {GRANT}, access: read-only, options: {{x: , y: {{1: [1.5, no, true]}}}}}}"
+    )
+    config = loaded((SMALL % "") + f"adapters: {{a: {adapter}}}\n")
+    assert config.adapters["a"].options == {"x": None, "y": {1: [1.5, "no", True]}}
+    assert loaded(config.dump()) == config
+
+
+def test_what_is_left_out_is_not_there(loaded: Callable[..., Config]) -> None:
+    config = loaded()
+    assert (config.rest, config.mqtt, config.metrics, config.audit) == (None, None, None, None)
+    assert config.adapters == {}
 
 
 def test_yes_and_no_are_text(loaded: Callable[..., Config]) -> None:
@@ -208,6 +416,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "      - sources: [10.0.0.7/32, fd00::/64]\n"
         "        units: {1: plant, 16: plant}\n"
         "        access: read-only\n"
+        "adapters: {}\n"
         "log:\n"
         "  level: info\n"
         "  format: text\n"
@@ -229,85 +438,13 @@ def test_the_dump_loads_from_another_folder_with_its_initial_values(
 
 def test_the_examples_are_right() -> None:
     for path in EXAMPLES.glob("*.yaml"):
-        assert load(path).memories
+        assert load(path).warnings == ()
 
 
-NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
-TEXTS = st.text(st.characters(exclude_categories=("Cc", "Cs")), min_size=1, max_size=60)
-SPANS = st.integers(0, 65535).flatmap(
-    lambda start: st.integers(1, 65536 - start).map(lambda size: {"start": start, "size": size})
-)
-SIZES = st.integers(1, 65536) | SPANS
-CODES = st.lists(st.sampled_from([1, 2, 3, 4, 8, 11, 17, 43]), min_size=1, unique=True)
-NETWORKS = st.ip_addresses(v=4, network="10.0.0.0/8").map(str) | st.ip_addresses(
-    v=6, network="fd00::/16"
-).map(str)
-
-
-@st.composite
-def rules(draw: st.DrawFn, memories: list[str], source: str) -> dict[str, Any]:
-    rule: dict[str, Any] = {
-        "sources": [source],
-        "units": draw(
-            st.dictionaries(st.integers(0, 255), st.sampled_from(memories), min_size=1, max_size=4)
-        ),
-        "access": draw(st.sampled_from(["read-only", "read-write"])),
-    }
-    limit = draw(st.sampled_from([None, "functions", "deny"]))
-    return rule if limit is None else {**rule, limit: draw(CODES)}
-
-
-@st.composite
-def listeners(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
-    sources = draw(st.lists(NETWORKS, min_size=1, max_size=3, unique=True))
-    most = draw(st.integers(1, 65535))
-    return {
-        "type": "modbus-tcp",
-        "bind": f"127.0.0.1:{port}",
-        "rules": [draw(rules(memories, source)) for source in sources],
-        "max_connections": most,
-        "max_connections_per_source": draw(st.none() | st.integers(1, most)),
-        "when_full": draw(st.sampled_from(["refuse", "evict"])),
-        "idle_timeout": draw(st.just(0) | st.floats(0.001, 31_622_400) | st.integers(1, 1000)),
-        "request_timeout": draw(st.floats(0.001, 31_622_400)),
-    }
-
-
-@st.composite
-def configurations(draw: st.DrawFn) -> dict[str, Any]:
-    areas = st.fixed_dictionaries(
-        {"holding_registers": SIZES},
-        optional={"coils": SIZES, "discrete_inputs": SIZES, "input_registers": SIZES},
-    )
-    memories = draw(st.dictionaries(NAMES, areas, min_size=1, max_size=3))
-    names = draw(st.lists(NAMES, min_size=1, max_size=3, unique=True))
-    return {
-        "memories": memories,
-        "identity": draw(
-            st.fixed_dictionaries(
-                {"vendor_name": TEXTS},
-                optional={
-                    "revision": TEXTS,
-                    "model_name": TEXTS,
-                    "unit_names": st.dictionaries(st.integers(0, 255), TEXTS, max_size=3),
-                    "objects": st.dictionaries(st.integers(128, 255), TEXTS, max_size=3),
-                },
-            )
-        ),
-        "listeners": {
-            name: draw(listeners(list(memories), 5000 + index)) for index, name in enumerate(names)
-        },
-        "workers": draw(st.integers(1, 64)),
-    }
-
-
-def written(data: object) -> str:
-    """The data as YAML on one line, all text quoted."""
-    if isinstance(data, dict):
-        return "{" + ", ".join(f"{written(k)}: {written(v)}" for k, v in data.items()) + "}"
-    if isinstance(data, list):
-        return "[" + ", ".join(written(item) for item in data) + "]"
-    return json.dumps(data, ensure_ascii=False)
+def test_the_full_example_has_every_section_and_every_listener() -> None:
+    config = load(EXAMPLES / "full.yaml")
+    assert config.model_fields_set == set(Config.model_fields)
+    assert {type(listener) for listener in config.listeners.values()} == set(get_args(Listener))
 
 
 @settings(deadline=None, max_examples=60)
@@ -356,14 +493,42 @@ def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:
         for key, node in properties(json_schema()).items()
         if {"type": "null"} in node.get("anyOf", ())
     ]
-    assert nullable == ["ModbusTcpListener.max_connections_per_source"]
+    assert sorted(nullable) == [
+        "ModbusRtuOverTcpListener.max_connections_per_source",
+        "ModbusTcpListener.max_connections_per_source",
+        "RawIngestListener.max_connections_per_source",
+    ]
 
 
 def test_the_schema_asks_for_what_bears_on_safety() -> None:
-    schema = json_schema()
-    assert schema["$defs"]["RuleConfig"]["required"] == ["sources", "units", "access"]
-    assert schema["$defs"]["ModbusTcpListener"]["required"] == ["type", "bind", "rules"]
-    assert schema["required"] == ["memories", "listeners"]
+    required = {name: node.get("required") for name, node in json_schema()["$defs"].items()}
+    assert required == {
+        "AdapterConfig": ["type", "memories", "areas", "access"],
+        "AsciiSerialConfig": ["device"],
+        "AuditConfig": ["file"],
+        "IdentityConfig": None,
+        "LogConfig": None,
+        "MemoryConfig": None,
+        "MetricsConfig": ["bind"],
+        "ModbusAsciiListener": ["type", "serial", "rules"],
+        "ModbusRtuListener": ["type", "serial", "rules"],
+        "ModbusRtuOverTcpListener": ["type", "bind", "rules"],
+        "ModbusTcpListener": ["type", "bind", "rules"],
+        "ModbusUdpListener": ["type", "bind", "rules"],
+        "MqttConfig": ["url", "client_id", "subscriptions"],
+        "MqttTlsConfig": None,
+        "RawIngestListener": ["type", "bind", "rules"],
+        "RawRuleConfig": ["sources", "areas"],
+        "RestConfig": ["bind", "sources", "tokens"],
+        "RtuSerialConfig": ["device"],
+        "RuleConfig": ["sources", "units", "access"],
+        "Seal": ["area", "address"],
+        "SerialRuleConfig": ["units", "access"],
+        "Span": ["size"],
+        "SubscriptionConfig": ["topic", "memories", "areas"],
+        "TokenConfig": ["name", "sha256", "memories", "areas", "access"],
+    }
+    assert json_schema()["required"] == ["memories"]
 
 
 def test_the_schema_is_the_same_in_every_version() -> None:

@@ -9,34 +9,70 @@ from __future__ import annotations
 
 from holdfast.config.addresses import Bind, Network
 from holdfast.config.initial import InitialRun
-from holdfast.config.loading import load
-from holdfast.config.model import (
-    Config,
-    IdentityConfig,
-    LogConfig,
-    MemoryConfig,
+from holdfast.config.listeners import (
+    AsciiSerialConfig,
+    Listener,
+    ModbusAsciiListener,
+    ModbusRtuListener,
+    ModbusRtuOverTcpListener,
     ModbusTcpListener,
+    ModbusUdpListener,
+    RawIngestListener,
+    RawRuleConfig,
+    RtuSerialConfig,
     RuleConfig,
-    Seal,
-    Span,
+    SerialConfig,
+    SerialRuleConfig,
 )
+from holdfast.config.loading import load
+from holdfast.config.memories import MemoryConfig, Seal, Span
+from holdfast.config.model import Config, IdentityConfig, LogConfig
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.schema import json_schema
+from holdfast.config.services import (
+    AdapterConfig,
+    AuditConfig,
+    MetricsConfig,
+    MqttConfig,
+    MqttTlsConfig,
+    RestConfig,
+    SubscriptionConfig,
+    TokenConfig,
+)
 
 __all__ = [
+    "AdapterConfig",
+    "AsciiSerialConfig",
+    "AuditConfig",
     "Bind",
     "Config",
     "ConfigError",
     "IdentityConfig",
     "InitialRun",
+    "Listener",
     "LogConfig",
     "MemoryConfig",
+    "MetricsConfig",
+    "ModbusAsciiListener",
+    "ModbusRtuListener",
+    "ModbusRtuOverTcpListener",
     "ModbusTcpListener",
+    "ModbusUdpListener",
+    "MqttConfig",
+    "MqttTlsConfig",
     "Network",
     "Problem",
+    "RawIngestListener",
+    "RawRuleConfig",
+    "RestConfig",
+    "RtuSerialConfig",
     "RuleConfig",
     "Seal",
+    "SerialConfig",
+    "SerialRuleConfig",
     "Span",
+    "SubscriptionConfig",
+    "TokenConfig",
     "json_schema",
     "load",
 ]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.schema import cached
+from holdfast.config.tolerance import entries, mapping
 from holdfast.config.words import choice, listing
 
 if TYPE_CHECKING:
@@ -18,34 +19,57 @@ if TYPE_CHECKING:
 Node: TypeAlias = dict[str, Any]
 
 
-def allowed(path: KeyPath) -> str:
-    """What the value at `path` can be."""
-    nodes = _at(path)
-    return _words(nodes[0]) if nodes else "nothing"
+def allowed(path: KeyPath, data: object) -> str:
+    """What the value at `path` of `data` can be."""
+    nodes = _at(path, data)
+    return choice([_words(node) for node in nodes]) if nodes else "nothing"
 
 
-def known_keys(path: KeyPath) -> list[str]:
-    """The keys that the mapping at `path` can have."""
-    return [key for node in _at(path) for key in _resolved(node).get("properties", {})]
+def known_keys(path: KeyPath, data: object) -> list[str]:
+    """The keys that the mapping at `path` of `data` can have."""
+    return [
+        key
+        for node in _at(path, data)
+        for kind in _kinds(_resolved(node), _value(path, data)) or [node]
+        for key in _resolved(kind).get("properties", {})
+    ]
 
 
-def _at(path: KeyPath) -> list[Node]:
+def _at(path: KeyPath, data: object) -> list[Node]:
     nodes = [cached()]
-    for part in path:
-        nodes = [child for node in nodes for child in _children(node, part)]
+    for index, part in enumerate(path):
+        value = _value(path[:index], data)
+        nodes = [child for node in nodes for child in _children(node, part, value)]
     return nodes
 
 
-def _children(node: Node, part: Key) -> Iterator[Node]:
+def _value(path: KeyPath, data: object) -> object:
+    for part in path:
+        inside: dict[Any, Any] = dict(enumerate(entries(data))) or mapping(data)
+        data = inside.get(part)
+    return data
+
+
+def _children(node: Node, part: Key, value: object) -> Iterator[Node]:
     node = _resolved(node)
-    for kind in node.get("anyOf", ()):
-        yield from _children(kind, part)
+    for kind in _kinds(node, value):
+        yield from _children(kind, part, value)
     if part in node.get("properties", {}):
         yield node["properties"][part]
     yield from node.get("patternProperties", {}).values()
     for inside in ("additionalProperties", "items"):
         if isinstance(node.get(inside), dict):
             yield node[inside]
+
+
+def _kinds(node: Node, value: object) -> list[Node]:
+    """What a node is one of; only the kind that the value names, where it names one."""
+    kinds: list[Node] = [*node.get("anyOf", ()), *node.get("oneOf", ())]
+    if "discriminator" in node:
+        named = mapping(value).get(node["discriminator"]["propertyName"])
+        refs = node["discriminator"]["mapping"]
+        return [{"$ref": refs[named]}] if isinstance(named, str) and named in refs else kinds
+    return kinds
 
 
 def _resolved(node: Node) -> Node:
@@ -57,8 +81,11 @@ def _resolved(node: Node) -> Node:
 
 def _words(node: Node) -> str:
     node = _resolved(node)
-    if "anyOf" in node:
-        return choice([_words(kind) for kind in node["anyOf"]])
+    if "discriminator" in node:
+        return f"a mapping with the type {choice(node['discriminator']['mapping'])}"
+    kinds = _kinds(node, None)
+    if kinds:
+        return choice([_words(kind) for kind in kinds])
     if "enum" in node:
         return choice(node["enum"])
     if "const" in node:
@@ -67,6 +94,8 @@ def _words(node: Node) -> str:
 
 
 def _range(kind: str, node: Node) -> str:
+    if "maximum" not in node:
+        return f"{kind} of at least {node['minimum']}"
     return f"{kind} from {node['minimum']} to {node['maximum']}"
 
 

@@ -22,6 +22,9 @@ from holdfast.config.source import scalar
 NULL_IS_SAID = frozenset({"max_connections_per_source"})
 """Keys whose absence is written as null; the others are left out."""
 
+AS_WRITTEN = frozenset({"options"})
+"""Keys whose values are not the models' own: a null in them is data."""
+
 PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", re.ASCII)
 """Text that means itself anywhere in YAML; whatever else is quoted."""
 
@@ -29,7 +32,7 @@ PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", r
 def effective(model: dict[Any, Any]) -> dict[Any, Any]:
     """The data of a model as YAML and JSON have it, without keys that hold nothing."""
     return {
-        key: _plain(value)
+        key: value if key in AS_WRITTEN else _plain(value)
         for key, value in model.items()
         if value is not None or key in NULL_IS_SAID
     }

@@ -1,56 +1,66 @@
-"""What the keys of the listeners must keep together: sockets, limits, rules and memories."""
+"""What the keys of the listeners must keep together: limits, rules and memories."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.addresses import Bind, Network, covers, parse_bind, parse_source
-from holdfast.config.model import ModbusTcpListener
+from holdfast.config.addresses import Network, covers, parse_source
+from holdfast.config.allowed import allowed
+from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
 from holdfast.config.tolerance import entries, integer, mapping, parsed
+from holdfast.config.unique import refuse_repeats
 from holdfast.config.values import WRITES
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import show
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+    from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
 
 _MOST = ModbusTcpListener.model_fields["max_connections"].default
+_OTHER = {"v1": "crc", "crc": "v1"}
+_NAMING = {"v1": "units", "crc": "memories"}
+"""How a raw ingest rule names memories, by the format of the packets."""
 
 
 @dataclass
 class ListenerChecks:
-    """Checks the listeners of one file; `skip` are those that are refused already."""
+    """Checks the listeners of one file."""
 
     report: Report
-    skip: Sequence[KeyPath]
-    memories: list[str] | None
-    """Names of the memories, `None` when they can't be told."""
+    grants: GrantChecks
+    ids: dict[Any, Any]
+    """The memories as they are written, for their ids."""
 
     def check(self, listeners: object) -> None:
         """Reports what is wrong."""
-        binds: list[tuple[KeyPath, Bind]] = []
         for name, listener in mapping(listeners).items():
             path: KeyPath = ("listeners", name)
-            if path in self.skip or not isinstance(listener, dict):
+            if self.report.is_settled(path) or not isinstance(listener, dict):
                 continue
-            bind = parsed(parse_bind, listener.get("bind"))
-            if bind is not None:
-                binds.append(((*path, "bind"), bind))
+            kind = listener.get("type")
             self._limits(path, listener)
-            self._rules((*path, "rules"), entries(listener.get("rules")))
-        self._sockets(binds)
+            if kind == "raw-ingest":
+                self._raw(path, listener)
+            for rule_path, rule in self._rules(path, listener):
+                if kind == "raw-ingest":
+                    self._raw_rule(rule_path, rule, listener.get("format", "v1"))
+                else:
+                    RuleCheck(rule_path, rule, self.report, self.grants).check()
+            if kind in SERIAL_TYPES:
+                self._line(path, listener)
+            else:
+                self._shadows(path, listener)
 
-    def _sockets(self, binds: list[tuple[KeyPath, Bind]]) -> None:
-        for index, (path, bind) in enumerate(binds):
-            for other_path, other in binds[:index]:
-                if bind.overlaps(other):
-                    line = self.report.line(other_path)
-                    of = f"{other} of listeners.{other_path[1]} in line {line}"
-                    message = f"found {str(bind)!r}, which overlaps {of}"
-                    self.report.add(path, f"{message}, allowed: an address and port of its own")
+    def _rules(
+        self, path: KeyPath, listener: dict[Any, Any]
+    ) -> list[tuple[KeyPath, dict[Any, Any]]]:
+        return [
+            ((*path, "rules", index), rule)
+            for index, rule in enumerate(entries(listener.get("rules")))
+            if isinstance(rule, dict)
+        ]
 
     def _limits(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         most = integer(listener.get("max_connections", _MOST), 1, 65535)
@@ -59,13 +69,20 @@ class ListenerChecks:
             message = f"{of_source} has no effect: max_connections is {most}"
             self.report.doubt((*path, "max_connections_per_source"), message)
 
-    def _rules(self, path: KeyPath, rules: list[Any]) -> None:
+    def _line(self, path: KeyPath, listener: dict[Any, Any]) -> None:
+        for rule_path, rule in self._rules(path, listener):
+            if "sources" in rule:
+                known = "allowed: units, access, functions, deny"
+                message = f"a serial line has no addresses, {known}"
+                self.report.settle((*rule_path, "sources"), message, of_key=True)
+            if rule_path[-1] != 0:
+                first = f"rules[0] in line {self.report.line((*path, 'rules', 0))}"
+                message = f"never matches: the whole serial line belongs to {first}"
+                self.report.doubt(rule_path, message)
+
+    def _shadows(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         earlier: list[tuple[KeyPath, list[Network]]] = []
-        for index, rule in enumerate(rules):
-            if not isinstance(rule, dict):
-                continue
-            here = (*path, index)
-            RuleCheck(here, rule, self.report).check(self.memories)
+        for here, rule in self._rules(path, listener):
             written = entries(rule.get("sources"))
             sources = [parsed(parse_source, text) for text in written]
             known = [source for source in sources if source is not None]
@@ -87,40 +104,54 @@ class ListenerChecks:
         message = f"never matches: all its sources belong to {' and '.join(taking)}"
         self.report.doubt(path, message)
 
+    def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
+        if "crc" in listener and listener.get("format", "v1") == "v1":
+            message = "found beside format v1, allowed: beside format crc only"
+            self.report.add((*path, "crc"), message, of_key=True)
+
+    def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
+        self.grants.units((*path, "units"), rule.get("units"))
+        self.grants.grant(path, rule)
+        if form not in ("v1", "crc"):
+            return
+        needed, other = _NAMING[form], _NAMING[_OTHER[form]]
+        if needed not in rule:
+            words = allowed((*path, needed), self.report.document.data)
+            message = f"missing beside format {form}, allowed: {words}"
+            self.report.add((*path, needed), message, of_key=True)
+        if other in rule:
+            message = f"found beside format {form}, allowed: {needed}"
+            self.report.add((*path, other), message, of_key=True)
+        if form == "crc":
+            self._have_ids((*path, "memories"), entries(rule.get("memories")))
+
+    def _have_ids(self, path: KeyPath, names: list[Any]) -> None:
+        for index, name in enumerate(names):
+            memory = self.ids.get(name) if isinstance(name, str) else None
+            if isinstance(memory, dict) and "id" not in memory:
+                message = f"found {show(name)}, which has no id, allowed: a memory with an id"
+                self.report.add((*path, index), message)
+
 
 @dataclass
 class RuleCheck:
-    """Checks one rule."""
+    """Checks one rule for Modbus clients."""
 
     path: KeyPath
     rule: dict[Any, Any]
     report: Report
-    _lists: tuple[str, str] = field(default=("functions", "deny"), init=False)
+    grants: GrantChecks
 
-    def check(self, memories: list[str] | None) -> None:
+    def check(self) -> None:
         """Reports what is wrong."""
-        if memories is not None:
-            self._units(memories)
-        for key in self._lists:
-            self._twice(key)
-        if all(key in self.rule for key in self._lists):
+        self.grants.units((*self.path, "units"), self.rule.get("units"))
+        for key in ("functions", "deny"):
+            refuse_repeats((*self.path, key), entries(self.rule.get(key)), self.report)
+        if "functions" in self.rule and "deny" in self.rule:
             message = "found beside functions, allowed: one of both"
             self.report.add((*self.path, "deny"), message, of_key=True)
         if self.rule.get("access") == "read-only":
             self._writes()
-
-    def _units(self, memories: list[str]) -> None:
-        for unit, name in mapping(self.rule.get("units")).items():
-            if isinstance(name, str) and name not in memories:
-                close = guess(name, memories)
-                message = f"found {show(name)}, allowed: {listing(memories)}{close}"
-                self.report.add((*self.path, "units", unit), message)
-
-    def _twice(self, key: str) -> None:
-        codes = [integer(code, 0, 255) for code in entries(self.rule.get(key))]
-        for index, code in enumerate(codes):
-            if code is not None and code in codes[:index]:
-                self.report.add((*self.path, key, index), f"found {code} again, allowed: once")
 
     def _writes(self) -> None:
         for index, code in enumerate(entries(self.rule.get("functions"))):

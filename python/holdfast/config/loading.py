@@ -7,13 +7,17 @@ it was written: a mistake of one kind hides none of the other.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from holdfast.config import source
 from holdfast.config.allowed import allowed
+from holdfast.config.grant_checks import GrantChecks, doubt_grants
 from holdfast.config.listener_checks import ListenerChecks
 from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
 from holdfast.config.problems import ConfigError, Problem, Report
+from holdfast.config.service_checks import ServiceChecks
+from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
 from holdfast.config.tolerance import mapping
 from holdfast.config.unavailable import refuse_unavailable
@@ -29,18 +33,26 @@ def load(path: Path | str) -> Config:
     document, problems = source.parse(source.read_text(Path(path), file), file)
     if not isinstance(document.data, dict):
         found = "an empty file" if document.data is None else show(document.data)
-        message = f"found {found}, allowed: {allowed(())}"
+        message = f"found {found}, allowed: {allowed((), None)}"
         raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
-    report = Report(document)
-    skip = refuse_unavailable(document.data, report)
+    report, data = Report(document), document.data
     folder = Path(path).absolute().parent
+    refuse_unavailable(data, report)
     memories = MemoryChecks(folder, report)
-    memories.check(document.data.get("memories"))
-    names = [str(name) for name in mapping(document.data.get("memories"))]
-    ListenerChecks(report, skip, names or None).check(document.data.get("listeners"))
+    memories.check(data.get("memories"))
+    _check_others(data, folder, report)
     context = {"folder": folder, "initial_values": memories.values}
-    config = build(document.data, context, report, skip)
+    config = build(data, context, report)
     problems += [*report.problems, *memories.problems_elsewhere]
     if config is None or problems:
         raise ConfigError(file, problems)
-    return config.with_warnings(report.doubts)
+    doubt_grants(config, report)
+    return config.with_warnings(sorted(report.doubts, key=lambda doubt: doubt.line or 0))
+
+
+def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
+    memories = mapping(data.get("memories"))
+    grants = GrantChecks(report, [str(name) for name in memories])
+    ListenerChecks(report, grants, memories).check(data.get("listeners"))
+    ServiceChecks(folder, report, grants).check(data)
+    check_sockets(data, report)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from pydantic import TypeAdapter
 
 from holdfast.config import initial, source
-from holdfast.config.model import Extent, Span
+from holdfast.config.memories import Extent, Span
 from holdfast.config.problems import ConfigError
 from holdfast.config.tolerance import fitting, integer, mapping
+from holdfast.config.unique import Owners
 from holdfast.config.values import AREAS, BIT_AREAS, Area
 from holdfast.config.words import listing, show
 
@@ -99,14 +100,9 @@ class MemoryChecks:
         self.problems_elsewhere += problems
 
     def _ids(self, memories: dict[Any, Any]) -> None:
-        first: dict[int, KeyPath] = {}
+        owners = Owners(self.report, "id")
         for name, memory in memories.items():
-            path = ("memories", name, "id")
+            path: KeyPath = ("memories", name)
             number = integer(mapping(memory).get("id"), 0, 65535)
-            if number in first:
-                other = first[number]
-                line = self.report.line(other)
-                message = f"found {number}, which is the id of {other[1]} in line {line}"
-                self.report.add(path, f"{message}, allowed: an id of its own")
-            elif number is not None:
-                first[number] = path
+            if number is not None:
+                owners.claim((*path, "id"), number, str(number), path)

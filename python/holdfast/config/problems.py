@@ -53,6 +53,7 @@ class Report:
     document: Document
     found: dict[Problem, None] = field(default_factory=dict)
     doubts: list[Problem] = field(default_factory=list)
+    settled: list[KeyPath] = field(default_factory=list)
 
     @property
     def problems(self) -> list[Problem]:
@@ -62,6 +63,17 @@ class Report:
     def add(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
         """Adds a problem of the value at `path`, or of the key itself."""
         self.found[self._at(path, message, of_key)] = None
+
+    def settle(
+        self, path: KeyPath, message: str, part: KeyPath = (), *, of_key: bool = False
+    ) -> None:
+        """Adds the one problem of `path`, at a part of it; what is there is not looked at again."""
+        self.add((*path, *part), message, of_key=of_key)
+        self.settled.append(path)
+
+    def is_settled(self, path: KeyPath) -> bool:
+        """Whether all that is to be said of `path` was said."""
+        return any(path[: len(settled)] == settled for settled in self.settled)
 
     def doubt(self, path: KeyPath, message: str) -> None:
         """Adds what is allowed at `path` but can't be what was meant."""

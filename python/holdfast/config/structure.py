@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from holdfast.config.allowed import allowed, known_keys
+from holdfast.config.listeners import LISTENER_TYPES
 from holdfast.config.model import Config
-from holdfast.config.words import guess, listing, show
+from holdfast.config.words import choice, guess, listing, shape, show
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from pydantic_core import ErrorDetails
 
@@ -22,39 +23,64 @@ if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
 
 _KEY = "[key]"
+_NO_KIND = ("union_tag_invalid", "union_tag_not_found")
+_TOLD = ("default_factory_not_called",)
+"""Errors that only follow from others."""
 
 
-def build(
-    data: object, context: Mapping[str, Any], report: Report, skip: Sequence[KeyPath]
-) -> Config | None:
-    """The models of `data`, or `None` and what is wrong; what is below `skip` is not looked at."""
+def build(data: object, context: Mapping[str, Any], report: Report) -> Config | None:
+    """The models of `data`, or `None` and what is wrong; what is settled is not looked at."""
     try:
         return Config.model_validate(data, context=dict(context))
     except ValidationError as errors:
         for error in errors.errors(include_url=False):
-            if not any(error["loc"][: len(path)] == path for path in skip):
-                _add(error, report)
+            path = _untagged(error["loc"])
+            if not report.is_settled(path):
+                _add(path, error, report)
         return None
 
 
-def _add(error: ErrorDetails, report: Report) -> None:
-    path, kind = error["loc"], error["type"]
+def _untagged(path: KeyPath) -> KeyPath:
+    """The path without the name of a kind, which pydantic puts in where there are several."""
+    of_listener = path[:1] == ("listeners",) and path[2:] != (_KEY,)
+    return path[:2] + path[3:] if of_listener or path[:2] == ("rest", "tokens") else path
+
+
+def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
+    kind, data = error["type"], report.document.data
     of_key = bool(path) and path[-1] == _KEY
     path = path[:-1] if of_key else path
-    if kind == "too_short" and error["input"]:
+    if kind in _TOLD or (kind == "too_short" and error["input"]):
         return  # What is inside is wrong, and reported.
-    if kind == "missing":
-        report.add(path, f"missing, allowed: {allowed(path)}", of_key=True)
+    if kind in _NO_KIND:
+        _add_kind((*path, "type"), error["input"], report)
+    elif kind == "missing":
+        report.add(path, f"missing, allowed: {allowed(path, data)}", of_key=True)
     elif kind in ("extra_forbidden", "invalid_key"):
-        report.add(path, _unknown(path), of_key=True)
+        report.add(path, _unknown(path, data), of_key=True)
     elif kind == "value_error":
         report.add(path, str(error["ctx"]["error"]), of_key=of_key)
     else:
         while not report.document.holds(path):
             path = path[:-1]
-        report.add(path, f"found {show(error['input'])}, allowed: {allowed(path)}")
+        report.add(path, f"found {_shown(path, error['input'])}, allowed: {allowed(path, data)}")
 
 
-def _unknown(path: KeyPath) -> str:
-    known = known_keys(path[:-1])
+def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
+    words = f"allowed: {choice(LISTENER_TYPES)}"
+    if "type" not in owner:
+        report.add(path, f"missing, {words}", of_key=True)
+    else:
+        near = guess(owner["type"], LISTENER_TYPES)
+        report.add(path, f"found {show(owner['type'])}, {words}{near}")
+
+
+def _shown(path: KeyPath, value: object) -> str:
+    """The value in words; in the place of a token only its shape, as it could be the secret."""
+    of_token = path[:2] == ("rest", "tokens") and len(path) <= 3
+    return shape(value) if of_token else show(value)
+
+
+def _unknown(path: KeyPath, data: object) -> str:
+    known = known_keys(path[:-1], data)
     return f"unknown key, allowed: {listing(known)}{guess(path[-1], known)}"

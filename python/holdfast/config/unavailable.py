@@ -7,34 +7,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast.config.listeners import LISTENER_TYPES
 from holdfast.config.tolerance import mapping
+from holdfast.config.words import choice
 
 if TYPE_CHECKING:
     from holdfast.config.problems import Report
-    from holdfast.config.source import KeyPath
 
-SECTIONS = ("rest", "mqtt", "metrics", "devices", "nats", "audit", "gateway")
-LISTENER_TYPES = (
-    "modbus-tls",
-    "modbus-udp",
-    "modbus-rtu-over-tcp",
-    "modbus-rtu",
-    "modbus-ascii",
-    "raw-ingest",
-)
+SECTIONS = ("devices", "nats", "gateway")
+TYPES = ("modbus-tls",)
 
 
-def refuse_unavailable(data: object, report: Report) -> list[KeyPath]:
-    """Reports what is not available; returns where it is, for nobody else to look at it."""
-    refused: list[KeyPath] = []
+def refuse_unavailable(data: object, report: Report) -> None:
+    """Reports what is not available, for nobody else to look at it."""
     for name in SECTIONS:
         if name in mapping(data):
-            report.add((name,), "this section is not available in this version", of_key=True)
-            refused.append((name,))
+            message = "this section is not available in this version"
+            report.settle((name,), message, of_key=True)
     for name, listener in mapping(mapping(data).get("listeners")).items():
         kind = mapping(listener).get("type")
-        if isinstance(kind, str) and kind in LISTENER_TYPES:
-            message = f"{kind!r} is not available in this version, allowed: modbus-tcp"
-            report.add(("listeners", name, "type"), message)
-            refused.append(("listeners", name))
-    return refused
+        if isinstance(kind, str) and kind in TYPES:
+            allowed = f"allowed: {choice(LISTENER_TYPES)}"
+            message = f"{kind!r} is not available in this version, {allowed}"
+            report.settle(("listeners", name), message, ("type",))

@@ -8,59 +8,120 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from typing import Annotated, Literal, TypeAlias, get_args
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias, TypeGuard, get_args
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
     PlainSerializer,
     PlainValidator,
     Strict,
+    ValidationInfo,
 )
 from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue, WithJsonSchema
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from holdfast.config.addresses import Bind, Network, parse_bind, parse_source
-from holdfast.config.words import choice, show
+from holdfast.config.broker import LONGEST_TEXT, parse_broker, parse_topic_filter
+from holdfast.config.words import choice, shape, show
 
 MOST_BYTES = 244
+LONGEST_DEVICE = 4095
 LONGEST_TIME = 31_622_400
 SHORTEST_TIME = 0.001
 
+NOT_ON_A_LINE = "; 0 is the broadcast, 248 to 255 are reserved"
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
 _BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
 _HIGH_BYTE = r"(12[89]|1[3-9][0-9]|2[0-4][0-9]|25[0-5])"
+_SERIAL = r"([1-9]|[1-9][0-9]|1[0-9][0-9]|2[0-3][0-9]|24[0-7])"
+_WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5]))))"
 
 Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
 BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
+Access: TypeAlias = Literal["read-only", "read-write"]
 
 AREAS: tuple[Area, ...] = get_args(Area)
 BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 FUNCTIONS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43)
 WRITES = (5, 6, 15, 16, 22, 23)
+RESERVED = ("rest", "mqtt", "metrics")
+"""Names that adapters can't have, because the appliance's own parts have them."""
+
+
+def is_name(value: object) -> TypeGuard[str]:
+    """Whether it can be the name of a memory."""
+    return isinstance(value, str) and re.fullmatch(_NAME, value) is not None
 
 
 def _name(value: object) -> str:
-    if isinstance(value, str) and re.fullmatch(_NAME, value):
+    if is_name(value):
         return value
     quote = f"; write '{value}' to make it text" if type(value) is int else ""
     raise ValueError(f"found {show(value)}, allowed: {NAME_FORM}{quote}")
 
 
-def _unit(value: object) -> int:
-    if type(value) is int and 0 <= value <= 255:
-        return value
-    raise ValueError(f"found {show(value)}, allowed: a unit id from 0 to 255")
+def _id_of(what: str, least: int, most: int, note: str = "") -> Callable[[object], int]:
+    """Takes integers of that range."""
+
+    def number(value: object) -> int:
+        if type(value) is int and least <= value <= most:
+            return value
+        raise ValueError(f"found {show(value)}, allowed: {what} from {least} to {most}{note}")
+
+    return number
 
 
-def _object(value: object) -> int:
-    if type(value) is int and 128 <= value <= 255:
+def _adapter_name(value: object) -> str:
+    if value in RESERVED:
+        raise ValueError(f"found {show(value)}, allowed: a name other than {choice(RESERVED)}")
+    return _name(value)
+
+
+def _option_name(value: object) -> str:
+    if isinstance(value, str):
         return value
-    raise ValueError(f"found {show(value)}, allowed: an object id from 128 to 255")
+    raise ValueError(f"found {show(value)}, allowed: text; write '{value}' to make it text")
+
+
+def parse_sha256(value: object) -> str:
+    """Raises `ValueError` without the value: it could be the token itself."""
+    if isinstance(value, str) and re.fullmatch("[0-9a-fA-F]{64}", value):
+        return value.lower()
+    quote = "" if isinstance(value, str) else ", as text"
+    allowed = f"allowed: the SHA-256 of the token, 64 hexadecimal digits{quote}"
+    raise ValueError(f"found {shape(value)}, {allowed}")
+
+
+def _broker_url(value: object) -> str:
+    parse_broker(value)
+    return str(value)
+
+
+def _integral(value: object) -> object:
+    """Keeps `true` and `1.0` from being taken for 1."""
+    if type(value) is not int:
+        raise PydanticCustomError("integral", "no integer")
+    return value
+
+
+def _version(value: object) -> object:
+    return "5" if type(value) is int and value == 5 else value
+
+
+def _in_folder(value: object, info: ValidationInfo) -> object:
+    if not isinstance(value, str):
+        return value
+    if not value or "\0" in value:
+        raise ValueError(f"found {show(value)}, allowed: the path of a file")
+    return (info.context or {}).get("folder", Path()) / value
 
 
 def _function(value: object) -> int:
@@ -69,18 +130,23 @@ def _function(value: object) -> int:
     raise ValueError(f"found {show(value)}, allowed: {choice(FUNCTIONS)}")
 
 
-def _text(value: object) -> str:
-    allowed = f"allowed: text of 1 to {MOST_BYTES} bytes"
-    if not isinstance(value, str):
-        quote = f"; write '{value}' to make it text" if isinstance(value, int | float) else ""
-        raise ValueError(f"found {show(value)}, {allowed}{quote}")
-    for character in value:
-        if unicodedata.category(character) in ("Cc", "Cs"):
-            raise ValueError(f"found {show(value)}, allowed: text without {character!r}")
-    size = len(value.encode())
-    if not 1 <= size <= MOST_BYTES:
-        raise ValueError(f"found text of {size} bytes, {allowed}")
-    return value
+def _text_of(most: int) -> Callable[[object], str]:
+    """Takes text of at most so many bytes."""
+    allowed = f"allowed: text of 1 to {most} bytes"
+
+    def text(value: object) -> str:
+        if not isinstance(value, str):
+            quote = f"; write '{value}' to make it text" if isinstance(value, int | float) else ""
+            raise ValueError(f"found {show(value)}, {allowed}{quote}")
+        for character in value:
+            if unicodedata.category(character) in ("Cc", "Cs"):
+                raise ValueError(f"found {show(value)}, allowed: text without {character!r}")
+        size = len(value.encode())
+        if not 1 <= size <= most:
+            raise ValueError(f"found text of {size} bytes, {allowed}")
+        return value
+
+    return text
 
 
 def _no_instant(value: float) -> float:
@@ -125,13 +191,68 @@ Name = Annotated[
     PlainValidator(_name),
     WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"}),
 ]
-UnitId = Annotated[int, PlainValidator(_unit), WithJsonSchema({"type": "integer"})]
-ObjectId = Annotated[int, PlainValidator(_object), WithJsonSchema({"type": "integer"})]
+AdapterName = Annotated[
+    str,
+    PlainValidator(_adapter_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"}),
+]
+OptionName = Annotated[str, PlainValidator(_option_name), WithJsonSchema({"type": "string"})]
+UnitId = Annotated[
+    int, PlainValidator(_id_of("a unit id", 0, 255)), WithJsonSchema({"type": "integer"})
+]
+SerialUnitId = Annotated[
+    int,
+    PlainValidator(_id_of("a unit id", 1, 247, NOT_ON_A_LINE)),
+    WithJsonSchema({"type": "integer"}),
+]
+RawUnitId = Annotated[
+    int, PlainValidator(_id_of("a unit id", 0, 65535)), WithJsonSchema({"type": "integer"})
+]
+ObjectId = Annotated[
+    int, PlainValidator(_id_of("an object id", 128, 255)), WithJsonSchema({"type": "integer"})
+]
 Text = Annotated[
     str,
-    PlainValidator(_text),
+    PlainValidator(_text_of(MOST_BYTES)),
     WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MOST_BYTES}),
 ]
+DeviceName = Annotated[
+    str,
+    PlainValidator(_text_of(LONGEST_DEVICE)),
+    WithJsonSchema({"type": "string", "minLength": 1, "examples": ["/dev/ttyUSB0", "COM3"]}),
+]
+MqttText = Annotated[
+    str,
+    PlainValidator(_text_of(LONGEST_TEXT)),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": LONGEST_TEXT}),
+]
+FilePath = Annotated[Path, BeforeValidator(_in_folder, json_schema_input_type=str)]
+Sha256 = Annotated[
+    str,
+    PlainValidator(parse_sha256),
+    WithJsonSchema({"type": "string", "pattern": "^[0-9a-fA-F]{64}$"}),
+]
+BrokerUrl = Annotated[
+    str,
+    PlainValidator(_broker_url),
+    WithJsonSchema(
+        {"type": "string", "examples": ["mqtt://127.0.0.1:1883", "mqtts://broker.example"]}
+    ),
+]
+TopicFilter = Annotated[
+    str,
+    PlainValidator(parse_topic_filter),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": LONGEST_TEXT}),
+]
+MqttVersion = Annotated[
+    Literal["5", "3.1.1"],
+    BeforeValidator(_version, json_schema_input_type=Literal["5", "3.1.1", 5]),
+]
+QualityOfService = Annotated[Literal[0, 1, 2], BeforeValidator(_integral)]
+StopBits = Annotated[Literal[1, 2], BeforeValidator(_integral)]
+DataBits = Annotated[Literal[7, 8], BeforeValidator(_integral)]
+EightBits = Annotated[Literal[8], BeforeValidator(_integral)]
+Connections = Annotated[int, Field(ge=1, le=65535)]
 Source = Annotated[
     Network,
     PlainValidator(parse_source),
@@ -164,7 +285,24 @@ Codes = Annotated[
     tuple[FunctionCode, ...], Strict(False), Field(json_schema_extra={"uniqueItems": True})
 ]
 
+Sources = Annotated[tuple[Source, ...], Strict(False), Field(min_length=1)]
+MemoryNames = Annotated[
+    tuple[Name, ...],
+    Strict(False),
+    Field(min_length=1, json_schema_extra={"uniqueItems": True}),
+]
+Areas = Annotated[
+    tuple[Area, ...],
+    Strict(False),
+    Field(min_length=1, json_schema_extra={"uniqueItems": True}),
+]
+
 NAME_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_NAME}$"}}
 UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_BYTE}$"}}
+SERIAL_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_SERIAL}$"}}
+RAW_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_WORD}$"}}
 OBJECT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_HIGH_BYTE}$"}}
+ADAPTER_KEYS: JsonDict = {
+    "propertyNames": {"pattern": f"^{_NAME}$", "not": {"enum": list(RESERVED)}}
+}
 """What a schema says of the keys of a mapping, which are text to it."""

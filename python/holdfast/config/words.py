@@ -9,7 +9,7 @@ import difflib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
 LONGEST = 60
 
@@ -28,9 +28,16 @@ def show(value: object) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 
-def choice(values: Sequence[object]) -> str:
-    """`a`, `a or b`, `a, b or c`."""
-    *most, last = [str(value) for value in values]
+def shape(value: object) -> str:
+    """What kind of value it is, for places where the value itself may be a secret."""
+    if isinstance(value, str):
+        return f"text of {len(value)} characters"
+    return "a number" if type(value) in (int, float) else show(value)
+
+
+def choice(values: Iterable[object]) -> str:
+    """`a`, `a or b`, `a, b or c`; what comes again is left out."""
+    *most, last = dict.fromkeys(str(value) for value in values)
     return f"{', '.join(most)} or {last}" if most else last
 
 

@@ -1,0 +1,110 @@
+"""Who may write where beside Modbus: that what is named exists, and what a grant comes to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from holdfast.config.tolerance import entries, mapping
+from holdfast.config.unique import refuse_repeats
+from holdfast.config.values import is_name
+from holdfast.config.words import guess, listing, show
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from holdfast.config.model import Config
+    from holdfast.config.problems import Report
+    from holdfast.config.source import KeyPath
+    from holdfast.config.values import Area
+
+
+@dataclass
+class GrantChecks:
+    """Checks what names memories and areas, on the data as it was written."""
+
+    report: Report
+    names: Sequence[str]
+    """Names of the memories, none when they can't be told."""
+
+    def grant(self, path: KeyPath, grant: dict[Any, Any]) -> None:
+        """The `memories` and `areas` of a grant."""
+        self.memories((*path, "memories"), grant.get("memories"))
+        self.areas((*path, "areas"), grant.get("areas"))
+
+    def units(self, path: KeyPath, units: object) -> None:
+        """A mapping of unit ids to memories."""
+        for unit, name in mapping(units).items():
+            self.memory((*path, unit), name)
+
+    def memories(self, path: KeyPath, names: object) -> None:
+        """A list of memories."""
+        for index, name in enumerate(entries(names)):
+            self.memory((*path, index), name)
+        refuse_repeats(path, entries(names), self.report)
+
+    def areas(self, path: KeyPath, areas: object) -> None:
+        """A list of areas."""
+        refuse_repeats(path, entries(areas), self.report)
+
+    def memory(self, path: KeyPath, name: object) -> None:
+        """The name of one memory."""
+        if self.names and is_name(name) and name not in self.names:
+            allowed = f"allowed: {listing(self.names)}{guess(name, self.names)}"
+            self.report.add(path, f"found {show(name)}, {allowed}")
+
+
+class Grant(NamedTuple):
+    """Where one writer may go; `path` is its place in the file."""
+
+    path: KeyPath
+    memories: Sequence[str]
+    areas: Sequence[Area]
+    writes: bool
+
+
+def grants(config: Config) -> Iterator[Grant]:
+    """All grants to others than Modbus clients."""
+    for name, listener in config.listeners.items():
+        if listener.type != "raw-ingest":
+            continue
+        for index, rule in enumerate(listener.rules):
+            memories = (*rule.units.values(), *rule.memories)
+            yield Grant(("listeners", name, "rules", index), memories, rule.areas, writes=True)
+    if config.rest is not None and config.rest.tokens != "none":
+        for index, token in enumerate(config.rest.tokens):
+            writes = token.access == "read-write"
+            yield Grant(("rest", "tokens", index), token.memories, token.areas, writes)
+    if config.mqtt is not None:
+        for index, topic in enumerate(config.mqtt.subscriptions):
+            path: KeyPath = ("mqtt", "subscriptions", index)
+            yield Grant(path, topic.memories, topic.areas, writes=True)
+    for name, adapter in config.adapters.items():
+        writes = adapter.access == "read-write"
+        yield Grant(("adapters", name), adapter.memories, adapter.areas, writes)
+
+
+def doubt_grants(config: Config, report: Report) -> None:
+    """Warns of areas that no memory of a grant has, and of seals that nothing can open."""
+    for grant in grants(config):
+        there = {area for name in grant.memories for area in config.memories[name].areas()}
+        for index, area in enumerate(grant.areas):
+            if area not in there:
+                message = f"{area} has no effect: {_have(grant.memories)} no such area"
+                report.doubt((*grant.path, "areas", index), message)
+    if config.rest is not None and config.rest.tokens == "none":
+        return  # Everyone may write everything, the gate bits too.
+    for name, memory in config.memories.items():
+        seal = memory.seal
+        if seal is not None and not any(
+            grant.writes and name in grant.memories and seal.area in grant.areas
+            for grant in grants(config)
+        ):
+            writers = "raw-ingest rule, token, subscription or adapter"
+            message = f"it can never be opened: no {writers} may write {seal.area} of {name}"
+            report.doubt(("memories", name, "seal"), message)
+
+
+def _have(memories: Sequence[str]) -> str:
+    names = list(dict.fromkeys(memories))
+    return f"{names[0]} has" if len(names) == 1 else f"{listing(names)} have"

@@ -1,0 +1,85 @@
+"""Memories: areas of bits and registers, the seal, and the initial values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, PrivateAttr
+
+from holdfast.config.base import Model
+from holdfast.config.initial import InitialRun
+from holdfast.config.values import AREAS, Area, BitArea, FilePath, NotNull
+
+Size = Annotated[int, Field(ge=1, le=65536)]
+Register = Annotated[int, Field(ge=0, le=65535)]
+
+
+class Span(Model):
+    """The addresses of an area: start to start + size - 1."""
+
+    start: Register = 0
+    """The first address."""
+    size: Size
+    """How many addresses there are; start + size is at most 65536."""
+
+    @property
+    def addresses(self) -> range:
+        """The addresses, as a range."""
+        return range(self.start, self.start + self.size)
+
+
+def _long_form(value: object) -> object:
+    return {"size": value} if type(value) is int else value
+
+
+Extent = Annotated[
+    Span | None, BeforeValidator(_long_form, json_schema_input_type=Size | Span), NotNull()
+]
+
+
+class Seal(Model):
+    """The gate of a sealed memory: Modbus is answered with exception 06 while it is sealed."""
+
+    area: BitArea
+    """The area of the gate bit."""
+    address: Register
+    """The address of the gate bit, inside its area."""
+    mode: Literal["once", "level"] = "once"
+    """`once`: the bit opens the memory for good. `level`: it is sealed whenever the bit is 0."""
+
+
+class MemoryConfig(Model):
+    """Four areas of bits and registers. An area that is left out does not exist."""
+
+    id: Annotated[Register | None, NotNull()] = None
+    """The MemoryID of the raw ingest format with CRC; no two memories share one."""
+    coils: Extent = None
+    """Coils, read and written by Modbus: a size, or start and size."""
+    discrete_inputs: Extent = None
+    """Discrete inputs, read by Modbus: a size, or start and size."""
+    holding_registers: Extent = None
+    """Holding registers, read and written by Modbus: a size, or start and size."""
+    input_registers: Extent = None
+    """Input registers, read by Modbus: a size, or start and size."""
+    seal: Annotated[Seal | None, NotNull()] = None
+    """Starts the memory sealed, until its gate bit is 1."""
+    initial: Annotated[FilePath | None, NotNull()] = None
+    """Initial values: a .csv file of area,address,value lines or a .yaml file, beside this one."""
+
+    _initial_values: tuple[InitialRun, ...] = PrivateAttr(default=())
+
+    def model_post_init(self, context: object, /) -> None:
+        """Takes the initial values that were read for this memory's file."""
+        if self.initial is not None and isinstance(context, Mapping):
+            self._initial_values = context["initial_values"].get(self.initial, ())
+
+    @property
+    def initial_values(self) -> tuple[InitialRun, ...]:
+        """What the memory holds at first where it is not 0, as runs of neighbours."""
+        return self._initial_values
+
+    def areas(self) -> dict[Area, Span]:
+        """The areas that exist."""
+        spans = ((area, getattr(self, area)) for area in AREAS)
+        return {area: span for area, span in spans if span is not None}

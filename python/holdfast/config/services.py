@@ -1,0 +1,173 @@
+"""What an appliance offers or uses beside its listeners: REST, MQTT, adapters, metrics, audit."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Network, IPv6Network
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import Discriminator, Field, Strict, Tag
+
+from holdfast.config.base import Model
+from holdfast.config.broker import Broker, parse_broker
+from holdfast.config.values import (
+    Access,
+    Areas,
+    BindAddress,
+    BrokerUrl,
+    Connections,
+    Duration,
+    FilePath,
+    MemoryNames,
+    MqttText,
+    MqttVersion,
+    Name,
+    NotNull,
+    OptionName,
+    QualityOfService,
+    Sha256,
+    Sources,
+    TopicFilter,
+)
+
+
+class TokenConfig(Model):
+    """One who may use REST, by a secret token, and what for."""
+
+    name: Name
+    """What the logs call it; no two tokens share one."""
+    sha256: Sha256
+    """The SHA-256 of the token, 64 hexadecimal digits; the token itself is not in the file."""
+    memories: MemoryNames
+    """The memories it reaches."""
+    areas: Areas
+    """The areas it reaches."""
+    access: Access
+    """Whether it may write."""
+
+
+def _form(tokens: object) -> str:
+    return "word" if isinstance(tokens, str) else "list"
+
+
+Tokens: TypeAlias = Annotated[
+    Annotated[tuple[TokenConfig, ...], Strict(False), Field(min_length=1), Tag("list")]
+    | Annotated[Literal["none"], Tag("word")],
+    Discriminator(_form),
+]
+
+
+class RestConfig(Model):
+    """The REST interface: JSON in and out over HTTP."""
+
+    bind: BindAddress
+    """Where to listen: an IP address and a port."""
+    sources: Sources
+    """Networks and addresses of the clients, IPv4 or IPv6."""
+    tokens: Tokens
+    """Who may do what; `none` lets everyone do everything, on a loopback address only."""
+    max_body: Annotated[int, Field(ge=1024, le=2**30)] = 8 * 2**20
+    """The most bytes of the body of a request."""
+    max_connections: Connections = 64
+    """Connections that are open at once."""
+    request_timeout: Duration = 10.0
+    """Seconds from the first byte of a request to its last."""
+
+
+class MqttTlsConfig(Model):
+    """Certificates for MQTT over TLS; without them, the broker is judged by the system's own."""
+
+    ca_file: Annotated[FilePath | None, NotNull()] = None
+    """The authorities that may vouch for the broker, in PEM."""
+    cert_file: Annotated[FilePath | None, NotNull()] = None
+    """The certificate that is shown to the broker, in PEM; together with key_file."""
+    key_file: Annotated[FilePath | None, NotNull()] = None
+    """The key of that certificate, in PEM."""
+
+
+class SubscriptionConfig(Model):
+    """Topics to listen to, and what their messages may write."""
+
+    topic: TopicFilter
+    """The topic filter; `+` stands for one level, a last `#` for all that follow."""
+    qos: QualityOfService = 0
+    """The quality of service that is asked for."""
+    memories: MemoryNames
+    """The memories that messages may write."""
+    areas: Areas
+    """The areas that messages may write."""
+
+
+class MqttConfig(Model):
+    """The MQTT client: takes JSON commands from the topics of a broker."""
+
+    url: BrokerUrl
+    """The broker: mqtt://host:port, or mqtts:// for TLS; the port is 1883 or 8883 if left out."""
+    username: Annotated[MqttText | None, NotNull()] = None
+    """The user name that is told to the broker."""
+    password_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that holds the password; beside username only."""
+    client_id: MqttText
+    """The name of this client, which no other client of the broker has."""
+    version: MqttVersion = "5"
+    """The version of MQTT."""
+    keep_alive: Annotated[int, Field(ge=1, le=65535)] = 60
+    """Seconds without a message after which the connection is tested."""
+    tls: Annotated[MqttTlsConfig | None, NotNull()] = None
+    """Certificates; beside mqtts:// only."""
+    subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
+    """The topics to listen to."""
+
+    @property
+    def broker(self) -> Broker:
+        """The parts of the URL."""
+        return parse_broker(self.url)
+
+    @property
+    def host(self) -> str:
+        """The broker's name or address, without brackets."""
+        return self.broker.host
+
+    @property
+    def port(self) -> int:
+        """The broker's TCP port."""
+        return self.broker.port
+
+    @property
+    def secure(self) -> bool:
+        """Whether TLS is spoken."""
+        return self.broker.secure
+
+
+class AdapterConfig(Model):
+    """A third-party adapter, and what it may reach."""
+
+    type: Name
+    """The entry point of the adapter, in the group holdfast.adapters."""
+    memories: MemoryNames
+    """The memories it reaches."""
+    areas: Areas
+    """The areas it reaches."""
+    access: Access
+    """Whether it may write."""
+    options: dict[OptionName, Any] = Field(default={})
+    """What the adapter itself wants to know, as it is written."""
+
+
+class MetricsConfig(Model):
+    """Counters and gauges, as Prometheus text."""
+
+    bind: BindAddress
+    """Where to listen: an IP address and a port."""
+    sources: Sources = (IPv4Network("127.0.0.0/8"), IPv6Network("::1"))
+    """Networks and addresses of the readers, IPv4 or IPv6."""
+
+
+class AuditConfig(Model):
+    """A file that records every change, line by line."""
+
+    file: FilePath
+    """The file, in a folder that is there."""
+    max_bytes: Annotated[int, Field(ge=65536)] = 100 * 2**20
+    """Bytes after which the file is put aside and a new one begun."""
+    keep: Annotated[int, Field(ge=1, le=1000)] = 10
+    """Files put aside that are kept."""
