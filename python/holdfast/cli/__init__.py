@@ -14,8 +14,11 @@ from holdfast import __version__
 
 COMMANDS = {
     "check": "holdfast.cli.check:check",
+    "import": "holdfast.cli.import_:import_",
+    "raw-send": "holdfast.cli.raw_send:raw_send",
     "run": "holdfast.cli.run:run",
     "schema": "holdfast.cli.schema:schema",
+    "token": "holdfast.cli.token:token",
 }
 
 

@@ -1,0 +1,114 @@
+"""`holdfast import`: a configuration of another program, made into one of ours."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli.configuration import WRONG, show_problems
+from holdfast.config import ConfigError
+from holdfast.importing import ORDINALS, NotImportable, read_mma
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.config import Problem
+    from holdfast.importing import Imported, Note
+
+FAILED = 1
+
+
+@click.group("import", epilog="Example: holdfast import mma config.yaml --output plant.yaml")
+def import_() -> None:
+    """Turn the configuration of another program into one of Holdfast."""
+
+
+@import_.command(epilog="Example: holdfast import mma config.yaml --output plant.yaml")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--output", metavar="OUT", type=click.Path(path_type=Path), help="Write the YAML to this file."
+)
+@click.option("--force", is_flag=True, help="Replace OUT if it is there.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+def mma(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+    """Turn FILE, a configuration of the Modbus Memory Appliance, into one of Holdfast.
+
+    Prints the new configuration. What it could not carry over, what it changed and what is to be
+    checked is on standard error, a line each, and in the comments of the configuration. Exit codes:
+    0 done, 1 OUT could not be written, 2 FILE can't be imported.
+    """
+    if output is not None and _same(file, output):
+        raise click.UsageError("OUT is FILE itself.")
+    try:
+        imported = read_mma(file)
+    except ConfigError as error:
+        _refuse(error, as_json)
+    if output is not None:
+        _write(output, imported.to_yaml(), force)
+    if as_json:
+        click.echo(json.dumps(_answer(imported), indent=2))
+        return
+    if output is None:
+        click.echo(imported.to_yaml(), nl=False)
+    for note in imported.notes:
+        click.echo(str(note), err=True)
+    click.echo(_summary(imported, output), err=True)
+
+
+def _refuse(error: ConfigError, as_json: bool) -> None:
+    """Prints why it is impossible, and ends with 2."""
+    notes = error.notes if isinstance(error, NotImportable) else ()
+    if as_json:
+        problems = {"ok": False, "problems": _plain(error.problems), "notes": _plain(notes)}
+        click.echo(json.dumps(problems, indent=2))
+    else:
+        for note in notes:
+            click.echo(str(note), err=True)
+        show_problems(error)
+    sys.exit(WRONG)
+
+
+def _write(output: Path, text: str, force: bool) -> None:
+    try:
+        with output.open("w" if force else "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        click.echo(f"{output}: is there already; --force replaces it", err=True)
+        sys.exit(FAILED)
+    except OSError as error:
+        click.echo(f"{output}: can't be written: {error.strerror or error}", err=True)
+        sys.exit(FAILED)
+
+
+def _same(file: Path, output: Path) -> bool:
+    try:
+        return file.samefile(output)
+    except OSError:
+        return False
+
+
+def _summary(imported: Imported, output: Path | None) -> str:
+    generation = ORDINALS[imported.generation]
+    count = len(imported.notes)
+    notes = "1 note" if count == 1 else f"{count} notes"
+    check = f"; next: holdfast check {output}" if output is not None else ""
+    return f"{imported.file} is of the {generation} generation: {notes}{check}"
+
+
+def _answer(imported: Imported) -> dict[str, object]:
+    return {
+        "ok": True,
+        "problems": [],
+        "generation": imported.generation,
+        "notes": _plain(imported.notes),
+        "config": imported.data,
+    }
+
+
+def _plain(entries: Iterable[Note | Problem]) -> list[dict[str, object]]:
+    return [dataclasses.asdict(entry) for entry in entries]

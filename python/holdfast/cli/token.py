@@ -1,0 +1,93 @@
+"""`holdfast token`: a secret for a client of REST, and the entry that lets it in."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import re
+import secrets
+import sys
+from typing import NoReturn
+
+import click
+
+from holdfast.cli.configuration import WRONG
+from holdfast.config.dump import PLAIN
+from holdfast.config.source import scalar
+from holdfast.config.values import NAME_FORM, is_name
+
+BYTES = 32
+SHORT = 16
+"""Characters below which a secret can be guessed."""
+
+_ENTRY = """\
+    - name: {name}
+      sha256: "{digest}"
+      memories: []          # names of memories
+      areas: []             # coils, discrete_inputs, holding_registers, input_registers
+      access:               # read-only or read-write
+"""
+
+
+@click.command(epilog="Example: holdfast token --name edge-gateway")
+@click.option("--name", default="edge-gateway", show_default=True, help="The name of the client.")
+@click.option("--stdin", is_flag=True, help="Take the secret from standard input.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+def token(name: str, stdin: bool, as_json: bool) -> None:
+    """Make a secret for a client of REST, and the entry of the configuration that lets it in.
+
+    The secret is shown once and kept nowhere: the configuration holds only its SHA-256. With
+    --stdin the secret is the one line of standard input, and is not shown again.
+    """
+    if not is_name(name):
+        raise click.BadParameter(f"found {name!r}, allowed: {NAME_FORM}", param_hint="'--name'")
+    secret = _read() if stdin else secrets.token_urlsafe(BYTES)
+    digest = hashlib.sha256(secret.encode()).hexdigest()
+    if as_json:
+        shown = {} if stdin else {"token": secret}
+        click.echo(json.dumps({"name": name, **shown, "sha256": digest}, indent=2))
+        return
+    if not stdin:
+        click.echo(f"The secret, shown this once: {secret}\n")
+    click.echo("Under rest.tokens in the configuration:\n")
+    click.echo(_ENTRY.format(name=_quoted(name), digest=digest), nl=False)
+
+
+def _read() -> str:
+    """The secret from standard input, without the line's end; on a terminal it is not shown."""
+    if sys.stdin.isatty():
+        ask = functools.partial(click.prompt, "Secret", hide_input=True, err=True)
+        secret = str(ask(default="", show_default=False))
+    else:
+        secret = _decoded(sys.stdin.buffer.read())
+    if not secret:
+        _refuse("standard input holds no secret")
+    if re.search(r"[\r\n]", secret):
+        _refuse("standard input holds more than one line, allowed: the secret alone")
+    if not re.fullmatch(r"[!-~]+", secret):
+        _warn("the secret has other characters than visible ASCII, which many clients can't send")
+    if len(secret) < SHORT:
+        _warn(f"the secret has fewer than {SHORT} characters, and can be guessed")
+    return secret
+
+
+def _decoded(data: bytes) -> str:
+    try:
+        return re.sub(r"\r?\n\Z", "", data.decode())
+    except UnicodeDecodeError:
+        _refuse("standard input is not UTF-8")
+
+
+def _refuse(message: str) -> NoReturn:
+    click.echo(f"holdfast: {message}", err=True)
+    sys.exit(WRONG)
+
+
+def _warn(message: str) -> None:
+    click.echo(f"warning: {message}", err=True)
+
+
+def _quoted(name: str) -> str:
+    """The name as YAML reads it as text."""
+    return name if PLAIN.fullmatch(name) and scalar(name) == name else json.dumps(name)

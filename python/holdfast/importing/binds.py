@@ -1,0 +1,54 @@
+"""Where the source listens, as an address and a port of ours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.config.addresses import Bind, parse_bind
+from holdfast.config.words import show
+
+if TYPE_CHECKING:
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.notes import Desk
+
+FORM = "a port, :port or address:port with an IP address"
+
+
+class Binds:
+    """Reads the places to listen on, and refuses two that can't be open at once."""
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        self._taken: list[tuple[KeyPath, Bind]] = []
+
+    def read(self, path: KeyPath, value: object, *, of_key: bool = False) -> Bind | None:
+        """The place that `value` names; `None`, and a problem, where it names none."""
+        bind = self._parsed(path, value, of_key)
+        if bind is None:
+            return None
+        for other_path, other in self._taken:
+            if bind.overlaps(other):
+                spelled = self._desk.document.spell(other_path)
+                message = f"found {show(value)}, where {spelled} listens"
+                self._desk.problem(path, f"{message}, allowed: another port", of_key=of_key)
+                return None
+        self._taken.append((path, bind))
+        return bind
+
+    def _parsed(self, path: KeyPath, value: object, of_key: bool) -> Bind | None:
+        text = str(value) if type(value) is int else value
+        host, _, port = text.strip().rpartition(":") if isinstance(text, str) else ("", "", "")
+        numeric = {"": "0.0.0.0", "*": "0.0.0.0", "localhost": "127.0.0.1"}.get(host.lower(), host)
+        try:
+            bind = parse_bind(f"{numeric}:{port}")
+        except ValueError:
+            bind = None
+        if bind is None or bind.port == 0:
+            self._desk.problem(path, f"found {show(value)}, allowed: {FORM}", of_key=of_key)
+            return None
+        if host in ("", "*"):
+            other = f"for IPv6 too, write [::]:{port}, which takes both"
+            self._desk.note("changed", path, f"listens on all IPv4 addresses, {bind}; {other}")
+        elif host != numeric:
+            self._desk.note("changed", path, f"listens on {bind}: a bind has no host name")
+        return bind

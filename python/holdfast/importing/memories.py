@@ -1,0 +1,83 @@
+"""The memories of the source: their areas and seals, which both generations write nearly alike."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.values import AREAS
+from holdfast.config.words import listing
+
+if TYPE_CHECKING:
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.notes import Desk
+    from holdfast.importing.sections import Section
+
+ADDRESSES = 65536
+
+
+def read_id(name: str) -> dict[str, int]:
+    """The id of a memory that is named by a number: as such a name Raw Ingest looks it up."""
+    number = int(name) if re.fullmatch("0|[1-9][0-9]{0,4}", name) else ADDRESSES
+    return {"id": number} if number < ADDRESSES else {}
+
+
+def read_areas(memory: Section, size_key: str) -> dict[str, Any]:
+    """The areas by name, as a configuration of ours has them."""
+    areas: dict[str, Any] = {}
+    wrong = len(memory.desk.report.problems)
+    for area in AREAS:
+        if type(memory.get(area)) is int:
+            extent = _extent(memory, area, 0, memory.integer(area, 0, ADDRESSES) or 0)
+        else:
+            extent = _long_form(memory, area, size_key)
+        if extent is not None:
+            areas[area] = extent
+    if not areas and len(memory.desk.report.problems) == wrong:
+        message = f"no area, allowed: at least one of {listing(AREAS)}"
+        memory.desk.problem(memory.path, message, of_key=True)
+    return areas
+
+
+def _long_form(memory: Section, area: str, size_key: str) -> dict[str, int] | int | None:
+    section = memory.mapping(area)
+    if section is None:
+        return None
+    start = section.integer("start", 0, ADDRESSES - 1)
+    size = section.integer(size_key, 0, ADDRESSES, required=True)
+    section.close()
+    return None if size is None else _extent(memory, area, start or 0, size)
+
+
+def _extent(memory: Section, area: str, start: int, size: int) -> dict[str, int] | int | None:
+    if size == 0:
+        memory.desk.note("left out", memory.at(area), "has no addresses, so there is no such area")
+        return None
+    if start + size > ADDRESSES:
+        message = f"found {start} and {size}, allowed: a sum up to {ADDRESSES}"
+        memory.desk.problem(memory.at(area), message)
+        return None
+    return {"start": start, "size": size} if start else size
+
+
+def addresses(extent: Any) -> range:
+    """The addresses of an area as `read_areas` gives it."""
+    if isinstance(extent, int):
+        return range(extent)
+    return range(extent["start"], extent["start"] + extent["size"])
+
+
+def check_gate(
+    desk: Desk, path: KeyPath, memory: str, areas: dict[str, Any], area: str, address: int
+) -> bool:
+    """Whether the gate bit is inside its area; if not, that is a problem."""
+    if area not in areas:
+        message = f"the gate is in {area}, which {memory} does not have"
+        desk.problem(path, f"{message}, allowed: a memory that has it, or no seal of that memory")
+        return False
+    there = addresses(areas[area])
+    if address in there:
+        return True
+    allowed = f"allowed in {area} of {memory}: {there.start} to {there.stop - 1}"
+    desk.problem(path, f"found {address}, {allowed}")
+    return False

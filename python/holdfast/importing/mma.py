@@ -1,0 +1,131 @@
+"""Configurations of the Modbus Memory Appliance, of both its generations.
+
+The first has `memory`, `routing` and `ports`, the second nests memories in `listeners`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from holdfast.config import source
+from holdfast.config.dump import to_yaml
+from holdfast.config.problems import ConfigError
+from holdfast.config.words import show
+from holdfast.importing.binds import Binds
+from holdfast.importing.draft import Draft
+from holdfast.importing.filters import read_filter
+from holdfast.importing.mma_adapters import Adapters
+from holdfast.importing.mma_first import FirstGeneration
+from holdfast.importing.mma_second import TOP_REASONS, SecondGeneration
+from holdfast.importing.notes import Desk, Note
+from holdfast.importing.sections import Section
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.config.problems import Problem
+
+Generation: TypeAlias = Literal[1, 2]
+ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}
+
+_SECRET = re.compile(r"(token|password|broker)[\"']?\s*:")
+_FIRST = ("memory", "routing", "ports")
+_SECOND = "listeners"
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A configuration of ours, and what is to be known about it."""
+
+    file: str
+    generation: Generation
+    data: dict[str, Any]
+    notes: tuple[Note, ...]
+
+    def to_yaml(self) -> str:
+        """The configuration as YAML, with the notes as comments above it."""
+        name = ORDINALS[self.generation]
+        lines = [
+            "Made by `holdfast import mma` from a configuration of the Modbus Memory Appliance,"
+        ]
+        lines.append(f"{name} generation: {self.file}")
+        if self.notes:
+            lines += ["What was left out, changed, or is to be checked:", *map(str, self.notes)]
+        comments = "".join(f"# {' '.join(line.splitlines())}\n" for line in lines)
+        body = "".join(f"{line.rstrip()}\n" for line in to_yaml(self.data).splitlines())
+        return f"{comments}\n{body}"
+
+
+class NotImportable(ConfigError):
+    """A source that can't be imported, with what was noted until then."""
+
+    def __init__(self, file: str, problems: Iterable[Problem], notes: tuple[Note, ...]) -> None:
+        super().__init__(file, problems)
+        self.notes = notes
+
+
+def read_mma(path: Path | str) -> Imported:
+    """Reads a configuration of either generation.
+
+    Raises `ConfigError` with everything that makes it impossible to import.
+    """
+    file = str(path)
+    text = source.read_text(Path(path), file)
+    try:
+        document, found = source.parse(text, file)
+    except ConfigError as error:
+        raise ConfigError(file, _without_secrets(text, error.problems)) from None
+    problems = _without_secrets(text, found)
+    desk = Desk(document)
+    generation = _generation(desk)
+    draft = Draft()
+    if generation is not None:
+        _read(desk, draft, generation)
+        if not (draft.listeners or draft.rest or draft.mqtt or desk.report.problems):
+            desk.problem((), "nothing is left to serve, allowed: a listener, REST or MQTT")
+    problems += desk.report.problems
+    if problems or generation is None:
+        raise NotImportable(file, problems, desk.notes)
+    return Imported(file, generation, draft.data(), desk.notes)
+
+
+def _without_secrets(text: str, problems: Iterable[Problem]) -> list[Problem]:
+    """The problems; one that YAML finds in a line with a secret does not say what it found."""
+    lines = text.splitlines()
+    hidden = "not YAML (not shown: there may be a secret in this line), allowed: text in quotes"
+    return [
+        replace(problem, message=hidden)
+        if problem.line and _SECRET.search(" ".join(lines[problem.line - 1 : problem.line]))
+        else problem
+        for problem in problems
+    ]
+
+
+def _generation(desk: Desk) -> Generation | None:
+    data = desk.document.data
+    if not isinstance(data, dict):
+        found = "an empty file" if data is None else show(data)
+        desk.problem((), f"found {found}, allowed: a mapping")
+        return None
+    if _SECOND in data:
+        return 2
+    if any(key in data for key in _FIRST):
+        return 1
+    allowed = "memory, routing and ports (first generation) or listeners (second)"
+    desk.problem((), f"found none of the keys that tell what this is, allowed: {allowed}")
+    return None
+
+
+def _read(desk: Desk, draft: Draft, generation: Generation) -> None:
+    root = Section(desk, (), desk.document.data)
+    admitted = read_filter(root)
+    binds = Binds(desk)
+    if generation == 1:
+        FirstGeneration(desk, draft, binds, admitted).read(root)
+    else:
+        SecondGeneration(desk, draft, binds, admitted).read(root)
+    Adapters(desk, draft, binds, admitted).read(root)
+    root.close(TOP_REASONS if generation == 2 else None)

@@ -1,0 +1,251 @@
+"""What writes into the source's memories beside Modbus: REST, MQTT and Raw Ingest."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.broker import parse_broker, parse_topic_filter
+from holdfast.config.words import listing, show
+from holdfast.importing.filters import ALL
+from holdfast.importing.names import free_name, unique_names
+from holdfast.importing.peers import LOOPBACK, Peers, written
+from holdfast.importing.sections import section
+
+if TYPE_CHECKING:
+    from holdfast.config.addresses import Bind
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.binds import Binds
+    from holdfast.importing.draft import Draft
+    from holdfast.importing.notes import Desk
+    from holdfast.importing.sections import Section
+
+SHORT = 16
+"""Characters below which a secret can be guessed."""
+
+PASSWORD_FILE = "mqtt.password"
+CLIENT_ID = "holdfast"
+QOS = 0
+_SCHEMES = {"tcp": "mqtt", "mqtt": "mqtt", "ssl": "mqtts", "tls": "mqtts", "mqtts": "mqtts"}
+_BROKER = re.compile(
+    r"((?P<scheme>[A-Za-z]{1,8})://)?(?P<user>.*@)?(?P<host>[^/?#@]+)(?P<more>([/?#].*)?)"
+)
+_AREAS_TOLD = "may write all areas of all memories; name those that it needs"
+
+
+@dataclass
+class Adapters:
+    """Reads `rest`, `mqtt` and `raw_ingest` into a draft that has its memories."""
+
+    desk: Desk
+    draft: Draft
+    binds: Binds
+    admitted: Peers | None
+
+    def read(self, root: Section) -> None:
+        """Reads those that are there and on."""
+        rest, mqtt = self._enabled(root, "rest"), self._enabled(root, "mqtt")
+        raw = self._enabled(root, "raw_ingest")
+        if raw is not None:
+            self._raw_ingest(raw)
+        if rest is not None:
+            self._rest(rest)
+        if mqtt is not None:
+            self._mqtt(mqtt)
+        for name, path in self.draft.seals.items():
+            self._tell_who_opens(name, path)
+
+    def _enabled(self, root: Section, key: str) -> Section | None:
+        found = root.mapping(key)
+        if found is None or found.flag("enabled"):
+            return found
+        self.desk.note("left out", found.path, "it is not enabled")
+        return None
+
+    def _tell_who_opens(self, name: str, path: KeyPath) -> None:
+        by_raw = "raw-ingest" in (one["type"] for one in self.draft.listeners.values())
+        if self.draft.rest or self.draft.mqtt or (by_raw and "id" in self.draft.memories[name]):
+            return
+        message = f"nothing here can open {name}: only REST, MQTT and Raw Ingest write its gate"
+        self.desk.note("check", path, f"{message}, and none of them reaches it")
+
+    def _rest(self, rest: Section) -> None:
+        address = rest.get("address")
+        bind = None if address is None else self.binds.read(rest.at("address"), address)
+        tokens = self._tokens(rest)
+        rest.close()
+        if address is None:
+            self.desk.note("left out", rest.path, "REST is left out: it has no address")
+        if bind is None or tokens is None:
+            return
+        sources = self._rest_sources(rest, bind)
+        if not tokens and not bind.address.is_loopback:
+            message = "REST is left out: without auth it is served on loopback only; bind it to"
+            told = f"{message} 127.0.0.1 with tokens: none, or make tokens with `holdfast token`"
+            self.desk.note("left out", rest.path, told)
+        elif sources:
+            found = {"bind": str(bind), "sources": sources, "tokens": tokens or "none"}
+            self.draft.rest = found
+
+    def _rest_sources(self, rest: Section, bind: Bind) -> list[str]:
+        if bind.address.is_loopback:
+            return [written(network) for network in LOOPBACK]
+        return self._sources(rest, "REST")
+
+    def _sources(self, parent: Section, what: str) -> list[str]:
+        """Whom the filter of the whole file admits, though it did not hold for these before."""
+        if self.admitted is None:
+            message = "sources are everybody; name the networks that need it"
+            self.desk.note("check", parent.path, message)
+            return ALL.written()
+        if not self.admitted:
+            message = f"{what} is left out: ip_filter lets nobody in"
+            self.desk.note("left out", parent.path, message)
+            return []
+        message = "sources are those of ip_filter, which did not hold here; is nobody missing?"
+        self.desk.note("check", parent.path, message)
+        return self.admitted.written()
+
+    def _tokens(self, rest: Section) -> list[dict[str, Any]] | None:
+        """The tokens; empty without authentication, `None` where no client could get in."""
+        auth = rest.mapping("auth")
+        if auth is None:
+            return []
+        enabled = auth.flag("enabled")
+        auth.word("type", ["bearer"], required=bool(enabled))
+        bearer = auth.mapping("bearer", required=bool(enabled))
+        entries = [] if bearer is None else bearer.entries("tokens", required=bool(enabled)) or []
+        if bearer is not None:
+            bearer.close()
+        auth.close()
+        if not enabled:
+            self.desk.note("left out", auth.path, "it is not enabled")
+            return []
+        tokens = self._token_list(entries)
+        if not tokens:
+            self.desk.note("left out", rest.path, "REST is left out: no token could get in")
+            return None
+        self.desk.note("check", auth.path, f"each token {_AREAS_TOLD}")
+        return tokens
+
+    def _token_list(self, entries: list[tuple[KeyPath, Any]]) -> list[dict[str, Any]]:
+        found: dict[str, tuple[KeyPath, str]] = {}
+        for path, value in entries:
+            token = section(self.desk, path, value)
+            if token is None:
+                continue
+            name, secret = token.name("name"), (token.secret("token") or "").strip()
+            token.close()
+            digest = hashlib.sha256(secret.encode()).hexdigest()
+            if not secret:
+                self.desk.note("left out", path, "an empty token, which nobody could use")
+            elif digest in found:
+                message = "the token is the same as one before it"
+                self.desk.note("left out", path, message)
+            else:
+                found[digest] = (token.at("name"), name or f"token-{len(found) + 1}")
+                if len(secret) < SHORT:
+                    message = f"the token has fewer than {SHORT} characters; `holdfast token` makes"
+                    self.desk.note("check", token.at("token"), f"{message} a better one")
+        names = unique_names(self.desk, list(found.values()))
+        grant = {**self.draft.grant(list(self.draft.memories)), "access": "read-write"}
+        return [
+            {"name": name, "sha256": digest, **grant}
+            for digest, name in zip(found, names, strict=True)
+        ]
+
+    def _mqtt(self, mqtt: Section) -> None:
+        url = self._broker(mqtt)
+        topic = mqtt.text("topic")
+        client_id, username = mqtt.text("client_id"), mqtt.text("username")
+        password = mqtt.secret("password")
+        mqtt.close()
+        if topic is None:
+            self.desk.note("left out", mqtt.path, "MQTT is left out: it has no topic")
+        if url is None or topic is None or not self._is_topic(mqtt.at("topic"), topic):
+            return
+        found: dict[str, Any] = {"url": url, "version": "3.1.1"}
+        if username is not None:
+            found["username"] = username
+        if password is not None:
+            found |= self._password(mqtt, username)
+        if client_id is None:
+            message = f"no client_id; it is {CLIENT_ID} now, which no other client may have"
+            self.desk.note("changed", mqtt.path, message)
+        found["client_id"] = client_id or CLIENT_ID
+        grant = self.draft.grant(list(self.draft.memories))
+        found["subscriptions"] = [{"topic": topic, "qos": QOS, **grant}]
+        self.desk.note("check", mqtt.at("topic"), f"the topic {_AREAS_TOLD}")
+        self.draft.mqtt = found
+
+    def _is_topic(self, path: KeyPath, topic: str) -> bool:
+        try:
+            parse_topic_filter(topic)
+        except ValueError as error:
+            self.desk.problem(path, str(error))
+            return False
+        return True
+
+    def _password(self, mqtt: Section, username: str | None) -> dict[str, Any]:
+        path = mqtt.at("password")
+        if username is None:
+            message = "without a username the source did not send it"
+            self.desk.note("left out", path, message)
+            return {}
+        message = f"write the password into the file {PASSWORD_FILE} beside the configuration"
+        self.desk.note("check", path, f"{message}, readable to nobody else")
+        return {"password_file": PASSWORD_FILE}
+
+    def _broker(self, mqtt: Section) -> str | None:
+        """The URL of the broker; what a message shows of it has no user and no password."""
+        path, text = mqtt.at("broker"), mqtt.text("broker")
+        if text is None:
+            self.desk.note("left out", mqtt.path, "MQTT is left out: it has no broker")
+            return None
+        match = _BROKER.fullmatch(text)
+        scheme = (match["scheme"] or "tcp").lower() if match else ""
+        if match and scheme not in _SCHEMES:
+            message = f"MQTT is left out: {show(scheme)} is not served, only {listing(_SCHEMES)}"
+            self.desk.note("left out", path, message)
+            return None
+        url = f"{_SCHEMES[scheme]}://{match['host']}" if match else ""
+        try:
+            parse_broker(url)
+        except ValueError:
+            self.desk.problem(path, "found no broker (not shown here), allowed: tcp://host:port")
+            return None
+        if match and match["user"]:
+            message = "the user and the password in it: write username and password_file"
+            self.desk.note("left out", path, message)
+        if match and match["more"].strip("/"):
+            self.desk.note("left out", path, "what is behind the host and the port")
+        return url
+
+    def _raw_ingest(self, raw: Section) -> None:
+        listen = raw.get("listen")
+        if listen is None:
+            message = "missing, allowed: :port or address:port"
+            self.desk.problem(raw.at("listen"), message, of_key=True)
+        bind = None if listen is None else self.binds.read(raw.at("listen"), listen)
+        timeout = raw.integer("read_timeout_ms", 1, 31_622_400_000)
+        raw.close({"max_packet_bytes": "a packet is as long as its count says, up to a whole area"})
+        memories = self.draft.written_by_raw_ingest()
+        for name in self.draft.memories:
+            if name not in memories:
+                message = f"never reached {name}, whose name is no MemoryID"
+                self.desk.note("check", raw.path, f"{message}; give it an id if it should")
+        if not memories:
+            message = "Raw Ingest is left out: no memory is named by a number from 0 to 65535"
+            self.desk.note("left out", raw.path, message)
+            return
+        sources = self._sources(raw, "Raw Ingest")
+        if bind is None or not sources:
+            return
+        listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind)}
+        listener |= {"format": "crc", "crc": "none"}
+        if timeout is not None:
+            listener["request_timeout"] = timeout / 1000 if timeout % 1000 else timeout // 1000
+        listener["rules"] = [{"sources": sources, **self.draft.grant(memories)}]
+        self.draft.listeners[free_name("raw-ingest", set(self.draft.listeners))] = listener

@@ -1,0 +1,280 @@
+"""The first generation: memories with names, one map of unit ids, and a policy for each port."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.values import WRITES
+from holdfast.config.words import guess, listing, show
+from holdfast.importing import functions
+from holdfast.importing.filters import ALL, read_filter
+from holdfast.importing.memories import check_gate, read_areas, read_id
+from holdfast.importing.names import unique_names
+from holdfast.importing.sections import Section, section
+
+if TYPE_CHECKING:
+    from holdfast.config.addresses import Bind
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.binds import Binds
+    from holdfast.importing.draft import Draft
+    from holdfast.importing.notes import Desk
+    from holdfast.importing.peers import Peers
+
+MAX_CONNECTIONS = 32
+
+
+@dataclass
+class FirstGeneration:
+    """Reads `memory`, `routing` and `ports` into a draft."""
+
+    desk: Desk
+    draft: Draft
+    binds: Binds
+    admitted: Peers | None
+    """Those whom the filter of the whole file lets in, `None` when it has none."""
+
+    def read(self, root: Section) -> None:
+        """Reads all of it."""
+        self.names: dict[str, str] = {}
+        self.units: dict[int, str] = {}
+        self.served: set[int] = set()
+        memory = root.mapping("memory", required=True)
+        if memory is not None:
+            self._memories(memory)
+        routing = root.mapping("routing", required=True)
+        if routing is not None:
+            self._routing(routing)
+        ports = root.mapping("ports")
+        if ports is not None:
+            self._ports(ports)
+        if routing is not None:
+            for unit in self.units.keys() - self.served:
+                message = "no port serves this unit id"
+                self.desk.note("left out", routing.at("unit_id_map", unit), message)
+
+    def _memories(self, memory: Section) -> None:
+        memories = memory.mapping("memories", required=True)
+        if memories is None:
+            return
+        wanted = [(memories.at(key), str(key)) for key in memories.data]
+        for index, (path, text) in enumerate(wanted):
+            if text in (earlier for _, earlier in wanted[:index]):
+                message = f"found the name {text} twice, as text and as a number, allowed: once"
+                self.desk.problem(path, message, of_key=True)
+        self.names = {
+            text: name
+            for (_, text), name in zip(wanted, unique_names(self.desk, wanted), strict=True)
+        }
+        for_all = self._gate(memory)
+        for key in memories.data:
+            one = memories.mapping(key)
+            if one is None:
+                self.desk.problem(memories.at(key), "found nothing, allowed: a mapping")
+                continue
+            self._memory(one, str(key), for_all)
+        memory.close()
+
+    def _memory(self, one: Section, text: str, for_all: tuple[KeyPath, int] | None) -> None:
+        name = self.names[text]
+        areas = read_areas(one, "size")
+        found: dict[str, Any] = {**read_id(text), **areas}
+        for area in areas:
+            if isinstance(areas[area], dict):
+                message = "addresses begin at start; releases that ignored it began at 0"
+                self.desk.note("check", one.at(area, "start"), message)
+        gate = self._gate(one) if "state_sealing" in one.data else for_all
+        if gate is not None:
+            path, address = gate
+            if check_gate(self.desk, path, name, areas, "discrete_inputs", address):
+                found["seal"] = {"area": "discrete_inputs", "address": address, "mode": "once"}
+                self.draft.seals[name] = path
+        one.close({"default": "there is no default memory: a unit id that is not mapped has none"})
+        self.draft.memories[name] = found
+
+    def _gate(self, parent: Section) -> tuple[KeyPath, int] | None:
+        """Where the gate bit of a `state_sealing` is, if that is there and on."""
+        sealing = parent.mapping("state_sealing")
+        if sealing is None:
+            return None
+        enabled = sealing.flag("enable")
+        gate = sealing.mapping("gate", required=bool(enabled))
+        sealing.close()
+        if not enabled:
+            self.desk.note("left out", sealing.path, "it is not enabled")
+        if gate is None:
+            return None
+        gate.word("area", ["discrete_inputs"], required=bool(enabled))
+        address = gate.integer("address", 0, 65535, required=bool(enabled))
+        gate.close()
+        return (gate.at("address"), address) if enabled and address is not None else None
+
+    def _routing(self, routing: Section) -> None:
+        units = routing.mapping("unit_id_map", required=True)
+        routing.close()
+        for unit in units.data if units else ():
+            path = routing.at("unit_id_map", unit)
+            name = self._known(path, units.get(unit)) if units else None
+            if type(unit) is not int or not 0 <= unit <= 255:
+                message = f"found {show(unit)}, allowed: a unit id from 0 to 255"
+                self.desk.problem(path, message, of_key=True)
+            elif name is not None:
+                self.units[unit] = name
+
+    def _known(self, path: KeyPath, value: object) -> str | None:
+        """Our name for a memory that the source names."""
+        text = str(value) if type(value) is int else value
+        if isinstance(text, str) and text in self.names:
+            return self.names[text]
+        close = guess(text, self.names) if isinstance(text, str) else ""
+        known = listing(self.names) or "a memory"
+        self.desk.problem(path, f"found {show(value)}, allowed: {known}{close}")
+        return None
+
+    def _ports(self, ports: Section) -> None:
+        if ports.data:
+            message = "a function that is not allowed is answered 0x01, and a unit id that is not"
+            self.desk.note("check", ports.path, f"{message} mapped 0x0B; it was 0x02 for both")
+        for key in ports.data:
+            bind = self.binds.read(ports.at(key), key, of_key=True)
+            policy = section(self.desk, ports.at(key), ports.get(key))
+            listener = None if policy is None else self._port(policy, str(bind))
+            if bind is not None and listener is not None:
+                self.draft.listeners[self._free_name(bind)] = listener
+
+    def _free_name(self, bind: Bind) -> str:
+        """`port-502`; where two addresses have the same port, the address is in the name."""
+        name = f"port-{bind.port}"
+        if name not in self.draft.listeners:
+            return name
+        return re.sub("[^A-Za-z0-9.-]", "_", f"{name}-{bind.host}")
+
+    def _port(self, policy: Section, bind: str) -> dict[str, Any] | None:
+        sources = self._sources(policy)
+        units = self._units(policy)
+        rights = self._rights(policy)
+        most = self._max_connections(policy)
+        policy.close()
+        if sources is None or not units or rights is None:
+            return None
+        rule = {"sources": sources, "units": units, **rights}
+        return {"type": "modbus-tcp", "bind": bind, "max_connections": most, "rules": [rule]}
+
+    def _sources(self, policy: Section) -> list[str] | None:
+        own = read_filter(policy)
+        if own is None and self.admitted is None:
+            message = "no ip_filter: sources are everybody; name the networks that need it"
+            self.desk.note("check", policy.path, message)
+        peers = (ALL if own is None else own) & (ALL if self.admitted is None else self.admitted)
+        if not peers:
+            message = "the port is left out: its ip_filter lets nobody in"
+            self.desk.note("left out", policy.path, message)
+            return None
+        return peers.written()
+
+    def _units(self, policy: Section) -> dict[int, str]:
+        allowed = self._unit_ids(policy)
+        memories = self._memory_names(policy)
+        if allowed is None or memories is None:
+            return {}
+        units = {
+            unit: name for unit, name in self.units.items() if unit in allowed and name in memories
+        }
+        if not units:
+            message = "the port is left out: no unit id is mapped to a memory that it allows"
+            self.desk.note("left out", policy.path, message)
+        self.served |= units.keys()
+        return units
+
+    def _unit_ids(self, policy: Section) -> set[int] | None:
+        if policy.get("unit_ids") == "all":
+            return set(self.units)
+        entries = _list_or_all(policy, "unit_ids", "unit ids")
+        if entries is None:
+            return None
+        found: set[int] = set()
+        for path, unit in entries:
+            if type(unit) is not int or not 0 <= unit <= 255:
+                message = f"found {show(unit)}, allowed: a unit id from 0 to 255"
+                self.desk.problem(path, message)
+            elif unit not in self.units:
+                message = f"unit id {unit} is not in routing.unit_id_map, so it was never served"
+                self.desk.note("left out", path, message)
+            else:
+                found.add(unit)
+        return found
+
+    def _memory_names(self, policy: Section) -> set[str] | None:
+        if policy.get("memories") == "all":
+            return set(self.names.values())
+        entries = _list_or_all(policy, "memories", "names of memories")
+        if entries is None:
+            return None
+        found = (self._known(path, value) for path, value in entries)
+        return {name for name in found if name is not None}
+
+    def _rights(self, policy: Section) -> dict[str, Any] | None:
+        access = policy.word("access", ["read-only", "read-write"], required=True)
+        codes = policy.mapping("function_codes")
+        allow = deny = None
+        if codes is not None:
+            allow, deny = functions.read_codes(codes, "allow"), functions.read_codes(codes, "deny")
+            listed = bool(codes.get("allow"))
+            codes.close()
+            if listed and allow is not None:
+                return self._only(codes, access, allow, deny or [])
+        if access is None:
+            return None
+        return {"access": access, **self._denied(codes, access, deny or [])}
+
+    def _only(
+        self, codes: Section, access: str | None, allow: list[int], deny: list[int]
+    ) -> dict[str, Any] | None:
+        """The rights where there is a list of what is allowed."""
+        path = codes.at("allow")
+        if both := [code for code in allow if code in deny]:
+            message = f"not {functions.spelled(both)}: denied too, and that wins"
+            self.desk.note("changed", path, message)
+        left = [code for code in allow if code not in deny]
+        writing = [code for code in left if code in WRITES]
+        if access == "read-only" and writing:
+            message = f"not {functions.spelled(writing)}: writes, and access is read-only"
+            self.desk.note("changed", path, message)
+            left = [code for code in left if code not in writing]
+        if not left:
+            message = "the port is left out: it allows no function"
+            self.desk.note("left out", path, message)
+            return None
+        return None if access is None else {"access": access, "functions": left}
+
+    def _denied(self, codes: Section | None, access: str, deny: list[int]) -> dict[str, Any]:
+        """The rights where only some functions are denied."""
+        if codes is None or not deny:
+            return {}
+        more = functions.beside(deny) if access == "read-write" else []
+        if more:
+            message = f"denies {functions.spelled(more)} too, which do what is denied"
+            self.desk.note("changed", codes.at("deny"), f"{message}; nobody had them before")
+        return {"deny": [*deny, *more]}
+
+    def _max_connections(self, policy: Section) -> int:
+        most = policy.integer("max_connections", -(2**31), 2**31 - 1)
+        if most is None:
+            return MAX_CONNECTIONS
+        allowed = MAX_CONNECTIONS if most < 1 else min(most, 65535)
+        if allowed != most:
+            message = f"is {allowed}, found {most}, allowed: an integer from 1 to 65535"
+            self.desk.note("changed", policy.at("max_connections"), message)
+        return allowed
+
+
+def _list_or_all(policy: Section, key: str, what: str) -> list[tuple[KeyPath, Any]] | None:
+    """The entries of a list that `all` could stand for; without any it is a problem."""
+    value = policy.get(key)
+    if isinstance(value, list) and value:
+        return policy.entries(key)
+    found = "missing" if value is None else f"found {show(value)}"
+    message = f"{found}, allowed: all or a list of {what}"
+    policy.desk.problem(policy.at(key), message, of_key=value is None)
+    return None

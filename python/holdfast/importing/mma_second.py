@@ -1,0 +1,212 @@
+"""The second generation: listeners that hold their memories, each with a policy of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast.importing import functions
+from holdfast.importing.filters import ALL, read_networks
+from holdfast.importing.memories import check_gate, read_areas, read_id
+from holdfast.importing.names import unique_names
+from holdfast.importing.policies import Merger, Policy, unserved
+from holdfast.importing.sections import Section, section
+
+if TYPE_CHECKING:
+    from holdfast.config.addresses import Network
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.binds import Binds
+    from holdfast.importing.draft import Draft
+    from holdfast.importing.notes import Desk
+    from holdfast.importing.peers import Peers
+
+TOP_REASONS = {
+    "debug": "what is logged is set by log.level",
+    "device_identity": "write what it says under identity",
+    "notify": "there are no notifications; programs read by Modbus or REST",
+    "rbe": "there is no report by exception; programs read by Modbus or REST",
+    "access_events": "refused peers are in the log",
+    "persistence": "memory is not kept; initial values come from a file, see initial",
+    "memory": "a listener has its memories of its own in this generation",
+}
+_MEMORY_REASONS = {
+    "fc43": "write what it says under identity, which is that of the whole appliance",
+    "port": "a memory is reached by the listener that it stands in",
+    "notify": TOP_REASONS["notify"],
+    "rbe": TOP_REASONS["rbe"],
+    "persistence": TOP_REASONS["persistence"],
+}
+_ALLOW = {"ro": functions.READING, "rw": functions.ALL, "wo": functions.WRITING_ONLY}
+BUSY = 6
+
+
+@dataclass
+class _Memory:
+    """One memory of a listener, as far as it can be read."""
+
+    section: Section
+    unit: int | None
+    name: str = ""
+
+
+@dataclass
+class SecondGeneration:
+    """Reads `listeners` into a draft."""
+
+    desk: Desk
+    draft: Draft
+    binds: Binds
+    admitted: Peers | None
+    """Those whom the filter of the whole file lets in, `None` when it has none."""
+
+    def read(self, root: Section) -> None:
+        """Reads all of it."""
+        self.rules_have_ids = False
+        entries = root.entries("listeners", required=True) or []
+        found = [section(self.desk, path, value) for path, value in entries]
+        listeners = [listener for listener in found if listener is not None]
+        wanted = [
+            (one.at("id"), one.name("id", required=True) or f"listener-{number}")
+            for number, one in enumerate(listeners, 1)
+        ]
+        names = unique_names(self.desk, wanted)
+        memories = [self._memories(one) for one in listeners]
+        self._name(list(zip(names, memories, strict=True)))
+        for name, listener, own in zip(names, listeners, memories, strict=True):
+            self._listener(name, listener, own)
+        if listeners:
+            self._tell_all(root.at("listeners"))
+
+    def _tell_all(self, path: KeyPath) -> None:
+        message = "Raw Ingest came in at these ports too; for it, add a listener with type:"
+        self.desk.note("check", path, f"{message} raw-ingest, format: v1 and a port of its own")
+        message = "a function that is not allowed is answered 0x01, and a unit id that is not"
+        closed = "a peer without any rule is closed at once"
+        self.desk.note("check", path, f"{message} mapped 0x0B; {closed}")
+        if self.rules_have_ids:
+            self.desk.note("left out", path, "the ids of policy rules: our rules have no names")
+
+    def _memories(self, listener: Section) -> list[_Memory]:
+        read = []
+        first: dict[int, KeyPath] = {}
+        for path, value in listener.entries("memory") or ():
+            memory = section(self.desk, path, value)
+            if memory is None:
+                continue
+            unit = memory.integer("unit_id", 0, 255, required=True, what="a unit id")
+            if unit is not None and unit in first:
+                other = self.desk.document.spell(first[unit])
+                message = f"found {unit}, which is that of {other}, allowed: one of its own"
+                self.desk.problem(memory.at("unit_id"), message)
+            elif unit is not None:
+                first[unit] = path
+            read.append(_Memory(memory, unit))
+        return read
+
+    def _name(self, listeners: list[tuple[str, list[_Memory]]]) -> None:
+        """Gives all memories their names; without one, it is that of the listener and the unit."""
+        every = [(listener, memory) for listener, own in listeners for memory in own]
+        wanted = []
+        for listener, memory in every:
+            name = memory.section.name("name") or f"{listener}-{memory.unit}"
+            wanted.append((memory.section.at("name"), name))
+        for (_, memory), name in zip(every, unique_names(self.desk, wanted), strict=True):
+            memory.name = name
+
+    def _listener(self, name: str, listener: Section, memories: list[_Memory]) -> None:
+        listen = listener.get("listen")
+        if listen is None:
+            message = "missing, allowed: :port or address:port"
+            self.desk.problem(listener.at("listen"), message, of_key=True)
+        bind = None if listen is None else self.binds.read(listener.at("listen"), listen)
+        listener.close()
+        policies = [self._memory(memory) for memory in memories]
+        known = [policy for policy in policies if policy is not None]
+        rules = Merger(self.desk, listener.path, known).rules(
+            ALL if self.admitted is None else self.admitted
+        )
+        if not rules:
+            message = "the listener is left out: no policy allows what the areas of its memory have"
+            self.desk.note("left out", listener.path, message)
+            return
+        for policy in unserved(known, rules):
+            message = f"no rule serves unit {policy.unit}, as it allows nothing that its areas have"
+            self.desk.note("check", listener.path, message)
+        self.draft.listeners[name] = {"type": "modbus-tcp", "bind": str(bind), "rules": rules}
+
+    def _memory(self, memory: _Memory) -> Policy | None:
+        one = memory.section
+        areas = read_areas(one, "count")
+        found: dict[str, Any] = {**read_id(memory.name), **areas}
+        self.draft.memories[memory.name] = found
+        seal = self._seal(one, memory.name, areas)
+        if seal is not None:
+            found["seal"] = seal
+            self.draft.seals[memory.name] = one.at("state_sealing")
+        rules = self._policy(one)
+        one.close(_MEMORY_REASONS)
+        if memory.unit is None or rules is None:
+            return None
+        return Policy(memory.unit, memory.name, functions.touching(areas), tuple(rules))
+
+    def _seal(self, one: Section, name: str, areas: dict[str, Any]) -> dict[str, Any] | None:
+        sealing = one.mapping("state_sealing")
+        if sealing is None:
+            return None
+        enabled = sealing.flag("enabled") is not False
+        sealing.word("area", ["coil"], required=enabled)
+        address = sealing.integer("address", 0, 65535, required=enabled)
+        exception = sealing.integer("exception", 1, 255)
+        sealing.close()
+        if not enabled:
+            self.desk.note("left out", sealing.path, "it is not enabled")
+            return None
+        if exception not in (None, BUSY):
+            message = f"a sealed memory always answers 0x{BUSY:02X}"
+            self.desk.note("left out", sealing.at("exception"), message)
+        path = sealing.at("address")
+        if address is None or not check_gate(self.desk, path, name, areas, "coils", address):
+            return None
+        message = "sealed whenever the coil is 0, and Modbus can't write that coil (0x02)"
+        self.desk.note("check", sealing.path, message)
+        return {"area": "coils", "address": address, "mode": "level"}
+
+    def _policy(self, one: Section) -> list[tuple[tuple[Network, ...], frozenset[int]]] | None:
+        policy = one.mapping("policy")
+        entries = [] if policy is None else policy.entries("rules") or []
+        if policy is not None:
+            policy.close()
+        if not entries:
+            message = "no policy, which refuses everybody; add its unit id to a rule to serve it"
+            self.desk.note("check", one.path, message)
+            return None
+        found = [section(self.desk, path, value) for path, value in entries]
+        return [self._rule(rule) for rule in found if rule is not None]
+
+    def _rule(self, rule: Section) -> tuple[tuple[Network, ...], frozenset[int]]:
+        self.rules_have_ids |= rule.get("id") is not None
+        networks = tuple(read_networks(rule, "source_ip", required=True))
+        if rule.get("source_ip") == []:
+            self.desk.note("left out", rule.path, "source_ip is empty: the rule matches nobody")
+        allowed = self._allowed(rule)
+        rule.close()
+        return networks, allowed
+
+    def _allowed(self, rule: Section) -> frozenset[int]:
+        codes = functions.read_codes(rule, "allow_fc")
+        word = rule.word("allow", list(_ALLOW))
+        if codes is not None and word is not None:
+            message = "found beside allow_fc, allowed: one of both"
+            self.desk.problem(rule.at("allow"), message, of_key=True)
+        if codes is not None:
+            return frozenset(codes)
+        if word is None:
+            if rule.get("allow") is None:
+                message = "neither allow_fc nor allow: the rule allows nothing"
+                self.desk.note("check", rule.path, message)
+            return frozenset()
+        if word == "wo":
+            message = f"only the functions {functions.spelled(_ALLOW[word])}, which write; 22 and"
+            told = f"{message} 23 read too. A rule has no other way to forbid reading"
+            self.desk.note("changed", rule.at("allow"), told)
+        return _ALLOW[word]

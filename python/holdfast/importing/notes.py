@@ -1,0 +1,59 @@
+"""What an import has to tell: a `Note` for whoever takes over the result, or a problem.
+
+Messages name what was found, but never the value of a secret.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from holdfast.config.problems import Report
+
+if TYPE_CHECKING:
+    from holdfast.config.source import Document, KeyPath
+
+Kind: TypeAlias = Literal["left out", "changed", "check"]
+"""`left out` is not in the result, `changed` is there in another way, `check` is for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """What became of one place of the source; the places are those of a `Problem`."""
+
+    kind: Kind
+    file: str
+    line: int
+    column: int
+    key: str
+    message: str
+
+    def __str__(self) -> str:
+        parts = (f"{self.file}:{self.line}", self.key, self.kind, self.message)
+        return ": ".join(part for part in parts if part)
+
+
+@dataclass
+class Desk:
+    """Collects the notes and the problems of one source file."""
+
+    document: Document
+    noted: dict[Note, None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.report = Report(self.document)
+
+    @property
+    def notes(self) -> tuple[Note, ...]:
+        """The notes in the order of the file, each once."""
+        return tuple(sorted(self.noted, key=lambda note: (note.line, note.column)))
+
+    def note(self, kind: Kind, path: KeyPath, message: str) -> None:
+        """Notes something about the key at `path`."""
+        place = self.document.place(path, of_key=True)
+        key = self.document.spell(path)
+        self.noted[Note(kind, self.document.file, place.line, place.column, key, message)] = None
+
+    def problem(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
+        """Adds what makes the import impossible."""
+        self.report.add(path, message, of_key=of_key)

@@ -1,0 +1,206 @@
+"""Policies of single units, made into rules that hold for all units of a listener.
+
+The source judges each unit by a list of its own; with us the first rule that matches a peer settles
+what it may do with every unit. Networks lie inside each other or apart, so each of them, less those
+inside it, is a set of peers that are all treated alike. Whatever is inside comes first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from holdfast.config.words import listing
+from holdfast.importing import functions
+from holdfast.importing.peers import Peers, written
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.config.addresses import Network
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.notes import Desk
+
+MOST_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The rules of one unit: the first with a network that holds the peer says what it may do."""
+
+    unit: int
+    memory: str
+    touching: frozenset[int]
+    """The functions that read or write an area of the memory; others do nothing to it."""
+    rules: tuple[tuple[tuple[Network, ...], frozenset[int]], ...]
+
+    def functions(self, network: Network) -> frozenset[int]:
+        """What those of a network may do who are in no narrower network of any rule."""
+        for networks, allowed in self.rules:
+            if any(_inside(network, other) for other in networks):
+                return allowed
+        return frozenset()
+
+
+Profile: TypeAlias = tuple[tuple[Policy, frozenset[int]], ...]
+"""What peers may do with each unit; only units that they may do something with."""
+
+
+@dataclass(frozen=True)
+class Grant:
+    """What a rule of ours says of those it matches."""
+
+    units: tuple[int, ...]
+    functions: frozenset[int]
+
+
+@dataclass
+class Merger:
+    """Makes the rules of one listener."""
+
+    desk: Desk
+    path: KeyPath
+    policies: list[Policy]
+    _conflicts: dict[Profile, list[Network]] = field(default_factory=dict, init=False)
+
+    def rules(self, admitted: Peers) -> list[dict[str, Any]]:
+        """The rules in order, for those peers that are admitted at all."""
+        grants = self._pruned(self._grants())
+        for profile, networks in self._conflicts.items():
+            self._tell(profile, networks)
+        nobody = [network for network, grant in grants.items() if not grant.units]
+        waiting = {network: grant for network, grant in grants.items() if grant.units}
+        memories = {policy.unit: policy.memory for policy in self.policies}
+        rules = []
+        while waiting:
+            grant, ready = _next(waiting)
+            peers = Peers(())
+            for network in ready:
+                del waiting[network]
+                cut = Peers.of(other for other in nobody if _inside(other, network))
+                peers |= Peers.of([network]) - cut
+            if peers := peers & admitted:
+                units = {unit: memories[unit] for unit in grant.units}
+                rights = functions.rights(grant.functions)
+                rules.append({"sources": peers.written(), "units": units, **rights})
+        return rules
+
+    def _grants(self) -> dict[Network, Grant]:
+        """The grant of each network that some peer is in without being in a narrower one."""
+        networks = dict.fromkeys(
+            network for policy in self.policies for rule in policy.rules for network in rule[0]
+        )
+        grants = {}
+        for network in networks:
+            narrower = (other for other in networks if _within(other, network))
+            if not Peers.of([network]) - Peers.of(narrower):
+                continue
+            grants[network] = self._grant(self._profile(network), network)
+        return grants
+
+    def _profile(self, network: Network) -> Profile:
+        found = ((policy, policy.functions(network)) for policy in self.policies)
+        return tuple((policy, allowed) for policy, allowed in found if allowed & policy.touching)
+
+    def _grant(self, profile: Profile, network: Network) -> Grant:
+        grant = _common(profile)
+        if len(grant.units) < len(profile) or any(
+            (allowed & policy.touching & functions.SOURCE) - grant.functions
+            for policy, allowed in profile
+        ):
+            self._conflicts.setdefault(profile, []).append(network)
+        return grant
+
+    def _pruned(self, grants: dict[Network, Grant]) -> dict[Network, Grant]:
+        """Without networks that are granted what the next wider one is granted."""
+        nothing = Grant((), frozenset())
+        kept: dict[Network, Grant] = {}
+        for network in sorted(grants, key=lambda network: network.prefixlen):
+            wider = [other for other in kept if _within(network, other)]
+            around = max(wider, key=lambda other: other.prefixlen, default=None)
+            if grants[network] != (nothing if around is None else kept[around]):
+                kept[network] = grants[network]
+        return {network: kept[network] for network in grants if network in kept}
+
+    def _tell(self, profile: Profile, networks: list[Network]) -> None:
+        shown = [written(network) for network in networks[:MOST_SHOWN]]
+        if len(networks) > MOST_SHOWN:
+            shown.append(f"{len(networks) - MOST_SHOWN} more")
+        had = "; ".join(
+            f"unit {policy.unit}: {functions.spelled(allowed & policy.touching)}"
+            for policy, allowed in profile
+        )
+        grant = _common(profile)
+        touched = {code for policy, _ in profile for code in policy.touching}
+        got = functions.spelled(grant.functions & touched)
+        left = [str(policy.unit) for policy, _ in profile if policy.unit not in grant.units]
+        gone = f", and unit {listing(left)} is not served to them" if left else ""
+        message = (
+            f"peers in {listing(shown)} had different functions ({had}); a rule has the same for"
+            f" all its units, so they get {got}{gone}; units that"
+            " need others need a listener of their own"
+        )
+        self.desk.note("changed", self.path, message)
+
+
+def _common(profile: Profile) -> Grant:
+    """One set of functions for all units: it gives no unit a function that it did not have.
+
+    A unit that could do nothing then, or leave nothing to those before it, is left out.
+    """
+    served: Profile = ()
+    for entry in profile:
+        more = (*served, entry)
+        if all(_shared(more) & allowed & policy.touching for policy, allowed in more):
+            served = more
+    by_all = functions.ALL.intersection(*(allowed for _, allowed in served))
+    by_one = frozenset[int]().union(*(allowed & policy.touching for policy, allowed in served))
+    had = by_all | by_one if served else by_one
+    return Grant(tuple(policy.unit for policy, _ in served), had & _shared(served))
+
+
+def _shared(profile: Profile) -> frozenset[int]:
+    """The functions that every unit had, or to whose memory they do nothing."""
+    refused = ((policy.touching | functions.OTHERS) - allowed for policy, allowed in profile)
+    return functions.ALL.difference(*refused)
+
+
+def _next(waiting: dict[Network, Grant]) -> tuple[Grant, list[Network]]:
+    """The grant whose rule can come next, with networks that wait for no narrower one.
+
+    Best is a grant of which nothing is left for a later rule. If there is none, only those
+    networks come now that a wider one waits for.
+    """
+
+    def ready(network: Network) -> bool:
+        return not any(
+            _within(other, network) and waiting[other] != waiting[network] for other in waiting
+        )
+
+    free = [network for network in waiting if ready(network)]
+    grants = dict.fromkeys(waiting[network] for network in free)
+    whole = [
+        grant
+        for grant in grants
+        if all(network in free for network in waiting if waiting[network] == grant)
+    ]
+    if whole:
+        return whole[0], [network for network in free if waiting[network] == whole[0]]
+    urgent = [one for one in free if any(_within(one, other) for other in waiting)]
+    grant = waiting[urgent[0]]
+    return grant, [network for network in urgent if waiting[network] == grant]
+
+
+def _inside(network: Network, other: Network) -> bool:
+    """Whether all of `network` is in `other`."""
+    return network.version == other.version and network.subnet_of(other)  # type: ignore[arg-type]
+
+
+def _within(network: Network, other: Network) -> bool:
+    return network != other and _inside(network, other)
+
+
+def unserved(policies: Iterable[Policy], rules: Iterable[dict[str, Any]]) -> list[Policy]:
+    """The policies whose unit no rule serves."""
+    served = {unit for rule in rules for unit in rule["units"]}
+    return [policy for policy in policies if policy.unit not in served]

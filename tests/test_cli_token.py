@@ -1,0 +1,123 @@
+"""`holdfast token`: a secret, its hash, and the entry to paste."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from click.testing import CliRunner
+
+from holdfast.cli import main
+from holdfast.config import load
+from holdfast.config.source import parse
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from click.testing import Result
+
+SECRET = "correct-horse-battery-staple"
+REST = """\
+memories: {plant: {coils: 8}}
+rest:
+  bind: 127.0.0.1:8080
+  sources: [127.0.0.0/8]
+  tokens:
+"""
+
+
+def run(*arguments: str, stdin: str | bytes | None = None) -> Result:
+    return CliRunner().invoke(main, ["token", *arguments], input=stdin)
+
+
+def entry(result: Result) -> dict[str, Any]:
+    document, problems = parse(result.stdout.partition(":\n\n")[2], "entry.yaml")
+    assert problems == []
+    found: dict[str, Any] = document.data[0]
+    return found
+
+
+def digest(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def test_a_secret_is_printed_once_with_its_hash() -> None:
+    result = run()
+    secret = result.stdout.splitlines()[0].rpartition(" ")[2]
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout.count(secret) == 1
+    assert entry(result)["name"] == "edge-gateway"
+    assert entry(result)["sha256"] == digest(secret)
+
+
+def test_a_secret_is_32_random_bytes() -> None:
+    secrets = [json.loads(run("--json").stdout)["token"] for _ in range(2)]
+    assert secrets[0] != secrets[1]
+    assert [len(base64.urlsafe_b64decode(secret + "=")) for secret in secrets] == [32, 32]
+
+
+def test_programs_get_json() -> None:
+    answer = json.loads(run("--name", "node-red", "--json").stdout)
+    assert list(answer) == ["name", "token", "sha256"]
+    assert answer["name"] == "node-red"
+    assert answer["sha256"] == digest(answer["token"])
+
+
+@pytest.mark.parametrize("name", ["node-red", "true", "7", "-x", "1e5"])
+def test_the_name_is_text_in_the_entry(name: str) -> None:
+    assert entry(run(f"--name={name}"))["name"] == name
+
+
+@pytest.mark.parametrize("name", ["", "a b", "x" * 65])
+def test_a_name_that_no_configuration_takes_is_refused(name: str) -> None:
+    result = run("--name", name)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "allowed: 1 to 64 letters" in result.stderr
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\r\n"])
+def test_a_secret_from_standard_input_is_hashed_without_the_end_of_its_line(end: str) -> None:
+    result = run("--stdin", stdin=SECRET + end)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert entry(result)["sha256"] == digest(SECRET)
+
+
+@pytest.mark.parametrize("extra", [[], ["--json"]])
+def test_a_secret_from_standard_input_is_not_printed_back(extra: list[str]) -> None:
+    result = run("--stdin", *extra, stdin=SECRET)
+    assert SECRET not in result.output
+    assert '"token"' not in result.output
+
+
+@pytest.mark.parametrize("stdin", ["", "\n", "\r\n", "a\nb\n", b"\xff\xfe"])
+def test_what_is_no_single_secret_is_refused(stdin: str | bytes) -> None:
+    result = run("--stdin", stdin=stdin)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("holdfast: standard input ")
+
+
+def test_a_short_secret_is_warned_of() -> None:
+    assert run("--stdin", stdin="x" * 16).stderr == ""
+    result = run("--stdin", stdin="x" * 15)
+    assert result.exit_code == 0
+    assert result.stderr == "warning: the secret has fewer than 16 characters, and can be guessed\n"
+
+
+def test_a_secret_that_a_header_cannot_carry_is_warned_of() -> None:
+    assert "visible ASCII" in run("--stdin", stdin="zwölf Boxkämpfer jagen").stderr
+
+
+def test_a_secret_is_no_argument() -> None:
+    assert run(SECRET).exit_code == 2
+
+
+def test_the_entry_fits_into_a_configuration(tmp_path: Path) -> None:
+    lines = run().stdout.partition("    - name")[1:]
+    text = "".join(lines).replace("memories: []", "memories: [plant]")
+    text = text.replace("areas: []", "areas: [coils]").replace("access:", "access: read-only")
+    path = tmp_path / "plant.yaml"
+    path.write_text(REST + text)
+    assert load(path).rest is not None
