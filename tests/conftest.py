@@ -6,10 +6,12 @@ Nothing here leaves the loopback interface, and everything that is started is st
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import threading
@@ -21,9 +23,12 @@ import pytest
 
 import holdfast
 import wire
+from holdfast.appliance import Appliance
+from holdfast.config import load
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
     from typing import Unpack
 
     from holdfast.identity import Identity
@@ -84,6 +89,20 @@ def tool(name: str) -> str:
     if path is None:
         missing(f"the program {name}")
     return str(path)
+
+
+def has_ipv6() -> bool:
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET6) as probe:
+        probe.bind(("::1", 0))
+        return True
+    return False
+
+
+@pytest.fixture
+def ipv6() -> None:
+    """Needs IPv6 on the loopback interface."""
+    if not has_ipv6():
+        missing("IPv6 on the loopback interface")
 
 
 class Serve(Protocol):
@@ -193,6 +212,32 @@ def server_process() -> Iterator[Process]:
             return process
 
         yield start
+
+
+class Run(Protocol):
+    """Starts an appliance that is stopped when the test ends."""
+
+    def __call__(self, text: str) -> Appliance: ...
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    """Runs the configuration that a text is; files it names are in `tmp_path`."""
+    with ExitStack() as running:
+
+        def start(text: str) -> Appliance:
+            file = tmp_path / "appliance.yaml"
+            file.write_text(text)
+            return running.enter_context(Appliance(load(file)))
+
+        yield start
+
+
+def endpoint(appliance: Appliance, name: str) -> tuple[str, int]:
+    """The address and port that a part of an appliance listens on."""
+    [(host, port)] = [(e.host, e.port) for e in appliance.endpoints() if e.name == name]
+    assert port is not None
+    return host, port
 
 
 def content(memory: holdfast.Memory) -> dict[Area, list[int]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 import sys
 import threading
 from pathlib import Path
@@ -27,19 +26,6 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="need
 needs_127_0_0_2 = pytest.mark.skipif(
     sys.platform != "linux", reason="only Linux has all of 127.0.0.0/8"
 )
-
-
-def has_ipv6() -> bool:
-    with contextlib.suppress(OSError), socket.socket(socket.AF_INET6) as probe:
-        probe.bind(("::1", 0))
-        return True
-    return False
-
-
-@pytest.fixture
-def ipv6() -> None:
-    if not has_ipv6():
-        missing("IPv6 on the loopback interface")
 
 
 def is_refused(address: tuple[str, int], source: str | None = None) -> bool:

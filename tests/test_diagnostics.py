@@ -506,7 +506,8 @@ def test_frames_that_are_no_requests_are_counted(
     client.send(bytes.fromhex("000100010002010b") * 3 + bytes.fromhex("000100000000"))
 
     assert client.rest() == b""
-    assert server.counters()["frames"] == {"foreign": 3, "broken": 1}
+    frames = server.counters()["frames"]
+    assert frames == {"foreign": 3, "broken": 1, "damaged": 0, "other_unit": 0}
     assert server.counters()["requests"] == {}
 
 

@@ -7,7 +7,7 @@ from typing import Literal, final
 
 from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
 
-__all__ = ["Engine", "Listener", "Memory", "OutOfRange", "Rule", "__version__", "write_across"]
+__all__ = ["Engine", "Listener", "Memory", "OutOfRange", "RawRule", "Rule", "__version__", "write_across"]
 
 __version__: str
 
@@ -101,10 +101,23 @@ class Rule:
     ) -> Rule: ...
 
 @final
-class Listener:
-    """The settings of a Modbus TCP listener; times in seconds, `idle_timeout` 0 is for ever.
+class RawRule:
+    """What senders of Raw Ingest packets from some sources may write.
 
-    Raises `ValueError` for an address, limit or time that can't be.
+    `targets` maps unit ids (v1) or memory ids (crc), 0 to 65535, to memories. Raises `ValueError`
+    for an id, source or area that can't be.
+    """
+
+    def __new__(
+        cls, targets: Mapping[int, Memory], *, sources: Sequence[str], areas: Sequence[Area]
+    ) -> RawRule: ...
+
+@final
+class Listener:
+    """The settings of a listener; as constructed, one for Modbus over TCP connections.
+
+    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP. Times are in seconds, `idle_timeout`
+    0 is for ever. Raises `ValueError` for an address, limit or time that can't be.
     """
 
     def __new__(
@@ -113,22 +126,58 @@ class Listener:
         bind: str,
         rules: Sequence[Rule],
         *,
+        framing: Literal["mbap", "rtu"] = "mbap",
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
         when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
     ) -> Listener: ...
+    @staticmethod
+    def udp(name: str, bind: str, rules: Sequence[Rule]) -> Listener:
+        """For Modbus over UDP."""
+
+    @staticmethod
+    def serial(
+        name: str,
+        device: str,
+        rule: Rule,
+        *,
+        mode: Literal["rtu", "ascii"],
+        baud: int,
+        parity: Literal["none", "even", "odd"],
+        stop_bits: int,
+        data_bits: int,
+        silence: float | None = None,
+    ) -> Listener:
+        """For a serial line; the rule's sources are not looked at.
+
+        `silence` in seconds ends an RTU frame, `None` is 3.5 characters.
+        """
+
+    @staticmethod
+    def raw_ingest(
+        name: str,
+        bind: str,
+        rules: Sequence[RawRule],
+        *,
+        format: Literal["v1", "crc"] = "v1",
+        crc: Literal["required", "none"] = "required",
+        max_connections: int = 256,
+        max_connections_per_source: int | None = None,
+        request_timeout: float = 10.0,
+    ) -> Listener:
+        """For Raw Ingest packets."""
 
 @final
 class Engine:
     """Listeners on native threads, served from construction to `stop`.
 
     `identity` holds identification objects by id, 0 to 2 among them; `events` says which of the
-    listeners' events are kept for `next_event`.
+    listeners' events are kept for `next_event`, `audit` whether writes are for `next_writes`.
 
-    Raises `OSError` when a listener can't be bound (then none is), `ValueError` for an identity
-    that can't be served.
+    Raises `OSError` when a listener can't be bound or a device opened (then none is served),
+    `ValueError` for an identity that can't be served.
     """
 
     def __new__(
@@ -139,20 +188,31 @@ class Engine:
         unit_names: Sequence[tuple[int, str]] | None = None,
         workers: int = 1,
         events: Literal["nothing", "refusals", "all"] = "nothing",
+        audit: bool = False,
     ) -> Engine: ...
     @property
-    def addresses(self) -> list[tuple[str, int]]:
-        """Where each listener listens, in the order they were given."""
+    def addresses(self) -> list[tuple[str, int] | None]:
+        """Where each listener listens, in the order they were given; `None` for serial lines."""
 
     def counters(self) -> dict[str, ListenerCounters]:
         """The counters of each listener by name, since the start."""
 
-    def next_event(self, timeout: float) -> tuple[str, str, str | None] | None:
-        """Listener, kind and peer of the next event, if one comes within `timeout` seconds."""
+    def next_event(self, timeout: float) -> tuple[str, str, str | None, str | None] | None:
+        """Listener, kind, peer and reason of the next event, if one comes in `timeout` seconds."""
 
     @property
     def lost_events(self) -> int:
         """Events that were lost because nobody took them."""
+
+    def next_writes(self, timeout: float, most: int) -> list[dict[str, object]]:
+        """Up to `most` writes that came in, done or refused, as fields of an audit log.
+
+        Waits up to `timeout` seconds for the first.
+        """
+
+    @property
+    def lost_writes(self) -> int:
+        """Writes that `next_writes` misses because nobody took them."""
 
     def stop(self) -> None:
         """Answers what was received and ends; returns within a second. From any thread."""

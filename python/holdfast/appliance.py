@@ -1,4 +1,4 @@
-"""The appliance: memories and listeners built from a configuration, started, logged and stopped.
+"""The appliance: memories, listeners and adapters of a configuration, started, logged and stopped.
 
 It wires parts that know their work. It parses no protocol, and once started it takes no part in
 answering a request.
@@ -7,126 +7,100 @@ answering a request.
 from __future__ import annotations
 
 import logging
-import time
+import threading
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
-from holdfast import _core, logs
-from holdfast.identity import Identity
+from holdfast import _core, assembly, logs
+from holdfast.adapters.supervisor import Supervisor
+from holdfast.audit import Audit
+from holdfast.config import ModbusAsciiListener, ModbusRtuListener
+from holdfast.diagnostics import Diagnostics
+from holdfast.ingest import Door
 
 if TYPE_CHECKING:
-    from holdfast.config import (
-        Config,
-        IdentityConfig,
-        MemoryConfig,
-        ModbusTcpListener,
-        RuleConfig,
-    )
+    import socket
+    from collections.abc import Callable
+
+    from holdfast.adapters import Adapter
+    from holdfast.config import Config, Listener, MetricsConfig, RestConfig
 
 # Everything else that a listener reports is a refusal or a fault.
-ORDINARY = {"opened", "closed", "idle"}
+LEVELS = {
+    "opened": logging.DEBUG,
+    "closed": logging.DEBUG,
+    "idle": logging.DEBUG,
+    "line_back": logging.INFO,
+}
+
+# How many writes the audit log takes at once.
+AUDIT_BATCH = 1000
+
+# How long a thread waits for the next event or write before it looks around, in seconds.
+PATIENCE = 0.2
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Where a listener of the configuration listens."""
+    """Where a part of the configuration is served: a socket, or a serial device."""
 
     name: str
+    type: str
     host: str
-    port: int
-    settings: ModbusTcpListener
+    port: int | None
+    """`None` on a serial line, whose device is `host`."""
+    settings: Listener | RestConfig | MetricsConfig
 
 
 class Appliance:
     """One configuration, running from `start` (or `with`) to `stop`.
 
-    Raises `OSError` from `start` when a listener can't be bound; nothing is left running then.
+    Raises `OSError` from `start` when something can't be bound or opened, `UnknownAdapter` for an
+    adapter that is not installed; nothing is left running then.
     """
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.memories = {name: _memory(entry) for name, entry in config.memories.items()}
-        self._engine: _core.Engine | None = None
-        self._throttle = logs.Throttle()
-        self._lost = 0
+        self.memories = {
+            name: assembly.memory(settings) for name, settings in config.memories.items()
+        }
+        self._running: _Running | None = None
 
     def start(self) -> Self:
-        """Binds all listeners and serves. Raises `RuntimeError` when it runs already."""
-        if self._engine is not None:
+        """Binds everything and serves. Raises `RuntimeError` when it runs already."""
+        if self._running is not None:
             raise RuntimeError("the appliance runs already")
-        config = self.config
-        identity = _identity(config.identity)
-        verbose = config.log.level == "debug"
-        self._engine = _core.Engine(
-            [self._listener(name, entry) for name, entry in config.listeners.items()],
-            identity=identity.objects(),
-            unit_names=identity.names(),
-            workers=config.workers,
-            events="all" if verbose else "refusals",
-        )
+        self._running = _Running(self.config, self.memories)
         for endpoint in self.endpoints():
-            address = f"{endpoint.host}:{endpoint.port}"
+            address = endpoint.host if endpoint.port is None else _joined(endpoint)
             logs.write(logging.INFO, "listening", listener=endpoint.name, address=address)
         return self
 
     def stop(self) -> None:
-        """Answers what was received and ends, within a second."""
-        engine, self._engine = self._engine, None
-        if engine is not None:
-            engine.stop()
+        """Answers what was received and ends."""
+        running, self._running = self._running, None
+        if running is not None:
+            running.stop()
             logs.write(logging.INFO, "stopped")
 
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """What it says of itself. Raises `RuntimeError` when it does not run."""
+        return self._parts().diagnostics
+
     def endpoints(self) -> list[Endpoint]:
-        """Where each listener listens, in the order of the configuration."""
-        listeners = self.config.listeners.items()
-        addresses = self._running().addresses
-        return [
-            Endpoint(name, host, port, settings)
-            for (name, settings), (host, port) in zip(listeners, addresses, strict=True)
-        ]
+        """Where everything is served, in the order of the configuration."""
+        return self._parts().endpoints
 
     def log_events(self, timeout: float) -> None:
-        """Waits up to `timeout` seconds for an event, and logs it."""
-        engine = self._running()
-        event = engine.next_event(timeout)
-        if event is not None:
-            self._log_event(*event)
-        lost, self._lost = engine.lost_events - self._lost, engine.lost_events
-        if lost:
-            logs.write(logging.WARNING, "events_lost", count=lost)
+        """Waits up to `timeout` seconds for an event, and logs it; also what seals did."""
+        self._parts().log_events(timeout)
 
-    def _log_event(self, listener: str, kind: str, peer: str | None) -> None:
-        level = logging.DEBUG if kind in ORDINARY else logging.WARNING
-        admitted, held_back = self._throttle.admit((listener, kind), time.monotonic())
-        if admitted or level == logging.DEBUG:
-            fields = {"held_back": held_back} if held_back else {}
-            logs.write(level, kind, listener=listener, peer=peer or "-", **fields)
-
-    def _listener(self, name: str, settings: ModbusTcpListener) -> _core.Listener:
-        return _core.Listener(
-            name,
-            str(settings.bind),
-            [self._rule(rule) for rule in settings.rules],
-            max_connections=settings.max_connections,
-            max_connections_per_source=settings.max_connections_per_source,
-            when_full=settings.when_full,
-            idle_timeout=settings.idle_timeout,
-            request_timeout=settings.request_timeout,
-        )
-
-    def _rule(self, rule: RuleConfig) -> _core.Rule:
-        return _core.Rule(
-            {unit: self.memories[name] for unit, name in rule.units.items()},
-            sources=[str(source) for source in rule.sources],
-            access=rule.access,
-            functions=rule.functions,
-            deny=rule.deny,
-        )
-
-    def _running(self) -> _core.Engine:
-        if self._engine is None:
+    def _parts(self) -> _Running:
+        if self._running is None:
             raise RuntimeError("the appliance does not run")
-        return self._engine
+        return self._running
 
     def __enter__(self) -> Self:
         return self.start()
@@ -135,28 +109,170 @@ class Appliance:
         self.stop()
 
 
-def _memory(settings: MemoryConfig) -> _core.Memory:
-    """The memory that a configuration describes, with its initial values."""
-    seal = settings.seal
-    memory = _core.Memory(
-        **{area: (span.start, span.size) for area, span in settings.areas().items()},
-        seal=None if seal is None else (seal.area, seal.address, seal.mode),
-    )
-    writes = [(run.area, run.address, run.values) for run in settings.initial_values]
-    if writes:
-        memory.write_many(writes)
-    return memory
+class _Running:
+    """The parts of a running appliance; making it starts them all, or none."""
+
+    def __init__(self, config: Config, memories: dict[str, _core.Memory]) -> None:
+        self._config = config
+        self._memories = memories
+        self._supervisors: list[Supervisor] = []
+        self._lost_events = 0
+        self._seals = {name: memory.seal_changes for name, memory in memories.items()}
+        with ExitStack() as undo:
+            self._audit = self._opened_audit(undo)
+            sockets = self._bound_sockets(undo)
+            self._engine = self._started_engine()
+            undo.callback(self._engine.stop)
+            self.endpoints = self._listed(sockets)
+            self.diagnostics = Diagnostics(memories, self._engine)
+            self.diagnostics.audit = self._audit
+            self._add_adapters(sockets)
+            undo.pop_all()
+        self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
+        self._stopped = threading.Event()
+        if self._audit is not None:
+            self._auditing.start()
+        for supervisor in self._supervisors:
+            supervisor.start()
+
+    def stop(self) -> None:
+        """Tells all parts to end, then waits for each."""
+        for supervisor in self._supervisors:
+            supervisor.stop()
+        self._engine.stop()
+        self._stopped.set()
+        for supervisor in self._supervisors:
+            supervisor.join()
+        if self._audit is not None:
+            self._auditing.join()
+            self._audit.close()
+
+    def log_events(self, timeout: float) -> None:
+        event = self._engine.next_event(timeout)
+        if event is not None:
+            self._log_event(*event)
+        lost, self._lost_events = (
+            self._engine.lost_events - self._lost_events,
+            self._engine.lost_events,
+        )
+        if lost:
+            logs.write(logging.WARNING, "events_lost", count=lost)
+        for name, memory in self._memories.items():
+            before, now = self._seals[name], memory.seal_changes
+            if now != before:
+                self._seals[name] = now
+                opened, closed = now[0] - before[0], now[1] - before[1]
+                state = "sealed" if memory.sealed else "open"
+                logs.write(
+                    logging.INFO, "seal", memory=name, state=state, opened=opened, closed=closed
+                )
+
+    def _log_event(self, listener: str, event: str, peer: str | None, reason: str | None) -> None:
+        fields = {"listener": listener, "peer": peer or "-"}
+        if reason is not None:
+            fields["reason"] = reason
+        if event in LEVELS:
+            logs.write(LEVELS[event], event, **fields)
+        else:
+            logs.refused(event, kind=(listener, reason), **fields)
+
+    def _opened_audit(self, undo: ExitStack) -> Audit | None:
+        settings = self._config.audit
+        if settings is None:
+            return None
+        audit = Audit(settings.file, max_bytes=settings.max_bytes, keep=settings.keep)
+        undo.callback(audit.close)
+        return audit
+
+    def _bound_sockets(self, undo: ExitStack) -> dict[str, socket.socket]:
+        """The sockets of what is served over HTTP."""
+        sockets: dict[str, socket.socket] = {}
+        services = {"rest": self._config.rest, "metrics": self._config.metrics}
+        for name, settings in services.items():
+            if settings is not None:
+                from holdfast import http
+
+                sockets[name] = http.listen(settings.bind.host, settings.bind.port)
+                undo.callback(sockets[name].close)
+        return sockets
+
+    def _started_engine(self) -> _core.Engine:
+        config = self._config
+        identity = assembly.identity(config.identity)
+        return _core.Engine(
+            [assembly.listener(name, config, self._memories) for name in config.listeners],
+            identity=identity.objects(),
+            unit_names=identity.names(),
+            workers=config.workers,
+            events="all" if config.log.level == "debug" else "refusals",
+            audit=self._audit is not None,
+        )
+
+    def _listed(self, sockets: dict[str, socket.socket]) -> list[Endpoint]:
+        listeners = self._config.listeners.items()
+        endpoints: list[Endpoint] = []
+        for (name, settings), address in zip(listeners, self._engine.addresses, strict=True):
+            if isinstance(settings, ModbusRtuListener | ModbusAsciiListener):
+                device = settings.serial.device
+                endpoints.append(Endpoint(name, settings.type, device, None, settings))
+            elif address is not None:
+                endpoints.append(Endpoint(name, settings.type, *address, settings))
+        for name, bound in sockets.items():
+            host, port = bound.getsockname()[:2]
+            service = getattr(self._config, name)
+            endpoints.append(Endpoint(name, "http", host, port, service))
+        return endpoints
+
+    def _add_adapters(self, sockets: dict[str, socket.socket]) -> None:
+        config = self._config
+        if config.rest is not None:
+            from holdfast.adapters.rest import Rest
+
+            rest, door = config.rest, self._door("rest")
+            at = sockets["rest"]
+            self._add("rest", door, lambda: Rest(rest, door, self.diagnostics, at))
+        if config.mqtt is not None:
+            from holdfast.adapters.mqtt import Mqtt
+
+            mqtt, to_mqtt = config.mqtt, self._door("mqtt")
+            self._add("mqtt", to_mqtt, lambda: Mqtt(mqtt, to_mqtt))
+        if config.metrics is not None:
+            from holdfast.adapters.metrics import Metrics
+
+            metrics, metrics_at = config.metrics, sockets["metrics"]
+            self._add("metrics", None, lambda: Metrics(metrics, self.diagnostics, metrics_at))
+        for name, settings in config.adapters.items():
+            from holdfast.adapters import foreign
+
+            own_door = self._door(name)
+            self._add(name, own_door, foreign.factory(name, settings, own_door))
+
+    def _door(self, name: str) -> Door:
+        return Door(name, self._memories, self._audit)
+
+    def _add(self, name: str, door: Door | None, factory: Callable[[], Adapter]) -> None:
+        supervisor = Supervisor(name, factory)
+        self._supervisors.append(supervisor)
+        self.diagnostics.adapters[name] = (supervisor, door)
+
+    def _take_writes(self) -> None:
+        """Brings the writes of listeners into the audit log, until all have stopped."""
+        audit, lost = self._audit, 0
+        assert audit is not None
+        while True:
+            ended = self._stopped.is_set()
+            writes = self._engine.next_writes(0 if ended else PATIENCE, AUDIT_BATCH)
+            for write in writes:
+                audit.write(**write)
+            missed = self._engine.lost_writes
+            if missed > lost:
+                audit.write(lost=missed - lost)
+                logs.write(logging.ERROR, "audit_lost", count=missed - lost)
+                lost = missed
+            if ended and not writes:
+                return
 
 
-def _identity(settings: IdentityConfig) -> Identity:
-    return Identity(
-        vendor_name=settings.vendor_name,
-        product_code=settings.product_code,
-        revision=settings.revision,
-        vendor_url=settings.vendor_url or "",
-        product_name=settings.product_name or "",
-        model_name=settings.model_name or "",
-        user_application_name=settings.user_application_name or "",
-        unit_names=settings.unit_names,
-        private_objects=settings.objects,
-    )
+def _joined(endpoint: Endpoint) -> str:
+    host = f"[{endpoint.host}]" if ":" in endpoint.host else endpoint.host
+    return f"{host}:{endpoint.port}"

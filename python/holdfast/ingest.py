@@ -140,7 +140,7 @@ class Door:
             target = self._granted(memory, area, grant, where)
             self._check_range(memory, area, address, count, where)
         except Refused as refused:
-            self._note(refused, grant.name, peer)
+            self.note(refused, grant.name, peer)
             raise
         with self._lock:
             self._counts.reads += 1
@@ -148,7 +148,7 @@ class Door:
 
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
         """Counts, logs and audits a write that is refused, also one that never came in here."""
-        self._note(refused, who, peer)
+        self.note(refused, who, peer)
         if self._audit is not None:
             self._audit.write(
                 listener=self.name,
@@ -159,7 +159,8 @@ class Door:
                 outcome=refused.reason,
             )
 
-    def _note(self, refused: Refused, who: str, peer: str) -> None:
+    def note(self, refused: Refused, who: str, peer: str) -> None:
+        """Counts and logs a refusal; what is no write is not audited."""
         with self._lock:
             self._counts.refused[refused.reason] += 1
         logs.refused(

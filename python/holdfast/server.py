@@ -6,7 +6,7 @@ An appliance with several listeners is `holdfast.appliance`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, cast
 
 from holdfast import _core
 from holdfast.identity import Identity
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from holdfast._core import Memory, Rule
-    from holdfast.types import Access, ListenerCounters, WhenFull
+    from holdfast.types import Access, ModbusCounters, WhenFull
 
 MAX_WORKERS = 64
 LOOPBACK = ("127.0.0.0/8", "::1/128")
@@ -114,11 +114,13 @@ class Server:
     @property
     def address(self) -> tuple[str, int]:
         """The address and port that it listens on. Raises `RuntimeError` when it does not run."""
-        return self._running().addresses[0]
+        address = self._running().addresses[0]
+        assert address is not None
+        return address
 
-    def counters(self) -> ListenerCounters:
+    def counters(self) -> ModbusCounters:
         """What it counted since it was started. Raises `RuntimeError` when it does not run."""
-        return self._running().counters()["server"]
+        return cast("ModbusCounters", self._running().counters()["server"])
 
     def _running(self) -> _core.Engine:
         if self._engine is None:

@@ -33,17 +33,41 @@ class ConnectionCounters(TypedDict):
 
 
 class FrameCounters(TypedDict):
-    """Frames that are no requests: with a protocol id other than 0, with an impossible length."""
+    """Frames that are no requests.
+
+    With a protocol id other than 0, with an impossible length, damaged (check sum, characters), on
+    a serial line for a unit that is not served.
+    """
 
     foreign: int
     broken: int
+    damaged: int
+    other_unit: int
 
 
-class ListenerCounters(TypedDict):
-    """What one listener counted: requests by function code, exceptions by exception code."""
+class PacketCounters(TypedDict):
+    """Raw Ingest packets: written, the values in them, refused by reason."""
+
+    accepted: int
+    values: int
+    refused: dict[str, int]
+
+
+class ModbusCounters(TypedDict):
+    """What a Modbus listener counted: requests by function code, exceptions by exception code."""
 
     requests: dict[int, int]
     exceptions: dict[int, int]
     unanswered: int
     connections: ConnectionCounters
     frames: FrameCounters
+
+
+class RawCounters(TypedDict):
+    """What a Raw Ingest listener counted."""
+
+    packets: PacketCounters
+    connections: ConnectionCounters
+
+
+ListenerCounters: TypeAlias = ModbusCounters | RawCounters

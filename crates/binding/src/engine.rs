@@ -171,9 +171,10 @@ fn start_error(error: StartError) -> PyErr {
     match &error {
         StartError::Bind { error: cause, .. }
         | StartError::Open { error: cause, .. }
-        | StartError::Worker(cause) => {
-            PyOSError::new_err((cause.raw_os_error(), error.to_string()))
-        }
+        | StartError::Worker(cause) => match cause.raw_os_error() {
+            Some(number) => PyOSError::new_err((number, error.to_string())),
+            None => PyOSError::new_err(error.to_string()),
+        },
         StartError::Identity(_) => PyValueError::new_err(error.to_string()),
     }
 }

@@ -76,20 +76,25 @@ impl Line {
         SerialPort::open(&self.device, |mut settings: Settings| {
             settings.set_raw();
             settings.set_baud_rate(self.baud)?;
-            settings.set_char_size(if self.data_bits == 7 {
-                CharSize::Bits7
-            } else {
-                CharSize::Bits8
-            });
-            settings.set_parity(match self.parity {
-                LineParity::None => Parity::None,
-                LineParity::Even => Parity::Even,
-                LineParity::Odd => Parity::Odd,
-            });
             settings.set_stop_bits(if self.stop_bits == 2 { StopBits::Two } else { StopBits::One });
             settings.set_flow_control(FlowControl::None);
+            if !self.is_pseudo_terminal() {
+                let seven = self.data_bits == 7;
+                settings.set_char_size(if seven { CharSize::Bits7 } else { CharSize::Bits8 });
+                settings.set_parity(match self.parity {
+                    LineParity::None => Parity::None,
+                    LineParity::Even => Parity::Even,
+                    LineParity::Odd => Parity::Odd,
+                });
+            }
             Ok(settings)
         })
+    }
+
+    /// A pseudo terminal carries bytes: Linux refuses to give its characters another form.
+    fn is_pseudo_terminal(&self) -> bool {
+        let device = std::fs::canonicalize(&self.device);
+        device.is_ok_and(|device| device.starts_with("/dev/pts"))
     }
 
     /// The silence that ends an RTU frame: 3.5 characters.

@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast import logs
+from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import Appliance
-from holdfast.cli.configuration import load_or_exit
+from holdfast.cli.configuration import WRONG, load_or_exit
+from holdfast.config import ModbusTcpListener
 
 if TYPE_CHECKING:
     from types import FrameType
 
     from holdfast.appliance import Endpoint
-    from holdfast.config import Config
+    from holdfast.config import Config, RawRuleConfig, RuleConfig, SerialRuleConfig
 
 # How long a signal may wait until it is noticed, in seconds.
 PATIENCE = 0.2
@@ -57,6 +59,9 @@ def run(file: Path) -> None:
     except OSError as error:
         click.echo(f"holdfast: {_explained(error)}", err=True)
         sys.exit(1)
+    except UnknownAdapter as error:
+        click.echo(f"{file}: {error}", err=True)
+        sys.exit(WRONG)
     try:
         click.echo(_greeting(appliance, file))
         while not signals.received:
@@ -71,8 +76,8 @@ def _allow_open_files(config: Config) -> None:
         import resource
     except ImportError:  # Windows has no such limit.
         return
-    listeners = config.listeners.values()
-    needed = sum(listener.max_connections for listener in listeners) + OTHER_FILES
+    served = [*config.listeners.values(), config.rest]
+    needed = sum(getattr(each, "max_connections", 0) for each in served) + OTHER_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
         return
@@ -107,21 +112,36 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     width = max(len(endpoint.name) for endpoint in endpoints)
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
-        address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
-        lines.append(f"  {endpoint.name:{width}}  {endpoint.settings.type}  {address}")
-        for rule in endpoint.settings.rules:
-            units = ", ".join(f"{unit} = {memory}" for unit, memory in rule.units.items())
-            sources = ", ".join(str(source) for source in rule.sources)
-            lines.append(f"  {'':{width}}    units {units}; {rule.access} for {sources}")
+        lines.append(f"  {endpoint.name:{width}}  {endpoint.type}  {_address(endpoint)}")
+        rules = getattr(endpoint.settings, "rules", ())
+        lines += [f"  {'':{width}}    {_granted(rule)}" for rule in rules]
     lines += ["", "Try:", ""]
     lines += [f"  {command}" for command in _suggestions(appliance, endpoints, file)]
     return "\n".join([*lines, "", "Ctrl-C stops it."])
+
+
+def _address(endpoint: Endpoint) -> str:
+    if endpoint.port is None:
+        return endpoint.host
+    address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
+    return f"http://{address}" if endpoint.type == "http" else address
+
+
+def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
+    """What a rule lets whom do, in a line."""
+    units = ", ".join(f"{unit} = {memory}" for unit, memory in rule.units.items())
+    to = f"units {units}" if units else f"memories {', '.join(getattr(rule, 'memories', ()))}"
+    rights = getattr(rule, "access", None) or f"writes {', '.join(getattr(rule, 'areas', ()))}"
+    sources = ", ".join(str(source) for source in getattr(rule, "sources", ()))
+    return f"{to}; {rights} for {sources or 'the line'}"
 
 
 def _suggestions(appliance: Appliance, endpoints: list[Endpoint], file: Path) -> list[str]:
     """Commands that work on this appliance: a read, a write where one is allowed, the check."""
     check = f"{_program()} check {shlex.quote(str(file))}"
     for endpoint in endpoints:
+        if not isinstance(endpoint.settings, ModbusTcpListener):
+            continue
         for rule in endpoint.settings.rules:
             unit, name = next(iter(rule.units.items()))
             areas = appliance.memories[name].areas

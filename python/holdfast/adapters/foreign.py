@@ -1,0 +1,39 @@
+"""Adapters of others, found by their entry points."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING
+
+from holdfast.adapters import ENTRY_POINTS, Context, Grant
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.adapters import Adapter, Door
+    from holdfast.config import AdapterConfig
+
+
+class UnknownAdapter(ValueError):
+    """An adapter of the configuration that is not installed."""
+
+
+def factory(name: str, settings: AdapterConfig, door: Door) -> Callable[[], Adapter]:
+    """What makes the adapter. Its code is loaded when it is made: a fault of it is its own.
+
+    Raises `UnknownAdapter` when no installed package has an entry point of that type.
+    """
+    known = entry_points(group=ENTRY_POINTS)
+    found = [entry for entry in known if entry.name == settings.type]
+    if not found:
+        installed = ", ".join(sorted(known.names)) or "none"
+        message = f"adapters.{name}.type: found {settings.type!r}, installed: {installed}"
+        raise UnknownAdapter(message)
+    grant = Grant(name, settings.memories, settings.areas, settings.access == "read-write")
+    context = Context(name, door, grant, settings.options)
+
+    def make() -> Adapter:
+        adapter: Adapter = found[0].load()(context)
+        return adapter
+
+    return make
