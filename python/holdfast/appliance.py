@@ -120,7 +120,7 @@ class _Running:
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         with ExitStack() as undo:
             self._audit = self._opened_audit(undo)
-            sockets = self._bound_sockets(undo)
+            self._sockets = sockets = self._bound_sockets(undo)
             self._engine = self._started_engine()
             undo.callback(self._engine.stop)
             self.endpoints = self._listed(sockets)
@@ -143,6 +143,8 @@ class _Running:
         self._stopped.set()
         for supervisor in self._supervisors:
             supervisor.join()
+        for bound in self._sockets.values():
+            bound.close()
         if self._audit is not None:
             self._auditing.join()
             self._audit.close()
