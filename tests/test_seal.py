@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import logging
 import socket
 from typing import TYPE_CHECKING
 
@@ -141,6 +142,7 @@ def test_everything_is_busy_while_a_memory_is_sealed(run: Run, connect: Connect)
 
 
 def test_what_a_seal_does_is_logged(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
     appliance = run(CONFIGURATION.format(mode="level"))
     for bit in (1, 0, 1):
         by_raw(appliance, bit)
