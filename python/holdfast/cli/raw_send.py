@@ -1,0 +1,179 @@
+"""`holdfast raw-send`: one Raw Ingest packet."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from typing import IO
+
+import click
+
+from holdfast import raw
+from holdfast.types import AREAS, Area
+
+MOST = 0xFFFF
+
+# Everything that may stand between two values of a file.
+SEPARATORS = re.compile(r"[\s,;]+")
+
+
+def _number(text: str) -> int | None:
+    if re.fullmatch("0[xX][0-9a-fA-F]{1,20}", text):
+        return int(text, 16)
+    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None
+
+
+def _integer(text: str) -> int:
+    number = _number(text)
+    if number is None:
+        raise click.BadParameter(f"{text!r} is not an integer, decimal or 0x.")
+    return number
+
+
+def _word(text: str) -> int:
+    number = _integer(text)
+    if number > MOST:
+        raise click.BadParameter(f"{text} is outside 0 to {MOST}.")
+    return number
+
+
+def _receiver(text: str) -> tuple[str, int]:
+    """Host and port; an IPv6 address without its brackets."""
+    host, _, digits = text.rpartition(":")
+    if host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        raise click.BadParameter(f"{text!r}: an IPv6 address goes in brackets, as in [::1]:9000.")
+    port = _number(digits)
+    if not host or port is None:
+        raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
+    if not 1 <= port <= MOST:
+        raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MOST}.")
+    return host, port
+
+
+@click.command(
+    epilog="Example: holdfast raw-send 127.0.0.1:9000 input_registers 0 100 200 0x12C --unit 1"
+)
+@click.argument("receiver", metavar="HOST:PORT", type=_receiver)
+@click.argument("area", type=click.Choice(AREAS), metavar="AREA")
+@click.argument("address", type=_word)
+@click.argument("values", metavar="[VALUE]...", nargs=-1, type=_integer)
+@click.option("--unit", type=_word, metavar="N", help="Unit id: the packet is of format v1.")
+@click.option(
+    "--memory-id", type=_word, metavar="N", help="Memory id: the packet is of format crc."
+)
+@click.option("--no-crc", is_flag=True, help="Format crc, for a listener with `crc: none`.")
+@click.option(
+    "--file", type=click.File(encoding="utf-8"), help="Take the values from a file, or from - ."
+)
+@click.option("--hex", "payload", metavar="BYTES", help="Take the payload as it is on the wire.")
+@click.option("--count", type=_word, metavar="N", help="How many bits --hex has.")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    default=raw.TIMEOUT,
+    show_default=True,
+    metavar="SECONDS",
+    help="For connection, packet and reply together.",
+)
+@click.option("--dry-run", is_flag=True, help="Print the packet in hex and send nothing.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+def raw_send(
+    receiver: tuple[str, int],
+    area: Area,
+    address: int,
+    values: tuple[int, ...],
+    unit: int | None,
+    memory_id: int | None,
+    no_crc: bool,
+    file: IO[str] | None,
+    payload: str | None,
+    count: int | None,
+    timeout: float,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Write VALUEs to AREA from ADDRESS on, all in one step, with one Raw Ingest packet.
+
+    AREA is coils, discrete_inputs, holding_registers or input_registers. Numbers are decimal or 0x.
+    A file has the values on lines, or separated by commas, semicolons or spaces.
+
+    Exit codes: 0 written, 1 refused or not known to be written, 2 wrong usage.
+    """
+    if (unit is None) == (memory_id is None):
+        raise click.UsageError("Give --unit (format v1) or --memory-id (format crc).")
+    if no_crc and memory_id is None:
+        raise click.UsageError("--no-crc goes with --memory-id.")
+    if bool(values) + (file is not None) + (payload is not None) != 1:
+        raise click.UsageError("Give VALUEs, --file or --hex, one of them.")
+    if count is not None and payload is None:
+        raise click.UsageError("--count goes with --hex.")
+    try:
+        packet = raw.encode(
+            area,
+            address,
+            None if payload is not None else values if file is None else _values(file),
+            data=None if payload is None else _bytes(payload),
+            count=count,
+            unit=unit,
+            memory_id=memory_id,
+            crc="none" if no_crc else None,
+        )
+    except (ValueError, TypeError) as error:
+        raise click.UsageError(f"{error}.") from error
+    if dry_run:
+        click.echo(json.dumps({"packet": packet.hex()}) if as_json else packet.hex())
+        return
+    host, port = receiver
+    answer: dict[str, object] = {"area": area, "address": address, "bytes": len(packet)}
+    try:
+        raw.send_packet_sync(host, port, packet, timeout=timeout)
+    except ValueError as error:
+        raise click.UsageError(f"{error}.") from error
+    except raw.RawError as error:
+        if not as_json:
+            click.echo(f"holdfast: {error}", err=True)
+            sys.exit(1)
+        answer["reason"] = _reason(error)
+        answer |= {"detail": str(error), "maybe_written": error.maybe_written}
+        click.echo(json.dumps({"ok": False} | answer))
+        sys.exit(1)
+    if as_json:
+        click.echo(json.dumps({"ok": True} | answer))
+    else:
+        click.echo(f"Written: {area} from address {address}, one packet of {len(packet)} bytes.")
+
+
+def _reason(error: raw.RawError) -> str:
+    if isinstance(error, raw.RawRefused):
+        return "refused"
+    return "timeout" if isinstance(error, raw.RawTimeout) else "failed"
+
+
+def _values(file: IO[str]) -> list[int]:
+    """The values of a file; raises `ValueError` with the line of the first that is none."""
+    values: list[int] = []
+    try:
+        for line, text in enumerate(file, 1):
+            for item in SEPARATORS.split(text.strip()):
+                if not item:
+                    continue
+                number = _number(item)
+                if number is None:
+                    found = f"{file.name}:{line}: {item[:40]!r} is not an integer"
+                    raise ValueError(f"{found}, decimal or 0x")
+                values.append(number)
+            if len(values) > MOST:
+                raise ValueError(f"{file.name} has more than {MOST} values")
+    except UnicodeDecodeError:
+        raise ValueError(f"{file.name} is not text in UTF-8") from None
+    return values
+
+
+def _bytes(payload: str) -> bytes:
+    try:
+        return bytes.fromhex(payload)
+    except ValueError:
+        raise ValueError(f"--hex is {payload[:40]!r}, allowed are pairs of hex digits") from None
