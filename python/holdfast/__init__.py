@@ -1,12 +1,36 @@
-"""Holdfast: a Modbus memory that many writers fill and many readers read.
+"""Holdfast: a Modbus memory that many writers fill and many readers read, and clients of devices.
 
 The public names of the library. Everything else is the command line's (`holdfast.cli`), the
-configuration's (`holdfast.config`) or native (`holdfast._core`, which these names come from).
+configuration's (`holdfast.config`) or native (`holdfast._core`, which some of these come from).
 """
 
 from __future__ import annotations
 
+from holdfast import raw, values
 from holdfast._core import Memory, OutOfRange, Rule, __version__
+from holdfast.client import Client, SyncClient
+from holdfast.errors import (
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
 from holdfast.server import Server
 
-__all__ = ["Memory", "OutOfRange", "Rule", "Server", "__version__"]
+__all__ = [
+    "Client",
+    "ConnectionLost",
+    "InvalidResponse",
+    "Memory",
+    "ModbusError",
+    "ModbusException",
+    "OutOfRange",
+    "RequestTimeout",
+    "Rule",
+    "Server",
+    "SyncClient",
+    "__version__",
+    "raw",
+    "values",
+]

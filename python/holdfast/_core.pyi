@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal, final
+from typing import Any, Literal, final
 
 from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
 
-__all__ = ["Engine", "Listener", "Memory", "OutOfRange", "RawRule", "Rule", "__version__", "write_across"]
+__all__ = [
+    "BlockingClient",
+    "Engine",
+    "Listener",
+    "Memory",
+    "OutOfRange",
+    "RawRule",
+    "Request",
+    "Rule",
+    "Session",
+    "__version__",
+    "write_across",
+]
 
 __version__: str
 
@@ -216,3 +228,121 @@ class Engine:
 
     def stop(self) -> None:
         """Answers what was received and ends; returns within a second. From any thread."""
+
+@final
+class Request:
+    """A request of a client, checked and encoded; raises `ValueError` for what can't be asked."""
+
+    @staticmethod
+    def read(area: Area, address: int, count: int) -> Request:
+        """Functions 1 to 4, by the area."""
+
+    @staticmethod
+    def write_coil(address: int, value: bool) -> Request:
+        """Function 5."""
+
+    @staticmethod
+    def write_register(address: int, value: int) -> Request:
+        """Function 6."""
+
+    @staticmethod
+    def write_coils(address: int, values: Iterable[int]) -> Request:
+        """Function 15."""
+
+    @staticmethod
+    def write_registers(address: int, values: Iterable[int]) -> Request:
+        """Function 16."""
+
+    @staticmethod
+    def mask_write(address: int, and_mask: int, or_mask: int) -> Request:
+        """Function 22."""
+
+    @staticmethod
+    def read_write(
+        read_address: int, count: int, write_address: int, values: Iterable[int]
+    ) -> Request:
+        """Function 23."""
+
+    @staticmethod
+    def diagnostics(sub_function: int, data: bytes) -> Request:
+        """Function 8."""
+
+    @staticmethod
+    def event_counter() -> Request:
+        """Function 11."""
+
+    @staticmethod
+    def report_server_id() -> Request:
+        """Function 17."""
+
+    @staticmethod
+    def identification(code: int, object_id: int) -> Request:
+        """Function 43/14."""
+
+    @property
+    def pdu(self) -> bytes:
+        """As it is sent."""
+
+@final
+class BlockingClient:
+    """One request and its reply at a time, over any transport; connects when it is needed.
+
+    Any thread may call it; the calls take turns. The interpreter is free while a call waits.
+    """
+
+    @staticmethod
+    def network(
+        transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int
+    ) -> BlockingClient:
+        """Of a device behind an address."""
+
+    @staticmethod
+    def serial(
+        device: str,
+        *,
+        mode: Literal["rtu", "ascii"],
+        baud: int,
+        parity: Literal["none", "even", "odd"],
+        stop_bits: int,
+        data_bits: int,
+        silence: float | None = None,
+        echo: bool = False,
+    ) -> BlockingClient:
+        """Of a serial line."""
+
+    def call(self, request: Request, unit: int, timeout: float) -> Any:
+        """The result of a request: values, bytes, or `None` for a write.
+
+        Raises `holdfast.ModbusError`.
+        """
+
+    def close(self) -> None:
+        """Ends the connection; the next call makes a new one."""
+
+    @property
+    def late(self) -> int:
+        """Replies that came after their requests had been given up."""
+
+@final
+class Session:
+    """The requests in flight on one Modbus TCP connection, without its socket."""
+
+    def __new__(cls) -> Session: ...
+    def send(self, request: Request, unit: int) -> int | None:
+        """Queues a request; its transaction id, or `None` when all are in use."""
+
+    def outgoing(self) -> bytes:
+        """What is to be sent now."""
+
+    def receive(self, data: bytes) -> tuple[list[tuple[int, Any]], str | None]:
+        """What received bytes complete: transaction ids, each with a result or a `ModbusError`.
+
+        And why the connection is to be closed, if it is.
+        """
+
+    def give_up(self, id: int) -> None:
+        """Gives a request up: its reply, should it come, is dropped and counted."""
+
+    @property
+    def late(self) -> int:
+        """Replies that came after their requests had been given up."""

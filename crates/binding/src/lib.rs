@@ -5,6 +5,7 @@
 
 mod arguments;
 mod audit;
+mod client;
 mod engine;
 mod listener;
 mod memory;
@@ -15,6 +16,8 @@ use pyo3::prelude::*;
 mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult};
 
+    #[pymodule_export]
+    use super::client::{BlockingClient, Request, Session};
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use holdfast_engine::policy::{Functions, Rights, Rule as CoreRule};
 use holdfast_engine::{
-    Limits, Line, LineMode, LineParity, ListenerKind, ListenerSettings, RawRule as CoreRawRule,
-    RawSettings, SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
+    Limits, ListenerKind, ListenerSettings, RawRule as CoreRawRule, RawSettings, SerialSettings,
+    StreamFraming, StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_memory::Memory as CoreMemory;
 use holdfast_protocol::raw_ingest::Format;
@@ -16,6 +16,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyMapping;
 
 use crate::arguments::{address, byte, network, seconds, within, word};
+use crate::client::line;
 use crate::memory::{Memory, named};
 
 #[pyclass(frozen, module = "holdfast")]
@@ -132,18 +133,7 @@ impl Listener {
         data_bits: i128,
         silence: Option<f64>,
     ) -> PyResult<Listener> {
-        let silence = silence.map(|silence| time_to_wait("silence", silence)).transpose()?;
-        let modes = [("rtu", LineMode::Rtu { silence }), ("ascii", LineMode::Ascii)];
-        let parities =
-            [("none", LineParity::None), ("even", LineParity::Even), ("odd", LineParity::Odd)];
-        let line = Line {
-            device,
-            baud: within("baud", baud, 50..=4_000_000)? as u32,
-            parity: word("parity", parity, &parities)?,
-            stop_bits: within("stop_bits", stop_bits, 1..=2)? as u8,
-            data_bits: within("data_bits", data_bits, 7..=8)? as u8,
-            mode: word("mode", mode, &modes)?,
-        };
+        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence)?;
         let kind = ListenerKind::ModbusSerial(SerialSettings { line, rule: rule.core.clone() });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }

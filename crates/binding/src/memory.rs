@@ -291,7 +291,7 @@ fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
 }
 
 /// The integers of a Python sequence, each one checked.
-fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
+pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
     if let Ok(list) = values.cast_exact::<PyList>() {
         return list.iter().enumerate().map(|(index, value)| number(area, index, &value)).collect();
     }

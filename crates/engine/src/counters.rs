@@ -33,7 +33,7 @@ pub struct Counters {
     exceptions: [Counter; 16],
     /// Requests carried out, those for the event counter itself not among them (V1.1b3, 6.9).
     pub events: Counter,
-    /// Requests to a unit that is in listen only mode.
+    /// Requests without a reply: to a unit that is in listen only mode, and broadcasts.
     pub unanswered: Counter,
     pub frames: FrameCounters,
     cleared: Mutex<Bus>,
@@ -169,7 +169,8 @@ impl Counters {
         let frames = &self.frames;
         let errors = frames.foreign.get() + frames.broken.get() + frames.damaged.get();
         Bus {
-            messages: requests + errors + frames.other_unit.get(),
+            // Without damaged ones (Serial Line V1.02, annex A).
+            messages: requests + frames.other_unit.get(),
             communication_errors: errors,
             exceptions: self.exceptions.iter().map(Counter::get).sum(),
             server_messages: requests,

@@ -16,6 +16,7 @@
 
 mod admission;
 pub mod audit;
+pub mod client;
 mod connection;
 pub mod counters;
 mod engine;

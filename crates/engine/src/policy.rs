@@ -96,16 +96,18 @@ impl Grant {
         self.units[usize::from(unit_id)].as_deref()
     }
 
-    /// Every memory that some unit id maps, each once.
-    pub fn memories(&self) -> impl Iterator<Item = (u8, &Arc<Memory>)> {
-        let units = self.units.iter().enumerate();
-        let mapped = units.filter_map(|(unit, memory)| Some((unit as u8, memory.as_ref()?)));
-        mapped.filter(|(unit, memory)| {
-            !self.units[..usize::from(*unit)]
-                .iter()
-                .flatten()
-                .any(|other| Arc::ptr_eq(other, memory))
-        })
+    /// Unit ids that map every memory behind those that are `wanted`, each memory once.
+    pub fn one_unit_of_each_memory(&self, wanted: impl Fn(u8) -> bool) -> Vec<u8> {
+        let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
+        for (unit_id, memory) in (0..=u8::MAX).zip(&self.units) {
+            if let Some(memory) = memory
+                && wanted(unit_id)
+                && !found.iter().any(|(_, known)| Arc::ptr_eq(known, memory))
+            {
+                found.push((unit_id, memory));
+            }
+        }
+        found.into_iter().map(|(unit_id, _)| unit_id).collect()
     }
 
     /// Whether a function code is known and allowed.

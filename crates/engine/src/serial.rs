@@ -73,22 +73,29 @@ pub struct SerialSettings {
 impl Line {
     /// Opens the device, in the context of a runtime.
     pub(crate) fn open(&self) -> io::Result<SerialPort> {
-        SerialPort::open(&self.device, |mut settings: Settings| {
-            settings.set_raw();
-            settings.set_baud_rate(self.baud)?;
-            settings.set_stop_bits(if self.stop_bits == 2 { StopBits::Two } else { StopBits::One });
-            settings.set_flow_control(FlowControl::None);
-            if !self.is_pseudo_terminal() {
-                let seven = self.data_bits == 7;
-                settings.set_char_size(if seven { CharSize::Bits7 } else { CharSize::Bits8 });
-                settings.set_parity(match self.parity {
-                    LineParity::None => Parity::None,
-                    LineParity::Even => Parity::Even,
-                    LineParity::Odd => Parity::Odd,
-                });
-            }
-            Ok(settings)
-        })
+        SerialPort::open(&self.device, |settings: Settings| self.set(settings))
+    }
+
+    /// Opens the device for blocking calls.
+    pub(crate) fn open_blocking(&self) -> io::Result<serial2::SerialPort> {
+        serial2::SerialPort::open(&self.device, |settings: Settings| self.set(settings))
+    }
+
+    fn set(&self, mut settings: Settings) -> io::Result<Settings> {
+        settings.set_raw();
+        settings.set_baud_rate(self.baud)?;
+        settings.set_stop_bits(if self.stop_bits == 2 { StopBits::Two } else { StopBits::One });
+        settings.set_flow_control(FlowControl::None);
+        if !self.is_pseudo_terminal() {
+            let seven = self.data_bits == 7;
+            settings.set_char_size(if seven { CharSize::Bits7 } else { CharSize::Bits8 });
+            settings.set_parity(match self.parity {
+                LineParity::None => Parity::None,
+                LineParity::Even => Parity::Even,
+                LineParity::Odd => Parity::Odd,
+            });
+        }
+        Ok(settings)
     }
 
     /// A pseudo terminal carries bytes: Linux refuses to give its characters another form.
@@ -98,7 +105,7 @@ impl Line {
     }
 
     /// The silence that ends an RTU frame: 3.5 characters.
-    fn silence(&self) -> Duration {
+    pub(crate) fn silence(&self) -> Duration {
         let (fast, shortest) = FAST;
         match self.mode {
             LineMode::Rtu { silence: Some(silence) } => silence,
@@ -164,7 +171,9 @@ impl ModbusSerial {
         let mut quiet = std::pin::pin!(sleep_until(Instant::now()));
         loop {
             let at = len.min(frame.len() - 1);
+            // Characters that are there already end no silence, however late they are looked at.
             let read = tokio::select! {
+                biased;
                 read = port.read(&mut frame[at..]) => read,
                 () = &mut quiet, if len > 0 => {
                     if let Err(error) = self.answer_rtu(front, port, &frame[..len]).await {
@@ -225,7 +234,9 @@ impl ModbusSerial {
                 Err(error) => return error,
             };
             for &character in &input[..len] {
-                if character == b':' {
+                let ends =
+                    character == self.station.ascii_delimiter() && frame.last() == Some(&b'\r');
+                if character == b':' && !ends {
                     if !frame.is_empty() {
                         damaged.add();
                     }
@@ -239,9 +250,7 @@ impl ModbusSerial {
                     continue;
                 }
                 frame.push(character);
-                if character == self.station.ascii_delimiter()
-                    && frame.ends_with(&[b'\r', character])
-                {
+                if ends {
                     if let Err(error) = self.answer_ascii(front, port, &mut frame).await {
                         return error;
                     }
@@ -285,18 +294,23 @@ impl ModbusSerial {
         reply: &mut pdu::Buffer,
     ) -> Option<usize> {
         if unit_id == BROADCAST {
-            self.broadcast(front, request, reply);
+            self.broadcast(front, request);
             return None;
         }
         if self.grant.memory(unit_id).is_none() {
             self.station.counters.frames.other_unit.add();
             return None;
         }
-        self.carry_out(front, unit_id, unit_id, request, reply)
+        let len = self.station.answer(&self.grant, unit_id, request, reply);
+        if let Some(auditor) = &front.auditor {
+            let reply = &reply[..len.unwrap_or_default()];
+            auditor.note(&front.name, None, unit_id, request, reply);
+        }
+        len
     }
 
-    /// A write for all: one for each memory, whose replies nobody waits for.
-    fn broadcast(&self, front: &Front, request: &[u8], reply: &mut pdu::Buffer) {
+    /// A write for all: every memory takes it, nobody replies.
+    fn broadcast(&self, front: &Front, request: &[u8]) {
         let function = request.first().copied().and_then(Function::from_code);
         let wanted = function
             .is_some_and(|code| code.is_write() && code != Function::ReadWriteMultipleRegisters);
@@ -304,25 +318,11 @@ impl ModbusSerial {
             self.station.counters.frames.other_unit.add();
             return;
         }
-        for (unit_id, _) in self.grant.memories() {
-            self.carry_out(front, unit_id, BROADCAST, request, reply);
-        }
-    }
-
-    fn carry_out(
-        &self,
-        front: &Front,
-        unit_id: u8,
-        addressed: u8,
-        request: &[u8],
-        reply: &mut pdu::Buffer,
-    ) -> Option<usize> {
-        let len = self.station.answer(&self.grant, unit_id, request, reply);
-        if let Some(auditor) = &front.auditor {
-            let reply = &reply[..len.unwrap_or_default()];
-            auditor.note(&front.name, None, addressed, request, reply);
-        }
-        len
+        self.station.broadcast(&self.grant, request, |reply| {
+            if let Some(auditor) = &front.auditor {
+                auditor.note(&front.name, None, BROADCAST, request, reply);
+            }
+        });
     }
 }
 

@@ -3,13 +3,13 @@
 //! The order of checks: the function is known and allowed (exception 01), the unit is mapped (0B),
 //! form, quantity and value are right (03), the memory is open (06), the range is inside its area
 //! (02). A denied function is answered before the unit is looked up, so that a stranger can't learn
-//! which units there are.
+//! which units there are. A unit in listen only mode answers nothing at all.
 
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use holdfast_memory::{Access, Area, Memory, Read, Refusal, Write};
 use holdfast_protocol::pdu::{
-    Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
+    self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
 
 use crate::counters::{Bus, Counters};
@@ -71,6 +71,39 @@ impl Station {
         }
     }
 
+    /// Carries out a write that is addressed to all (Serial Line V1.02, 2.1): one message without a
+    /// reply, however many memories take it. `note` gets what each would have answered.
+    pub fn broadcast(&self, grant: &Grant, request: &[u8], mut note: impl FnMut(&[u8])) {
+        let function_code = request.first().copied().unwrap_or_default();
+        self.counters.request(function_code);
+        self.counters.unanswered.add();
+        let (mut carried_out, mut refused) = (false, None);
+        for unit_id in grant.one_unit_of_each_memory(|unit_id| !self.is_silent(unit_id)) {
+            let mut reply = [0; pdu::MAX_LEN];
+            let len = match self.serve(grant, unit_id, function_code, request, &mut reply) {
+                Ok(len) => {
+                    carried_out = true;
+                    len.unwrap_or_default()
+                }
+                Err(code) => {
+                    refused = refused.or(Some(code));
+                    reply::exception(function_code, code, &mut reply)
+                }
+            };
+            note(&reply[..len]);
+        }
+        match refused {
+            Some(code) => self.counters.exception(code),
+            None if carried_out => self.counters.events.add(),
+            None => {}
+        }
+    }
+
+    #[inline]
+    fn is_silent(&self, unit_id: u8) -> bool {
+        self.silent[usize::from(unit_id)].load(Ordering::Relaxed)
+    }
+
     #[inline]
     fn serve(
         &self,
@@ -81,14 +114,18 @@ impl Station {
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
-        if !grant.allows(function_code) || denied(grant, pdu, &request) {
-            return Err(ExceptionCode::IllegalFunction);
-        }
-        let memory = grant.memory(unit_id).ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
-        if self.silent[usize::from(unit_id)].load(Ordering::Relaxed) {
-            self.listen(unit_id, &request);
+        let denied = !grant.allows(function_code) || denied(grant, pdu, &request);
+        let memory = grant.memory(unit_id);
+        if memory.is_some() && self.is_silent(unit_id) {
+            if !denied {
+                self.listen(unit_id, &request);
+            }
             return Ok(None);
         }
+        if denied {
+            return Err(ExceptionCode::IllegalFunction);
+        }
+        let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
         match request? {
             Request::ReadCoils(range) => {
                 read(memory, Area::Coils, Function::ReadCoils, range, reply)

@@ -13,6 +13,9 @@ use crate::listener::Front;
 use crate::policy::{Grant, Policy, Rule};
 use crate::station::Station;
 
+/// How many datagrams are answered that wait when all are to stop.
+const LAST_DATAGRAMS: usize = 1024;
+
 /// A listener for Modbus datagrams.
 #[derive(Debug, Clone)]
 pub struct UdpSettings {
@@ -31,7 +34,7 @@ impl ModbusUdp {
         ModbusUdp { station, policy: Policy::of(&settings.rules) }
     }
 
-    /// Answers datagrams until `stop`.
+    /// Answers datagrams until `stop`, then those that the system has received already.
     pub(crate) async fn serve(
         self,
         front: Arc<Front>,
@@ -46,7 +49,7 @@ impl ModbusUdp {
         loop {
             let received = tokio::select! {
                 biased;
-                _ = stop.wait_for(|stop| *stop) => return,
+                _ = stop.wait_for(|stop| *stop) => break,
                 received = socket.recv_from(&mut input) => received,
             };
             // An error tells of an earlier reply that could not be delivered.
@@ -55,6 +58,14 @@ impl ModbusUdp {
             if len > 0 {
                 // A reply that the system has no room for is lost, as any datagram can be.
                 let _ = socket.try_send_to(&output[..len], peer);
+            }
+        }
+        let Ok(socket) = socket.into_std() else { return };
+        for _ in 0..LAST_DATAGRAMS {
+            let Ok((len, peer)) = socket.recv_from(&mut input) else { break };
+            let len = self.answer(&front, peer, &input[..len], &mut output);
+            if len > 0 {
+                let _ = socket.send_to(&output[..len], peer);
             }
         }
     }

@@ -117,10 +117,60 @@ fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
 }
 
 fn first_fit(bytes: &[u8]) -> Next<'_> {
-    for len in 4..=bytes.len().min(MAX_LEN) {
-        if let Ok((unit_id, pdu)) = decode(&bytes[..len]) {
-            return Next::Frame { unit_id, pdu, len };
-        }
+    let longest = bytes.len().min(MAX_LEN);
+    let Some(first) = (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) else {
+        return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
+    };
+    // Where the last byte of the data is the first of the CRC of those before it, the CRC fits one
+    // byte too early, and a 0 is left over: no frame for unit 0 begins with it.
+    let longer = first < longest && bytes[first] == 0 && !is_known_and_whole(&bytes[first..]);
+    let len = first + usize::from(longer);
+    match decode(&bytes[..len]) {
+        Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
+        Err(_) => Next::Damaged { len },
     }
-    if bytes.len() >= MAX_LEN { Next::Broken } else { Next::Incomplete }
+}
+
+/// Whether bytes start with a frame whose function, and so its length, is known.
+fn is_known_and_whole(bytes: &[u8]) -> bool {
+    let [_, function_code, data @ ..] = bytes else {
+        return false;
+    };
+    match request_data_len(*function_code, data) {
+        DataLen::Known(len) => bytes.get(..2 + len + 2).is_some_and(|frame| decode(frame).is_ok()),
+        DataLen::Incomplete | DataLen::Unknown => false,
+    }
+}
+
+/// How long the frame at the start of `bytes` is, which answers a request of `request_len` bytes of
+/// PDU: from its function code, as far as that tells. `None` while more bytes are needed.
+///
+/// # Errors
+/// [`FrameError::Length`] when no frame can begin so.
+pub fn response_len(bytes: &[u8], request_len: usize) -> Result<Option<usize>, FrameError> {
+    let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
+        return Ok(None);
+    };
+    let data_len = match function_code {
+        0x80.. => Some(1),
+        1..=4 | 17 | 23 => data.first().map(|count| 1 + usize::from(*count)),
+        5 | 6 | 11 | 15 | 16 => Some(4),
+        8 => Some(request_len.saturating_sub(1)),
+        22 => Some(6),
+        43 => identification_len(data),
+        _ => return Err(FrameError::Length),
+    };
+    match data_len.map(|len| 2 + len + 2) {
+        Some(len) if len > MAX_LEN => Err(FrameError::Length),
+        len => Ok(len),
+    }
+}
+
+/// MEI type, read code, conformity, more, next, number of objects, then the objects.
+fn identification_len(data: &[u8]) -> Option<usize> {
+    let mut len = 6;
+    for _ in 0..*data.get(5)? {
+        len += 2 + usize::from(*data.get(len + 1)?);
+    }
+    Some(len)
 }

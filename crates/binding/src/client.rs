@@ -1,0 +1,424 @@
+//! `Request`, `BlockingClient` and `Session`: requests in, values or exceptions out.
+
+use std::sync::Mutex;
+
+use holdfast_engine::client::{
+    BlockingClient as Core, ClientError, Endpoint, Session as CoreSession, exception_name,
+};
+use holdfast_engine::{Line, LineMode, LineParity};
+use holdfast_protocol::pdu::identification::ReadCode;
+use holdfast_protocol::pdu::{
+    self, Diagnostics, Range, Request as CoreRequest, Response, ResponseError, SubFunction, limit,
+};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyList};
+
+use crate::arguments::{byte, seconds, within, word};
+use crate::memory::numbers;
+
+pyo3::import_exception!(holdfast.errors, ModbusException);
+pyo3::import_exception!(holdfast.errors, ConnectionLost);
+pyo3::import_exception!(holdfast.errors, RequestTimeout);
+pyo3::import_exception!(holdfast.errors, InvalidResponse);
+
+/// Addresses of an area.
+const ADDRESSES: i128 = 65_536;
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Request {
+    pdu: Vec<u8>,
+}
+
+#[pymethods]
+impl Request {
+    #[staticmethod]
+    fn read(area: &str, address: i128, count: i128) -> PyResult<Request> {
+        let area = crate::memory::named(area)?;
+        let most = if area.is_bits() { limit::READ_BITS } else { limit::READ_REGISTERS };
+        let range = range(address, count, most)?;
+        encoded(&match area {
+            holdfast_memory::Area::Coils => CoreRequest::ReadCoils(range),
+            holdfast_memory::Area::DiscreteInputs => CoreRequest::ReadDiscreteInputs(range),
+            holdfast_memory::Area::HoldingRegisters => CoreRequest::ReadHoldingRegisters(range),
+            holdfast_memory::Area::InputRegisters => CoreRequest::ReadInputRegisters(range),
+        })
+    }
+
+    #[staticmethod]
+    fn write_coil(address: i128, value: bool) -> PyResult<Request> {
+        let address = register("address", address)?;
+        encoded(&CoreRequest::WriteSingleCoil { address, value })
+    }
+
+    #[staticmethod]
+    fn write_register(address: i128, value: &Bound<'_, PyAny>) -> PyResult<Request> {
+        let address = register("address", address)?;
+        let value = single(value)?;
+        encoded(&CoreRequest::WriteSingleRegister { address, value })
+    }
+
+    #[staticmethod]
+    fn write_coils(address: i128, values: &Bound<'_, PyAny>) -> PyResult<Request> {
+        let values = numbers(holdfast_memory::Area::Coils, values)?;
+        let range = range(address, values.len() as i128, limit::WRITE_BITS)?;
+        let mut bits = vec![0; values.len().div_ceil(8)];
+        for (index, bit) in values.iter().enumerate() {
+            bits[index / 8] |= (*bit as u8) << (index % 8);
+        }
+        encoded(&CoreRequest::WriteMultipleCoils { range, bits: &bits })
+    }
+
+    #[staticmethod]
+    fn write_registers(address: i128, values: &Bound<'_, PyAny>) -> PyResult<Request> {
+        let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
+        let range = range(address, values.len() as i128, limit::WRITE_REGISTERS)?;
+        let registers = &packed(&values);
+        encoded(&CoreRequest::WriteMultipleRegisters { range, registers })
+    }
+
+    #[staticmethod]
+    fn mask_write(address: i128, and_mask: i128, or_mask: i128) -> PyResult<Request> {
+        encoded(&CoreRequest::MaskWriteRegister {
+            address: register("address", address)?,
+            and_mask: register("and_mask", and_mask)?,
+            or_mask: register("or_mask", or_mask)?,
+        })
+    }
+
+    #[staticmethod]
+    fn read_write(
+        read_address: i128,
+        count: i128,
+        write_address: i128,
+        values: &Bound<'_, PyAny>,
+    ) -> PyResult<Request> {
+        let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
+        let read = range(read_address, count, limit::READ_REGISTERS)?;
+        let write = range(write_address, values.len() as i128, limit::READ_WRITE_REGISTERS)?;
+        let registers = &packed(&values);
+        encoded(&CoreRequest::ReadWriteMultipleRegisters { read, write, registers })
+    }
+
+    #[staticmethod]
+    fn diagnostics(sub_function: i128, data: &[u8]) -> PyResult<Request> {
+        let code = register("sub_function", sub_function)?;
+        let sub_function = SubFunction::from_code(code).ok_or_else(|| {
+            PyValueError::new_err(format!("sub_function {code} is not one of the standard"))
+        })?;
+        encoded(&CoreRequest::Diagnostics(Diagnostics { sub_function, data }))
+    }
+
+    #[staticmethod]
+    fn event_counter() -> PyResult<Request> {
+        encoded(&CoreRequest::GetCommEventCounter)
+    }
+
+    #[staticmethod]
+    fn report_server_id() -> PyResult<Request> {
+        encoded(&CoreRequest::ReportServerId)
+    }
+
+    #[staticmethod]
+    fn identification(code: i128, object_id: i128) -> PyResult<Request> {
+        let code = ReadCode::from_code(byte("code", code)?)
+            .ok_or_else(|| PyValueError::new_err(format!("code is {code}, allowed are 1 to 4")))?;
+        let object_id = byte("object id", object_id)?;
+        encoded(&CoreRequest::ReadDeviceIdentification { code, object_id })
+    }
+
+    #[getter]
+    fn pdu<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, &self.pdu)
+    }
+}
+
+impl Request {
+    /// What was encoded.
+    fn core(&self) -> PyResult<CoreRequest<'_>> {
+        CoreRequest::parse(&self.pdu).map_err(|code| PyValueError::new_err(code.to_string()))
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct BlockingClient {
+    core: Core,
+}
+
+#[pymethods]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+impl BlockingClient {
+    #[staticmethod]
+    fn network(transport: &str, host: String, port: u16) -> PyResult<BlockingClient> {
+        let endpoint = match transport {
+            "tcp" => Endpoint::Tcp { host, port },
+            "rtu+tcp" => Endpoint::RtuOverTcp { host, port },
+            "udp" => Endpoint::Udp { host, port },
+            _ => {
+                let message = format!("transport is {transport:?}, allowed are tcp, rtu+tcp, udp");
+                return Err(PyValueError::new_err(message));
+            }
+        };
+        Ok(BlockingClient { core: Core::new(endpoint) })
+    }
+
+    #[staticmethod]
+    #[pyo3(signature = (device, *, mode, baud, parity, stop_bits, data_bits, silence=None, echo=false))]
+    fn serial(
+        device: String,
+        mode: &str,
+        baud: i128,
+        parity: &str,
+        stop_bits: i128,
+        data_bits: i128,
+        silence: Option<f64>,
+        echo: bool,
+    ) -> PyResult<BlockingClient> {
+        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence)?;
+        Ok(BlockingClient { core: Core::new(Endpoint::Serial { line, echo }) })
+    }
+
+    /// The result of a request, as Python has it.
+    fn call<'py>(
+        &self,
+        py: Python<'py>,
+        request: &Request,
+        unit: i128,
+        timeout: f64,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let unit = byte("unit", unit)?;
+        let timeout = seconds("timeout", timeout)?;
+        let core = request.core()?;
+        let result = py.detach(|| {
+            self.core.call(unit, &core, timeout, |response: Response<'_>| Reply::from(response))
+        });
+        result.map_err(raised)?.into_python(py, &core)
+    }
+
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| self.core.close());
+    }
+
+    #[getter]
+    fn late(&self) -> u64 {
+        self.core.late()
+    }
+}
+
+/// A serial line as arguments describe it.
+pub fn line(
+    device: String,
+    mode: &str,
+    baud: i128,
+    parity: &str,
+    stop_bits: i128,
+    data_bits: i128,
+    silence: Option<f64>,
+) -> PyResult<Line> {
+    let silence = silence.map(|silence| seconds("silence", silence)).transpose()?;
+    let modes = [("rtu", LineMode::Rtu { silence }), ("ascii", LineMode::Ascii)];
+    let parities =
+        [("none", LineParity::None), ("even", LineParity::Even), ("odd", LineParity::Odd)];
+    Ok(Line {
+        device,
+        baud: within("baud", baud, 50..=4_000_000)? as u32,
+        parity: word("parity", parity, &parities)?,
+        stop_bits: within("stop_bits", stop_bits, 1..=2)? as u8,
+        data_bits: within("data_bits", data_bits, 7..=8)? as u8,
+        mode: word("mode", mode, &modes)?,
+    })
+}
+
+#[pyclass(module = "holdfast")]
+pub struct Session {
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    core: CoreSession,
+    requests: std::collections::HashMap<u16, Py<Request>>,
+    out: Vec<u8>,
+}
+
+/// Transaction id, and a result or an exception.
+type Completed<'py> = (u16, Bound<'py, PyAny>);
+
+#[pymethods]
+impl Session {
+    #[new]
+    fn new() -> Session {
+        Session { state: Mutex::default() }
+    }
+
+    /// Queues a request; its transaction id, or `None` when all are in use.
+    fn send(&self, request: Py<Request>, unit: i128) -> PyResult<Option<u16>> {
+        let unit = byte("unit", unit)?;
+        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let id = state.core.send(unit, &request.get().pdu, &mut state.out);
+        if let Some(id) = id {
+            state.requests.insert(id, request);
+        }
+        Ok(id)
+    }
+
+    /// The bytes to send now.
+    fn outgoing<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let bytes = PyBytes::new(py, &state.out);
+        state.out.clear();
+        bytes
+    }
+
+    /// What received bytes complete, and why the connection is to be closed.
+    fn receive<'py>(
+        &self,
+        py: Python<'py>,
+        data: &[u8],
+    ) -> PyResult<(Vec<Completed<'py>>, Option<String>)> {
+        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let requests = &mut state.requests;
+        let mut completed = Vec::new();
+        let mut failed = None;
+        let received = state.core.receive(data, |id, response| {
+            let Some(request) = requests.remove(&id) else { return };
+            match completion(py, request.get(), response) {
+                Ok(value) => completed.push((id, value)),
+                Err(error) => failed = Some(error),
+            }
+        });
+        match failed {
+            Some(error) => Err(error),
+            None => Ok((completed, received.err().map(|broken| broken.to_string()))),
+        }
+    }
+
+    /// Gives a request up: its reply, should it come, is dropped and counted.
+    fn give_up(&self, id: u16) {
+        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        state.core.give_up(id);
+        state.requests.remove(&id);
+    }
+
+    #[getter]
+    fn late(&self) -> u64 {
+        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner).core.late()
+    }
+}
+
+/// A result, or the exception that it is.
+fn completion<'py>(
+    py: Python<'py>,
+    request: &Request,
+    response: Result<Response<'_>, ResponseError>,
+) -> PyResult<Bound<'py, PyAny>> {
+    match response {
+        Ok(response) => Reply::from(response).into_python(py, &request.core()?),
+        Err(error) => Ok(raised(error.into()).into_value(py).into_bound(py).into_any()),
+    }
+}
+
+/// A response without the buffer that it borrows from.
+enum Reply {
+    Bits(Vec<u8>),
+    Registers(Vec<u8>),
+    Written,
+    Bytes(Vec<u8>),
+    EventCounter(bool, u16),
+    Identification(u8, Option<u8>, Vec<(u8, Vec<u8>)>),
+}
+
+impl From<Response<'_>> for Reply {
+    fn from(response: Response<'_>) -> Reply {
+        match response {
+            Response::Bits(bits) => Reply::Bits(bits.to_vec()),
+            Response::Registers(registers) => Reply::Registers(registers.to_vec()),
+            Response::Written => Reply::Written,
+            Response::Diagnostics(data) | Response::ServerId(data) => Reply::Bytes(data.to_vec()),
+            Response::EventCounter { busy, events } => Reply::EventCounter(busy, events),
+            Response::Identification(answer) => {
+                let objects = answer.iter().map(|(id, value)| (id, value.to_vec())).collect();
+                Reply::Identification(answer.conformity_level, answer.next, objects)
+            }
+        }
+    }
+}
+
+impl Reply {
+    fn into_python<'py>(
+        self,
+        py: Python<'py>,
+        request: &CoreRequest<'_>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        Ok(match self {
+            Reply::Bits(bits) => {
+                let quantity = match request {
+                    CoreRequest::ReadCoils(range) | CoreRequest::ReadDiscreteInputs(range) => {
+                        usize::from(range.quantity)
+                    }
+                    _ => bits.len() * 8,
+                };
+                let bit = |index: usize| bits[index / 8] >> (index % 8) & 1 == 1;
+                PyList::new(py, (0..quantity).map(bit))?.into_any()
+            }
+            Reply::Registers(registers) => {
+                let (pairs, _) = registers.as_chunks::<2>();
+                PyList::new(py, pairs.iter().map(|pair| u16::from_be_bytes(*pair)))?.into_any()
+            }
+            Reply::Written => py.None().into_bound(py),
+            Reply::Bytes(data) => PyBytes::new(py, &data).into_any(),
+            Reply::EventCounter(busy, events) => (busy, events).into_pyobject(py)?.into_any(),
+            Reply::Identification(conformity, next, objects) => {
+                let objects: Vec<(u8, Bound<'_, PyBytes>)> =
+                    objects.iter().map(|(id, value)| (*id, PyBytes::new(py, value))).collect();
+                (conformity, next, objects).into_pyobject(py)?.into_any()
+            }
+        })
+    }
+}
+
+fn raised(error: ClientError) -> PyErr {
+    match error {
+        ClientError::Exception(code) => ModbusException::new_err((code, exception_name(code))),
+        ClientError::Timeout(_) => RequestTimeout::new_err(error.to_string()),
+        ClientError::Connect { .. } | ClientError::Lost(_) => {
+            ConnectionLost::new_err(error.to_string())
+        }
+        ClientError::Invalid(_) => InvalidResponse::new_err(error.to_string()),
+    }
+}
+
+fn encoded(request: &CoreRequest<'_>) -> PyResult<Request> {
+    let mut buffer = [0; pdu::MAX_LEN];
+    match request.encode(&mut buffer) {
+        Some(len) => Ok(Request { pdu: buffer[..len].to_vec() }),
+        None => Err(PyValueError::new_err(format!(
+            "{} does not allow these arguments",
+            request.function().name()
+        ))),
+    }
+}
+
+fn range(address: i128, count: i128, most: u16) -> PyResult<Range> {
+    let address = register("address", address)?;
+    let quantity = within("count", count, 1..=usize::from(most))? as u16;
+    if i128::from(address) + count > ADDRESSES {
+        let message = format!("{count} from address {address}: the last address is 65535");
+        return Err(PyValueError::new_err(message));
+    }
+    Ok(Range { address, quantity })
+}
+
+fn register(what: &str, number: i128) -> PyResult<u16> {
+    Ok(within(what, number, 0..=65_535)? as u16)
+}
+
+/// One register's value.
+fn single(value: &Bound<'_, PyAny>) -> PyResult<u16> {
+    let values = PyList::new(value.py(), [value])?;
+    Ok(numbers(holdfast_memory::Area::HoldingRegisters, values.as_any())?[0])
+}
+
+fn packed(values: &[u16]) -> Vec<u8> {
+    values.iter().flat_map(|value| value.to_be_bytes()).collect()
+}

@@ -1,0 +1,467 @@
+//! One request and its reply, by blocking calls with one deadline for all of it.
+//!
+//! The connection is made when it is needed and kept. A call that fails after its request may have been
+//! sent is never repeated; only a read over UDP is, which changes nothing. What leaves the state of
+//! a connection in doubt ends it: then the next call makes a new one. Over TCP a timeout does not,
+//! because a late reply is known by its transaction id.
+
+use std::io::{self, ErrorKind};
+use std::net::{TcpStream, UdpSocket};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use holdfast_protocol::frame::{ascii, mbap, rtu};
+use holdfast_protocol::pdu::{self, Request, Response, ResponseError};
+
+use super::line::{self, Line};
+use super::session::Session;
+use super::{Broken, ClientError};
+use crate::serial::{Line as SerialLine, LineMode};
+
+/// Bytes taken from a socket at once.
+const CHUNK: usize = 4096;
+
+/// After this time without use a connection is looked at before it is trusted.
+const IDLE: Duration = Duration::from_millis(50);
+
+/// How often a read is sent over UDP within its deadline.
+const UDP_ATTEMPTS: u32 = 3;
+
+/// What devices get to carry out a broadcast (Modbus over Serial Line V1.02, 2.4.1).
+const TURNAROUND: Duration = Duration::from_millis(100);
+
+/// What a client talks to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Endpoint {
+    Tcp {
+        host: String,
+        port: u16,
+    },
+    RtuOverTcp {
+        host: String,
+        port: u16,
+    },
+    Udp {
+        host: String,
+        port: u16,
+    },
+    /// With `echo` the adapter hands back what is sent; one that does is also noticed by itself.
+    Serial {
+        line: SerialLine,
+        echo: bool,
+    },
+}
+
+/// A client of one endpoint. Any number of threads may call it: their calls take turns.
+pub struct BlockingClient {
+    endpoint: Endpoint,
+    connection: Mutex<Option<Connection>>,
+    late: AtomicU64,
+}
+
+struct Connection {
+    kind: Kind,
+    used: Instant,
+}
+
+enum Kind {
+    Tcp { stream: TcpStream, session: Session },
+    Udp { socket: UdpSocket, next_id: u16 },
+    Rtu { line: Box<dyn Line>, silence: Option<Duration>, echo: bool },
+    Ascii { line: Box<dyn Line>, echo: bool },
+}
+
+/// A call's request and times.
+struct Call<'c> {
+    unit_id: u8,
+    request: &'c Request<'c>,
+    pdu: &'c [u8],
+    timeout: Duration,
+    deadline: Instant,
+}
+
+/// A call that failed, and whether the connection can be used again.
+struct Failure {
+    error: ClientError,
+    usable: bool,
+}
+
+impl BlockingClient {
+    pub fn new(endpoint: Endpoint) -> BlockingClient {
+        BlockingClient { endpoint, connection: Mutex::default(), late: AtomicU64::new(0) }
+    }
+
+    /// Sends a request and gives its response to `take`. On a serial line unit id 0 is a broadcast:
+    /// nobody replies, and a write is held to be done when it was sent.
+    ///
+    /// # Errors
+    /// [`ClientError`]; a request that can't be encoded is [`ClientError::Invalid`].
+    pub fn call<T>(
+        &self,
+        unit_id: u8,
+        request: &Request<'_>,
+        timeout: Duration,
+        take: impl FnOnce(Response<'_>) -> T,
+    ) -> Result<T, ClientError> {
+        let mut buffer = [0; pdu::MAX_LEN];
+        let len = request
+            .encode(&mut buffer)
+            .ok_or_else(|| ClientError::Invalid("the request can't be encoded".into()))?;
+        let deadline = Instant::now() + timeout;
+        let call = Call { unit_id, request, pdu: &buffer[..len], timeout, deadline };
+        let mut held = self.connection.lock().unwrap_or_else(PoisonError::into_inner);
+        if held.as_ref().is_some_and(Connection::has_ended) {
+            *held = None;
+        }
+        let connection = match held.as_mut() {
+            Some(connection) => connection,
+            None => held.insert(self.open(deadline, timeout)?),
+        };
+        let mut take = Some(take);
+        let mut taken = None;
+        let mut give = |response: Response<'_>| {
+            taken = take.take().map(|take| take(response));
+        };
+        let done = connection.exchange(&call, &mut give, &self.late);
+        connection.used = Instant::now();
+        match done {
+            Ok(()) => taken.ok_or_else(|| ClientError::Invalid("there was no response".into())),
+            Err(Failure { error, usable }) => {
+                if !usable {
+                    *held = None;
+                }
+                Err(error)
+            }
+        }
+    }
+
+    /// Ends the connection; the next call makes a new one.
+    pub fn close(&self) {
+        *self.connection.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
+    /// Replies that came after their requests had been given up.
+    pub fn late(&self) -> u64 {
+        self.late.load(Ordering::Relaxed)
+    }
+
+    fn open(&self, deadline: Instant, timeout: Duration) -> Result<Connection, ClientError> {
+        let failed = |to: String| {
+            move |error: io::Error| match error.kind() {
+                ErrorKind::TimedOut => ClientError::Timeout(timeout.as_secs_f64()),
+                _ => ClientError::Connect { to, error },
+            }
+        };
+        let at = |host: &str, port: u16| failed(format!("{host}:{port}"));
+        let kind = match &self.endpoint {
+            Endpoint::Tcp { host, port } => {
+                let stream = line::connect(host, *port, deadline).map_err(at(host, *port))?;
+                Kind::Tcp { stream, session: Session::default() }
+            }
+            Endpoint::RtuOverTcp { host, port } => {
+                let stream = line::connect(host, *port, deadline).map_err(at(host, *port))?;
+                Kind::Rtu { line: Box::new(stream), silence: None, echo: false }
+            }
+            Endpoint::Udp { host, port } => {
+                let socket = line::first(host, *port, |address| {
+                    let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
+                    let socket = UdpSocket::bind(any)?;
+                    socket.connect(address)?;
+                    Ok(socket)
+                });
+                Kind::Udp { socket: socket.map_err(at(host, *port))?, next_id: 0 }
+            }
+            Endpoint::Serial { line, echo } => {
+                let port = line.open_blocking().map_err(failed(line.device.clone()))?;
+                let (silence, line_of) = (line.silence(), Box::new(port));
+                match line.mode {
+                    LineMode::Rtu { .. } => {
+                        Kind::Rtu { line: line_of, silence: Some(silence), echo: *echo }
+                    }
+                    LineMode::Ascii => Kind::Ascii { line: line_of, echo: *echo },
+                }
+            }
+        };
+        Ok(Connection { kind, used: Instant::now() })
+    }
+}
+
+impl Connection {
+    /// Whether the peer ended the connection while nobody used it.
+    fn has_ended(&self) -> bool {
+        match &self.kind {
+            Kind::Tcp { stream, .. } => self.used.elapsed() > IDLE && line::has_ended(stream),
+            _ => false,
+        }
+    }
+
+    fn exchange(
+        &mut self,
+        call: &Call<'_>,
+        give: &mut dyn FnMut(Response<'_>),
+        late: &AtomicU64,
+    ) -> Result<(), Failure> {
+        match &mut self.kind {
+            Kind::Tcp { stream, session } => over_tcp(stream, session, call, give, late),
+            Kind::Udp { socket, next_id } => over_udp(socket, next_id, call, give, late),
+            Kind::Rtu { line, silence, echo } => {
+                over_rtu(line.as_mut(), *silence, self.used, echo, call, give)
+            }
+            Kind::Ascii { line, echo } => over_ascii(line.as_mut(), echo, call, give),
+        }
+    }
+}
+
+impl Call<'_> {
+    /// What an I/O error means to the caller.
+    fn failed(&self, error: &io::Error, usable: bool) -> Failure {
+        let error = match error.kind() {
+            ErrorKind::TimedOut => ClientError::Timeout(self.timeout.as_secs_f64()),
+            ErrorKind::UnexpectedEof => ClientError::Lost("closed by the peer".into()),
+            _ => ClientError::Lost(error.to_string()),
+        };
+        Failure { error, usable }
+    }
+
+    /// The response that a PDU is.
+    fn judge(&self, reply: &[u8], give: &mut dyn FnMut(Response<'_>)) -> Result<(), Failure> {
+        match self.request.response(reply) {
+            Ok(response) => {
+                give(response);
+                Ok(())
+            }
+            Err(error) => Err(refused(error)),
+        }
+    }
+
+    fn is_read(&self) -> bool {
+        !self.request.function().is_write() && !matches!(self.request, Request::Diagnostics(_))
+    }
+
+    fn is_broadcast(&self) -> bool {
+        self.unit_id == 0
+    }
+}
+
+/// A response that is an exception leaves the connection as it was; any other says that the two
+/// sides mean different things.
+fn refused(error: ResponseError) -> Failure {
+    let usable = matches!(error, ResponseError::Exception(_) | ResponseError::UnknownException(_));
+    Failure { error: error.into(), usable }
+}
+
+fn invalid(text: impl Into<String>) -> Failure {
+    Failure { error: ClientError::Invalid(text.into()), usable: false }
+}
+
+fn over_tcp(
+    stream: &mut TcpStream,
+    session: &mut Session,
+    call: &Call<'_>,
+    give: &mut dyn FnMut(Response<'_>),
+    late: &AtomicU64,
+) -> Result<(), Failure> {
+    let mut frame = Vec::with_capacity(mbap::MAX_LEN);
+    let Some(id) = session.send(call.unit_id, call.pdu, &mut frame) else {
+        return Err(Failure {
+            error: ClientError::Lost("no transaction id is free".into()),
+            usable: false,
+        });
+    };
+    stream.send(&frame, call.deadline).map_err(|error| call.failed(&error, false))?;
+    let mut chunk = [0; CHUNK];
+    let mut done = None;
+    while done.is_none() {
+        let len = match stream.receive(&mut chunk, call.deadline) {
+            Ok(len) => len,
+            Err(error) => {
+                session.give_up(id);
+                return Err(call.failed(&error, error.kind() == ErrorKind::TimedOut));
+            }
+        };
+        let before = session.late();
+        let received = session.receive(&chunk[..len], |found, response| {
+            if found == id {
+                done = Some(response.map(&mut *give).map_err(refused));
+            }
+        });
+        late.fetch_add(session.late() - before, Ordering::Relaxed);
+        if let Err(broken) = received {
+            return Err(match (done, broken) {
+                (Some(Err(failure)), Broken::Response(_)) => failure,
+                (_, broken) => invalid(broken.to_string()),
+            });
+        }
+    }
+    done.unwrap_or(Ok(()))
+}
+
+fn over_udp(
+    socket: &mut UdpSocket,
+    next_id: &mut u16,
+    call: &Call<'_>,
+    give: &mut dyn FnMut(Response<'_>),
+    late: &AtomicU64,
+) -> Result<(), Failure> {
+    let id = *next_id;
+    *next_id = id.wrapping_add(1);
+    let frame = [&mbap::header(id, call.unit_id, call.pdu.len())[..], call.pdu].concat();
+    let attempts = if call.is_read() { UDP_ATTEMPTS } else { 1 };
+    let mut chunk = [0; mbap::MAX_LEN + 1];
+    for attempt in (0..attempts).rev() {
+        let until = call.deadline - call.timeout * attempt / attempts;
+        socket.send(&frame).map_err(|error| call.failed(&error, false))?;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                break;
+            }
+            socket.set_read_timeout(Some(left)).map_err(|error| call.failed(&error, false))?;
+            let len = match socket.recv(&mut chunk) {
+                Ok(len) => len,
+                Err(error) if is_timeout(&error) => break,
+                Err(error) => return Err(call.failed(&error, false)),
+            };
+            match mbap::next(&chunk[..len]) {
+                mbap::Next::Frame { transaction_id, unit_id, pdu, len: whole } if whole == len => {
+                    if transaction_id == id && unit_id == call.unit_id {
+                        return call.judge(pdu, give);
+                    }
+                    late.fetch_add(1, Ordering::Relaxed);
+                }
+                other => return Err(invalid(format!("a datagram that is no frame: {other:?}"))),
+            }
+        }
+    }
+    Err(call.failed(&ErrorKind::TimedOut.into(), true))
+}
+
+fn is_timeout(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted)
+}
+
+fn over_rtu(
+    line: &mut dyn Line,
+    silence: Option<Duration>,
+    used: Instant,
+    echo: &mut bool,
+    call: &Call<'_>,
+    give: &mut dyn FnMut(Response<'_>),
+) -> Result<(), Failure> {
+    let serial = silence.is_some();
+    let lost = |error: io::Error| {
+        // A serial line has nothing to lose: what is late is thrown away before the next request.
+        call.failed(&error, serial && error.kind() == ErrorKind::TimedOut)
+    };
+    if let Some(silence) = silence {
+        thread::sleep(silence.saturating_sub(used.elapsed()));
+    }
+    line.discard().map_err(lost)?;
+    let mut frame = [0; rtu::MAX_LEN];
+    let len = rtu::encode(call.unit_id, call.pdu, &mut frame)
+        .ok_or_else(|| invalid("the request can't be framed"))?;
+    let frame = &frame[..len];
+    line.send(frame, call.deadline).map_err(lost)?;
+    if serial && call.is_broadcast() {
+        thread::sleep(TURNAROUND);
+        give(Response::Written);
+        return Ok(());
+    }
+    // Room for an echo and a reply.
+    let mut received = [0; 2 * rtu::MAX_LEN];
+    let (mut len, mut stripped) = (0, false);
+    loop {
+        if !stripped && (*echo || (serial && call.is_read())) {
+            stripped = strip(&mut received, &mut len, frame);
+            *echo |= stripped;
+        }
+        if (stripped || !*echo)
+            && let Some(whole) = rtu::response_len(&received[..len], call.pdu.len())
+                .map_err(|error| unusable(&error, serial))?
+            && whole <= len
+        {
+            let (unit_id, pdu) =
+                rtu::decode(&received[..whole]).map_err(|error| unusable(&error, serial))?;
+            if unit_id != call.unit_id {
+                return Err(Failure {
+                    error: ClientError::Invalid(format!(
+                        "a reply from unit {unit_id} to a request to unit {}",
+                        call.unit_id
+                    )),
+                    usable: serial,
+                });
+            }
+            let judged = call.judge(pdu, give);
+            return judged
+                .map_err(|failure| Failure { usable: failure.usable || serial, ..failure });
+        }
+        if len == received.len() {
+            return Err(invalid("more bytes than a reply has"));
+        }
+        len += line.receive(&mut received[len..], call.deadline).map_err(lost)?;
+    }
+}
+
+fn unusable(error: &dyn std::fmt::Display, serial: bool) -> Failure {
+    Failure { error: ClientError::Invalid(error.to_string()), usable: serial }
+}
+
+/// Takes the request itself from the front of what came, as adapters hand it back that hear what
+/// they send; whether it was there.
+fn strip(received: &mut [u8], len: &mut usize, frame: &[u8]) -> bool {
+    if !received[..*len].starts_with(frame) {
+        return false;
+    }
+    received.copy_within(frame.len()..*len, 0);
+    *len -= frame.len();
+    true
+}
+
+fn over_ascii(
+    line: &mut dyn Line,
+    echo: &mut bool,
+    call: &Call<'_>,
+    give: &mut dyn FnMut(Response<'_>),
+) -> Result<(), Failure> {
+    let lost = |error: io::Error| call.failed(&error, error.kind() == ErrorKind::TimedOut);
+    line.discard().map_err(lost)?;
+    let mut frame = [0; ascii::MAX_LEN];
+    let len = ascii::encode(call.unit_id, call.pdu, &mut frame)
+        .ok_or_else(|| invalid("the request can't be framed"))?;
+    let frame = &frame[..len];
+    line.send(frame, call.deadline).map_err(lost)?;
+    if call.is_broadcast() {
+        thread::sleep(TURNAROUND);
+        give(Response::Written);
+        return Ok(());
+    }
+    let mut received: Vec<u8> = Vec::with_capacity(ascii::MAX_LEN);
+    let mut chunk = [0; 256];
+    let mut echo_expected = *echo;
+    loop {
+        if let Some(end) = received.windows(2).position(|pair| pair == b"\r\n") {
+            let start = received[..end].iter().rposition(|byte| *byte == b':').unwrap_or(0);
+            let reply: Vec<u8> = received.drain(..end + 2).skip(start).collect();
+            if reply == frame && (echo_expected || call.is_read()) {
+                (*echo, echo_expected) = (true, false);
+                continue;
+            }
+            let mut body = [0; pdu::MAX_LEN + 2];
+            let (unit_id, pdu) =
+                ascii::decode(&reply, &mut body).map_err(|error| unusable(&error, true))?;
+            if unit_id != call.unit_id {
+                let error = format!("a reply from unit {unit_id} to a request to {}", call.unit_id);
+                return Err(unusable(&error, true));
+            }
+            let judged = call.judge(pdu, give);
+            return judged.map_err(|failure| Failure { usable: true, ..failure });
+        }
+        if received.len() > 2 * ascii::MAX_LEN {
+            return Err(unusable(&"more characters than a reply has", true));
+        }
+        let len = line.receive(&mut chunk, call.deadline).map_err(lost)?;
+        received.extend_from_slice(&chunk[..len]);
+    }
+}

@@ -1,0 +1,113 @@
+//! Streams of bytes with deadlines: a TCP connection, a serial port.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::time::{Duration, Instant};
+
+/// The shortest time that a system waits for.
+const LEAST: Duration = Duration::from_micros(1);
+
+pub(super) trait Line: Send {
+    /// Reads what is there, at least one byte.
+    ///
+    /// # Errors
+    /// `TimedOut` when nothing comes before the deadline, `UnexpectedEof` when nothing will.
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize>;
+
+    /// # Errors
+    /// `TimedOut` when the line does not take all of it before the deadline.
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()>;
+
+    /// Throws away what has come and was not asked for.
+    fn discard(&mut self) -> io::Result<()>;
+}
+
+/// What is left until a deadline, for a system that knows no time of 0.
+fn left(deadline: Instant) -> io::Result<Duration> {
+    let left = deadline.saturating_duration_since(Instant::now());
+    if left.is_zero() { Err(ErrorKind::TimedOut.into()) } else { Ok(left.max(LEAST)) }
+}
+
+/// Says the same of a time that ran out on every system.
+fn read(result: io::Result<usize>) -> io::Result<usize> {
+    match result {
+        Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
+        Err(error) if error.kind() == ErrorKind::WouldBlock => Err(ErrorKind::TimedOut.into()),
+        other => other,
+    }
+}
+
+impl Line for TcpStream {
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
+        self.set_read_timeout(Some(left(deadline)?))?;
+        loop {
+            match Read::read(self, buffer) {
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                result => return read(result),
+            }
+        }
+    }
+
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
+        self.set_write_timeout(Some(left(deadline)?))?;
+        self.write_all(bytes).map_err(|error| match error.kind() {
+            ErrorKind::WouldBlock => ErrorKind::TimedOut.into(),
+            _ => error,
+        })
+    }
+
+    fn discard(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Line for serial2::SerialPort {
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
+        self.set_read_timeout(left(deadline)?)?;
+        read(Read::read(self, buffer))
+    }
+
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
+        self.set_write_timeout(left(deadline)?)?;
+        Write::write_all(self, bytes)
+    }
+
+    fn discard(&mut self) -> io::Result<()> {
+        self.discard_input_buffer()
+    }
+}
+
+/// Connects to the first address of a name that takes the connection before the deadline.
+pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpStream> {
+    let stream =
+        first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
+    stream.set_nodelay(true)?;
+    Ok(stream)
+}
+
+/// The first address of a name that `open` succeeds with.
+pub(super) fn first<T>(
+    host: &str,
+    port: u16,
+    open: impl Fn(SocketAddr) -> io::Result<T>,
+) -> io::Result<T> {
+    let mut failure = io::Error::new(ErrorKind::NotFound, "the name has no address");
+    for address in (host, port).to_socket_addrs()? {
+        match open(address) {
+            Ok(opened) => return Ok(opened),
+            Err(error) => failure = error,
+        }
+    }
+    Err(failure)
+}
+
+/// Whether the peer of an idle connection has ended it.
+pub(super) fn has_ended(stream: &TcpStream) -> bool {
+    let mut byte = [0];
+    let ended = stream.set_nonblocking(true).is_err()
+        || match stream.peek(&mut byte) {
+            Ok(len) => len == 0,
+            Err(error) => error.kind() != ErrorKind::WouldBlock,
+        };
+    ended || stream.set_nonblocking(false).is_err()
+}

@@ -1,0 +1,199 @@
+"""What a client can do, as steps: each yields a request and is given its result.
+
+The same steps serve the client that waits and the one that awaits. Nothing here does I/O. Arguments
+are checked when a request is made, which is before anything is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from holdfast import values
+from holdfast._core import Request
+from holdfast.errors import InvalidResponse, ModbusException
+from holdfast.types import BIT_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.types import Area
+
+Result = TypeVar("Result")
+Steps: TypeAlias = Generator[Request, Any, Result]
+
+ADDRESSES = 65536
+READ_LIMITS: dict[str, int] = {
+    "coils": 2000,
+    "discrete_inputs": 2000,
+    "holding_registers": 125,
+    "input_registers": 125,
+}
+WRITE_LIMITS = {"coils": 1968, "holding_registers": 123}
+"""The most values of one request (V1.1b3, 6)."""
+
+ILLEGAL_VALUE = 3
+OBJECT_NAMES = (
+    "vendor_name",
+    "product_code",
+    "revision",
+    "vendor_url",
+    "product_name",
+    "model_name",
+    "user_application_name",
+)
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What a device says of itself by function 43/14; a name it does not have is `None`."""
+
+    vendor_name: str | None
+    product_code: str | None
+    revision: str | None
+    vendor_url: str | None
+    product_name: str | None
+    model_name: str | None
+    user_application_name: str | None
+    conformity_level: int
+    """Which categories the device has, and how it gives them (V1.1b3, 6.21)."""
+    objects: dict[int, bytes]
+    """All objects as they came, by object id."""
+
+
+@dataclass(frozen=True)
+class ServerId:
+    """The answer to function 17, whose layout is the device's own."""
+
+    data: bytes
+    """All of it."""
+
+    @property
+    def server_id(self) -> int | None:
+        """The first byte, which most devices use for an id."""
+        return self.data[0] if self.data else None
+
+    @property
+    def running(self) -> bool | None:
+        """The run indicator in the second byte, where it is one of its two values."""
+        return {0xFF: True, 0x00: False}.get(self.data[1]) if len(self.data) > 1 else None
+
+    @property
+    def additional(self) -> bytes:
+        """What follows."""
+        return self.data[2:]
+
+
+def read_range(area: Area, address: int, count: int) -> Steps[list[Any]]:
+    """`count` bits or registers, in as many requests as that takes."""
+    limit = READ_LIMITS.get(area, 0)
+    if type(count) is not int or count <= limit:
+        result: list[Any] = yield Request.read(area, address, count)
+        return result
+    requests = [
+        Request.read(area, start, min(limit, address + count - start))
+        for start in _starts(address, count, limit)
+    ]
+    whole: list[Any] = []
+    for request in requests:
+        whole += yield request
+    return whole
+
+
+def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) -> Steps[None]:
+    """Bits or registers, in one request; in more only if that is allowed."""
+    limit = WRITE_LIMITS[area]
+    make = Request.write_coils if area == "coils" else Request.write_registers
+    if len(items) <= limit or not split:
+        if len(items) > limit:
+            raise ValueError(
+                f"{len(items)} values, one request writes at most {limit}; with split=True they "
+                "are written by several, which the device does not do as one step"
+            )
+        yield make(address, items)
+        return
+    requests = [
+        make(start, items[start - address : start - address + limit])
+        for start in _starts(address, len(items), limit)
+    ]
+    yield from requests
+
+
+def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
+    """A typed value, or an array of them."""
+    count = values.register_count(kind)
+    raw = yield from read_range(area, address, count)
+    options = {} if encoding is None else {"encoding": encoding}
+    return values.decode(raw, kind, order, **options)
+
+
+def write_typed(
+    area: Area,
+    address: int,
+    value: Any,
+    kind: str,
+    order: str,
+    encoding: str | None,
+    *,
+    split: bool,
+) -> Steps[None]:
+    """A typed value: one bit or register by functions 5 and 6, more by 15 and 16."""
+    if area not in WRITE_LIMITS:
+        raise ValueError(f"area is {area!r}, only {' and '.join(WRITE_LIMITS)} can be written")
+    options = {} if encoding is None else {"encoding": encoding}
+    raw = values.encode(value, kind, order, **options)
+    if len(raw) > 1:
+        yield from write_range(area, address, raw, split=split)
+    elif area in BIT_AREAS:
+        yield Request.write_coil(address, bool(raw[0]))
+    else:
+        yield Request.write_register(address, raw[0])
+
+
+def identify() -> Steps[Identification]:
+    """All objects that the device has, in as many requests as it wants."""
+    objects: dict[int, bytes] = {}
+    conformity = 0
+    for code in (3, 2, 1):
+        try:
+            conformity = yield from _stream(code, objects)
+            break
+        except ModbusException as error:
+            # A device of a lower level may refuse the higher ones.
+            if error.code != ILLEGAL_VALUE or code == 1:
+                raise
+    names = {
+        name: objects[number].decode("utf-8", "replace") if number in objects else None
+        for number, name in enumerate(OBJECT_NAMES)
+    }
+    return Identification(**names, conformity_level=conformity, objects=objects)
+
+
+def _stream(code: int, objects: dict[int, bytes]) -> Steps[int]:
+    """The objects of one read code; the conformity level."""
+    following: int | None = 0
+    conformity = 0
+    while following is not None:
+        asked = following
+        conformity, following, found = yield Request.identification(code, asked)
+        objects.update(found)
+        if following is not None and (following <= asked or not found):
+            raise InvalidResponse(f"object {following} is said to follow after object {asked}")
+    return conformity
+
+
+def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
+    """Function 8: data words out and in."""
+    for word in data:
+        if type(word) is not int or not 0 <= word <= 0xFFFF:
+            raise ValueError(f"data holds {word!r}, allowed are words 0 to 65535")
+    sent = b"".join(word.to_bytes(2, "big") for word in data)
+    came: bytes = yield Request.diagnostics(sub_function, sent)
+    return [int.from_bytes(came[at : at + 2], "big") for at in range(0, len(came), 2)]
+
+
+def _starts(address: int, count: int, limit: int) -> range:
+    if type(address) is not int or not 0 <= address < ADDRESSES or address + count > ADDRESSES:
+        raise ValueError(f"{count} from address {address}: the last address is 65535")
+    return range(address, address + count, limit)

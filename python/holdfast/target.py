@@ -1,0 +1,147 @@
+"""Whom a client talks to: URLs, read strictly."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+Transport: TypeAlias = Literal["tcp", "udp", "rtu+tcp"]
+Mode: TypeAlias = Literal["rtu", "ascii"]
+Parity: TypeAlias = Literal["none", "even", "odd"]
+
+PORT = 502
+"""The port of Modbus over TCP and UDP."""
+
+FORMS = (
+    "tcp://host:502, udp://host:502, rtu+tcp://host:502, "
+    "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+)
+
+
+@dataclass(frozen=True)
+class NetworkTarget:
+    """A device, or a gateway, behind an address."""
+
+    transport: Transport
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.transport}://{host}:{self.port}"
+
+
+@dataclass(frozen=True)
+class SerialTarget:
+    """A serial line."""
+
+    mode: Mode
+    device: str
+    baud: int = 19200
+    parity: Parity = "even"
+    stop_bits: int = 1
+    data_bits: int = 8
+    silence: float | None = None
+    """Seconds that end an RTU frame; `None` for 3.5 characters."""
+    echo: bool = False
+    """Whether the adapter hands back what is sent."""
+
+    def __str__(self) -> str:
+        return f"{self.mode}://{self.device}"
+
+
+Target: TypeAlias = NetworkTarget | SerialTarget
+
+
+def parse(url: str) -> Target:
+    """The target that a URL names. Raises `ValueError`, which says what is allowed."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError as error:
+        raise ValueError(f"{url!r}: {error}; allowed are {FORMS}") from None
+    scheme = parts.scheme
+    if parts.fragment or parts.username is not None:
+        raise ValueError(f"{url!r} has a user or a fragment; allowed are {FORMS}")
+    if scheme in ("tcp", "udp", "rtu+tcp"):
+        if not parts.hostname or parts.path not in ("", "/") or parts.query:
+            raise ValueError(f"{url!r} is no address of a device; allowed are {FORMS}")
+        if port == 0:
+            raise ValueError(f"{url!r}: port 0, allowed are 1 to 65535")
+        host = unquote(parts.hostname)
+        return NetworkTarget(cast("Transport", scheme), host, PORT if port is None else port)
+    if scheme in ("rtu", "ascii"):
+        return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
+    if scheme == "tls":
+        raise ValueError(f"{url!r}: tls is not available in this version; allowed are {FORMS}")
+    raise ValueError(f"{url!r} is no URL of a device; allowed are {FORMS}")
+
+
+@dataclass(frozen=True)
+class _Option:
+    """A key of the query: what it may be, and how it is read."""
+
+    allowed: str
+    read: Callable[[str], Any]
+    modes: tuple[Mode, ...] = field(default=("rtu", "ascii"))
+
+
+def _one_of(*words: str, read: Callable[[str], Any] = str) -> _Option:
+    def chosen(text: str) -> Any:
+        if text not in words:
+            raise ValueError(text)
+        return read(text)
+
+    return _Option(", ".join(words), chosen)
+
+
+def _baud(text: str) -> int:
+    if not re.fullmatch("[0-9]{2,7}", text) or not 50 <= int(text) <= 4_000_000:
+        raise ValueError(text)
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    if not re.fullmatch(r"[0-9]*\.?[0-9]+", text) or not 0 < float(text) <= 10:
+        raise ValueError(text)
+    return float(text)
+
+
+OPTIONS: Mapping[str, _Option] = {
+    "baud": _Option("50 to 4000000", _baud),
+    "parity": _one_of("none", "even", "odd"),
+    "stop_bits": _one_of("1", "2", read=int),
+    "data_bits": _one_of("7", "8", read=int),
+    "silence": _Option("seconds, up to 10", _seconds, ("rtu",)),
+    "echo": _one_of("0", "1", read=lambda text: text == "1"),
+}
+
+
+def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
+    device = unquote(path)
+    if re.fullmatch(r"/(COM[0-9]+|\\\\\.\\.+)", device):
+        device = device[1:]  # Windows has no folder before its ports.
+    if device in ("", "/"):
+        raise ValueError(f"{url!r} names no device; allowed are {FORMS}")
+    chosen: dict[str, Any] = {}
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        option = OPTIONS.get(key)
+        if option is None or mode not in option.modes:
+            known = ", ".join(name for name, each in OPTIONS.items() if mode in each.modes)
+            raise ValueError(f"{url!r}: {key!r} is not known, allowed are {known}")
+        if key in chosen:
+            raise ValueError(f"{url!r}: {key} is given twice")
+        try:
+            chosen[key] = option.read(text)
+        except ValueError:
+            raise ValueError(f"{url!r}: {key} is {text!r}, allowed are {option.allowed}") from None
+    if mode == "rtu" and chosen.get("data_bits", 8) != 8:
+        raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu is 8")
+    chosen.setdefault("data_bits", 8 if mode == "rtu" else 7)
+    chosen.setdefault("stop_bits", 2 if chosen.get("parity") == "none" else 1)
+    return SerialTarget(mode, device, **chosen)

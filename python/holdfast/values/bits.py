@@ -1,0 +1,74 @@
+"""Truth values: a register or bit of its own, or one bit of a register."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from holdfast.values.errors import DoesNotFit, shown
+from holdfast.values.kinds import Kind
+
+if TYPE_CHECKING:
+    from holdfast.values.orders import Order
+    from holdfast.values.types import Type
+
+TRUE = b"\0\1"
+FALSE = b"\0\0"
+
+
+class Bool(Kind):
+    """`bool`: a bit of a bit area, or a register that is not 0. Its order changes nothing."""
+
+    item = "H"
+    finish = bool
+
+    def unpack_one(self, data: bytes) -> bool:
+        """Whether the register is not 0."""
+        return data != FALSE
+
+    def unpack_many(self, data: bytes) -> list[bool]:
+        """Whether each register is not 0."""
+        return list(map(bool, memoryview(data).cast("H")))
+
+    def pack_one(self, value: Any) -> bytes:
+        """1 or 0. Raises `DoesNotFit`."""
+        return TRUE if _truth(value, self.name) else FALSE
+
+
+class Bit(Kind):
+    """`bit:N`: bit N of a register, 0 the least significant.
+
+    Packed alone a bit is a mask of its register: to be ORed when true, ANDed when false.
+    """
+
+    item = "H"
+
+    def __init__(self, type: Type, order: Order) -> None:
+        super().__init__(type, order)
+        self.bit = type.parameter
+        mask = self._mask = 1 << type.parameter
+        self.finish = lambda register: register & mask != 0
+
+    def unpack_one(self, data: bytes) -> bool:
+        """Whether the bit is set."""
+        return int.from_bytes(self.arrange(data)) & self._mask != 0
+
+    def pack_one(self, value: Any) -> bytes:
+        """The mask. Raises `DoesNotFit`."""
+        register = self._mask if _truth(value, self.name) else 0xFFFF ^ self._mask
+        return self.arrange(register.to_bytes(2))
+
+
+def merge(data: bytearray, start: int, masks: bytes) -> None:
+    """Changes one bit of each register from a byte on, by masks as `Bit` packs them."""
+    for place in range(0, len(masks), 2):
+        mask = int.from_bytes(masks[place : place + 2])
+        here = slice(start + place, start + place + 2)
+        register = int.from_bytes(data[here])
+        register = register | mask if mask.bit_count() == 1 else register & mask
+        data[here] = register.to_bytes(2)
+
+
+def _truth(value: object, name: str) -> bool:
+    if type(value) in (bool, int) and value in (0, 1):
+        return value == 1
+    raise DoesNotFit(f"{shown(value)} is not False, True, 0 or 1, which {name} holds")

@@ -1,0 +1,73 @@
+"""What all kinds of types have in common: elements to bytes and back, one by one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+from holdfast.values.errors import DoesNotFit, Undecodable, at
+from holdfast.values.orders import arrange
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from holdfast.values.orders import Order
+    from holdfast.values.types import Type
+
+
+class Kind(ABC):
+    """Elements of one type in one order. All bytes are those on the wire, but for `order.swapped`,
+    which was done, or will be, where registers are made bytes.
+    """
+
+    item: str
+    """An element as an item of `struct`, in the byte order `mark`."""
+    finish: Callable[[Any], Any] | None = None
+    """What makes that item the value, if it isn't already."""
+
+    def __init__(self, type: Type, order: Order) -> None:
+        self.name = type.element
+        self.width = type.width
+        self.order = order
+        self.mark = "<" if order.reversed else ">"
+
+    @abstractmethod
+    def unpack_one(self, data: bytes) -> Any:
+        """The value of an element's bytes. Raises `Undecodable`."""
+
+    @abstractmethod
+    def pack_one(self, value: Any) -> bytes:
+        """The bytes of an element's value. Raises `DoesNotFit`."""
+
+    def unpack_many(self, data: bytes) -> list[Any]:
+        """The values of any number of elements. Raises `Undecodable`."""
+        width, values = self.width, []
+        try:
+            for start in range(0, len(data), width):
+                values.append(self.unpack_one(data[start : start + width]))
+        except Undecodable as error:
+            raise at(f"values[{len(values)}]", error) from None
+        return values
+
+    def pack_many(self, values: Sequence[Any]) -> bytes:
+        """The bytes of any number of values. Raises `DoesNotFit`."""
+        packed: list[bytes] = []
+        try:
+            for value in values:
+                packed.append(self.pack_one(value))
+        except DoesNotFit as error:
+            raise at(f"values[{len(packed)}]", error) from None
+        return b"".join(packed)
+
+    def arrange(self, data: bytes) -> bytes:
+        """What the order does to elements; the same both ways."""
+        return arrange(data, self.order, self.width)
+
+
+class Bytewise(Kind):
+    """Elements that `struct` hands over as bytes."""
+
+    def __init__(self, type: Type, order: Order) -> None:
+        super().__init__(type, order)
+        self.item = f"{self.width}s"
+        self.finish = self.unpack_one

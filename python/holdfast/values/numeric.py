@@ -1,0 +1,118 @@
+"""Integers and floats, which `struct` knows, also whole arrays of them in one call."""
+
+from __future__ import annotations
+
+import operator
+import struct
+from abc import abstractmethod
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+from holdfast.values.errors import DoesNotFit, is_integer, shown
+from holdfast.values.kinds import Kind
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.values.orders import Order
+    from holdfast.values.types import Type
+
+INTEGERS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
+FLOATS = {"float16": "e", "float32": "f", "float64": "d"}
+LARGEST = {"float16": 65504.0, "float32": 3.4028234663852886e38, "float64": 1.7976931348623157e308}
+
+
+class Number(Kind):
+    """Elements that are an item of `struct` each."""
+
+    plain: frozenset[type]
+    """Types of Python whose values `struct` may be given unseen."""
+
+    def __init__(self, type: Type, order: Order, code: str) -> None:
+        super().__init__(type, order)
+        self.item = code
+        if order.places:
+            self.item = f"{self.width}s"
+            self.finish = self.unpack_one
+        self._one = struct.Struct(f"{self.mark}{code}")
+        self._many = struct.Struct(f"{self.mark}{type.count or 1}{code}")
+
+    def unpack_one(self, data: bytes) -> Any:
+        """The number."""
+        return self._one.unpack(self.arrange(data) if self.order.places else data)[0]
+
+    def unpack_many(self, data: bytes) -> list[Any]:
+        """The numbers of a whole array."""
+        return list(self._many.unpack(self.arrange(data) if self.order.places else data))
+
+    def pack_one(self, value: Any) -> bytes:
+        """The bytes of a number. Raises `DoesNotFit`."""
+        if type(value) not in self.plain:
+            value = self._number(value)
+        try:
+            data = self._one.pack(value)
+        except (struct.error, OverflowError):
+            raise self._too_large(value) from None
+        return self.arrange(data) if self.order.places else data
+
+    def pack_many(self, values: Sequence[Any]) -> bytes:
+        """The bytes of a whole array. Raises `DoesNotFit`."""
+        if self.plain.issuperset(map(type, values)):
+            try:
+                data = self._many.pack(*values)
+            except (struct.error, OverflowError):
+                return super().pack_many(values)
+            return self.arrange(data) if self.order.places else data
+        return super().pack_many(values)
+
+    @abstractmethod
+    def _number(self, value: Any) -> Any:
+        """A value of another type as one that `struct` may be given. Raises `DoesNotFit`."""
+
+    @abstractmethod
+    def _too_large(self, value: Any) -> DoesNotFit:
+        """What is raised for a number that the type does not hold."""
+
+    def arrange(self, data: bytes) -> bytes:
+        """Only what eight letters spell out: the rest is `struct`'s."""
+        return super().arrange(data) if self.order.places else data
+
+
+class Integer(Number):
+    """`int16` to `uint64`."""
+
+    plain = frozenset({int})
+
+    def __init__(self, type: Type, order: Order) -> None:
+        super().__init__(type, order, INTEGERS[type.base])
+        bits, signed = 8 * type.width, type.base.startswith("i")
+        self._least = -(1 << bits - 1) if signed else 0
+        self._most = self._least + (1 << bits) - 1
+
+    def _number(self, value: Any) -> int:
+        if not is_integer(value):
+            raise DoesNotFit(f"{shown(value)} is no integer, which {self.name} holds")
+        return operator.index(value)
+
+    def _too_large(self, value: Any) -> DoesNotFit:
+        allowed = f"{self._least} to {self._most} of {self.name}"
+        return DoesNotFit(f"{shown(value)} is outside {allowed}")
+
+
+class Float(Number):
+    """`float16` to `float64`. An integer, or a float of more digits, becomes the nearest one."""
+
+    plain = frozenset({float, int})
+
+    def __init__(self, type: Type, order: Order) -> None:
+        super().__init__(type, order, FLOATS[type.base])
+        self._most = LARGEST[type.base]
+
+    def _number(self, value: Any) -> float | int:
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise DoesNotFit(f"{shown(value)} is no number, which {self.name} holds")
+        return value if isinstance(value, int) else float(value)
+
+    def _too_large(self, value: Any) -> DoesNotFit:
+        allowed = f"{-self._most} to {self._most} of {self.name}"
+        return DoesNotFit(f"{shown(value)} is outside {allowed}")

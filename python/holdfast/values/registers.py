@@ -1,0 +1,93 @@
+"""Registers of every form to bytes, and bytes to registers."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, TypeAlias, cast
+
+from holdfast.values.errors import InvalidRegister, WrongLength, counted, is_integer, shown
+from holdfast.values.orders import swap_registers
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
+
+Registers: TypeAlias = "Sequence[int] | Buffer"
+"""Integers 0 to 65535, big-endian bytes, or a buffer of unsigned 16-bit integers, such as a numpy
+array of `uint16`. For `bool` also bits: a sequence of 0, 1, `False`, `True`, or an array of `bool`.
+"""
+
+ALLOWED = "a sequence of integers, bytes, or a buffer of bytes or of unsigned 16-bit integers"
+
+
+class Block:
+    """A number of registers as bytes: big-endian, or `swapped`. `bits` lets bools in."""
+
+    def __init__(self, count: int, name: str, *, swapped: bool = False, bits: bool = False) -> None:
+        self.count = count
+        self._name = name
+        self._swapped = swapped
+        self._bits = bits
+        form = struct.Struct(f"{'<' if swapped else '>'}{count}H")
+        self._pack = form.pack
+        self._unpack = form.unpack
+
+    def pack(self, registers: Registers) -> bytes:
+        """Registers as bytes. Raises `WrongLength`, `InvalidRegister` and `TypeError`."""
+        if type(registers) is not list and type(registers) is not tuple:
+            registers = _plain(registers)
+            if isinstance(registers, bytes):
+                return self._checked(registers)
+        if bool in map(type, registers) and not self._bits:
+            raise self._flaw(registers)
+        try:
+            return self._pack(*registers)
+        except (struct.error, TypeError):
+            raise self._flaw(registers) from None
+
+    def unpack(self, data: bytes | bytearray) -> list[int]:
+        """Bytes as registers."""
+        return list(self._unpack(data))
+
+    def _checked(self, data: bytes) -> bytes:
+        if len(data) != 2 * self.count:
+            raise self._wrong_length(counted(len(data), "byte"), f" ({2 * self.count} bytes)")
+        return swap_registers(data) if self._swapped else data
+
+    def _flaw(self, registers: Sequence[int]) -> WrongLength | InvalidRegister:
+        if len(registers) != self.count:
+            return self._wrong_length(str(len(registers)))
+        for index, register in enumerate(registers):
+            found = f"registers[{index}]: {shown(register)}"
+            if not is_integer(register) and not (self._bits and isinstance(register, bool)):
+                return InvalidRegister(f"{found} is no integer")
+            if not 0 <= register <= 65535:
+                return InvalidRegister(f"{found} is outside 0 to 65535")
+        raise AssertionError("registers without a flaw were refused")
+
+    def _wrong_length(self, found: str, also: str = "") -> WrongLength:
+        takes = counted(self.count, "register")
+        return WrongLength(f"{self._name} takes {takes}{also}, found {found}")
+
+
+def _plain(registers: Registers) -> bytes | Sequence[int]:
+    """Big-endian bytes of a buffer, a tuple of a sequence."""
+    try:
+        view = memoryview(registers)  # type: ignore[arg-type]
+    except TypeError:
+        unordered = isinstance(registers, str | Mapping)
+        if unordered or not hasattr(registers, "__len__") or not hasattr(registers, "__getitem__"):
+            found = f"registers are {shown(registers)}"
+            raise TypeError(f"{found}, allowed are {ALLOWED}") from None
+        return tuple(cast("Sequence[int]", registers))
+    mark, code = view.format[:-1], view.format[-1]
+    if view.ndim == 1 and code in "Bc":
+        return view.tobytes()
+    if view.ndim == 1 and code == "H":
+        big = mark in (">", "!") or (mark in ("", "@", "=") and sys.byteorder == "big")
+        return view.tobytes() if big else swap_registers(view.tobytes())
+    if view.ndim == 1 and code == "?":
+        return tuple(view.tolist())
+    found = f"registers are a buffer of format {view.format!r}, dimensions {view.ndim}"
+    raise TypeError(f"{found}, allowed are {ALLOWED}")

@@ -1,0 +1,78 @@
+"""Strings and bytes, two to a register."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from holdfast.values.errors import DoesNotFit, Undecodable, UnknownEncoding, shown
+from holdfast.values.kinds import Bytewise
+
+if TYPE_CHECKING:
+    from holdfast.values.orders import Order
+    from holdfast.values.types import Type
+
+
+class Bytes(Bytewise):
+    """`bytes:N`: exactly N bytes. The odd byte after them is written as 0 and not read."""
+
+    def __init__(self, type: Type, order: Order) -> None:
+        super().__init__(type, order)
+        self.size = type.parameter
+
+    def unpack_one(self, data: bytes) -> Any:
+        """The bytes."""
+        return self.arrange(data)[: self.size]
+
+    def pack_one(self, value: Any) -> bytes:
+        """The bytes, and the odd one. Raises `DoesNotFit`."""
+        if not isinstance(value, bytes | bytearray | memoryview):
+            raise DoesNotFit(f"{shown(value)} is no bytes, which {self.name} holds")
+        data = bytes(value)
+        if len(data) != self.size:
+            raise DoesNotFit(f"{len(data)} bytes are not the {self.size} of {self.name}")
+        return self._padded(data)
+
+    def _padded(self, data: bytes) -> bytes:
+        return self.arrange(data.ljust(self.width, b"\0"))
+
+
+class Text(Bytes):
+    """`string:N`: up to N bytes of text, then NUL."""
+
+    def __init__(self, type: Type, order: Order, encoding: str) -> None:
+        super().__init__(type, order)
+        self._encoding = encoding
+        try:
+            blank = "".encode(encoding).ljust(self.size, b"\0").decode(encoding)
+        except UnicodeError:
+            blank = "?"
+        except (LookupError, ValueError):
+            raise UnknownEncoding(f"encoding {shown(encoding)} is unknown") from None
+        if blank.strip("\0"):
+            found = f"encoding {encoding} can't pad with NUL"
+            raise UnknownEncoding(f"{found} to the {self.size} bytes of {self.name}")
+
+    def unpack_one(self, data: bytes) -> str:
+        """The text without the NULs after it. Raises `Undecodable`."""
+        field = self.arrange(data)[: self.size]
+        try:
+            return field.decode(self._encoding).rstrip("\0")
+        except UnicodeError:
+            raise Undecodable(f"{shown(field)} is no {self.name} in {self._encoding}") from None
+
+    def pack_one(self, value: Any) -> bytes:
+        """The text and NULs after it. Raises `DoesNotFit`, also for NULs at its end."""
+        if not isinstance(value, str):
+            raise DoesNotFit(f"{shown(value)} is no text, which {self.name} holds")
+        try:
+            data = value.encode(self._encoding)
+        except UnicodeError:
+            raise DoesNotFit(f"{shown(value)} can't be encoded in {self._encoding}") from None
+        if len(data) > self.size:
+            found = f"{shown(value)} has {len(data)} bytes in {self._encoding}"
+            raise DoesNotFit(f"{found}, {self.name} holds up to {self.size}")
+        field = self._padded(data)
+        back = self.unpack_one(field)
+        if back != value:
+            raise DoesNotFit(f"{shown(value)} would come back as {shown(back)}")
+        return field

@@ -1,0 +1,85 @@
+"""The names of types: what a field holds, and how many registers it takes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+
+from holdfast.values.errors import UnknownType, shown
+
+FIXED = {
+    "bool": 2,
+    "int16": 2,
+    "uint16": 2,
+    "int32": 4,
+    "uint32": 4,
+    "int64": 8,
+    "uint64": 8,
+    "float16": 2,
+    "float32": 4,
+    "float64": 8,
+    "bcd16": 2,
+    "bcd32": 4,
+}
+"""Types whose name says all: the bytes that an element takes in registers."""
+
+ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays as float32[10]"
+MOST_REGISTERS = 65536
+
+_NUMBER = r"(0|[1-9][0-9]{0,5})"
+_NAME = re.compile(rf"(([a-z]+[0-9]*)(?::{_NUMBER})?)(?:\[{_NUMBER}\])?")
+
+
+@dataclass(frozen=True, slots=True)
+class Type:
+    """A type by its parts."""
+
+    name: str
+    """The whole name, such as `string:5[3]`."""
+    element: str
+    """The name of one element: `string:5`."""
+    base: str
+    """`string`."""
+    parameter: int
+    """What stands after the colon, 0 if nothing does: 5."""
+    width: int
+    """The bytes that an element takes in registers: 6."""
+    count: int | None
+    """The elements of an array: 3. `None` for a single value, which is no array of one."""
+
+    @property
+    def registers(self) -> int:
+        """How many registers a field of this type takes."""
+        return self.width // 2 * (1 if self.count is None else self.count)
+
+
+@lru_cache(1024)
+def parsed(name: str) -> Type:
+    """The type of a name. Raises `UnknownType`."""
+    match = _NAME.fullmatch(name) if isinstance(name, str) else None
+    if match is None:
+        raise _unknown(name)
+    element, base, parameter, count = match.groups()
+    width = _width(base, None if parameter is None else int(parameter))
+    if width is None:
+        raise _unknown(name)
+    made = Type(name, element, base, int(parameter or 0), width, int(count) if count else None)
+    if not 1 <= made.registers <= MOST_REGISTERS:
+        allowed = f"allowed are 1 to {MOST_REGISTERS}"
+        raise UnknownType(f"type {shown(name)} would take {made.registers} registers, {allowed}")
+    return made
+
+
+def _width(base: str, parameter: int | None) -> int | None:
+    if parameter is None:
+        return FIXED.get(base)
+    if base == "bit" and parameter <= 15:
+        return 2
+    if base in ("string", "bytes"):
+        return parameter + parameter % 2
+    return None
+
+
+def _unknown(name: object) -> UnknownType:
+    return UnknownType(f"type {shown(name)} is unknown, allowed are {ALLOWED}")
