@@ -112,7 +112,7 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     width = max(len(endpoint.name) for endpoint in endpoints)
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
-        lines.append(f"  {endpoint.name:{width}}  {endpoint.type}  {_address(endpoint)}")
+        lines.append(f"  {endpoint.name:{width}}  {_address(endpoint)}")
         rules = getattr(endpoint.settings, "rules", ())
         lines += [f"  {'':{width}}    {_granted(rule)}" for rule in rules]
     lines += ["", "Try:", ""]
@@ -122,9 +122,9 @@ def _greeting(appliance: Appliance, file: Path) -> str:
 
 def _address(endpoint: Endpoint) -> str:
     if endpoint.port is None:
-        return endpoint.host
+        return f"{endpoint.type}  {endpoint.host}"
     address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
-    return f"http://{address}" if endpoint.type == "http" else address
+    return f"http://{address}" if endpoint.type == "http" else f"{endpoint.type}  {address}"
 
 
 def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
