@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.config import ModbusTcpListener, json_schema, load
+from holdfast.config import json_schema, load
 
 ROOT = Path(__file__).parent.parent
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
@@ -27,7 +27,10 @@ def test_the_schema_of_the_docs_is_that_of_the_program() -> None:
 
 
 def test_the_example_configuration_binds_loopback_and_high_ports_only() -> None:
-    for listener in load(ROOT / "examples" / "plant.yaml").listeners.values():
-        assert isinstance(listener, ModbusTcpListener)
-        assert listener.bind.address.is_loopback
-        assert listener.bind.port > 1024
+    config = load(ROOT / "examples" / "plant.yaml")
+    assert config.rest is not None
+    binds = [getattr(listener, "bind", None) for listener in config.listeners.values()]
+    for bind in [*binds, config.rest.bind]:
+        assert bind is not None
+        assert bind.address.is_loopback
+        assert bind.port > 1024

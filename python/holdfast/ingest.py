@@ -135,7 +135,7 @@ class Door:
         self, memory: str, area: str, address: int, count: int, grant: Grant, peer: str
     ) -> list[int]:
         """`count` values of one moment. Raises `Refused`."""
-        where = {"memory": memory, "area": area, "address": address}
+        where = _place(memory, area, address)
         try:
             target = self._granted(memory, area, grant, where)
             self._check_range(memory, area, address, count, where)
@@ -229,7 +229,7 @@ class Door:
                 words = "text" if kind is str else "an integer"
                 found = f"{key} is {_shown(command[key])}, not {words}"
                 raise _malformed(where, f"{_of(where)}{found}")
-        where |= {"memory": memory, "area": area, "address": address}
+        where |= _place(memory, area, address)
         target = self._granted(memory, area, grant, where)
         if not grant.writes:
             raise Refused("not_granted", f"{grant.name} may not write", **where)
@@ -269,7 +269,7 @@ class Door:
             allowed = f"allowed are addresses {addresses.start} to {addresses.stop - 1}"
         else:
             allowed = f"but {memory} has no {area}"
-        found = f"{_of(where)}{count} from address {address} of {area}"
+        found = f"{_of(where)}{count} from address {_shown(address)} of {area}"
         raise Refused("out_of_range", f"{found}, {allowed}", **where)
 
 
@@ -308,6 +308,15 @@ def _explain(command: Mapping[str, object], write: Write, where: dict[str, Any])
 
 def _of(where: Mapping[str, Any]) -> str:
     return f"commands[{where['command']}]: " if "command" in where else ""
+
+
+def _place(memory: str, area: str, address: int) -> dict[str, Any]:
+    """What a command aims at, for logs: no longer than a log can take."""
+    return {
+        "memory": memory[:LONGEST_SHOWN],
+        "area": area[:LONGEST_SHOWN],
+        "address": address if -(2**63) < address < 2**63 else _shown(address),
+    }
 
 
 def _malformed(where: Mapping[str, Any], detail: str) -> Refused:

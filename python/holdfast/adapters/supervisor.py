@@ -74,10 +74,10 @@ class Supervisor:
             logs.problem("adapter_status_failed", adapter=self.name)
             own = {}
         return {
+            **own,
             "state": self._state,
             "restarts": self._restarts,
-            "last_error": self._last_error,
-            **own,
+            "last_error": own.get("last_error") or self._last_error,
         }
 
     def _run(self) -> None:

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 # How long a signal may wait until it is noticed, in seconds.
 PATIENCE = 0.2
 
-# Open files beside the connections: listeners, worker threads, the interpreter's own.
-OTHER_FILES = 64
+# Open files beside the connections: listeners, readers of metrics, the interpreter's own.
+OTHER_FILES = 128
 
 # The number that mbpoll gives each area.
 MBPOLL_TYPES = {

@@ -1,0 +1,216 @@
+"""Metrics: everything that diagnostics count, for Prometheus, see docs/metrics.md."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector, make_asgi_app
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    InfoMetricFamily,
+)
+from prometheus_client.registry import Collector
+
+from holdfast import __version__
+from holdfast.http import SAFE, Host, rejection, respond
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+
+    from prometheus_client.metrics_core import Metric
+
+    from holdfast.adapters import Stop
+    from holdfast.config import MetricsConfig
+    from holdfast.diagnostics import Diagnostics
+    from holdfast.http import Receive, Scope, Send
+
+MAX_CONNECTIONS = 32
+REQUEST_TIMEOUT = 10.0
+PATH = "/metrics"
+STATES = ("running", "failed", "stopped")
+
+
+class Metrics:
+    """The metrics adapter, on a socket that listens already."""
+
+    def __init__(
+        self, settings: MetricsConfig, diagnostics: Diagnostics, listener: socket.socket
+    ) -> None:
+        registry = CollectorRegistry()
+        registry.register(Figures(diagnostics))
+        ProcessCollector(registry=registry)
+        GCCollector(registry=registry)
+        self._exporter = make_asgi_app(registry)
+        self._host = Host(
+            "metrics",
+            self._serve,
+            listener,
+            sources=settings.sources,
+            max_connections=MAX_CONNECTIONS,
+            request_timeout=REQUEST_TIMEOUT,
+        )
+
+    def run(self, stop: Stop) -> None:
+        """Serves until `stop`."""
+        self._host.run(stop)
+
+    def status(self) -> dict[str, object]:
+        """Where it listens, and what became of connections."""
+        return {"address": self._host.address, "connections": self._host.counts()}
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["path"] != PATH:
+            await respond(send, 404, *rejection("not_found", f"the metrics are at {PATH}"))
+        elif scope["method"] == "OPTIONS":
+            await respond(send, 204, [(b"allow", b"GET, HEAD, OPTIONS"), *SAFE])
+        elif scope["method"] not in ("GET", "HEAD"):
+            headers, body = rejection("method_not_allowed", "allowed are GET, HEAD, OPTIONS")
+            await respond(send, 405, [*headers, (b"allow", b"GET, HEAD, OPTIONS")], body)
+        else:
+            await self._export(scope, receive, send)
+
+    async def _export(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The exporter's answer, with a length and the headers of every answer."""
+        start: MutableMapping[str, Any] = {}
+
+        async def sent(message: MutableMapping[str, Any]) -> None:
+            if message["type"] == "http.response.start":
+                start.update(message)
+                return
+            body = message["body"]
+            headers = [*start["headers"], (b"content-length", b"%d" % len(body)), *SAFE]
+            await respond(send, start["status"], headers, body)
+
+        await self._exporter(scope, receive, sent)
+
+
+class Figures(Collector):
+    """Turns the diagnostics of the moment into metrics."""
+
+    def __init__(self, diagnostics: Diagnostics) -> None:
+        self._diagnostics = diagnostics
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing is known before it is asked for."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics of this moment."""
+        stats = self._diagnostics.stats()
+        yield InfoMetricFamily("holdfast_build", "The program.", {"version": __version__})
+        yield GaugeMetricFamily("holdfast_uptime_seconds", "Since the start.", stats["uptime"])
+        yield CounterMetricFamily(
+            "holdfast_events_lost",
+            "Events of listeners that were not logged.",
+            stats["events_lost"],
+        )
+        if stats["audit"] is not None:
+            yield CounterMetricFamily(
+                "holdfast_audit_lines", "Lines of the audit log.", stats["audit"]["lines"]
+            )
+            yield CounterMetricFamily(
+                "holdfast_audit_failed",
+                "Lines that the audit log's file did not take.",
+                stats["audit"]["failed"],
+            )
+        yield from _of_listeners(stats["listeners"])
+        yield from _of_adapters(stats["adapters"])
+        yield from _of_memories(self._diagnostics.memories())
+
+
+def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    requests = _counter("requests", "Modbus requests, by function code.", "listener", "function")
+    exceptions = _counter("exceptions", "Modbus exceptions, by exception code.", "listener", "code")
+    more = _counter("listener", "What else a listener counted.", "listener", "counter")
+    opened = _gauge("connections_open", "Connections that are open.", "listener")
+    connections = _counter(
+        "connections", "Connections, by what became of them.", "listener", "outcome"
+    )
+    for name, counters in listeners.items():
+        for key, counted in counters.items():
+            if key == "requests":
+                _add(requests, name, counted)
+            elif key == "exceptions":
+                _add(exceptions, name, counted)
+            elif key == "connections":
+                _add_connections(opened, connections, name, counted)
+            else:
+                _add(more, name, dict(_flat(key, counted)))
+    yield from (requests, exceptions, connections, opened, more)
+
+
+def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    accepted = _counter("ingest_accepted", "Messages that were carried out.", "adapter")
+    values = _counter("ingest_values", "Values that were written.", "adapter")
+    reads = _counter("ingest_reads", "Reads that were answered.", "adapter")
+    refused = _counter("ingest_refused", "Messages that were refused.", "adapter", "reason")
+    restarts = _counter("adapter_restarts", "How often it was made anew.", "adapter")
+    states = _gauge("adapter_state", "1 for the state that it is in.", "adapter", "state")
+    opened = _gauge("adapter_connections_open", "Connections that are open.", "adapter")
+    connections = _counter(
+        "adapter_connections", "Connections, by what became of them.", "adapter", "outcome"
+    )
+    status = _gauge("adapter_status", "What an adapter says of itself.", "adapter", "field")
+    plain = {"accepted": accepted, "values": values, "reads": reads, "restarts": restarts}
+    for name, fields in adapters.items():
+        state = fields.get("state")
+        _add(states, name, {known: known == state for known in STATES})
+        for key, value in fields.items():
+            if key in plain:
+                plain[key].add_metric([name], value)
+            elif key == "refused":
+                _add(refused, name, value)
+            elif key == "connections" and isinstance(value, dict):
+                _add_connections(opened, connections, name, value)
+            else:
+                _add(status, name, dict(_flat(key, value)))
+    yield from (accepted, values, reads, refused, restarts, states, connections, opened, status)
+
+
+def _of_memories(memories: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    sealed = _gauge("memory_sealed", "Whether Modbus clients are refused for now.", "memory")
+    opened = _counter("memory_seal_opened", "How often the seal opened.", "memory")
+    closed = _counter("memory_seal_closed", "How often the seal closed again.", "memory")
+    size = _gauge("memory_size", "Bits or registers of an area.", "memory", "area")
+    for name, memory in memories.items():
+        sealed.add_metric([name], memory["sealed"])
+        opened.add_metric([name], memory["opened"])
+        closed.add_metric([name], memory["closed"])
+        _add(size, name, {area: extent["size"] for area, extent in memory["areas"].items()})
+    yield from (sealed, opened, closed, size)
+
+
+def _counter(name: str, text: str, *labels: str) -> CounterMetricFamily:
+    return CounterMetricFamily(f"holdfast_{name}", text, labels=labels)
+
+
+def _gauge(name: str, text: str, *labels: str) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"holdfast_{name}", text, labels=labels)
+
+
+def _add(
+    family: CounterMetricFamily | GaugeMetricFamily, name: str, counted: Mapping[Any, float]
+) -> None:
+    for key, value in counted.items():
+        family.add_metric([name, str(key)], value)
+
+
+def _add_connections(
+    opened: GaugeMetricFamily,
+    connections: CounterMetricFamily,
+    name: str,
+    counted: Mapping[str, int],
+) -> None:
+    opened.add_metric([name], counted.get("open", 0))
+    _add(connections, name, {key: value for key, value in counted.items() if key != "open"})
+
+
+def _flat(key: str, value: object) -> Iterator[tuple[str, float]]:
+    """The numbers in something that was counted; the keys of what is nested are joined."""
+    if isinstance(value, dict):
+        for inner, more in value.items():
+            yield from _flat(f"{key}_{inner}", more)
+    elif isinstance(value, int | float):
+        yield key, value

@@ -1,0 +1,298 @@
+"""The adapter: one broker, for ever; it comes back by itself whatever happens to the connection."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from holdfast import logs
+from holdfast.adapters.mqtt.answers import Answers
+from holdfast.adapters.mqtt.backoff import Backoff
+from holdfast.adapters.mqtt.dialing import dial, tls_context
+from holdfast.adapters.mqtt.filters import Filters
+from holdfast.adapters.mqtt.inbox import Inbox
+from holdfast.adapters.mqtt.link import MOST_UNSENT, Link
+from holdfast.adapters.mqtt.waiting import Ended, Waiter
+
+if TYPE_CHECKING:
+    import socket
+    from pathlib import Path
+
+    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
+    from paho.mqtt.properties import Properties
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    from holdfast.adapters import Door, Stop
+    from holdfast.config import MqttConfig, SubscriptionConfig
+
+WELCOME = 10.0
+"""Seconds that the broker has to answer the introduction."""
+
+SILENCE = 600.0
+"""Seconds for which a failure to connect is not logged again when its reason is the same."""
+
+LONGEST_PASSWORD = 65535
+
+_TICK = 1.0
+"""Seconds between looks at the keep-alive."""
+
+
+class Mqtt:
+    """Takes messages from a broker, and hands them to the door."""
+
+    def __init__(self, settings: MqttConfig, door: Door) -> None:
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        self._settings = settings
+        self._broker = f"{host}:{settings.port}"
+        filters = Filters(settings.subscriptions)
+        self._inbox = Inbox(door, filters, self._broker)
+        self._answers = Answers(filters)
+        self._topics = [_Topic(entry) for entry in settings.subscriptions]
+        self._asked: dict[int, _Topic] = {}
+        self._unreleased: set[int] = set()
+        self._failures = _Failures(self._broker)
+        self._connected_at: float | None = None
+        self._connects = 0
+        self._ending: str | None = None
+        self._last_error: str | None = None
+
+    def run(self, stop: Stop) -> None:
+        """Stays connected until `stop`, and comes back when the connection ends."""
+        backoff = Backoff()
+        with Waiter(stop) as waiter, contextlib.suppress(Ended):
+            while not stop.wait(backoff.pause(self._connection(waiter))):
+                pass
+
+    def status(self) -> dict[str, object]:
+        """Whether it is connected, to which broker, and what the broker granted."""
+        return {
+            "connected": self._connected_at is not None,
+            "broker": self._broker,
+            "version": self._settings.version,
+            "topics": [
+                {"topic": topic.entry.topic, "qos": topic.entry.qos, "granted": topic.granted}
+                for topic in self._topics
+            ],
+            "last_error": self._last_error,
+            "received": self._inbox.received,
+            "reconnects": max(0, self._connects - 1),
+            "answers": self._answers.sent,
+            "answers_dropped": self._answers.dropped,
+        }
+
+    def _connection(self, waiter: Waiter) -> float:
+        """One connection, from dialing to its end; the seconds that it held."""
+        self._ending = None
+        link: Link | None = None
+        try:
+            link = self._link(waiter)
+            link.open(self._settings)
+            self._serve(link, waiter)
+        except Ended:
+            self._ending = "stopped"
+            if link is not None:
+                link.disconnect()
+            raise
+        except (OSError, ValueError) as error:
+            self._ending = str(error)
+        except Exception as error:  # Nothing that a broker sends may end the adapter.
+            logs.problem("mqtt_failed", broker=self._broker)
+            self._ending = type(error).__name__
+        finally:
+            if link is not None:
+                link.close()
+            held = self._ended()
+        return held
+
+    def _link(self, waiter: Waiter) -> Link:
+        settings = self._settings
+        context = tls_context(settings.tls) if settings.secure else None
+
+        def open_socket() -> socket.socket:
+            return dial(settings.host, settings.port, context, waiter)
+
+        password = _password(settings.password_file)
+        link = Link(settings, password, open_socket, self._unreleased, self._inbox, self._answers)
+        link.on_connect = self._on_connect
+        link.on_subscribe = self._on_subscribe
+        link.on_disconnect = self._on_disconnect
+        return link
+
+    def _serve(self, link: Link, waiter: Waiter) -> None:
+        """Reads and writes until the connection ends."""
+        welcome = time.monotonic() + WELCOME
+        tick = min(_TICK, self._settings.keep_alive / 2)
+        while (connection := link.socket()) is not None:
+            if self._connected_at is None and time.monotonic() > welcome:
+                raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
+            pending = getattr(connection, "pending", int)() > 0
+            read = link.unsent < MOST_UNSENT
+            readable, writable = waiter.wait(
+                connection,  # type: ignore[arg-type]
+                read=read,
+                write=link.want_write(),
+                seconds=0.0 if pending and read else tick,
+            )
+            if writable:
+                link.loop_write()
+            if readable or (pending and read):
+                link.loop_read()
+            link.loop_misc()
+        self._ending = link.trouble or self._ending
+
+    def _ended(self) -> float:
+        """Tells of the end of a connection, or of the attempt; how long it held."""
+        began, self._connected_at = self._connected_at, None
+        reason = self._ending or "the broker closed the connection"
+        for topic in self._topics:
+            topic.granted = None
+        if reason != "stopped":
+            self._last_error = reason
+        if began is not None:
+            level = logging.INFO if reason == "stopped" else logging.WARNING
+            logs.write(level, "mqtt_disconnected", broker=self._broker, reason=reason)
+            return time.monotonic() - began
+        if reason != "stopped":
+            self._failures.tell(reason)
+        return 0.0
+
+    def _on_connect(
+        self,
+        link: Client,
+        _data: object,
+        flags: ConnectFlags,
+        reason: ReasonCode,
+        properties: Properties | None,
+    ) -> None:
+        assert isinstance(link, Link)
+        if reason.is_failure:
+            self._ending = f"the broker refused the connection: {reason}"
+            return
+        link.accepted(properties)
+        self._failures.forget()
+        resumed = flags.session_present
+        if not resumed:
+            self._unreleased.clear()
+            for topic in self._topics:
+                topic.known = None
+        logs.write(
+            logging.INFO,
+            "mqtt_connected",
+            broker=self._broker,
+            version=self._settings.version,
+            session="resumed" if resumed else "new",
+        )
+        self._asked.clear()
+        for topic in self._topics:
+            self._subscribe(link, topic, resumed=resumed)
+        self._connects += 1
+        self._connected_at = time.monotonic()
+
+    def _subscribe(self, link: Link, topic: _Topic, *, resumed: bool) -> None:
+        """Asks for a topic. With MQTT 3.1.1 to ask again is to get retained messages again, so what
+        this process was granted in a session that still exists is not asked for.
+        """
+        again = resumed and topic.known is not None
+        if again and self._settings.version != "5":
+            topic.granted = topic.known
+            return
+        identifier = link.ask_for(topic.entry, again=again)
+        if identifier is not None:
+            self._asked[identifier] = topic
+
+    def _on_subscribe(
+        self,
+        _link: Client,
+        _data: object,
+        identifier: int,
+        reasons: list[ReasonCode],
+        _properties: Properties | None,
+    ) -> None:
+        topic = self._asked.pop(identifier, None)
+        if topic is None or not reasons:
+            return
+        reason = reasons[0]
+        if not reason.is_failure:
+            topic.granted = topic.known = reason.value
+            return
+        topic.granted = topic.known = None
+        self._last_error = f"subscription {topic.entry.topic} refused: {reason}"
+        logs.write(
+            logging.ERROR,
+            "mqtt_subscription_refused",
+            broker=self._broker,
+            topic=topic.entry.topic,
+            reason=str(reason),
+        )
+
+    def _on_disconnect(
+        self,
+        _link: Client,
+        _data: object,
+        flags: DisconnectFlags,
+        reason: ReasonCode,
+        _properties: Properties | None,
+    ) -> None:
+        if self._ending is not None:
+            return
+        if flags.is_disconnect_packet_from_server:
+            self._ending = f"the broker ended the connection: {reason}"
+        elif reason.getName() == "Unspecified error":
+            self._ending = "the connection was lost"
+        else:
+            self._ending = str(reason)
+
+
+class _Topic:
+    """A subscription, and the quality of service it was granted."""
+
+    def __init__(self, entry: SubscriptionConfig) -> None:
+        self.entry = entry
+        self.granted: int | None = None
+        """In this connection."""
+        self.known: int | None = None
+        """In this session, as far as this process knows."""
+
+
+class _Failures:
+    """Logs attempts that failed, but not the same reason again and again."""
+
+    def __init__(self, broker: str) -> None:
+        self._broker = broker
+        self._reason: str | None = None
+        self._logged = 0.0
+        self._attempts = 0
+
+    def tell(self, reason: str) -> None:
+        """An attempt failed."""
+        self._attempts += 1
+        now = time.monotonic()
+        if reason == self._reason and now - self._logged < SILENCE:
+            return
+        self._reason, self._logged = reason, now
+        logs.write(
+            logging.WARNING,
+            "mqtt_connect_failed",
+            broker=self._broker,
+            reason=reason,
+            attempts=self._attempts,
+        )
+
+    def forget(self) -> None:
+        """An attempt was successful."""
+        self._reason, self._attempts = None, 0
+
+
+def _password(file: Path | None) -> bytes | None:
+    """Read at each attempt, so that a new password is taken."""
+    if file is None:
+        return None
+    with file.open("rb") as opened:
+        content = opened.read(LONGEST_PASSWORD + 3)
+    newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
+    password = content.removesuffix(newline)
+    if len(password) > LONGEST_PASSWORD:
+        raise ValueError(f"{file} holds more than {LONGEST_PASSWORD} bytes")
+    return password

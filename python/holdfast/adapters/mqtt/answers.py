@@ -1,0 +1,65 @@
+"""Answers, to those who ask for one with a response topic (MQTT 5).
+
+An answer is a courtesy: it must neither hold up the messages behind it nor fill memory. It is
+dropped, and counted, when the broker is slow in taking the ones before, and when it could come back
+as a message.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast.adapters.mqtt.filters import Filters
+    from holdfast.adapters.mqtt.link import Link
+    from holdfast.adapters.mqtt.packets import Publish
+
+MOST_WAITING = 100
+"""Answers that the broker has not taken yet."""
+
+
+class Answers:
+    """Sends answers, and counts them."""
+
+    def __init__(self, filters: Filters) -> None:
+        self._filters = filters
+        self.sent = 0
+        self.dropped = 0
+
+    def send(self, link: Link, message: Publish, answer: Mapping[str, object]) -> None:
+        """Answers a message, if it asks for that."""
+        if message.response_topic is None:
+            return
+        if self._sent(link, message, message.response_topic, answer):
+            self.sent += 1
+        else:
+            self.dropped += 1
+
+    def _sent(
+        self, link: Link, message: Publish, response_topic: bytes, answer: Mapping[str, object]
+    ) -> bool:
+        try:
+            topic = response_topic.decode()
+        except UnicodeDecodeError:
+            return False
+        if not topic or set(topic) & set("+#\0") or self._filters.grant(topic) is not None:
+            return False
+        payload = msgspec.json.encode(answer)
+        size = len(payload) + len(response_topic) + len(message.correlation or b"")
+        if link.unsent >= MOST_WAITING or not link.takes(size):
+            return False
+        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        properties.ContentType = "application/json"
+        if message.correlation is not None:
+            properties.CorrelationData = message.correlation
+        qos = min(message.qos, 1, link.most_qos)
+        return link.publish(topic, payload, qos, properties=properties).rc == (
+            MQTTErrorCode.MQTT_ERR_SUCCESS
+        )

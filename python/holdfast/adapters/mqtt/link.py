@@ -1,0 +1,174 @@
+"""One connection to a broker: paho's client, with four things done otherwise.
+
+- A message is acknowledged after it was written, with every quality of service. paho sends the
+  acknowledgement of QoS 2 (PUBREC) first, and hands the message over later: a crash between the two
+  would lose it.
+- Connecting can be interrupted: `dial` opens the socket.
+- The properties of a message are read here, in linear time.
+- A packet too large to be taken is not kept in memory while it arrives.
+
+The methods that begin with an underscore are paho's own, overridden.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from holdfast.adapters.mqtt.answers import MOST_WAITING
+from holdfast.adapters.mqtt.inbox import MOST_BYTES
+from holdfast.adapters.mqtt.packets import MOST_PROPERTIES, parse_publish
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from holdfast.adapters.mqtt.answers import Answers
+    from holdfast.adapters.mqtt.inbox import Inbox
+    from holdfast.config import MqttConfig, SubscriptionConfig
+
+SESSION_EXPIRY = 3600
+"""Seconds that the broker keeps subscriptions and undelivered messages while this client is away.
+It can be told so with MQTT 5 only."""
+
+MOST_UNSENT = 1000
+"""Packets waiting to be sent, mostly acknowledgements, above which nothing more is read."""
+
+_MOST_ON_THE_WAY = 20
+"""Answers sent and not acknowledged; the others wait."""
+
+_KEPT = MOST_PROPERTIES + 2**17
+"""Bytes of a packet too large: enough for what stands before the payload."""
+
+_LARGEST = MOST_BYTES + _KEPT
+
+
+class Link(Client):
+    """One connection, from dialing to its end; the next one is another object."""
+
+    def __init__(
+        self,
+        settings: MqttConfig,
+        password: bytes | None,
+        dial: Callable[[], socket.socket],
+        unreleased: set[int],
+        inbox: Inbox,
+        answers: Answers,
+    ) -> None:
+        """`unreleased` are packet identifiers of QoS 2, kept from one connection to the next."""
+        self._five = settings.version == "5"
+        super().__init__(
+            CallbackAPIVersion.VERSION2,
+            client_id=settings.client_id,
+            clean_session=None if self._five else False,
+            protocol=MQTTProtocolVersion.MQTTv5 if self._five else MQTTProtocolVersion.MQTTv311,
+            reconnect_on_failure=False,
+        )
+        self._dial = dial
+        self._unreleased = unreleased
+        self._inbox = inbox
+        self._answers = answers
+        self._largest_sent: int | None = None
+        self.most_qos = 1
+        """The best quality of service that the broker takes, not above 1."""
+        self.trouble: str | None = None
+        """What paho last found wrong."""
+        self.on_log = self._note
+        self.max_queued_messages = MOST_WAITING
+        self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
+
+    def open(self, settings: MqttConfig) -> None:
+        """Dials, and introduces itself to the broker; raises as `dial`."""
+        if not self._five:
+            self.connect(settings.host, settings.port, settings.keep_alive)
+            return
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.SessionExpiryInterval = SESSION_EXPIRY
+        self.connect(
+            settings.host,
+            settings.port,
+            settings.keep_alive,
+            clean_start=False,
+            properties=properties,
+        )
+
+    def accepted(self, properties: Properties | None) -> None:
+        """The broker took the connection, and told its limits."""
+        self.on_log = None
+        most: int = getattr(properties, "ReceiveMaximum", _MOST_ON_THE_WAY)
+        self._max_inflight_messages = min(most, _MOST_ON_THE_WAY)
+        self._largest_sent = getattr(properties, "MaximumPacketSize", None)
+        self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
+
+    def ask_for(self, subscription: SubscriptionConfig, *, again: bool) -> int | None:
+        """Subscribes; the packet's identifier. `again`: retained messages have been taken."""
+        if not self._five:
+            return self.subscribe(subscription.topic, subscription.qos)[1]
+        options = SubscribeOptions(
+            qos=subscription.qos,
+            retainHandling=(
+                SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
+                if again
+                else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+            ),
+        )
+        return self.subscribe(subscription.topic, options=options)[1]
+
+    def takes(self, size: int) -> bool:
+        """Whether the broker takes a message of this size, with some bytes around it."""
+        return self._largest_sent is None or size + 64 <= self._largest_sent
+
+    @property
+    def unsent(self) -> int:
+        """How many packets wait to be sent."""
+        return len(self._out_packet)
+
+    def close(self) -> None:
+        """Closes the socket, if it is open."""
+        self._sock_close()
+
+    def _note(self, _client: Client, _data: object, level: int, text: str) -> None:
+        if level == LogLevel.MQTT_LOG_ERR or "malformed" in text:
+            self.trouble = text
+
+    def _create_socket(self) -> Any:
+        return self._dial()
+
+    def _packet_read(self) -> MQTTErrorCode:
+        code = super()._packet_read()
+        if self._in_packet["remaining_length"] > _LARGEST:
+            del self._in_packet["packet"][_KEPT:]
+        return code
+
+    def _handle_publish(self) -> MQTTErrorCode:
+        packet = self._in_packet
+        try:
+            message = parse_publish(
+                packet["command"], packet["packet"], packet["remaining_length"], five=self._five
+            )
+        except ValueError as error:
+            self.trouble = f"a malformed message: {error}"
+            return MQTTErrorCode.MQTT_ERR_PROTOCOL
+        if message.qos == 2 and message.identifier in self._unreleased:
+            return self._send_pubrec(message.identifier)
+        answer = self._inbox.take(message)
+        code = MQTTErrorCode.MQTT_ERR_SUCCESS
+        if message.qos == 1:
+            code = self._send_puback(message.identifier)
+        elif message.qos == 2:
+            self._unreleased.add(message.identifier)
+            code = self._send_pubrec(message.identifier)
+        # After the acknowledgement: a broker that closes the connection for the answer's sake
+        # does not deliver the message again then.
+        if code == MQTTErrorCode.MQTT_ERR_SUCCESS:
+            self._answers.send(self, message, answer)
+        return code
+
+    def _send_pubcomp(self, mid: int) -> MQTTErrorCode:
+        self._unreleased.discard(mid)
+        return super()._send_pubcomp(mid)

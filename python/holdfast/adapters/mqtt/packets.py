@@ -1,0 +1,120 @@
+"""Reading a PUBLISH packet, in time that grows only with the size of its properties."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+MOST_PROPERTIES = 2**18
+"""Bytes: response topic, correlation data and content type at their longest, and some more."""
+
+_FIXED = {1: 1, 2: 4, 35: 2}
+"""Properties of a fixed size: payload format, message expiry, topic alias."""
+
+_LENGTHS = {3: 1, 8: 1, 9: 1, 38: 2}
+"""Properties with a length before them: content type, response topic, correlation data, and user
+property, which is two texts."""
+
+_SUBSCRIPTION_IDENTIFIER = 11
+_RESPONSE_TOPIC = 8
+_CORRELATION_DATA = 9
+
+
+class Publish(NamedTuple):
+    """A message."""
+
+    topic: str
+    qos: int
+    identifier: int
+    """Of the packet, to acknowledge it by; 0 with QoS 0."""
+    payload: memoryview
+    size: int
+    """How many bytes the payload has, also when it was not kept to its end."""
+    response_topic: bytes | None = None
+    correlation: bytes | None = None
+    problem: str | None = None
+    """What is wrong with its properties."""
+
+
+def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: bool) -> Publish:
+    """A message of MQTT 5 or 3.1.1; `length` is that of the body before it was cut short.
+
+    Raises `ValueError` when it can't even be acknowledged.
+    """
+    view = memoryview(body)
+    qos = flags >> 1 & 3
+    if qos == 3:
+        raise ValueError("QoS 3")
+    topic, at = _text(view, 0)
+    identifier = 0
+    if qos:
+        identifier, at = _integer(view, at, 2)
+        if identifier == 0:
+            raise ValueError("packet identifier 0")
+    found: dict[int, bytes] = {}
+    problem = None
+    if five:
+        size, at = _variable(view, at)
+        try:
+            found = _properties(view[at : at + size], size)
+        except ValueError as error:
+            problem = f"properties: {error}"
+        at += size
+        if at > length:
+            raise ValueError("properties that don't end")
+    return Publish(
+        topic.decode(errors="replace"),
+        qos,
+        identifier,
+        view[at:],
+        length - at,
+        found.get(_RESPONSE_TOPIC),
+        found.get(_CORRELATION_DATA),
+        problem,
+    )
+
+
+def _properties(view: memoryview, size: int) -> dict[int, bytes]:
+    """The value of each property with a length; of two the last."""
+    if size > MOST_PROPERTIES:
+        raise ValueError(f"{size} bytes, allowed are {MOST_PROPERTIES}")
+    if len(view) < size:
+        raise ValueError("cut off")
+    found = {}
+    at = 0
+    while at < size:
+        kind, at = _variable(view, at)
+        if kind == _SUBSCRIPTION_IDENTIFIER:
+            _, at = _variable(view, at)
+        elif kind in _FIXED:
+            _, at = _integer(view, at, _FIXED[kind])
+        elif kind in _LENGTHS:
+            for _ in range(_LENGTHS[kind]):
+                found[kind], at = _text(view, at)
+        else:
+            raise ValueError(f"{kind} is none of a message")
+    return found
+
+
+def _integer(view: memoryview, at: int, size: int) -> tuple[int, int]:
+    piece = view[at : at + size]
+    if len(piece) < size:
+        raise ValueError("cut off")
+    return int.from_bytes(piece, "big"), at + size
+
+
+def _text(view: memoryview, at: int) -> tuple[bytes, int]:
+    size, at = _integer(view, at, 2)
+    piece = view[at : at + size]
+    if len(piece) < size:
+        raise ValueError("cut off")
+    return bytes(piece), at + size
+
+
+def _variable(view: memoryview, at: int) -> tuple[int, int]:
+    value = 0
+    for place in range(4):
+        digit, at = _integer(view, at, 1)
+        value |= (digit & 0x7F) << 7 * place
+        if digit < 0x80:
+            return value, at
+    raise ValueError("a length that doesn't end")

@@ -1,0 +1,69 @@
+"""Waiting for a socket in such a way that a stop ends it at once."""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+    from holdfast.adapters import Stop
+
+_Selector: type[selectors.BaseSelector] = getattr(
+    selectors, "PollSelector", selectors.SelectSelector
+)
+"""Not select(), where there is something else: it can't wait for a descriptor above 1023."""
+
+
+class Ended(Exception):
+    """The adapter is to end."""
+
+
+class Waiter:
+    """Waits for one socket at a time, in one thread; raises `Ended` as soon as `stop` is set."""
+
+    def __init__(self, stop: Stop) -> None:
+        self._stop = stop
+        self._bell, self._rope = socket.socketpair()
+        self._rope.setblocking(False)
+        stop.then(self._ring)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bell.close()
+        self._rope.close()
+
+    def _ring(self) -> None:
+        with contextlib.suppress(OSError):
+            self._rope.send(b"\0")
+
+    def check(self) -> None:
+        """Raises `Ended` when the adapter is to end."""
+        if self._stop.is_set():
+            raise Ended
+
+    def wait(
+        self, for_this: socket.socket, *, read: bool, write: bool, seconds: float
+    ) -> tuple[bool, bool]:
+        """Whether the socket can be read, and whether it can be written, within a time."""
+        self.check()
+        wanted = selectors.EVENT_READ * read | selectors.EVENT_WRITE * write
+        with _Selector() as selector:
+            selector.register(self._bell, selectors.EVENT_READ)
+            if wanted:
+                selector.register(for_this, wanted)
+            ready = {key.fileobj: events for key, events in selector.select(max(0.0, seconds))}
+        self.check()
+        events = ready.get(for_this, 0)
+        return bool(events & selectors.EVENT_READ), bool(events & selectors.EVENT_WRITE)

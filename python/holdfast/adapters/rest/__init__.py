@@ -1,0 +1,42 @@
+"""REST: memory written and read as JSON over HTTP, see docs/rest.md."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.adapters.rest.app import App
+from holdfast.http import Host
+
+if TYPE_CHECKING:
+    import socket
+
+    from holdfast.adapters import Stop
+    from holdfast.config import RestConfig
+    from holdfast.diagnostics import Diagnostics
+    from holdfast.ingest import Door
+
+__all__ = ["Rest"]
+
+
+class Rest:
+    """The REST adapter, on a socket that listens already."""
+
+    def __init__(
+        self, settings: RestConfig, door: Door, diagnostics: Diagnostics, listener: socket.socket
+    ) -> None:
+        self._host = Host(
+            "rest",
+            App(settings, door, diagnostics, listener),
+            listener,
+            sources=settings.sources,
+            max_connections=settings.max_connections,
+            request_timeout=settings.request_timeout,
+        )
+
+    def run(self, stop: Stop) -> None:
+        """Serves until `stop`."""
+        self._host.run(stop)
+
+    def status(self) -> dict[str, object]:
+        """Where it listens, and what became of connections."""
+        return {"address": self._host.address, "connections": self._host.counts()}
