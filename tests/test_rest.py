@@ -989,7 +989,7 @@ def test_stop_ends_it_at_once_also_with_a_connection_that_is_open(
         half.send(web.post(GOOD)[:-5])
         service.until_counted("accepted", 2)
         service.supervisor.stop()
-        wire.until(lambda: service.supervisor.status()["state"] == "stopped", "stopped", 3.0)
+        wire.until(lambda: service.supervisor.status()["state"] == "stopped", "stopped")
 
 
 def test_it_runs_again_on_the_same_socket(memories: dict[str, holdfast.Memory]) -> None:
