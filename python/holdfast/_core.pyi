@@ -9,15 +9,19 @@ from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFul
 
 __all__ = [
     "BlockingClient",
+    "Device",
+    "Endpoint",
     "Engine",
     "Listener",
     "Memory",
     "OutOfRange",
+    "Poller",
     "RawRule",
     "Request",
     "Rule",
     "Session",
     "__version__",
+    "plan_blocks",
     "write_across",
 ]
 
@@ -284,17 +288,12 @@ class Request:
         """As it is sent."""
 
 @final
-class BlockingClient:
-    """One request and its reply at a time, over any transport; connects when it is needed.
-
-    Any thread may call it; the calls take turns. The interpreter is free while a call waits.
-    """
+class Endpoint:
+    """What a client, or the poller, talks to. Raises `ValueError` for what can't be."""
 
     @staticmethod
-    def network(
-        transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int
-    ) -> BlockingClient:
-        """Of a device behind an address."""
+    def network(transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int) -> Endpoint:
+        """A device, or a gateway, behind an address."""
 
     @staticmethod
     def serial(
@@ -307,9 +306,17 @@ class BlockingClient:
         data_bits: int,
         silence: float | None = None,
         echo: bool = False,
-    ) -> BlockingClient:
-        """Of a serial line."""
+    ) -> Endpoint:
+        """A serial line."""
 
+@final
+class BlockingClient:
+    """One request and its reply at a time, over any transport; connects when it is needed.
+
+    Any thread may call it; the calls take turns. The interpreter is free while a call waits.
+    """
+
+    def __new__(cls, endpoint: Endpoint) -> BlockingClient: ...
     def call(self, request: Request, unit: int, timeout: float) -> Any:
         """The result of a request: values, bytes, or `None` for a write.
 
@@ -344,5 +351,69 @@ class Session:
         """Gives a request up: its reply, should it come, is dropped and counted."""
 
     @property
+    def is_amid_reply(self) -> bool:
+        """Whether the last bytes received were the beginning of a reply."""
+
+    @property
     def late(self) -> int:
         """Replies that came after their requests had been given up."""
+
+@final
+class Device:
+    """A device to be polled: what is read, how often, and where it goes.
+
+    `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
+    `max_gap` (0 when left out) or `cost` (of a request, of an item) says which holes are read; `readable` and
+    `forbidden` are areas with start and end. `forward` are hosts, ports, formats (`v1`, `crc`), crc
+    (`required`, `none`), unit or memory ids, and timeouts. `status` is the memory, area and slot of
+    the status block. Times are in seconds; interval 0 polls without a pause.
+    """
+
+    def __new__(
+        cls,
+        name: str,
+        endpoint: Endpoint,
+        *,
+        unit: int,
+        interval: float,
+        timeout: float,
+        reads: Sequence[tuple[Area, int, int, tuple[Memory, Area, int] | None]],
+        max_gap: int | None = None,
+        cost: tuple[float, float] | None = None,
+        max_registers: int = 125,
+        max_bits: int = 2000,
+        readable: Sequence[tuple[Area, int, int]] | None = None,
+        forbidden: Sequence[tuple[Area, int, int]] | None = None,
+        forward: Sequence[tuple[str, int, str, str, int, float]] | None = None,
+        status: tuple[Memory, Area, int] | None = None,
+    ) -> Device: ...
+
+@final
+class Poller:
+    """Devices that are polled by a native thread, from construction to `stop`.
+
+    Raises `ValueError` for a read that no request can carry or a destination that it does not fit.
+    """
+
+    def __new__(cls, devices: Sequence[Device]) -> Poller: ...
+    def counters(self) -> dict[str, dict[str, Any]]:
+        """How each device does, by name: its health, counters, and those of its forwards."""
+
+    def stop(self) -> None:
+        """Stops polling. From any thread."""
+
+def plan_blocks(
+    fields: Sequence[tuple[Area, int, int]],
+    *,
+    max_gap: int | None = None,
+    cost: tuple[float, float] | None = None,
+    max_registers: int = 125,
+    max_bits: int = 2000,
+    readable: Sequence[tuple[Area, int, int]] | None = None,
+    forbidden: Sequence[tuple[Area, int, int]] | None = None,
+) -> list[tuple[Area, int, int, list[int], int]]:
+    """The requests that read all fields (area, address, count), none of which is split.
+
+    Each is an area, an address, a count, the indexes of its fields, and how many items no field
+    wants. Raises `ValueError` for a field that no request may read.
+    """

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import operations
-from holdfast._core import BlockingClient, Request
+from holdfast._core import BlockingClient, Endpoint, Request
 from holdfast.errors import ModbusException
 from holdfast.link import Link
 from holdfast.target import NetworkTarget, SerialTarget, parse
@@ -469,8 +469,13 @@ class _Thread:
 
 def blocking(target: Target) -> BlockingClient:
     """The native client of a target; it connects when it is first used."""
+    return BlockingClient(endpoint(target))
+
+
+def endpoint(target: Target) -> Endpoint:
+    """A target as the native core has it."""
     if isinstance(target, SerialTarget):
-        return BlockingClient.serial(
+        return Endpoint.serial(
             target.device,
             mode=target.mode,
             baud=target.baud,
@@ -480,7 +485,7 @@ def blocking(target: Target) -> BlockingClient:
             silence=target.silence,
             echo=target.echo,
         )
-    return BlockingClient.network(target.transport, target.host, target.port)
+    return Endpoint.network(target.transport, target.host, target.port)
 
 
 def _unit(unit: int) -> int:

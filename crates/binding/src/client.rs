@@ -3,7 +3,8 @@
 use std::sync::Mutex;
 
 use holdfast_engine::client::{
-    BlockingClient as Core, ClientError, Endpoint, Session as CoreSession, exception_name,
+    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Session as CoreSession,
+    exception_name,
 };
 use holdfast_engine::{Line, LineMode, LineParity};
 use holdfast_protocol::pdu::identification::ReadCode;
@@ -15,7 +16,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 
 use crate::arguments::{byte, seconds, within, word};
-use crate::memory::numbers;
+use crate::memory::{integer, numbers};
 
 pyo3::import_exception!(holdfast.errors, ModbusException);
 pyo3::import_exception!(holdfast.errors, ConnectionLost);
@@ -33,7 +34,11 @@ pub struct Request {
 #[pymethods]
 impl Request {
     #[staticmethod]
-    fn read(area: &str, address: i128, count: i128) -> PyResult<Request> {
+    fn read(
+        area: &str,
+        #[pyo3(from_py_with = integer)] address: i128,
+        #[pyo3(from_py_with = integer)] count: i128,
+    ) -> PyResult<Request> {
         let area = crate::memory::named(area)?;
         let most = if area.is_bits() { limit::READ_BITS } else { limit::READ_REGISTERS };
         let range = range(address, count, most)?;
@@ -46,20 +51,30 @@ impl Request {
     }
 
     #[staticmethod]
-    fn write_coil(address: i128, value: bool) -> PyResult<Request> {
+    fn write_coil(
+        #[pyo3(from_py_with = integer)] address: i128,
+        value: &Bound<'_, PyAny>,
+    ) -> PyResult<Request> {
         let address = register("address", address)?;
+        let value = single(holdfast_memory::Area::Coils, value)? == 1;
         encoded(&CoreRequest::WriteSingleCoil { address, value })
     }
 
     #[staticmethod]
-    fn write_register(address: i128, value: &Bound<'_, PyAny>) -> PyResult<Request> {
+    fn write_register(
+        #[pyo3(from_py_with = integer)] address: i128,
+        value: &Bound<'_, PyAny>,
+    ) -> PyResult<Request> {
         let address = register("address", address)?;
-        let value = single(value)?;
+        let value = single(holdfast_memory::Area::HoldingRegisters, value)?;
         encoded(&CoreRequest::WriteSingleRegister { address, value })
     }
 
     #[staticmethod]
-    fn write_coils(address: i128, values: &Bound<'_, PyAny>) -> PyResult<Request> {
+    fn write_coils(
+        #[pyo3(from_py_with = integer)] address: i128,
+        values: &Bound<'_, PyAny>,
+    ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::Coils, values)?;
         let range = range(address, values.len() as i128, limit::WRITE_BITS)?;
         let mut bits = vec![0; values.len().div_ceil(8)];
@@ -70,7 +85,10 @@ impl Request {
     }
 
     #[staticmethod]
-    fn write_registers(address: i128, values: &Bound<'_, PyAny>) -> PyResult<Request> {
+    fn write_registers(
+        #[pyo3(from_py_with = integer)] address: i128,
+        values: &Bound<'_, PyAny>,
+    ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
         let range = range(address, values.len() as i128, limit::WRITE_REGISTERS)?;
         let registers = &packed(&values);
@@ -78,7 +96,11 @@ impl Request {
     }
 
     #[staticmethod]
-    fn mask_write(address: i128, and_mask: i128, or_mask: i128) -> PyResult<Request> {
+    fn mask_write(
+        #[pyo3(from_py_with = integer)] address: i128,
+        #[pyo3(from_py_with = integer)] and_mask: i128,
+        #[pyo3(from_py_with = integer)] or_mask: i128,
+    ) -> PyResult<Request> {
         encoded(&CoreRequest::MaskWriteRegister {
             address: register("address", address)?,
             and_mask: register("and_mask", and_mask)?,
@@ -88,9 +110,9 @@ impl Request {
 
     #[staticmethod]
     fn read_write(
-        read_address: i128,
-        count: i128,
-        write_address: i128,
+        #[pyo3(from_py_with = integer)] read_address: i128,
+        #[pyo3(from_py_with = integer)] count: i128,
+        #[pyo3(from_py_with = integer)] write_address: i128,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
@@ -101,7 +123,10 @@ impl Request {
     }
 
     #[staticmethod]
-    fn diagnostics(sub_function: i128, data: &[u8]) -> PyResult<Request> {
+    fn diagnostics(
+        #[pyo3(from_py_with = integer)] sub_function: i128,
+        data: &[u8],
+    ) -> PyResult<Request> {
         let code = register("sub_function", sub_function)?;
         let sub_function = SubFunction::from_code(code).ok_or_else(|| {
             PyValueError::new_err(format!("sub_function {code} is not one of the standard"))
@@ -120,7 +145,10 @@ impl Request {
     }
 
     #[staticmethod]
-    fn identification(code: i128, object_id: i128) -> PyResult<Request> {
+    fn identification(
+        #[pyo3(from_py_with = integer)] code: i128,
+        #[pyo3(from_py_with = integer)] object_id: i128,
+    ) -> PyResult<Request> {
         let code = ReadCode::from_code(byte("code", code)?)
             .ok_or_else(|| PyValueError::new_err(format!("code is {code}, allowed are 1 to 4")))?;
         let object_id = byte("object id", object_id)?;
@@ -140,26 +168,27 @@ impl Request {
     }
 }
 
+/// What a client, or the poller, talks to.
 #[pyclass(frozen, module = "holdfast")]
-pub struct BlockingClient {
-    core: Core,
+pub struct Endpoint {
+    pub core: CoreEndpoint,
 }
 
 #[pymethods]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
-impl BlockingClient {
+impl Endpoint {
     #[staticmethod]
-    fn network(transport: &str, host: String, port: u16) -> PyResult<BlockingClient> {
-        let endpoint = match transport {
-            "tcp" => Endpoint::Tcp { host, port },
-            "rtu+tcp" => Endpoint::RtuOverTcp { host, port },
-            "udp" => Endpoint::Udp { host, port },
+    fn network(transport: &str, host: String, port: u16) -> PyResult<Endpoint> {
+        let core = match transport {
+            "tcp" => CoreEndpoint::Tcp { host, port },
+            "rtu+tcp" => CoreEndpoint::RtuOverTcp { host, port },
+            "udp" => CoreEndpoint::Udp { host, port },
             _ => {
                 let message = format!("transport is {transport:?}, allowed are tcp, rtu+tcp, udp");
                 return Err(PyValueError::new_err(message));
             }
         };
-        Ok(BlockingClient { core: Core::new(endpoint) })
+        Ok(Endpoint { core })
     }
 
     #[staticmethod]
@@ -173,9 +202,22 @@ impl BlockingClient {
         data_bits: i128,
         silence: Option<f64>,
         echo: bool,
-    ) -> PyResult<BlockingClient> {
+    ) -> PyResult<Endpoint> {
         let line = line(device, mode, baud, parity, stop_bits, data_bits, silence)?;
-        Ok(BlockingClient { core: Core::new(Endpoint::Serial { line, echo }) })
+        Ok(Endpoint { core: CoreEndpoint::Serial { line, echo } })
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct BlockingClient {
+    core: Core,
+}
+
+#[pymethods]
+impl BlockingClient {
+    #[new]
+    fn new(endpoint: PyRef<'_, Endpoint>) -> BlockingClient {
+        BlockingClient { core: Core::new(endpoint.core.clone()) }
     }
 
     /// The result of a request, as Python has it.
@@ -300,6 +342,12 @@ impl Session {
         state.requests.remove(&id);
     }
 
+    /// Whether the last bytes received were the beginning of a reply.
+    #[getter]
+    fn is_amid_reply(&self) -> bool {
+        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner).core.is_amid_reply()
+    }
+
     #[getter]
     fn late(&self) -> u64 {
         self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner).core.late()
@@ -413,10 +461,10 @@ fn register(what: &str, number: i128) -> PyResult<u16> {
     Ok(within(what, number, 0..=65_535)? as u16)
 }
 
-/// One register's value.
-fn single(value: &Bound<'_, PyAny>) -> PyResult<u16> {
+/// The value of one bit or register.
+fn single(area: holdfast_memory::Area, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     let values = PyList::new(value.py(), [value])?;
-    Ok(numbers(holdfast_memory::Area::HoldingRegisters, values.as_any())?[0])
+    Ok(numbers(area, values.as_any())?[0])
 }
 
 fn packed(values: &[u16]) -> Vec<u8> {

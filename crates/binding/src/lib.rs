@@ -9,6 +9,7 @@ mod client;
 mod engine;
 mod listener;
 mod memory;
+mod poller;
 
 use pyo3::prelude::*;
 
@@ -17,13 +18,15 @@ mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult};
 
     #[pymodule_export]
-    use super::client::{BlockingClient, Request, Session};
+    use super::client::{BlockingClient, Endpoint, Request, Session};
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, write_across};
+    #[pymodule_export]
+    use super::poller::{Device, Poller, plan_blocks};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

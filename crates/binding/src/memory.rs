@@ -281,7 +281,7 @@ fn out_of_range(memory: &Core, area: Area, address: i128, count: i128) -> PyErr 
 
 /// A Python integer; one that 128 bits do not hold becomes the nearest that they do, which no
 /// address, count or value is either.
-fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
+pub fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
     match value.extract::<i128>() {
         Err(error) if error.is_instance_of::<PyOverflowError>(value.py()) => {
             Ok(if value.lt(0)? { i128::MIN } else { i128::MAX })

@@ -26,6 +26,7 @@ pub mod identity;
 mod listener;
 mod modbus_stream;
 pub mod policy;
+pub mod poller;
 mod raw_ingest;
 mod serial;
 pub mod station;

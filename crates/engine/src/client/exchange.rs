@@ -12,11 +12,12 @@ use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use holdfast_protocol::frame::{ascii, mbap, rtu};
+use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, Request, Response, ResponseError};
 
 use super::line::{self, Line};
 use super::session::Session;
+use super::turns::Turns;
 use super::{Broken, ClientError};
 use crate::serial::{Line as SerialLine, LineMode};
 
@@ -57,6 +58,7 @@ pub enum Endpoint {
 /// A client of one endpoint. Any number of threads may call it: their calls take turns.
 pub struct BlockingClient {
     endpoint: Endpoint,
+    turns: Turns,
     connection: Mutex<Option<Connection>>,
     late: AtomicU64,
 }
@@ -67,10 +69,25 @@ struct Connection {
 }
 
 enum Kind {
-    Tcp { stream: TcpStream, session: Session },
-    Udp { socket: UdpSocket, next_id: u16 },
-    Rtu { line: Box<dyn Line>, silence: Option<Duration>, echo: bool },
-    Ascii { line: Box<dyn Line>, echo: bool },
+    Tcp {
+        stream: TcpStream,
+        session: Session,
+    },
+    Udp {
+        socket: UdpSocket,
+        next_id: u16,
+    },
+    /// `silence` is that of a serial line.
+    Rtu {
+        line: Box<dyn Line>,
+        silence: Option<Duration>,
+        echo: bool,
+    },
+    Ascii {
+        line: Box<dyn Line>,
+        silence: Duration,
+        echo: bool,
+    },
 }
 
 /// A call's request and times.
@@ -90,11 +107,17 @@ struct Failure {
 
 impl BlockingClient {
     pub fn new(endpoint: Endpoint) -> BlockingClient {
-        BlockingClient { endpoint, connection: Mutex::default(), late: AtomicU64::new(0) }
+        BlockingClient {
+            endpoint,
+            turns: Turns::default(),
+            connection: Mutex::default(),
+            late: AtomicU64::new(0),
+        }
     }
 
-    /// Sends a request and gives its response to `take`. On a serial line unit id 0 is a broadcast:
-    /// nobody replies, and a write is held to be done when it was sent.
+    /// Sends a request when the caller's turn has come, which `timeout` does not cover, and gives
+    /// its response to `take`. On a serial line unit id 0 is a broadcast: nobody replies, and a
+    /// write is held to be done when it was sent.
     ///
     /// # Errors
     /// [`ClientError`]; a request that can't be encoded is [`ClientError::Invalid`].
@@ -109,6 +132,7 @@ impl BlockingClient {
         let len = request
             .encode(&mut buffer)
             .ok_or_else(|| ClientError::Invalid("the request can't be encoded".into()))?;
+        let _turn = self.turns.take();
         let deadline = Instant::now() + timeout;
         let call = Call { unit_id, request, pdu: &buffer[..len], timeout, deadline };
         let mut held = self.connection.lock().unwrap_or_else(PoisonError::into_inner);
@@ -137,8 +161,9 @@ impl BlockingClient {
         }
     }
 
-    /// Ends the connection; the next call makes a new one.
+    /// Ends the connection when the calls before this one have ended; the next makes a new one.
     pub fn close(&self) {
+        let _turn = self.turns.take();
         *self.connection.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 
@@ -180,7 +205,7 @@ impl BlockingClient {
                     LineMode::Rtu { .. } => {
                         Kind::Rtu { line: line_of, silence: Some(silence), echo: *echo }
                     }
-                    LineMode::Ascii => Kind::Ascii { line: line_of, echo: *echo },
+                    LineMode::Ascii => Kind::Ascii { line: line_of, silence, echo: *echo },
                 }
             }
         };
@@ -189,11 +214,15 @@ impl BlockingClient {
 }
 
 impl Connection {
-    /// Whether the peer ended the connection while nobody used it.
+    /// Whether the connection can't be used any more: the peer ended it while nobody used it, or
+    /// sent what nobody asked for. Where replies have no ids, that would be taken for a reply.
     fn has_ended(&self) -> bool {
         match &self.kind {
-            Kind::Tcp { stream, .. } => self.used.elapsed() > IDLE && line::has_ended(stream),
-            _ => false,
+            Kind::Tcp { stream, session } => {
+                session.is_broken() || (self.used.elapsed() > IDLE && line::has_ended(stream))
+            }
+            Kind::Udp { .. } => false,
+            Kind::Rtu { line, .. } | Kind::Ascii { line, .. } => !line.is_quiet(),
         }
     }
 
@@ -209,7 +238,9 @@ impl Connection {
             Kind::Rtu { line, silence, echo } => {
                 over_rtu(line.as_mut(), *silence, self.used, echo, call, give)
             }
-            Kind::Ascii { line, echo } => over_ascii(line.as_mut(), echo, call, give),
+            Kind::Ascii { line, silence, echo } => {
+                over_ascii(line.as_mut(), *silence, self.used, echo, call, give)
+            }
         }
     }
 }
@@ -278,7 +309,8 @@ fn over_tcp(
             Ok(len) => len,
             Err(error) => {
                 session.give_up(id);
-                return Err(call.failed(&error, error.kind() == ErrorKind::TimedOut));
+                let late = error.kind() == ErrorKind::TimedOut && !session.is_amid_reply();
+                return Err(call.failed(&error, late));
             }
         };
         let before = session.late();
@@ -289,10 +321,12 @@ fn over_tcp(
         });
         late.fetch_add(session.late() - before, Ordering::Relaxed);
         if let Err(broken) = received {
-            return Err(match (done, broken) {
-                (Some(Err(failure)), Broken::Response(_)) => failure,
-                (_, broken) => invalid(broken.to_string()),
-            });
+            // What breaks the connection behind the reply does not make the reply worse.
+            return match (done, broken) {
+                (Some(Ok(())), _) => Ok(()),
+                (Some(Err(failure)), Broken::Response(_)) => Err(failure),
+                (_, broken) => Err(invalid(broken.to_string())),
+            };
         }
     }
     done.unwrap_or(Ok(()))
@@ -321,8 +355,11 @@ fn over_udp(
             socket.set_read_timeout(Some(left)).map_err(|error| call.failed(&error, false))?;
             let len = match socket.recv(&mut chunk) {
                 Ok(len) => len,
-                Err(error) if is_timeout(&error) => break,
-                Err(error) => return Err(call.failed(&error, false)),
+                Err(error) => match error.kind() {
+                    ErrorKind::Interrupted => continue,
+                    ErrorKind::TimedOut | ErrorKind::WouldBlock => break,
+                    _ => return Err(call.failed(&error, false)),
+                },
             };
             match mbap::next(&chunk[..len]) {
                 mbap::Next::Frame { transaction_id, unit_id, pdu, len: whole } if whole == len => {
@@ -336,10 +373,6 @@ fn over_udp(
         }
     }
     Err(call.failed(&ErrorKind::TimedOut.into(), true))
-}
-
-fn is_timeout(error: &io::Error) -> bool {
-    matches!(error.kind(), ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted)
 }
 
 fn over_rtu(
@@ -356,9 +389,8 @@ fn over_rtu(
         call.failed(&error, serial && error.kind() == ErrorKind::TimedOut)
     };
     if let Some(silence) = silence {
-        thread::sleep(silence.saturating_sub(used.elapsed()));
+        settle(line, silence, used, call.deadline).map_err(lost)?;
     }
-    line.discard().map_err(lost)?;
     let mut frame = [0; rtu::MAX_LEN];
     let len = rtu::encode(call.unit_id, call.pdu, &mut frame)
         .ok_or_else(|| invalid("the request can't be framed"))?;
@@ -373,35 +405,57 @@ fn over_rtu(
     let mut received = [0; 2 * rtu::MAX_LEN];
     let (mut len, mut stripped) = (0, false);
     loop {
-        if !stripped && (*echo || (serial && call.is_read())) {
+        let may_be_echo = !stripped && (*echo || (serial && call.is_read()));
+        if may_be_echo {
             stripped = strip(&mut received, &mut len, frame);
             *echo |= stripped;
         }
-        if (stripped || !*echo)
-            && let Some(whole) = rtu::response_len(&received[..len], call.pdu.len())
-                .map_err(|error| unusable(&error, serial))?
-            && whole <= len
-        {
-            let (unit_id, pdu) =
-                rtu::decode(&received[..whole]).map_err(|error| unusable(&error, serial))?;
-            if unit_id != call.unit_id {
-                return Err(Failure {
-                    error: ClientError::Invalid(format!(
-                        "a reply from unit {unit_id} to a request to unit {}",
-                        call.unit_id
-                    )),
-                    usable: serial,
-                });
+        // The beginning of an echo is no damaged reply.
+        let echo_begun = may_be_echo && !stripped && frame.starts_with(&received[..len]);
+        let reply =
+            if stripped || !*echo { rtu_reply(&received[..len], call.pdu.len()) } else { Ok(None) };
+        match reply {
+            Ok(Some((unit_id, _))) if unit_id != call.unit_id => {
+                let error = format!("a reply from unit {unit_id} to a request to {}", call.unit_id);
+                return Err(unusable(&error, serial));
             }
-            let judged = call.judge(pdu, give);
-            return judged
-                .map_err(|failure| Failure { usable: failure.usable || serial, ..failure });
+            Ok(Some((_, pdu))) => {
+                let judged = call.judge(pdu, give);
+                return judged
+                    .map_err(|failure| Failure { usable: failure.usable || serial, ..failure });
+            }
+            Err(error) if !echo_begun => return Err(unusable(&error, serial)),
+            Ok(None) | Err(_) => {}
         }
         if len == received.len() {
             return Err(invalid("more bytes than a reply has"));
         }
         len += line.receive(&mut received[len..], call.deadline).map_err(lost)?;
     }
+}
+
+/// Unit id and PDU of the reply at the start of some bytes; `None` while more are needed.
+fn rtu_reply(bytes: &[u8], request_len: usize) -> Result<Option<(u8, &[u8])>, FrameError> {
+    let len = rtu::response_len(bytes, request_len)?;
+    len.and_then(|len| bytes.get(..len)).map(rtu::decode).transpose()
+}
+
+/// Waits until a serial line is silent, and throws away what has come till then: nobody asked for
+/// it, or nobody waits for it any more.
+fn settle(
+    line: &mut dyn Line,
+    silence: Duration,
+    used: Instant,
+    deadline: Instant,
+) -> io::Result<()> {
+    thread::sleep(silence.saturating_sub(used.elapsed()));
+    while line.discard()? {
+        if Instant::now() > deadline {
+            return Err(ErrorKind::TimedOut.into());
+        }
+        thread::sleep(silence);
+    }
+    Ok(())
 }
 
 fn unusable(error: &dyn std::fmt::Display, serial: bool) -> Failure {
@@ -421,12 +475,14 @@ fn strip(received: &mut [u8], len: &mut usize, frame: &[u8]) -> bool {
 
 fn over_ascii(
     line: &mut dyn Line,
+    silence: Duration,
+    used: Instant,
     echo: &mut bool,
     call: &Call<'_>,
     give: &mut dyn FnMut(Response<'_>),
 ) -> Result<(), Failure> {
     let lost = |error: io::Error| call.failed(&error, error.kind() == ErrorKind::TimedOut);
-    line.discard().map_err(lost)?;
+    settle(line, silence, used, call.deadline).map_err(lost)?;
     let mut frame = [0; ascii::MAX_LEN];
     let len = ascii::encode(call.unit_id, call.pdu, &mut frame)
         .ok_or_else(|| invalid("the request can't be framed"))?;

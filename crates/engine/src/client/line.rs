@@ -18,8 +18,11 @@ pub(super) trait Line: Send {
     /// `TimedOut` when the line does not take all of it before the deadline.
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()>;
 
-    /// Throws away what has come and was not asked for.
-    fn discard(&mut self) -> io::Result<()>;
+    /// Throws away what is there; whether there was something.
+    fn discard(&mut self) -> io::Result<bool>;
+
+    /// Whether the peer is there, and has sent nothing; a line that can be silenced always is.
+    fn is_quiet(&self) -> bool;
 }
 
 /// What is left until a deadline, for a system that knows no time of 0.
@@ -28,24 +31,25 @@ fn left(deadline: Instant) -> io::Result<Duration> {
     if left.is_zero() { Err(ErrorKind::TimedOut.into()) } else { Ok(left.max(LEAST)) }
 }
 
-/// Says the same of a time that ran out on every system.
-fn read(result: io::Result<usize>) -> io::Result<usize> {
-    match result {
-        Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
-        Err(error) if error.kind() == ErrorKind::WouldBlock => Err(ErrorKind::TimedOut.into()),
-        other => other,
+/// Reads until nothing interrupts it; says the same of an end and of a time that ran out on every
+/// system.
+fn read(mut once: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
+    loop {
+        return match once() {
+            Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
+            Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Err(ErrorKind::TimedOut.into()),
+            other => other,
+        };
     }
 }
 
 impl Line for TcpStream {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
-        self.set_read_timeout(Some(left(deadline)?))?;
-        loop {
-            match Read::read(self, buffer) {
-                Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                result => return read(result),
-            }
-        }
+        read(|| {
+            self.set_read_timeout(Some(left(deadline)?))?;
+            Read::read(self, buffer)
+        })
     }
 
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
@@ -56,15 +60,22 @@ impl Line for TcpStream {
         })
     }
 
-    fn discard(&mut self) -> io::Result<()> {
-        Ok(())
+    fn discard(&mut self) -> io::Result<bool> {
+        Ok(false)
+    }
+
+    fn is_quiet(&self) -> bool {
+        let waits = |error: io::Error| error.kind() == ErrorKind::WouldBlock;
+        peek(self).is_err_and(waits)
     }
 }
 
 impl Line for serial2::SerialPort {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
-        self.set_read_timeout(left(deadline)?)?;
-        read(Read::read(self, buffer))
+        read(|| {
+            self.set_read_timeout(left(deadline)?)?;
+            Read::read(self, buffer)
+        })
     }
 
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
@@ -72,8 +83,17 @@ impl Line for serial2::SerialPort {
         Write::write_all(self, bytes)
     }
 
-    fn discard(&mut self) -> io::Result<()> {
-        self.discard_input_buffer()
+    fn discard(&mut self) -> io::Result<bool> {
+        self.set_read_timeout(Duration::ZERO)?;
+        match read(|| Read::read(self, &mut [0; 4096])) {
+            Ok(_) => Ok(true),
+            Err(error) if error.kind() == ErrorKind::TimedOut => Ok(false),
+            Err(error) => Err(error),
+        }
+    }
+
+    fn is_quiet(&self) -> bool {
+        true
     }
 }
 
@@ -103,11 +123,16 @@ pub(super) fn first<T>(
 
 /// Whether the peer of an idle connection has ended it.
 pub(super) fn has_ended(stream: &TcpStream) -> bool {
-    let mut byte = [0];
-    let ended = stream.set_nonblocking(true).is_err()
-        || match stream.peek(&mut byte) {
-            Ok(len) => len == 0,
-            Err(error) => error.kind() != ErrorKind::WouldBlock,
-        };
-    ended || stream.set_nonblocking(false).is_err()
+    match peek(stream) {
+        Ok(len) => len == 0,
+        Err(error) => error.kind() != ErrorKind::WouldBlock,
+    }
+}
+
+/// Looks whether there is something to read, without waiting for it.
+fn peek(stream: &TcpStream) -> io::Result<usize> {
+    stream.set_nonblocking(true)?;
+    let found = stream.peek(&mut [0]);
+    stream.set_nonblocking(false)?;
+    found
 }

@@ -8,6 +8,7 @@
 mod exchange;
 mod line;
 pub mod session;
+mod turns;
 
 pub use exchange::{BlockingClient, Endpoint};
 pub use session::{Broken, Session};

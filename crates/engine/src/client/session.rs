@@ -43,6 +43,7 @@ pub struct Session {
     /// The beginning of a frame.
     partial: Vec<u8>,
     late: u64,
+    broken: bool,
 }
 
 impl Session {
@@ -82,12 +83,33 @@ impl Session {
         self.late
     }
 
+    /// Whether the last bytes received were the beginning of a reply. When a request times out then,
+    /// the connection is in doubt: if the rest never comes, the next reply is taken for it.
+    pub fn is_amid_reply(&self) -> bool {
+        !self.partial.is_empty()
+    }
+
+    /// Whether the connection is to be closed.
+    pub fn is_broken(&self) -> bool {
+        self.broken
+    }
+
     /// Takes received bytes, which may end anywhere, and calls `reply` for each request that they
     /// answer, in the order of the replies.
     ///
     /// # Errors
     /// [`Broken`]: the connection is to be closed. A request whose reply broke it has been told.
     pub fn receive(
+        &mut self,
+        bytes: &[u8],
+        reply: impl FnMut(u16, Result<Response<'_>, ResponseError>),
+    ) -> Result<(), Broken> {
+        let received = self.take(bytes, reply);
+        self.broken |= received.is_err();
+        received
+    }
+
+    fn take(
         &mut self,
         bytes: &[u8],
         mut reply: impl FnMut(u16, Result<Response<'_>, ResponseError>),

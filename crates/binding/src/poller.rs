@@ -1,0 +1,229 @@
+//! `Device` and `Poller`, and plans: what is to be polled, counters out.
+
+use std::sync::Arc;
+
+use holdfast_engine::poller::plan::{self, Field, Limits, Strategy, Stretch};
+use holdfast_engine::poller::{
+    Destination, DeviceSettings, DeviceState, ForwardSettings, Poller as Core, PollerError,
+    ReadSettings, StatusSettings,
+};
+use holdfast_protocol::raw_ingest::Format;
+use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arguments::{byte, seconds, within, word};
+use crate::client::Endpoint;
+use crate::memory::{Memory, named};
+
+/// An area, its first address, and the one behind its last.
+type Range = (String, u32, u32);
+
+/// A memory, an area and an address.
+type Place<'py> = (PyRef<'py, Memory>, String, u16);
+
+/// An area, an address, a count, and where the bytes go.
+type Read<'py> = (String, i128, i128, Option<Place<'py>>);
+
+/// Host, port, format, crc, unit or memory id, timeout.
+type Forward = (String, u16, String, String, u16, f64);
+
+/// Area, address, count, indexes of fields, items that no field wants.
+type PlannedBlock = (&'static str, u16, u16, Vec<usize>, u32);
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Device {
+    core: DeviceSettings,
+}
+
+#[pymethods]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+impl Device {
+    #[new]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None))]
+    fn new(
+        name: String,
+        endpoint: PyRef<'_, Endpoint>,
+        unit: i128,
+        interval: f64,
+        timeout: f64,
+        reads: Vec<Read<'_>>,
+        max_gap: Option<i128>,
+        cost: Option<(f64, f64)>,
+        max_registers: i128,
+        max_bits: i128,
+        readable: Option<Vec<Range>>,
+        forbidden: Option<Vec<Range>>,
+        forward: Option<Vec<Forward>>,
+        status: Option<Place<'_>>,
+    ) -> PyResult<Device> {
+        let reads = reads.into_iter().map(|(area, address, count, into)| {
+            Ok(ReadSettings {
+                area: named(&area)?,
+                address: within("address", address, 0..=65_535)? as u16,
+                count: within("count", count, 1..=65_536)? as u32,
+                into: into.map(destination).transpose()?,
+            })
+        });
+        let forward = forward.unwrap_or_default().into_iter().map(target);
+        let status = status.map(|(memory, area, slot)| {
+            let memory = Arc::clone(&memory.core);
+            Ok::<_, PyErr>(StatusSettings { memory, area: named(&area)?, slot })
+        });
+        let core = DeviceSettings {
+            name,
+            endpoint: endpoint.core.clone(),
+            unit_id: byte("unit", unit)?,
+            interval: seconds("interval", interval)?,
+            timeout: seconds("timeout", timeout)?,
+            reads: reads.collect::<PyResult<_>>()?,
+            limits: limits(max_registers, max_bits, readable, forbidden)?,
+            strategy: strategy(max_gap, cost)?,
+            forward: forward.collect::<PyResult<_>>()?,
+            status: status.transpose()?,
+        };
+        Ok(Device { core })
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Poller {
+    core: Core,
+}
+
+#[pymethods]
+impl Poller {
+    #[new]
+    fn new(py: Python<'_>, devices: Vec<PyRef<'_, Device>>) -> PyResult<Poller> {
+        let devices: Vec<DeviceSettings> =
+            devices.iter().map(|device| device.core.clone()).collect();
+        let core = py.detach(|| Core::start(devices)).map_err(|error| match error {
+            PollerError::Thread(_) => PyOSError::new_err(error.to_string()),
+            _ => PyValueError::new_err(error.to_string()),
+        })?;
+        Ok(Poller { core })
+    }
+
+    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for device in self.core.devices() {
+            let counted = state(py, &device.state)?;
+            let mut forwards = Vec::new();
+            for forward in &device.forwards {
+                let counters = PyDict::new(py);
+                counters.set_item("sent", forward.sent.get())?;
+                counters.set_item("refused", forward.refused.get())?;
+                counters.set_item("failed", forward.failed.get())?;
+                counters.set_item("replaced", forward.replaced.get())?;
+                forwards.push(counters);
+            }
+            counted.set_item("forward", forwards)?;
+            all.set_item(&device.name, counted)?;
+        }
+        Ok(all)
+    }
+
+    fn stop(&self, py: Python<'_>) {
+        py.detach(|| self.core.stop());
+    }
+}
+
+/// The requests that read all fields.
+#[pyfunction]
+#[pyo3(signature = (fields, *, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None))]
+pub fn plan_blocks(
+    fields: Vec<(String, i128, i128)>,
+    max_gap: Option<i128>,
+    cost: Option<(f64, f64)>,
+    max_registers: i128,
+    max_bits: i128,
+    readable: Option<Vec<Range>>,
+    forbidden: Option<Vec<Range>>,
+) -> PyResult<Vec<PlannedBlock>> {
+    let fields = fields.into_iter().map(|(area, address, count)| {
+        Ok(Field {
+            area: named(&area)?,
+            address: within("address", address, 0..=65_535)? as u16,
+            count: within("count", count, 1..=65_535)? as u16,
+        })
+    });
+    let fields = fields.collect::<PyResult<Vec<Field>>>()?;
+    let limits = limits(max_registers, max_bits, readable, forbidden)?;
+    let blocks = plan::plan(&fields, &limits, strategy(max_gap, cost)?)
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    let blocks = blocks.into_iter();
+    Ok(blocks
+        .map(|block| (block.area.name(), block.address, block.count, block.fields, block.holes))
+        .collect())
+}
+
+fn destination((memory, area, address): Place<'_>) -> PyResult<Destination> {
+    Ok(Destination { memory: Arc::clone(&memory.core), area: named(&area)?, address })
+}
+
+fn target(forward: Forward) -> PyResult<ForwardSettings> {
+    let (host, port, format, crc, target, timeout) = forward;
+    let required = word("crc", &crc, &[("required", true), ("none", false)])?;
+    let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
+    let format = word("format", &format, &formats)?;
+    Ok(ForwardSettings { host, port, format, target, timeout: seconds("timeout", timeout)? })
+}
+
+fn strategy(max_gap: Option<i128>, cost: Option<(f64, f64)>) -> PyResult<Strategy> {
+    match (max_gap, cost) {
+        (_, Some((request, item))) if request >= 0.0 && item >= 0.0 => {
+            Ok(Strategy::Cost { request, item })
+        }
+        (_, Some(_)) => Err(PyValueError::new_err("cost is below 0, allowed is 0 and more")),
+        (gap, None) => {
+            let max_gap = within("max_gap", gap.unwrap_or_default(), 0..=65_535)? as u16;
+            Ok(Strategy::Gap { max_gap })
+        }
+    }
+}
+
+fn limits(
+    max_registers: i128,
+    max_bits: i128,
+    readable: Option<Vec<Range>>,
+    forbidden: Option<Vec<Range>>,
+) -> PyResult<Limits> {
+    let stretches = |ranges: Option<Vec<Range>>| {
+        let ranges = ranges.unwrap_or_default().into_iter();
+        ranges
+            .map(|(area, start, end)| Ok(Stretch { area: named(&area)?, start, end }))
+            .collect::<PyResult<Vec<Stretch>>>()
+    };
+    Ok(Limits {
+        max_registers: within("max_registers", max_registers, 1..=125)? as u16,
+        max_bits: within("max_bits", max_bits, 1..=2000)? as u16,
+        readable: stretches(readable)?,
+        forbidden: stretches(forbidden)?,
+    })
+}
+
+fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDict>> {
+    let told = PyDict::new(py);
+    let counters = &state.counters;
+    told.set_item("health", state.health().name())?;
+    told.set_item("last_error", state.last_error())?;
+    told.set_item("seconds_in_error", state.in_error().as_secs_f64())?;
+    told.set_item("age", state.age().map(|age| age.as_secs_f64()))?;
+    told.set_item("failures", state.failures())?;
+    told.set_item("round_trip", state.round_trip().as_secs_f64())?;
+    told.set_item("requests_per_poll", state.requests_per_poll())?;
+    for (key, counter) in [
+        ("polls", &counters.polls),
+        ("missed", &counters.missed),
+        ("requests", &counters.requests),
+        ("valid", &counters.valid),
+        ("exceptions", &counters.exceptions),
+        ("timeouts", &counters.timeouts),
+        ("transport_errors", &counters.transport_errors),
+        ("reads", &counters.reads),
+        ("values", &counters.values),
+    ] {
+        told.set_item(key, counter.get())?;
+    }
+    Ok(told)
+}

@@ -1,0 +1,88 @@
+//! Turns: a lock whose callers come in one at a time, in the order in which they asked.
+//!
+//! A mutex alone lets the one that has just left in again, while the others are still waking up: a
+//! thread that calls without a pause would keep all others out.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread::{self, Thread};
+
+#[derive(Default)]
+pub(super) struct Turns {
+    tickets: Mutex<Tickets>,
+}
+
+#[derive(Default)]
+struct Tickets {
+    /// The number of the next who asks.
+    next: u64,
+    /// The number of who is in, or of the next who may.
+    current: u64,
+    waiting: VecDeque<Thread>,
+}
+
+/// The turn of one caller; it ends when this is dropped.
+pub(super) struct Turn<'t>(&'t Turns);
+
+impl Turns {
+    /// Waits for a turn.
+    pub(super) fn take(&self) -> Turn<'_> {
+        let mut tickets = self.tickets();
+        let mine = tickets.next;
+        tickets.next += 1;
+        if tickets.current != mine {
+            tickets.waiting.push_back(thread::current());
+        }
+        while tickets.current != mine {
+            drop(tickets);
+            thread::park();
+            tickets = self.tickets();
+        }
+        drop(tickets);
+        Turn(self)
+    }
+
+    fn tickets(&self) -> MutexGuard<'_, Tickets> {
+        self.tickets.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for Turn<'_> {
+    fn drop(&mut self) {
+        let mut tickets = self.0.tickets();
+        tickets.current += 1;
+        if let Some(thread) = tickets.waiting.pop_front() {
+            thread.unpark();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU64, Ordering};
+    use std::thread;
+
+    use super::*;
+
+    #[test]
+    fn callers_come_in_one_at_a_time_and_in_their_order() {
+        let turns = Turns::default();
+        let served = AtomicU64::new(0);
+        thread::scope(|threads| {
+            let first = turns.take();
+            for number in 1..=20 {
+                let (turns, served) = (&turns, &served);
+                threads.spawn(move || {
+                    let _turn = turns.take();
+                    assert_eq!(served.fetch_add(1, Ordering::SeqCst) + 1, number);
+                });
+                while turns.tickets().next != number + 1 {
+                    thread::yield_now();
+                }
+            }
+            assert_eq!(served.load(Ordering::SeqCst), 0);
+            drop(first);
+        });
+        assert_eq!(served.load(Ordering::SeqCst), 20);
+    }
+}

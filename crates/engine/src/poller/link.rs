@@ -1,0 +1,314 @@
+//! A link: one connection to one address, or one serial line, shared by all devices behind it.
+//!
+//! Over Modbus TCP several requests are in flight, so that a unit that is dead does not hold up the
+//! others behind the same gateway. All other transports carry one request at a time, in a thread of
+//! their own. A link that can't be connected fails at once until its pause is over.
+
+use std::cell::RefCell;
+use std::collections::HashMap;
+use std::io::ErrorKind;
+use std::rc::Rc;
+use std::sync::mpsc;
+use std::time::Duration;
+
+use holdfast_protocol::pdu::{Request, Response, ResponseError};
+use tokio::net::TcpStream;
+use tokio::net::tcp::OwnedReadHalf;
+use tokio::sync::{Mutex, Semaphore, oneshot};
+use tokio::task::AbortHandle;
+use tokio::time::{Instant, timeout_at};
+
+use super::backoff;
+use super::status::Fault;
+use crate::client::{BlockingClient, ClientError, Endpoint, Session};
+
+/// Requests in flight on one connection.
+const IN_FLIGHT: usize = 8;
+
+/// Bytes taken from a socket at once.
+const CHUNK: usize = 16 * 1024;
+
+/// The bytes of a read, or why there are none.
+pub(super) type Answer = Result<Vec<u8>, Fault>;
+
+pub(super) enum Link {
+    Tcp(TcpLink),
+    Blocking(BlockingLink),
+}
+
+impl Link {
+    /// In the context of a `LocalSet`.
+    pub(super) fn new(endpoint: Endpoint) -> Rc<Link> {
+        Rc::new(match endpoint {
+            Endpoint::Tcp { host, port } => Link::Tcp(TcpLink::new(host, port)),
+            other => Link::Blocking(BlockingLink::new(other)),
+        })
+    }
+
+    /// Sends a read and waits for its bytes.
+    pub(super) async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
+        match self {
+            Link::Tcp(link) => link.read(unit_id, pdu, timeout).await,
+            Link::Blocking(link) => link.read(unit_id, pdu, timeout).await,
+        }
+    }
+}
+
+pub(super) struct TcpLink {
+    host: String,
+    port: u16,
+    places: Semaphore,
+    connecting: Mutex<Attempts>,
+    open: Rc<RefCell<Option<Open>>>,
+}
+
+#[derive(Default)]
+struct Attempts {
+    failures: u32,
+    not_before: Option<Instant>,
+}
+
+/// A connection that is open.
+struct Open {
+    session: Session,
+    waiting: HashMap<u16, oneshot::Sender<Answer>>,
+    writer: tokio::net::tcp::OwnedWriteHalf,
+    /// What the socket did not take yet.
+    unsent: Vec<u8>,
+    reader: Option<AbortHandle>,
+}
+
+impl TcpLink {
+    fn new(host: String, port: u16) -> TcpLink {
+        TcpLink {
+            host,
+            port,
+            places: Semaphore::new(IN_FLIGHT),
+            connecting: Mutex::default(),
+            open: Rc::default(),
+        }
+    }
+
+    async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
+        let Ok(_place) = self.places.acquire().await else { return Err(Fault::Reset) };
+        let deadline = Instant::now() + timeout;
+        if self.open.borrow().is_none() {
+            self.connect(deadline).await?;
+        }
+        let (id, answer) = self.send(unit_id, pdu)?;
+        match timeout_at(deadline, answer).await {
+            Ok(Ok(answer)) => answer,
+            Ok(Err(_)) => Err(Fault::Reset),
+            Err(_) => {
+                if let Some(open) = self.open.borrow_mut().as_mut() {
+                    open.waiting.remove(&id);
+                    open.session.give_up(id);
+                }
+                Err(Fault::Timeout)
+            }
+        }
+    }
+
+    /// Makes the connection, once for all who wait for it.
+    async fn connect(&self, deadline: Instant) -> Result<(), Fault> {
+        let mut attempts =
+            timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
+        if self.open.borrow().is_some() {
+            return Ok(());
+        }
+        if attempts.not_before.is_some_and(|time| Instant::now() < time) {
+            return Err(Fault::Refused);
+        }
+        let address = (self.host.as_str(), self.port);
+        let connected = timeout_at(deadline, TcpStream::connect(address)).await;
+        let fault = match connected {
+            Ok(Ok(stream)) => {
+                *attempts = Attempts::default();
+                self.take(stream);
+                return Ok(());
+            }
+            Ok(Err(_)) => Fault::Refused,
+            Err(_) => Fault::Timeout,
+        };
+        attempts.failures = attempts.failures.saturating_add(1);
+        attempts.not_before = Some(Instant::now() + backoff::pause(attempts.failures));
+        Err(fault)
+    }
+
+    fn take(&self, stream: TcpStream) {
+        let _ = stream.set_nodelay(true);
+        let (reader, writer) = stream.into_split();
+        let open = Open {
+            session: Session::default(),
+            waiting: HashMap::new(),
+            writer,
+            unsent: Vec::new(),
+            reader: None,
+        };
+        *self.open.borrow_mut() = Some(open);
+        let task = tokio::task::spawn_local(receive(Rc::clone(&self.open), reader));
+        if let Some(open) = self.open.borrow_mut().as_mut() {
+            open.reader = Some(task.abort_handle());
+        }
+    }
+
+    fn send(&self, unit_id: u8, pdu: &[u8]) -> Result<(u16, oneshot::Receiver<Answer>), Fault> {
+        let mut open = self.open.borrow_mut();
+        let connection = open.as_mut().ok_or(Fault::Reset)?;
+        let mut frame = Vec::with_capacity(16);
+        let id = connection.session.send(unit_id, pdu, &mut frame);
+        let sent = id.is_some() && connection.write(&frame);
+        match id {
+            Some(id) if sent => {
+                let (sender, receiver) = oneshot::channel();
+                connection.waiting.insert(id, sender);
+                Ok((id, receiver))
+            }
+            _ => {
+                *open = None;
+                Err(Fault::Reset)
+            }
+        }
+    }
+}
+
+impl Open {
+    /// Sends without waiting; what the socket does not take goes with the next. Whether the
+    /// connection still works.
+    fn write(&mut self, frame: &[u8]) -> bool {
+        self.unsent.extend_from_slice(frame);
+        match self.writer.try_write(&self.unsent) {
+            Ok(len) => {
+                self.unsent.drain(..len);
+                true
+            }
+            // A device that takes nothing lets its requests time out; a bounded number of them.
+            Err(error) => error.kind() == ErrorKind::WouldBlock && self.unsent.len() < CHUNK,
+        }
+    }
+}
+
+impl Drop for Open {
+    fn drop(&mut self) {
+        if let Some(reader) = &self.reader {
+            reader.abort();
+        }
+    }
+}
+
+/// Reads replies until the connection ends.
+async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
+    let mut chunk = vec![0; CHUNK].into_boxed_slice();
+    loop {
+        let read = match reader.readable().await {
+            Ok(()) => reader.try_read(&mut chunk),
+            Err(error) => Err(error),
+        };
+        let mut open = link.borrow_mut();
+        let Some(connection) = open.as_mut() else { return };
+        let fault = match read {
+            Ok(0) => Fault::Reset,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => continue,
+            Err(_) => Fault::Reset,
+            Ok(len) => {
+                let Open { session, waiting, .. } = connection;
+                let received = session.receive(&chunk[..len], |id, response| {
+                    if let Some(sender) = waiting.remove(&id) {
+                        let _ = sender.send(bytes(response));
+                    }
+                });
+                // What the socket did not take earlier, it may take now.
+                if received.is_ok() && (connection.unsent.is_empty() || connection.write(&[])) {
+                    continue;
+                }
+                Fault::Invalid
+            }
+        };
+        let lost = open.take();
+        drop(open);
+        if let Some(mut lost) = lost {
+            lost.reader = None;
+            for (_, sender) in lost.waiting.drain() {
+                let _ = sender.send(Err(fault));
+            }
+        }
+        return;
+    }
+}
+
+/// The bytes that a response to a read carries.
+fn bytes(response: Result<Response<'_>, ResponseError>) -> Answer {
+    match response {
+        Ok(Response::Bits(bytes) | Response::Registers(bytes)) => Ok(bytes.to_vec()),
+        Ok(_) => Err(Fault::Invalid),
+        Err(ResponseError::Exception(code)) => Err(Fault::Exception(code.code())),
+        Err(ResponseError::UnknownException(code)) => Err(Fault::Exception(code)),
+        Err(_) => Err(Fault::Invalid),
+    }
+}
+
+/// One request at a time, by blocking calls in a thread that ends with the link.
+pub(super) struct BlockingLink {
+    jobs: mpsc::Sender<Job>,
+}
+
+struct Job {
+    unit_id: u8,
+    pdu: Vec<u8>,
+    timeout: Duration,
+    answer: oneshot::Sender<Answer>,
+}
+
+impl BlockingLink {
+    fn new(endpoint: Endpoint) -> BlockingLink {
+        let (jobs, queue) = mpsc::channel::<Job>();
+        let client = BlockingClient::new(endpoint);
+        let work = move || {
+            let mut attempts = (0, None);
+            for job in queue {
+                // Nobody waits any more for a job whose device was stopped.
+                if !job.answer.is_closed() {
+                    let answer = call(&client, &job, &mut attempts);
+                    let _ = job.answer.send(answer);
+                }
+            }
+        };
+        // Without a thread every job fails, which its device tells.
+        let _ = std::thread::Builder::new().name("holdfast-line".into()).spawn(work);
+        BlockingLink { jobs }
+    }
+
+    async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
+        let (answer, answered) = oneshot::channel();
+        let job = Job { unit_id, pdu: pdu.to_vec(), timeout, answer };
+        self.jobs.send(job).or(Err(Fault::Reset))?;
+        answered.await.unwrap_or(Err(Fault::Reset))
+    }
+}
+
+type Pause = (u32, Option<std::time::Instant>);
+
+fn call(client: &BlockingClient, job: &Job, (failures, not_before): &mut Pause) -> Answer {
+    if not_before.is_some_and(|time| std::time::Instant::now() < time) {
+        return Err(Fault::Refused);
+    }
+    let request = Request::parse(&job.pdu).or(Err(Fault::Invalid))?;
+    let answer = client.call(job.unit_id, &request, job.timeout, |response| bytes(Ok(response)));
+    match answer {
+        Err(ClientError::Connect { .. }) => {
+            *failures = failures.saturating_add(1);
+            *not_before = Some(std::time::Instant::now() + backoff::pause(*failures));
+            Err(Fault::Refused)
+        }
+        other => {
+            (*failures, *not_before) = (0, None);
+            match other {
+                Ok(bytes) => bytes,
+                Err(ClientError::Exception(code)) => Err(Fault::Exception(code)),
+                Err(ClientError::Timeout(_)) => Err(Fault::Timeout),
+                Err(ClientError::Invalid(_)) => Err(Fault::Invalid),
+                Err(_) => Err(Fault::Reset),
+            }
+        }
+    }
+}

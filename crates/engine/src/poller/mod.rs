@@ -1,0 +1,23 @@
+//! The poller: reads devices on schedule, and hands what they answered to memory and to others.
+//!
+//! * A device is a task: its schedule, its plan, its counters and its status ([`device`]).
+//! * Devices behind the same address share a link, and a link knows no device ([`link`]).
+//! * What is read is written as it came, byte for byte, one read as one step; a read that fails
+//!   writes nothing ([`sink`]).
+//!
+//! All tasks of a poller live on one thread, so that they share without locks.
+
+mod backoff;
+mod device;
+mod forward;
+mod link;
+pub mod plan;
+mod sink;
+mod status;
+mod thread;
+
+pub use device::{DeviceCounters, DeviceSettings, DeviceState, ReadSettings};
+pub use forward::{ForwardCounters, ForwardSettings};
+pub use sink::Destination;
+pub use status::{Health, StatusSettings};
+pub use thread::{Polled, Poller, PollerError};

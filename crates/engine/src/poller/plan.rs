@@ -1,0 +1,348 @@
+//! Which requests read a set of fields: a pure function, and how a plan changes when a device refuses.
+//!
+//! The rules this file keeps: a field is never split; a block is within the device's limits; a hole is
+//! read only where that is allowed. Two ways to choose are built in. [`Strategy::Gap`] crosses every
+//! hole up to a size. [`Strategy::Cost`] finds the cheapest plan for what a request and a register
+//! cost: at a high price of requests it crosses all holes that it may, at price 0 none.
+
+use holdfast_memory::Area;
+use thiserror::Error;
+
+/// Something to read as a whole.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Field {
+    pub area: Area,
+    pub address: u16,
+    /// At least 1.
+    pub count: u16,
+}
+
+/// One request, and the fields that it reads.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Block {
+    pub area: Area,
+    pub address: u16,
+    pub count: u16,
+    /// Indexes of the fields, by address.
+    pub fields: Vec<usize>,
+    /// Items that are read though no field wants them.
+    pub holes: u32,
+}
+
+/// A range of one area: `start` to `end`, `end` not included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stretch {
+    pub area: Area,
+    pub start: u32,
+    pub end: u32,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Strategy {
+    /// Holes of up to `max_gap` items are read.
+    Gap { max_gap: u16 },
+    /// Any hole is read if that is cheaper: `request` for each request and `item` for each item.
+    Cost { request: f64, item: f64 },
+}
+
+/// What a device bears.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Limits {
+    pub max_registers: u16,
+    pub max_bits: u16,
+    /// Holes are read only inside these, if there are any for the area.
+    pub readable: Vec<Stretch>,
+    /// Never read, not even as a hole.
+    pub forbidden: Vec<Stretch>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum PlanError {
+    #[error("field {index}: {count} items, one request reads at most {most}")]
+    TooLong { index: usize, count: u16, most: u16 },
+    #[error("field {index}: no items")]
+    Empty { index: usize },
+    #[error("field {index}: beyond address 65535")]
+    Beyond { index: usize },
+    #[error("field {index}: in a forbidden range")]
+    Forbidden { index: usize },
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits { max_registers: 125, max_bits: 2000, readable: Vec::new(), forbidden: Vec::new() }
+    }
+}
+
+impl Limits {
+    fn most(&self, area: Area) -> u16 {
+        if area.is_bits() { self.max_bits } else { self.max_registers }
+    }
+
+    /// Whether a hole may be read.
+    fn bears(&self, area: Area, start: u32, end: u32) -> bool {
+        let of_area = |stretches: &[Stretch]| {
+            stretches.iter().filter(|each| each.area == area).copied().collect::<Vec<_>>()
+        };
+        let readable = of_area(&self.readable);
+        let inside = |each: &Stretch| each.start <= start && end <= each.end;
+        let apart = |each: &Stretch| end <= each.start || each.end <= start;
+        (readable.is_empty() || readable.iter().any(inside))
+            && of_area(&self.forbidden).iter().all(apart)
+    }
+}
+
+impl Field {
+    fn end(&self) -> u32 {
+        u32::from(self.address) + u32::from(self.count)
+    }
+}
+
+/// The blocks that read all fields, in the order of areas and addresses.
+///
+/// # Errors
+/// [`PlanError`] for a field that no request may read.
+pub fn plan(
+    fields: &[Field],
+    limits: &Limits,
+    strategy: Strategy,
+) -> Result<Vec<Block>, PlanError> {
+    for (index, field) in fields.iter().enumerate() {
+        let most = limits.most(field.area);
+        if field.count == 0 {
+            return Err(PlanError::Empty { index });
+        } else if field.count > most {
+            return Err(PlanError::TooLong { index, count: field.count, most });
+        } else if field.end() > 65_536 {
+            return Err(PlanError::Beyond { index });
+        }
+        let open = Limits { readable: Vec::new(), ..limits.clone() };
+        if !open.bears(field.area, field.address.into(), field.end()) {
+            return Err(PlanError::Forbidden { index });
+        }
+    }
+    let mut order: Vec<usize> = (0..fields.len()).collect();
+    order.sort_by_key(|index| (fields[*index], *index));
+    let mut blocks = Vec::new();
+    for of_area in order.chunk_by(|a, b| fields[*a].area == fields[*b].area) {
+        match strategy {
+            Strategy::Gap { max_gap } => by_gap(fields, of_area, limits, max_gap, &mut blocks),
+            Strategy::Cost { request, item } => {
+                by_cost(fields, of_area, limits, (request, item), &mut blocks);
+            }
+        }
+    }
+    Ok(blocks)
+}
+
+/// Greedy from the left: a block ends where the hole is too large, or the block would be.
+fn by_gap(
+    fields: &[Field],
+    order: &[usize],
+    limits: &Limits,
+    max_gap: u16,
+    blocks: &mut Vec<Block>,
+) {
+    let mut from = 0;
+    let mut end = 0;
+    for (at, index) in order.iter().enumerate() {
+        let field = fields[*index];
+        let first = fields[order[from]];
+        let start = u32::from(field.address);
+        let fits =
+            field.end().max(end) - u32::from(first.address) <= u32::from(limits.most(field.area));
+        let near = start <= end
+            || (start - end <= u32::from(max_gap) && limits.bears(field.area, end, start));
+        if at > from && !(fits && near) {
+            blocks.push(block(fields, &order[from..at]));
+            from = at;
+            end = 0;
+        }
+        end = end.max(field.end());
+    }
+    if from < order.len() {
+        blocks.push(block(fields, &order[from..]));
+    }
+}
+
+/// The cheapest way to cut the fields into blocks, by dynamic programming: `best[n]` is that of
+/// the first `n` fields.
+fn by_cost(
+    fields: &[Field],
+    order: &[usize],
+    limits: &Limits,
+    (request, item): (f64, f64),
+    blocks: &mut Vec<Block>,
+) {
+    // Where all fields up to each one end: what a later field leaves between is a hole.
+    let ends = order.iter().scan(0, |end, index| {
+        *end = fields[*index].end().max(*end);
+        Some(*end)
+    });
+    let ends: Vec<u32> = ends.collect();
+    let mut best: Vec<(f64, usize)> = vec![(0.0, 0)];
+    for upto in 1..=order.len() {
+        let mut cheapest = (f64::INFINITY, upto - 1);
+        let mut end = 0;
+        let mut next_start = None;
+        for from in (0..upto).rev() {
+            let field = fields[order[from]];
+            let start = u32::from(field.address);
+            end = end.max(field.end());
+            if end - start > u32::from(limits.most(field.area)) {
+                break;
+            }
+            if let Some(next) = next_start
+                && next > ends[from]
+                && !limits.bears(field.area, ends[from], next)
+            {
+                break;
+            }
+            next_start = Some(start);
+            let cost = best[from].0 + request + item * f64::from(end - start);
+            // With equal cost the longer block is taken: it has fewer requests.
+            if cost <= cheapest.0 {
+                cheapest = (cost, from);
+            }
+        }
+        best.push(cheapest);
+    }
+    let mut cuts = Vec::new();
+    let mut upto = order.len();
+    while upto > 0 {
+        let from = best[upto].1;
+        cuts.push((from, upto));
+        upto = from;
+    }
+    blocks.extend(cuts.iter().rev().map(|(from, upto)| block(fields, &order[*from..*upto])));
+}
+
+/// Where the last of some fields ends.
+fn reach(fields: &[Field], order: &[usize]) -> u32 {
+    order.iter().map(|index| fields[*index].end()).max().unwrap_or_default()
+}
+
+fn block(fields: &[Field], order: &[usize]) -> Block {
+    let first = fields[order[0]];
+    let start = u32::from(first.address);
+    let (mut end, mut holes) = (start, 0);
+    for index in order {
+        let field = fields[*index];
+        holes += u32::from(field.address).saturating_sub(end);
+        end = end.max(field.end());
+    }
+    let count = (end - start) as u16;
+    Block { area: first.area, address: first.address, count, fields: order.to_vec(), holes }
+}
+
+/// The blocks to try in place of one that the device refused: without its holes, or, when it has
+/// none, in two halves. Empty for a block of one field: that one is bad.
+pub fn smaller(fields: &[Field], refused: &Block) -> Vec<Block> {
+    if refused.holes > 0 {
+        let mut blocks = Vec::new();
+        by_gap(fields, &refused.fields, &Limits::default(), 0, &mut blocks);
+        return blocks;
+    }
+    // Fields that overlap stay together: only a cut between fields helps.
+    let cuts = 1..refused.fields.len();
+    let cut = cuts
+        .filter(|cut| {
+            let (left, right) = refused.fields.split_at(*cut);
+            reach(fields, left) <= u32::from(fields[right[0]].address)
+        })
+        .min_by_key(|cut| cut.abs_diff(refused.fields.len() / 2));
+    match cut {
+        None => Vec::new(),
+        Some(cut) => {
+            let (left, right) = refused.fields.split_at(cut);
+            vec![block(fields, left), block(fields, right)]
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn field(address: u16, count: u16) -> Field {
+        Field { area: Area::HoldingRegisters, address, count }
+    }
+
+    fn spans(blocks: &[Block]) -> Vec<(u16, u16)> {
+        blocks.iter().map(|block| (block.address, block.count)).collect()
+    }
+
+    #[test]
+    fn holes_up_to_the_gap_are_read_and_larger_ones_are_not() {
+        let fields = [field(20, 2), field(0, 4), field(6, 2), field(11, 1)];
+        let strategy = Strategy::Gap { max_gap: 3 };
+        let blocks = plan(&fields, &Limits::default(), strategy).unwrap();
+        assert_eq!(spans(&blocks), [(0, 12), (20, 2)]);
+        assert_eq!((blocks[0].fields.clone(), blocks[0].holes), (vec![1, 2, 3], 5));
+    }
+
+    #[test]
+    fn limits_and_forbidden_ranges_cut() {
+        let area = Area::HoldingRegisters;
+        let limits = Limits {
+            max_registers: 10,
+            forbidden: vec![Stretch { area, start: 13, end: 14 }],
+            ..Limits::default()
+        };
+        let fields = [field(0, 6), field(6, 5), field(12, 1), field(14, 1), field(15, 1)];
+        let blocks = plan(&fields, &limits, Strategy::Gap { max_gap: 9 }).unwrap();
+        assert_eq!(spans(&blocks), [(0, 6), (6, 7), (14, 2)]);
+        let cost = Strategy::Cost { request: 100.0, item: 1.0 };
+        assert_eq!(plan(&fields, &limits, cost).unwrap().len(), 3);
+        assert_eq!(plan(&[field(13, 1)], &limits, cost), Err(PlanError::Forbidden { index: 0 }));
+    }
+
+    #[test]
+    fn holes_outside_readable_ranges_are_not_read() {
+        let area = Area::HoldingRegisters;
+        let readable = vec![Stretch { area, start: 0, end: 10 }];
+        let limits = Limits { readable, ..Limits::default() };
+        let fields = [field(0, 1), field(5, 1), field(9, 1), field(12, 1)];
+        for strategy in [Strategy::Gap { max_gap: 50 }, Strategy::Cost { request: 1e6, item: 1.0 }]
+        {
+            assert_eq!(spans(&plan(&fields, &limits, strategy).unwrap()), [(0, 10), (12, 1)]);
+        }
+    }
+
+    #[test]
+    fn the_price_of_a_request_decides_which_holes_are_read() {
+        let fields = [field(0, 1), field(11, 1), field(100, 1)];
+        let of = |request: f64| {
+            let strategy = Strategy::Cost { request, item: 1.0 };
+            spans(&plan(&fields, &Limits::default(), strategy).unwrap())
+        };
+        assert_eq!(of(0.0), [(0, 1), (11, 1), (100, 1)]);
+        assert_eq!(of(11.0), [(0, 12), (100, 1)]);
+        assert_eq!(of(1000.0), [(0, 101)]);
+    }
+
+    #[test]
+    fn a_refused_block_loses_its_holes_then_halves_until_one_field_is_alone() {
+        let fields = [field(0, 1), field(1, 1), field(2, 2), field(9, 1)];
+        let all = plan(&fields, &Limits::default(), Strategy::Gap { max_gap: 9 }).unwrap();
+        assert_eq!(spans(&all), [(0, 10)]);
+        let without_holes = smaller(&fields, &all[0]);
+        assert_eq!(spans(&without_holes), [(0, 4), (9, 1)]);
+        let halves = smaller(&fields, &without_holes[0]);
+        assert_eq!(spans(&halves), [(0, 1), (1, 3)]);
+        assert_eq!(smaller(&fields, &halves[0]), []);
+        assert_eq!(spans(&smaller(&fields, &halves[1])), [(1, 1), (2, 2)]);
+    }
+
+    #[test]
+    fn a_field_that_no_request_can_read_is_told() {
+        let strategy = Strategy::Gap { max_gap: 0 };
+        for (bad, error) in [
+            (field(0, 126), PlanError::TooLong { index: 0, count: 126, most: 125 }),
+            (field(0, 0), PlanError::Empty { index: 0 }),
+            (field(65_535, 2), PlanError::Beyond { index: 0 }),
+        ] {
+            assert_eq!(plan(&[bad], &Limits::default(), strategy), Err(error));
+        }
+    }
+}

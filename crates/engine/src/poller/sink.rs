@@ -1,0 +1,33 @@
+//! Where the bytes of a read go.
+
+use std::sync::Arc;
+
+use holdfast_memory::{Access, Area, Memory, Refusal, Write};
+
+/// A range of a memory.
+#[derive(Debug, Clone)]
+pub struct Destination {
+    pub memory: Arc<Memory>,
+    pub area: Area,
+    pub address: u16,
+}
+
+impl Destination {
+    /// Writes all of a read, as one step.
+    ///
+    /// # Errors
+    /// [`Refusal::OutOfRange`], when the read does not fit; then nothing has changed.
+    pub(super) fn write(&self, count: u32, bytes: &[u8]) -> Result<(), Refusal> {
+        let Destination { area, address, .. } = *self;
+        let write = Write { area, address, count: count as usize, bytes };
+        self.memory.write(Access::Ingest, write)
+    }
+
+    /// Whether `count` items fit.
+    pub(super) fn holds(&self, count: u32) -> bool {
+        let span = self.memory.span(self.area);
+        let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
+        let address = u32::from(self.address);
+        start <= address && address + count <= end
+    }
+}

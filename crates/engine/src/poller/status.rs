@@ -1,0 +1,151 @@
+//! The status block: 30 registers that tell how a device does.
+
+use std::sync::Arc;
+
+use holdfast_memory::{Access, Area, Memory, Write};
+
+/// Registers of one block.
+pub const BLOCK: u16 = 30;
+
+/// Bytes of the name in it.
+const NAME: usize = 16;
+
+/// Transport errors stand beside exception codes from here on.
+const TRANSPORT: u16 = 0x8000;
+
+/// Where the block of a device is: at `slot` × 30 of an area of registers.
+#[derive(Debug, Clone)]
+pub struct StatusSettings {
+    pub memory: Arc<Memory>,
+    pub area: Area,
+    pub slot: u16,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Health {
+    /// Not asked yet.
+    #[default]
+    Unknown,
+    Ok,
+    Error,
+    /// The device answers, but its polls fall behind their schedule.
+    Stale,
+}
+
+impl Health {
+    pub const fn code(self) -> u16 {
+        match self {
+            Health::Unknown => 0,
+            Health::Ok => 1,
+            Health::Error => 2,
+            Health::Stale => 3,
+        }
+    }
+
+    pub const fn name(self) -> &'static str {
+        match self {
+            Health::Unknown => "unknown",
+            Health::Ok => "ok",
+            Health::Error => "error",
+            Health::Stale => "stale",
+        }
+    }
+}
+
+/// Why a request failed, as the block tells it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    Exception(u8),
+    Timeout,
+    Refused,
+    Reset,
+    Invalid,
+}
+
+impl Fault {
+    pub const fn code(self) -> u16 {
+        match self {
+            Fault::Exception(code) => code as u16,
+            Fault::Timeout => TRANSPORT + 1,
+            Fault::Refused => TRANSPORT + 2,
+            Fault::Reset => TRANSPORT + 3,
+            Fault::Invalid => TRANSPORT + 4,
+        }
+    }
+}
+
+/// What a block tells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Status {
+    pub health: Health,
+    pub last_error: u16,
+    pub seconds_in_error: u16,
+    pub requests: u32,
+    pub valid: u32,
+    pub timeouts: u32,
+    pub transport_errors: u32,
+    pub failures: u16,
+    pub most_failures: u16,
+}
+
+impl Status {
+    fn registers(&self, name: &str) -> [u16; BLOCK as usize] {
+        let mut block = [0; BLOCK as usize];
+        block[0] = self.health.code();
+        block[1] = self.last_error;
+        block[2] = self.seconds_in_error;
+        let mut text = [0; NAME];
+        for (byte, character) in text.iter_mut().zip(name.bytes()) {
+            *byte = if character.is_ascii_graphic() { character } else { b'?' };
+        }
+        for (register, pair) in block[3..11].iter_mut().zip(text.as_chunks::<2>().0) {
+            *register = u16::from_be_bytes(*pair);
+        }
+        let counters = [self.requests, self.valid, self.timeouts, self.transport_errors];
+        for (pair, counter) in block[20..28].as_chunks_mut::<2>().0.iter_mut().zip(counters) {
+            *pair = [counter as u16, (counter >> 16) as u16];
+        }
+        block[28] = self.failures;
+        block[29] = self.most_failures;
+        block
+    }
+
+    /// Writes the block, as one step.
+    pub fn write(&self, name: &str, to: &StatusSettings) {
+        let bytes: Vec<u8> =
+            self.registers(name).iter().flat_map(|register| register.to_be_bytes()).collect();
+        let write = Write {
+            area: to.area,
+            address: to.slot.saturating_mul(BLOCK),
+            count: usize::from(BLOCK),
+            bytes: &bytes,
+        };
+        // That it fits was checked when the poller was made.
+        let _ = to.memory.write(Access::Ingest, write);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_block_has_everything_in_its_place() {
+        let status = Status {
+            health: Health::Error,
+            last_error: Fault::Timeout.code(),
+            seconds_in_error: 7,
+            requests: 0x0001_0002,
+            valid: 3,
+            timeouts: 4,
+            transport_errors: 5,
+            failures: 6,
+            most_failures: 8,
+        };
+        let block = status.registers("meter_1 and more than sixteen");
+        assert_eq!(block[..3], [2, 0x8001, 7]);
+        assert_eq!(block[3..11], [0x6D65, 0x7465, 0x725F, 0x313F, 0x616E, 0x643F, 0x6D6F, 0x7265]);
+        assert_eq!(block[11..20], [0; 9]);
+        assert_eq!(block[20..], [2, 1, 3, 0, 4, 0, 5, 0, 6, 8]);
+    }
+}
