@@ -33,7 +33,8 @@ def decode(
 
     Raises `ConversionError`; `TypeError` for registers that are no such sequence.
     """
-    return codec_of(type, order, encoding).decode(registers)
+    codec = codec_of(type, order, encoding)
+    return codec.unpack(codec.to_bytes(registers))
 
 
 def encode(value: Any, type: str, order: str = "ABCD", *, encoding: str | None = None) -> list[int]:
@@ -70,19 +71,16 @@ class Codec:
         self.kind = kind
         self.swapped = order.swapped
         block = Block(type.registers, type.name, swapped=order.swapped, bits=type.base == "bool")
-        self._to_bytes = block.pack
+        self.to_bytes = block.pack
+        """The bytes of registers in any form, those of each register swapped if `swapped`."""
         self._to_registers = block.unpack
         self.unpack = kind.unpack_one if type.count is None else kind.unpack_many
-        """The value of the bytes on the wire, those of each register swapped if `swapped`."""
+        """The value of those bytes."""
         single = type.count is None
         self.item = kind.item if single else f"{2 * type.registers}s"
         """The field as an item of `struct`, in the byte order `kind.mark`."""
         self.finish = kind.finish if single else kind.unpack_many
         """What makes that item the value, if it isn't already."""
-
-    def decode(self, registers: Registers) -> Any:
-        """The value of registers."""
-        return self.unpack(self._to_bytes(registers))
 
     def encode(self, value: Any) -> list[int]:
         """The registers of a value."""
@@ -115,7 +113,9 @@ def codec_of(name: str, order: str, encoding: str | None) -> Codec:
         raise UnknownEncoding(f"encoding {shown(encoding)} is for strings, {type.name} is none")
     if type.base == "bool":
         bytes_order = FOUR["ABCD"]
-    return Codec(type, bytes_order, _kind(type, bytes_order, encoding or "ascii"))
+    return Codec(
+        type, bytes_order, _kind(type, bytes_order, "ascii" if encoding is None else encoding)
+    )
 
 
 def _kind(type: Type, order: Order, encoding: str) -> Kind:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 from holdfast.values.errors import DoesNotFit, Undecodable, at
-from holdfast.values.orders import arrange
+from holdfast.values.orders import move
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -60,8 +60,10 @@ class Kind(ABC):
         return b"".join(packed)
 
     def arrange(self, data: bytes) -> bytes:
-        """What the order does to elements; the same both ways."""
-        return arrange(data, self.order, self.width)
+        """What the order does to one element, but for `order.swapped`; the same both ways."""
+        if self.order.reversed:
+            return data[::-1]
+        return move(data, self.order.places) if self.order.places else data
 
 
 class Bytewise(Kind):

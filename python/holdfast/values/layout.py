@@ -104,11 +104,12 @@ class Layout:
 
 
 def _field(entry: Field | tuple[Any, ...]) -> Field:
-    try:
-        made = entry if isinstance(entry, Field) else Field(*entry)
-    except TypeError:
+    made = entry
+    if isinstance(entry, tuple) and 3 <= len(entry) <= 5:
+        made = Field(*entry)
+    if not isinstance(made, Field):
         allowed = "a Field, or a tuple of name, type, offset, order and encoding"
-        raise InvalidLayout(f"a field is {shown(entry)}, allowed is {allowed}") from None
+        raise InvalidLayout(f"a field is {shown(entry)}, allowed is {allowed}")
     if not isinstance(made.name, str) or not made.name:
         raise InvalidLayout(f"the name of a field is {shown(made.name)}, not a text")
     if type(made.offset) is not int or not 0 <= made.offset < MOST_REGISTERS:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.values.errors import DoesNotFit, is_integer, shown
 from holdfast.values.kinds import Kind
+from holdfast.values.orders import move
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,11 +40,11 @@ class Number(Kind):
 
     def unpack_one(self, data: bytes) -> Any:
         """The number."""
-        return self._one.unpack(self.arrange(data) if self.order.places else data)[0]
+        return self._one.unpack(self._moved(data))[0]
 
     def unpack_many(self, data: bytes) -> list[Any]:
         """The numbers of a whole array."""
-        return list(self._many.unpack(self.arrange(data) if self.order.places else data))
+        return list(self._many.unpack(self._moved(data)))
 
     def pack_one(self, value: Any) -> bytes:
         """The bytes of a number. Raises `DoesNotFit`."""
@@ -53,7 +54,7 @@ class Number(Kind):
             data = self._one.pack(value)
         except (struct.error, OverflowError):
             raise self._too_large(value) from None
-        return self.arrange(data) if self.order.places else data
+        return self._moved(data)
 
     def pack_many(self, values: Sequence[Any]) -> bytes:
         """The bytes of a whole array. Raises `DoesNotFit`."""
@@ -62,7 +63,7 @@ class Number(Kind):
                 data = self._many.pack(*values)
             except (struct.error, OverflowError):
                 return super().pack_many(values)
-            return self.arrange(data) if self.order.places else data
+            return self._moved(data)
         return super().pack_many(values)
 
     @abstractmethod
@@ -73,9 +74,9 @@ class Number(Kind):
     def _too_large(self, value: Any) -> DoesNotFit:
         """What is raised for a number that the type does not hold."""
 
-    def arrange(self, data: bytes) -> bytes:
-        """Only what eight letters spell out: the rest is `struct`'s."""
-        return super().arrange(data) if self.order.places else data
+    def _moved(self, data: bytes) -> bytes:
+        """What eight letters spell out; reversing is `struct`'s."""
+        return move(data, self.order.places) if self.order.places else data
 
 
 class Integer(Number):

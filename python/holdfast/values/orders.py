@@ -70,17 +70,12 @@ def swap_registers(data: bytes) -> bytes:
     return words.tobytes()
 
 
-def arrange(data: bytes, order: Order, width: int) -> bytes:
-    """What an order does to elements of `width` bytes, apart from swapping in registers."""
-    if order.reversed:
-        whole = data[::-1]
-        return b"".join([whole[at - width : at] for at in range(len(whole), 0, -width)])
-    if order.places:
-        arranged = bytearray(len(data))
-        for place, source in enumerate(order.places):
-            arranged[place::width] = data[source::width]
-        return bytes(arranged)
-    return data
+def move(data: bytes, places: tuple[int, ...]) -> bytes:
+    """The bytes of each element moved; `places` say where each byte of an element comes from."""
+    moved = bytearray(len(data))
+    for place, source in enumerate(places):
+        moved[place :: len(places)] = data[source :: len(places)]
+    return bytes(moved)
 
 
 def _places(name: str) -> tuple[int, ...]:

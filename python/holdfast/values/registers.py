@@ -88,6 +88,6 @@ def _plain(registers: Registers) -> bytes | Sequence[int]:
         big = mark in (">", "!") or (mark in ("", "@", "=") and sys.byteorder == "big")
         return view.tobytes() if big else swap_registers(view.tobytes())
     if view.ndim == 1 and code == "?":
-        return tuple(view.tolist())
+        return tuple(map(bool, view.tobytes()))
     found = f"registers are a buffer of format {view.format!r}, dimensions {view.ndim}"
     raise TypeError(f"{found}, allowed are {ALLOWED}")
