@@ -97,12 +97,13 @@ class Oracle:
             return bytes([pdu[0] | 0x80, refusal.code])
 
     def _serve(self, unit: int, pdu: bytes) -> bytes | None:
-        require(self._allowed(pdu), ILLEGAL_FUNCTION)
-        require(unit == self.unit, NO_SUCH_UNIT)
-        if self.listen_only:
-            if pdu in (b"\x08\x00\x01\x00\x00", b"\x08\x00\x01\xff\x00"):
+        if self.listen_only and unit == self.unit:
+            restart = pdu in (b"\x08\x00\x01\x00\x00", b"\x08\x00\x01\xff\x00")
+            if restart and self._allowed(pdu):
                 self.listen_only = False
             return None
+        require(self._allowed(pdu), ILLEGAL_FUNCTION)
+        require(unit == self.unit, NO_SUCH_UNIT)
         carry_out = self._forms[pdu[0]](pdu)
         require(not self.sealed, BUSY)
         return carry_out()

@@ -224,6 +224,10 @@ def test_listen_only_mode_is_entered_without_a_reply(
         "0b",
         "11",
         "2b0e0100",
+        # Refused before the unit id is looked at.
+        "63",
+        "0800050000",
+        "2b0d0100",
     ],
 )
 def test_a_unit_in_listen_only_mode_is_silent_and_changes_nothing(

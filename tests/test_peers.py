@@ -5,7 +5,6 @@ What they wrote is looked up in memory, what they read was put there.
 
 from __future__ import annotations
 
-import asyncio
 import re
 import subprocess
 from typing import TYPE_CHECKING, Any
@@ -15,9 +14,10 @@ from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
 
 from conftest import tool
 from holdfast.identity import Identity
+from pymodbus_peer import OPTIONS, Patient, connected
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     import holdfast
     from conftest import Serve
@@ -127,55 +127,15 @@ def named_server(memory: holdfast.Memory, serve: Serve) -> holdfast.Server:
 @pytest.fixture
 def sync_client(named_server: holdfast.Server) -> Iterator[ModbusTcpClient]:
     host, port = named_server.address
-    client = ModbusTcpClient(host, port=port, timeout=10, retries=0)
-    assert client.connect()  # type: ignore[no-untyped-call]
-    yield client
-    client.close()  # type: ignore[no-untyped-call]
-
-
-class Patient:
-    """The asyncio client behind plain calls, so that one set of tests serves both clients."""
-
-    def __init__(self, address: tuple[str, int]) -> None:
-        self._loop = asyncio.new_event_loop()
-        host, port = address
-        self._client = self.run(self._connected(host, port))
-
-    async def _connected(self, host: str, port: int) -> AsyncModbusTcpClient:
-        client = AsyncModbusTcpClient(host, port=port, timeout=10, retries=0)
-        assert await client.connect()
-        return client
-
-    def run(self, awaitable: Awaitable[Any]) -> Any:
-        async def awaited() -> Any:
-            return await awaitable
-
-        return self._loop.run_until_complete(awaited())
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        return lambda *args, **named: self.run(getattr(self._client, name)(*args, **named))
-
-    def many(self, name: str, addresses: Sequence[int]) -> list[Any]:
-        """Calls one method for many addresses at once."""
-
-        async def gathered() -> list[Any]:
-            method = getattr(self._client, name)
-            return list(await asyncio.gather(*[method(address) for address in addresses]))
-
-        return list(self.run(gathered()))
-
-    def close(self) -> None:
-        self._client.close()
-        # The transport closes its socket in the next turn of the loop.
-        self._loop.run_until_complete(asyncio.sleep(0))
-        self._loop.close()
+    with connected(ModbusTcpClient(host, port=port, **OPTIONS)) as client:
+        yield client
 
 
 @pytest.fixture
 def async_client(named_server: holdfast.Server) -> Iterator[Patient]:
-    client = Patient(named_server.address)
-    yield client
-    client.close()
+    host, port = named_server.address
+    with Patient(lambda: AsyncModbusTcpClient(host, port=port, **OPTIONS)) as client:
+        yield client
 
 
 @pytest.fixture(params=["sync_client", "async_client"], ids=["sync", "asyncio"])
