@@ -363,10 +363,12 @@ class Device:
     """A device to be polled: what is read, how often, and where it goes.
 
     `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
-    `max_gap` (0 when left out) or `cost` (of a request, of an item) says which holes are read; `readable` and
-    `forbidden` are areas with start and end. `forward` are hosts, ports, formats (`v1`, `crc`), crc
+    `max_gap` (0 when left out) or `cost` (of a request, of an item) says which holes are read;
+    `readable` and `forbidden` are areas with start and end. `forward` are hosts, ports, formats (`v1`, `crc`), crc
     (`required`, `none`), unit or memory ids, and timeouts. `status` is the memory, area and slot of
-    the status block. Times are in seconds; interval 0 polls without a pause.
+    the status block. `start_within` is when the first poll comes at the latest, an interval when
+    left out; `report` hands polls to `Poller.results`; `release` closes the connection after each.
+    Times are in seconds; interval 0 polls without a pause.
     """
 
     def __new__(
@@ -386,6 +388,9 @@ class Device:
         forbidden: Sequence[tuple[Area, int, int]] | None = None,
         forward: Sequence[tuple[str, int, str, str, int, float]] | None = None,
         status: tuple[Memory, Area, int] | None = None,
+        start_within: float | None = None,
+        report: bool = False,
+        release: bool = False,
     ) -> Device: ...
 
 @final
@@ -396,6 +401,25 @@ class Poller:
     """
 
     def __new__(cls, devices: Sequence[Device]) -> Poller: ...
+    def add(self, device: Device) -> None:
+        """Polls one more device. Raises `ValueError`, also for a name that is taken."""
+
+    def remove(self, name: str) -> bool:
+        """Stops polling a device; whether there was one of that name."""
+
+    def results(
+        self, timeout: float
+    ) -> list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int]]]]:
+        """All polls of devices with `report` since the last call, waiting for the first.
+
+        Each is a device, the seconds since 1970, and its blocks: area, address, count, the bytes
+        (`None` when there are none), and the fault as a status block tells it.
+        """
+
+    @property
+    def dropped(self) -> int:
+        """Polls that `results` misses because nobody took them."""
+
     def counters(self) -> dict[str, dict[str, Any]]:
         """How each device does, by name: its health, counters, and those of its forwards."""
 

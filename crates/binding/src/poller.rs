@@ -1,16 +1,17 @@
 //! `Device` and `Poller`, and plans: what is to be polled, counters out.
 
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use holdfast_engine::poller::plan::{self, Field, Limits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    Destination, DeviceSettings, DeviceState, ForwardSettings, Poller as Core, PollerError,
+    Destination, DeviceSettings, DeviceState, ForwardSettings, Poll, Poller as Core, PollerError,
     ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, seconds, within, word};
 use crate::client::Endpoint;
@@ -40,7 +41,7 @@ pub struct Device {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Device {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, report=false, release=false))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -56,6 +57,9 @@ impl Device {
         forbidden: Option<Vec<Range>>,
         forward: Option<Vec<Forward>>,
         status: Option<Place<'_>>,
+        start_within: Option<f64>,
+        report: bool,
+        release: bool,
     ) -> PyResult<Device> {
         let reads = reads.into_iter().map(|(area, address, count, into)| {
             Ok(ReadSettings {
@@ -81,6 +85,9 @@ impl Device {
             strategy: strategy(max_gap, cost)?,
             forward: forward.collect::<PyResult<_>>()?,
             status: status.transpose()?,
+            start_within: seconds("start_within", start_within.unwrap_or(interval))?,
+            report,
+            release,
         };
         Ok(Device { core })
     }
@@ -102,6 +109,25 @@ impl Poller {
             _ => PyValueError::new_err(error.to_string()),
         })?;
         Ok(Poller { core })
+    }
+
+    fn add(&self, device: PyRef<'_, Device>) -> PyResult<()> {
+        self.core.add(device.core.clone()).map_err(|error| PyValueError::new_err(error.to_string()))
+    }
+
+    fn remove(&self, name: &str) -> bool {
+        self.core.remove(name)
+    }
+
+    fn results<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Vec<PollResult<'py>>> {
+        let timeout = seconds("timeout", timeout)?;
+        let polls = py.detach(|| self.core.results().take(timeout));
+        polls.iter().map(|poll| reported(py, poll)).collect()
+    }
+
+    #[getter]
+    fn dropped(&self) -> u64 {
+        self.core.results().dropped()
     }
 
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -200,6 +226,22 @@ fn limits(
         readable: stretches(readable)?,
         forbidden: stretches(forbidden)?,
     })
+}
+
+/// Device, seconds since 1970, and blocks: area, address, count, bytes or fault.
+type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);
+type ReportedBlock<'py> = (&'static str, u16, u16, Option<Bound<'py, PyBytes>>, u16);
+
+fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
+    let time = poll.time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let blocks = poll.blocks.iter().map(|block| {
+        let (bytes, fault) = match &block.outcome {
+            Ok(bytes) => (Some(PyBytes::new(py, bytes)), 0),
+            Err(fault) => (None, fault.code()),
+        };
+        (block.area.name(), block.address, block.count, bytes, fault)
+    });
+    Ok((poll.device.to_string(), time.as_secs_f64(), blocks.collect()))
 }
 
 fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDict>> {

@@ -9,7 +9,7 @@ use std::collections::HashMap;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use holdfast_memory::Area;
 use holdfast_protocol::pdu::{self, Range, Request};
@@ -19,13 +19,15 @@ use super::backoff;
 use super::forward::{Forward, ForwardSettings};
 use super::link::Link;
 use super::plan::{self, Block, Field, Limits, Strategy};
+use super::results::{BlockResult, Poll, Results};
 use super::sink::Destination;
 use super::status::{Fault, Health, Status, StatusSettings};
 use crate::client::Endpoint;
 use crate::counters::Counter;
 
 /// Exceptions that speak of what was asked for, not of the device.
-const ILLEGAL: [u8; 2] = [2, 3];
+const ILLEGAL: [u8; 2] = [2, ILLEGAL_VALUE];
+const ILLEGAL_VALUE: u8 = 3;
 
 /// Timeouts in a row after which a unit is held to be dead.
 const DEAD_AFTER: u32 = 3;
@@ -47,6 +49,12 @@ pub struct DeviceSettings {
     pub strategy: Strategy,
     pub forward: Vec<ForwardSettings>,
     pub status: Option<StatusSettings>,
+    /// The first poll comes within this time, at a moment that differs from device to device.
+    pub start_within: Duration,
+    /// Whether what is read goes to [`super::Results`] too.
+    pub report: bool,
+    /// Whether the connection is closed after each poll, for devices that have only one.
+    pub release: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -180,6 +188,9 @@ pub(super) struct Device {
     fields: Vec<Field>,
     /// The read that each field is a part of, and its place in it, in items.
     parts: Vec<(usize, u32)>,
+    report: Option<Arc<Results>>,
+    name: Arc<str>,
+    limits: RefCell<Limits>,
     plan: RefCell<Rc<Vec<Block>>>,
     /// When the first plan is tried again.
     revise: Cell<Option<Instant>>,
@@ -211,11 +222,15 @@ impl Device {
         state: Arc<DeviceState>,
         link: Rc<Link>,
         forwards: Vec<Rc<Forward>>,
+        report: Option<Arc<Results>>,
     ) -> Device {
         let parted = fields(&settings.reads, &settings.limits);
         let device = Device {
             fields: parted.iter().map(|(field, ..)| *field).collect(),
             parts: parted.iter().map(|(_, read, at)| (*read, *at)).collect(),
+            report,
+            name: settings.name.as_str().into(),
+            limits: RefCell::new(settings.limits.clone()),
             plan: RefCell::default(),
             revise: Cell::new(None),
             silent: Cell::new(0),
@@ -274,7 +289,7 @@ impl Device {
 
     fn draw_plan(&self) {
         // That every field can be read was checked when the poller was made.
-        let plan = plan::plan(&self.fields, &self.settings.limits, self.settings.strategy);
+        let plan = plan::plan(&self.fields, &self.limits.borrow(), self.settings.strategy);
         *self.plan.borrow_mut() = Rc::new(plan.unwrap_or_default());
         self.note_plan();
     }
@@ -288,10 +303,11 @@ impl Device {
     async fn poll(&self) {
         if self.revise.get().is_some_and(|time| Instant::now() >= time) {
             self.revise.set(None);
+            self.limits.replace(self.settings.limits.clone());
             self.draw_plan();
         }
         self.state.counters.polls.add();
-        let mut gathered = Gathered::default();
+        let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
         let (mut fault, mut answered) = (None, false);
         let plan = Rc::clone(&self.plan.borrow());
         for block in plan.iter() {
@@ -307,6 +323,13 @@ impl Device {
                     break;
                 }
             }
+        }
+        if let Some(results) = &self.report {
+            let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
+            results.push(Poll { device, time: SystemTime::now(), blocks });
+        }
+        if self.settings.release {
+            self.link.release();
         }
         match (fault, answered) {
             (Some(Fault::Timeout | Fault::Refused | Fault::Reset), false) => {
@@ -328,7 +351,11 @@ impl Device {
             Err(Fault::Exception(code)) if ILLEGAL.contains(&code) => {
                 let smaller = plan::smaller(&self.fields, block);
                 if smaller.is_empty() {
+                    gathered.note(block, Err(Fault::Exception(code)));
                     return Err(Fault::Exception(code));
+                }
+                if code == ILLEGAL_VALUE {
+                    self.lower_limit(block);
                 }
                 self.replace(block, &smaller);
                 let mut done = Ok(());
@@ -341,9 +368,13 @@ impl Device {
                 }
                 return done;
             }
-            Err(other) => return Err(other),
+            Err(other) => {
+                gathered.note(block, Err(other));
+                return Err(other);
+            }
         };
         self.spread(block, &bytes, gathered);
+        gathered.note(block, Ok(bytes));
         Ok(())
     }
 
@@ -384,6 +415,28 @@ impl Device {
         answer
     }
 
+    /// A device that can't bear so many items in one request gets fewer in all its requests, as far as
+    /// its fields allow.
+    fn lower_limit(&self, refused: &Block) {
+        let longest = self.fields.iter().filter(|field| field.area == refused.area);
+        let longest = longest.map(|field| field.count).max().unwrap_or(1);
+        let limit = (refused.count / 2).max(longest);
+        let mut limits = self.limits.borrow_mut();
+        let now =
+            if refused.area.is_bits() { &mut limits.max_bits } else { &mut limits.max_registers };
+        *now = limit.min(*now);
+        drop(limits);
+        self.draw_plan();
+        self.remember();
+    }
+
+    /// Sets the time when the first plan is tried again.
+    fn remember(&self) {
+        if self.revise.get().is_none() {
+            self.revise.set(Some(Instant::now() + REMEMBERED));
+        }
+    }
+
     /// Puts smaller blocks in the place of one that was refused.
     fn replace(&self, refused: &Block, smaller: &[Block]) {
         let mut plan = self.plan.borrow_mut();
@@ -392,9 +445,7 @@ impl Device {
         }
         drop(plan);
         self.note_plan();
-        if self.revise.get().is_none() {
-            self.revise.set(Some(Instant::now() + REMEMBERED));
-        }
+        self.remember();
     }
 
     /// Takes the fields of a block out of its bytes; reads that are whole then are handed on.
@@ -441,11 +492,23 @@ impl Device {
     }
 }
 
-/// The bytes of reads that come in parts, and how many items are missing.
+/// What one poll brings together: reads that come in parts, and how many items are missing; and
+/// all blocks, where somebody wants them.
 #[derive(Default)]
-struct Gathered(HashMap<usize, (Vec<u8>, u32)>);
+struct Gathered {
+    parts: HashMap<usize, (Vec<u8>, u32)>,
+    blocks: Vec<BlockResult>,
+    report: bool,
+}
 
 impl Gathered {
+    fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
+        if self.report {
+            let Block { area, address, count, .. } = *block;
+            self.blocks.push(BlockResult { area, address, count, outcome });
+        }
+    }
+
     /// Puts a field into its read; all of the read when nothing is missing any more.
     fn put(
         &mut self,
@@ -457,7 +520,8 @@ impl Gathered {
         offset: usize,
     ) -> Option<Vec<u8>> {
         let len = settings.area.byte_len(settings.count as usize);
-        let (whole, missing) = self.0.entry(read).or_insert_with(|| (vec![0; len], settings.count));
+        let (whole, missing) =
+            self.parts.entry(read).or_insert_with(|| (vec![0; len], settings.count));
         let (count, at) = (usize::from(field.count), at as usize);
         if field.area.is_bits() {
             for index in 0..count {
@@ -472,6 +536,6 @@ impl Gathered {
         if *missing > 0 {
             return None;
         }
-        self.0.remove(&read).map(|(whole, _)| whole)
+        self.parts.remove(&read).map(|(whole, _)| whole)
     }
 }

@@ -54,6 +54,23 @@ impl Link {
     }
 }
 
+impl Link {
+    /// Ends the connection if nobody waits for a reply; the next read makes a new one.
+    pub(super) fn release(&self) {
+        match self {
+            Link::Tcp(link) => {
+                let mut open = link.open.borrow_mut();
+                if open.as_ref().is_some_and(|open| open.waiting.is_empty()) {
+                    *open = None;
+                }
+            }
+            Link::Blocking(link) => {
+                let _ = link.jobs.send(Job::Release);
+            }
+        }
+    }
+}
+
 pub(super) struct TcpLink {
     host: String,
     port: u16,
@@ -172,6 +189,13 @@ impl TcpLink {
     }
 }
 
+impl Drop for TcpLink {
+    /// The task that reads holds the connection too.
+    fn drop(&mut self) {
+        self.open.borrow_mut().take();
+    }
+}
+
 impl Open {
     /// Sends without waiting; what the socket does not take goes with the next. Whether the
     /// connection still works.
@@ -252,7 +276,12 @@ pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
 }
 
-struct Job {
+enum Job {
+    Read(Read),
+    Release,
+}
+
+struct Read {
     unit_id: u8,
     pdu: Vec<u8>,
     timeout: Duration,
@@ -266,10 +295,14 @@ impl BlockingLink {
         let work = move || {
             let mut attempts = (0, None);
             for job in queue {
-                // Nobody waits any more for a job whose device was stopped.
-                if !job.answer.is_closed() {
-                    let answer = call(&client, &job, &mut attempts);
-                    let _ = job.answer.send(answer);
+                match job {
+                    Job::Release => client.close(),
+                    // Nobody waits any more for a read whose device was stopped.
+                    Job::Read(read) if read.answer.is_closed() => {}
+                    Job::Read(read) => {
+                        let answer = call(&client, &read, &mut attempts);
+                        let _ = read.answer.send(answer);
+                    }
                 }
             }
         };
@@ -280,15 +313,15 @@ impl BlockingLink {
 
     async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
         let (answer, answered) = oneshot::channel();
-        let job = Job { unit_id, pdu: pdu.to_vec(), timeout, answer };
-        self.jobs.send(job).or(Err(Fault::Reset))?;
+        let read = Read { unit_id, pdu: pdu.to_vec(), timeout, answer };
+        self.jobs.send(Job::Read(read)).or(Err(Fault::Reset))?;
         answered.await.unwrap_or(Err(Fault::Reset))
     }
 }
 
 type Pause = (u32, Option<std::time::Instant>);
 
-fn call(client: &BlockingClient, job: &Job, (failures, not_before): &mut Pause) -> Answer {
+fn call(client: &BlockingClient, job: &Read, (failures, not_before): &mut Pause) -> Answer {
     if not_before.is_some_and(|time| std::time::Instant::now() < time) {
         return Err(Fault::Refused);
     }

@@ -12,12 +12,14 @@ mod device;
 mod forward;
 mod link;
 pub mod plan;
+mod results;
 mod sink;
 mod status;
 mod thread;
 
 pub use device::{DeviceCounters, DeviceSettings, DeviceState, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
+pub use results::{BlockResult, Poll, Results};
 pub use sink::Destination;
-pub use status::{Health, StatusSettings};
+pub use status::{Fault, Health, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

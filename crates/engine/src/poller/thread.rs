@@ -1,20 +1,22 @@
-//! All devices on one thread: started together, stopped together.
+//! All devices on one thread: they come and go, and are stopped together.
 
 use std::collections::HashMap;
 use std::io;
+use std::rc::{Rc, Weak};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use thiserror::Error;
 use tokio::runtime::Builder;
-use tokio::sync::oneshot;
-use tokio::task::LocalSet;
+use tokio::sync::mpsc;
+use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::device::{Device, DeviceSettings, DeviceState, fields};
 use super::forward::{Forward, ForwardCounters};
 use super::link::Link;
 use super::plan::{self, PlanError};
+use super::results::Results;
 use super::status::BLOCK;
 use crate::client::Endpoint;
 
@@ -28,26 +30,37 @@ pub enum PollerError {
     Status { device: String },
     #[error("device {device}: read {read} goes beyond address 65535")]
     Beyond { device: String, read: usize },
+    #[error("device {device}: there is one of that name")]
+    Taken { device: String },
     #[error("can't start the poller's thread: {0}")]
     Thread(io::Error),
 }
 
 /// One device as it can be looked at from outside.
+#[derive(Clone)]
 pub struct Polled {
     pub name: String,
     pub state: Arc<DeviceState>,
     pub forwards: Vec<Arc<ForwardCounters>>,
 }
 
-/// Devices that are polled, until it is stopped or dropped.
+/// Devices that are polled, until it is stopped or dropped. They may come and go.
 pub struct Poller {
-    polled: Vec<Polled>,
-    stop: Mutex<Option<oneshot::Sender<()>>>,
+    polled: Mutex<Vec<Polled>>,
+    orders: mpsc::UnboundedSender<Order>,
+    results: Arc<Results>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
+/// What the poller's thread is told; it ends when nobody can tell it anything any more.
+enum Order {
+    Add(Box<DeviceSettings>, Polled),
+    Remove(String),
+    Stop,
+}
+
 impl Poller {
-    /// Checks all devices, then starts to poll. Their first polls are spread over an interval.
+    /// Checks all devices, then starts to poll. Their first polls are spread.
     ///
     /// # Errors
     /// [`PollerError`], with nothing left running.
@@ -55,43 +68,70 @@ impl Poller {
         for device in &devices {
             check(device)?;
         }
-        let polled: Vec<Polled> = devices
-            .iter()
-            .map(|device| Polled {
-                name: device.name.clone(),
-                state: Arc::default(),
-                forwards: device.forward.iter().map(|_| Arc::default()).collect(),
-            })
-            .collect();
-        let handles: Vec<_> =
-            polled.iter().map(|each| (Arc::clone(&each.state), each.forwards.clone())).collect();
-        let (stop, stopped) = oneshot::channel();
+        let (orders, told) = mpsc::unbounded_channel();
+        let results = Arc::new(Results::default());
         let runtime = Builder::new_current_thread()
             .enable_io()
             .enable_time()
             .build()
             .map_err(PollerError::Thread)?;
-        let work = move || {
-            let local = LocalSet::new();
-            local.block_on(&runtime, async move {
-                start_all(devices, handles);
-                let _ = stopped.await;
-            });
-        };
+        let to = Arc::clone(&results);
+        let work = move || LocalSet::new().block_on(&runtime, obey(told, to));
         let thread = thread::Builder::new()
             .name("holdfast-poller".into())
             .spawn(work)
             .map_err(PollerError::Thread)?;
-        Ok(Poller { polled, stop: Mutex::new(Some(stop)), thread: Mutex::new(Some(thread)) })
+        let poller =
+            Poller { polled: Mutex::default(), orders, results, thread: Mutex::new(Some(thread)) };
+        for device in devices {
+            poller.add(device)?;
+        }
+        Ok(poller)
     }
 
-    pub fn devices(&self) -> &[Polled] {
-        &self.polled
+    /// Polls one more device.
+    ///
+    /// # Errors
+    /// [`PollerError`] for one that can't be polled, or whose name is taken.
+    pub fn add(&self, device: DeviceSettings) -> Result<(), PollerError> {
+        check(&device)?;
+        let polled = Polled {
+            name: device.name.clone(),
+            state: Arc::default(),
+            forwards: device.forward.iter().map(|_| Arc::default()).collect(),
+        };
+        let mut all = self.polled.lock().unwrap_or_else(PoisonError::into_inner);
+        if all.iter().any(|other| other.name == device.name) {
+            return Err(PollerError::Taken { device: device.name });
+        }
+        all.push(polled.clone());
+        let _ = self.orders.send(Order::Add(Box::new(device), polled));
+        Ok(())
+    }
+
+    /// Stops polling a device; its connection is closed when no other device uses it. Whether there
+    /// was one of that name.
+    pub fn remove(&self, name: &str) -> bool {
+        let mut all = self.polled.lock().unwrap_or_else(PoisonError::into_inner);
+        let before = all.len();
+        all.retain(|device| device.name != name);
+        let _ = self.orders.send(Order::Remove(name.to_owned()));
+        all.len() < before
+    }
+
+    /// The devices as they are now.
+    pub fn devices(&self) -> Vec<Polled> {
+        self.polled.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// What devices with `report` answered.
+    pub fn results(&self) -> &Results {
+        &self.results
     }
 
     /// Stops polling. What was read has been handed on; a read under way is given up.
     pub fn stop(&self) {
-        drop(self.stop.lock().unwrap_or_else(PoisonError::into_inner).take());
+        let _ = self.orders.send(Order::Stop);
         if let Some(thread) = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take() {
             let _ = thread.join();
         }
@@ -104,36 +144,70 @@ impl Drop for Poller {
     }
 }
 
-type Handles = Vec<(Arc<DeviceState>, Vec<Arc<ForwardCounters>>)>;
-
-/// In the context of a `LocalSet`.
-fn start_all(devices: Vec<DeviceSettings>, handles: Handles) {
-    let mut links: HashMap<String, std::rc::Rc<Link>> = HashMap::new();
-    let total = devices.len().max(1) as u32;
-    for (number, (settings, (state, counters))) in devices.into_iter().zip(handles).enumerate() {
-        let link = links
-            .entry(address(&settings.endpoint))
-            .or_insert_with(|| Link::new(settings.endpoint.clone()))
-            .clone();
-        let forwards: Vec<_> = settings
-            .forward
-            .iter()
-            .cloned()
-            .zip(counters)
-            .map(|(settings, counters)| Forward::new(settings, counters))
-            .collect();
-        for forward in &forwards {
-            tokio::task::spawn_local(std::rc::Rc::clone(forward).run());
+/// Starts and ends the tasks of devices, until it is told to stop.
+async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
+    let mut links: HashMap<String, Weak<Link>> = HashMap::new();
+    let mut tasks: HashMap<String, Vec<AbortHandle>> = HashMap::new();
+    let mut started = 0;
+    while let Some(order) = orders.recv().await {
+        match order {
+            Order::Stop => return,
+            Order::Remove(name) => {
+                for task in tasks.remove(&name).unwrap_or_default() {
+                    task.abort();
+                }
+                links.retain(|_, link| link.strong_count() > 0);
+            }
+            Order::Add(settings, polled) => {
+                let phase = spread(settings.start_within, started);
+                started += 1;
+                let name = settings.name.clone();
+                let link = link_to(&settings.endpoint, &mut links);
+                tasks.insert(name, start(*settings, polled, link, phase, &results));
+            }
         }
-        let phase = spread(settings.interval, number as u32, total);
-        let device = Device::new(settings, state, link, forwards);
-        tokio::task::spawn_local(device.run(phase));
     }
 }
 
-/// The start of a device among `total`, so that they don't fire at once.
-fn spread(interval: Duration, number: u32, total: u32) -> Duration {
-    interval.mul_f64(f64::from(number) / f64::from(total))
+/// The link to an endpoint, shared with all other devices there.
+fn link_to(endpoint: &Endpoint, links: &mut HashMap<String, Weak<Link>>) -> Rc<Link> {
+    let known = links.entry(address(endpoint)).or_default();
+    known.upgrade().unwrap_or_else(|| {
+        let link = Link::new(endpoint.clone());
+        *known = Rc::downgrade(&link);
+        link
+    })
+}
+
+/// The tasks of one device.
+fn start(
+    settings: DeviceSettings,
+    polled: Polled,
+    link: Rc<Link>,
+    phase: Duration,
+    results: &Arc<Results>,
+) -> Vec<AbortHandle> {
+    let forwards: Vec<_> = settings
+        .forward
+        .iter()
+        .cloned()
+        .zip(polled.forwards)
+        .map(|(settings, counters)| Forward::new(settings, counters))
+        .collect();
+    let mut tasks: Vec<AbortHandle> = forwards
+        .iter()
+        .map(|forward| spawn_local(Rc::clone(forward).run()).abort_handle())
+        .collect();
+    let report = settings.report.then(|| Arc::clone(results));
+    let device = Device::new(settings, polled.state, link, forwards, report);
+    tasks.push(spawn_local(device.run(phase)).abort_handle());
+    tasks
+}
+
+/// When the device that was started as number `number` begins: by the golden ratio, which spreads
+/// any number of them evenly.
+fn spread(within: Duration, number: u32) -> Duration {
+    within.mul_f64((f64::from(number) * 0.618_033_988_749_895).fract())
 }
 
 /// What devices share a link by.
