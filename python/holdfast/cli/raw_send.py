@@ -10,6 +10,7 @@ from typing import IO
 import click
 
 from holdfast import raw
+from holdfast.cli.places import number
 from holdfast.types import AREAS, Area
 
 MOST = 0xFFFF
@@ -18,24 +19,18 @@ MOST = 0xFFFF
 SEPARATORS = re.compile(r"[\s,;]+")
 
 
-def _number(text: str) -> int | None:
-    if re.fullmatch("0[xX][0-9a-fA-F]{1,20}", text):
-        return int(text, 16)
-    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None
-
-
 def _integer(text: str) -> int:
-    number = _number(text)
-    if number is None:
+    found = number(text)
+    if found is None:
         raise click.BadParameter(f"{text!r} is not an integer, decimal or 0x.")
-    return number
+    return found
 
 
 def _word(text: str) -> int:
-    number = _integer(text)
-    if number > MOST:
+    found = _integer(text)
+    if found > MOST:
         raise click.BadParameter(f"{text} is outside 0 to {MOST}.")
-    return number
+    return found
 
 
 def _receiver(text: str) -> tuple[str, int]:
@@ -45,7 +40,7 @@ def _receiver(text: str) -> tuple[str, int]:
         host = host[1:-1]
     elif ":" in host:
         raise click.BadParameter(f"{text!r}: an IPv6 address goes in brackets, as in [::1]:9000.")
-    port = _number(digits)
+    port = number(digits)
     if not host or port is None:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
     if not 1 <= port <= MOST:
@@ -160,11 +155,11 @@ def _values(file: IO[str]) -> list[int]:
             for item in SEPARATORS.split(text.strip()):
                 if not item:
                     continue
-                number = _number(item)
-                if number is None:
+                value = number(item)
+                if value is None:
                     found = f"{file.name}:{line}: {item[:40]!r} is not an integer"
                     raise ValueError(f"{found}, decimal or 0x")
-                values.append(number)
+                values.append(value)
             if len(values) > MOST:
                 raise ValueError(f"{file.name} has more than {MOST} values")
     except UnicodeDecodeError:

@@ -1,0 +1,124 @@
+"""What the commands that talk to a device share: its URL, their options, how an error is told."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import click
+
+from holdfast.client import LONGEST_TIMEOUT, SyncClient
+from holdfast.errors import (
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
+from holdfast.target import parse
+from holdfast.types import BIT_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from holdfast.types import Area
+
+Command = TypeVar("Command", bound="Callable[..., Any]")
+
+FAILED = 1
+
+REASONS: tuple[tuple[type[ModbusError], str], ...] = (
+    (ModbusException, "exception"),
+    (RequestTimeout, "timeout"),
+    (ConnectionLost, "connection"),
+    (InvalidResponse, "invalid"),
+)
+
+
+def seconds(text: str) -> float:
+    """A time in seconds, as an option has it."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number <= LONGEST_TIMEOUT:
+        raise click.BadParameter(f"{text!r} is no number of seconds, more than 0 to 86400.")
+    return number
+
+
+def is_url(text: str) -> bool:
+    """Whether this is meant for a URL."""
+    return "://" in text
+
+
+def checked_url(text: str) -> str:
+    """The URL of a device."""
+    try:
+        parse(text)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.") from error
+    return text
+
+
+url_argument = click.argument("url", type=checked_url, metavar="URL")
+json_option = click.option("--json", "as_json", is_flag=True, help="JSON for programs.")
+
+
+def device_options(command: Command) -> Command:
+    """Adds `--unit` and `--timeout`."""
+    unit = click.option(
+        "--unit",
+        type=click.IntRange(0, 255),
+        default=1,
+        show_default=True,
+        metavar="N",
+        help="Unit id, 0 to 255.",
+    )
+    timeout = click.option(
+        "--timeout",
+        type=seconds,
+        default="1",
+        show_default=True,
+        metavar="SECONDS",
+        help="For a connection, a request and its reply together.",
+    )
+    return unit(timeout(command))
+
+
+def connect(url: str, unit: int, timeout: float) -> SyncClient:
+    """A client, which connects when it is used."""
+    try:
+        return SyncClient(url, unit=unit, timeout=timeout)
+    except ValueError as error:
+        raise click.UsageError(f"{error}.") from error
+
+
+def read_raw(
+    client: SyncClient, area: Area, address: int, count: int, unit: int | None = None
+) -> list[int]:
+    """Bits or registers, in as many requests as that takes."""
+    kind = "bool" if area in BIT_AREAS else "uint16"
+    raw: list[int] = client.read(area, address, f"{kind}[{count}]", unit=unit)
+    return raw
+
+
+def problem(error: ModbusError) -> dict[str, object]:
+    """An error as programs get it."""
+    reason = next(word for kind, word in REASONS if isinstance(error, kind))
+    code = {"code": error.code} if isinstance(error, ModbusException) else {}
+    return {"reason": reason, **code, "detail": str(error)}
+
+
+def fail(
+    error: ModbusError, url: str, answer: Mapping[str, object] | None, hint: str | None = None
+) -> NoReturn:
+    """Tells an error and ends with 1; for programs (`answer`) on standard output."""
+    if answer is not None:
+        click.echo(json.dumps({"ok": False, **answer, **problem(error)}))
+    else:
+        click.echo(f"holdfast: {url}: {error}", err=True)
+        if hint is not None:
+            click.echo(f"hint: {hint}", err=True)
+    sys.exit(FAILED)

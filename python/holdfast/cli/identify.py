@@ -1,0 +1,137 @@
+"""`holdfast identify`: what a device says of itself."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, TypeVar
+
+import click
+
+from holdfast.cli import device, showing
+from holdfast.errors import ModbusError
+from holdfast.operations import OBJECT_NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.operations import Identification, ServerId
+
+Answer = TypeVar("Answer")
+
+LEVELS = {1: "basic", 2: "regular", 3: "extended"}
+
+
+@click.command(epilog="Example: holdfast identify tcp://192.168.0.10 --unit 3")
+@device.url_argument
+@device.device_options
+@device.json_option
+def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
+    """Show what the device at URL says of itself.
+
+    Asks for its identification (function 43/14) and its server id (function 17), which many devices
+    have neither or one of.
+
+    Exit codes: 0 it said something, 1 it did not, 2 wrong usage.
+    """
+    with device.connect(url, unit, timeout) as client:
+        identification = _asked(client.identify)
+        server_id = _asked(client.report_server_id)
+    said = [each for each in (identification, server_id) if not isinstance(each, ModbusError)]
+    if as_json:
+        answer = {
+            "ok": bool(said),
+            "url": url,
+            "unit": unit,
+            "identification": _told(identification, _identification),
+            "server_id": _told(server_id, _server_id),
+        }
+        click.echo(json.dumps(answer, indent=2))
+    elif isinstance(identification, ModbusError) and isinstance(server_id, ModbusError):
+        click.echo(f"holdfast: {url}: function 43/14: {identification}", err=True)
+        click.echo(f"holdfast: {url}: function 17: {server_id}", err=True)
+    else:
+        click.echo("\n".join([*_identified(identification), "", *_served(server_id)]))
+    if not said:
+        sys.exit(device.FAILED)
+
+
+def _asked(call: Callable[[], Answer]) -> Answer | ModbusError:
+    try:
+        return call()
+    except ModbusError as error:
+        return error
+
+
+def _told(
+    answer: Answer | ModbusError, made: Callable[[Answer], dict[str, object]]
+) -> dict[str, object]:
+    """An answer for programs, or why there is none."""
+    if isinstance(answer, ModbusError):
+        return {"ok": False, **device.problem(answer)}
+    return {"ok": True, **made(answer)}
+
+
+def _identification(answer: Identification) -> dict[str, object]:
+    names = {name: getattr(answer, name) for name in OBJECT_NAMES}
+    objects = {str(number): data.hex() for number, data in sorted(answer.objects.items())}
+    return {**names, "conformity_level": answer.conformity_level, "objects": objects}
+
+
+def _server_id(answer: ServerId) -> dict[str, object]:
+    return {
+        "server_id": answer.server_id,
+        "running": answer.running,
+        "additional": answer.additional.hex(),
+        "data": answer.data.hex(),
+    }
+
+
+def _identified(answer: Identification | ModbusError) -> list[str]:
+    """The identification, for people."""
+    head = showing.styled("Device identification (function 43/14)", bold=True)
+    if isinstance(answer, ModbusError):
+        return [head, f"  {showing.styled(str(answer), fg='red')}"]
+    level = LEVELS.get(answer.conformity_level & 0x7F)
+    rows = [
+        (_name(number), _text(data) if number < 0x80 or _is_text(data) else data.hex(" "))
+        for number, data in sorted(answer.objects.items())
+    ]
+    code = f"0x{answer.conformity_level:02X}"
+    rows.append(("conformity level", f"{code}, {level}" if level else code))
+    return [head, *_listed(rows)]
+
+
+def _served(answer: ServerId | ModbusError) -> list[str]:
+    """The server id, for people."""
+    head = showing.styled("Server id (function 17)", bold=True)
+    if isinstance(answer, ModbusError):
+        return [head, f"  {showing.styled(str(answer), fg='red')}"]
+    rows = [("bytes", answer.data.hex(" "))]
+    if answer.server_id is not None:
+        rows.insert(0, ("server id", str(answer.server_id)))
+    if answer.running is not None:
+        rows.insert(1, ("running", "yes" if answer.running else "no"))
+        if answer.additional and _is_text(answer.additional):
+            rows.insert(2, ("text", _text(answer.additional)))
+    return [head, *_listed(rows)]
+
+
+def _listed(rows: list[tuple[str, str]]) -> list[str]:
+    width = max(len(name) for name, _ in rows)
+    return [f"  {name:{width}}  {text}".rstrip() for name, text in rows]
+
+
+def _name(number: int) -> str:
+    return showing.words(OBJECT_NAMES[number]) if number < len(OBJECT_NAMES) else f"object {number}"
+
+
+def _is_text(data: bytes) -> bool:
+    try:
+        return data.decode().rstrip("\0").isprintable()
+    except UnicodeDecodeError:
+        return False
+
+
+def _text(data: bytes) -> str:
+    return showing.plain(data.decode("utf-8", "replace").rstrip("\0"))

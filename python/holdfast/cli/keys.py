@@ -1,0 +1,63 @@
+"""Single keys from the terminal, without waiting for the end of a line."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import sys
+import time
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    Wait: TypeAlias = Callable[[float], str]
+
+END = "\x04"
+"""What comes when the terminal is gone."""
+
+
+@contextlib.contextmanager
+def keys() -> Iterator[Wait]:
+    """A function that waits some seconds for a key, and returns it, or nothing."""
+    if not sys.stdin.isatty():
+        yield _nothing
+    elif sys.platform == "win32":
+        yield _windows
+    else:
+        import termios
+        import tty
+
+        terminal = sys.stdin.fileno()
+        before = termios.tcgetattr(terminal)
+        try:
+            tty.setcbreak(terminal)
+            yield lambda seconds: _posix(terminal, seconds)
+        finally:
+            termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def _nothing(seconds: float) -> str:
+    time.sleep(seconds)
+    return ""
+
+
+def _posix(terminal: int, seconds: float) -> str:
+    if not select.select([terminal], [], [], seconds)[0]:
+        return ""
+    return os.read(terminal, 64).decode(errors="replace") or END
+
+
+def _windows(seconds: float) -> str:
+    if sys.platform != "win32":
+        raise AssertionError("only for Windows")
+    import msvcrt
+
+    end = time.monotonic() + seconds
+    while not msvcrt.kbhit():
+        left = end - time.monotonic()
+        if left <= 0:
+            return ""
+        time.sleep(min(left, 0.02))
+    return msvcrt.getwch()

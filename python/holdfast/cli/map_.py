@@ -1,0 +1,262 @@
+"""`holdfast map`: which addresses a device has."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast import mapping
+from holdfast.cli import device, places, showing
+from holdfast.cli.progress import bar
+from holdfast.errors import ModbusError
+from holdfast.mapping import Survey
+from holdfast.types import AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.mapping import AreaMap, Failure
+    from holdfast.types import Area
+
+BLOCKS = "▁▂▃▄▅▆▇█"
+NOTHING = "·"
+ASCII = ("-" * 7 + "#", ".")
+"""The same where only ASCII can be shown."""
+
+WIDEST = 100
+
+
+def _areas(text: str) -> tuple[Area, ...]:
+    return places.areas_of(text)
+
+
+def _span(text: str) -> range:
+    first, dash, last = text.partition("-")
+    numbers = places.number(first), places.number(last if dash else first)
+    if None in numbers or not 0 <= (numbers[0] or 0) <= (numbers[1] or 0) <= places.LAST:
+        raise click.BadParameter(f"{text!r} is not FIRST-LAST, as 0-999, up to {places.LAST}.")
+    return range(numbers[0] or 0, (numbers[1] or 0) + 1)
+
+
+@click.command("map", epilog="Example: holdfast map tcp://192.168.0.10 --areas hr,ir")
+@device.url_argument
+@click.option("--areas", type=_areas, metavar="AREA,...", help="Only these.  [default: all four]")
+@click.option("--exact", is_flag=True, help="Read every address, not samples.")
+@click.option(
+    "--max-quantity",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Read at most N bits or registers at once.",
+)
+@click.option(
+    "--step",
+    type=click.IntRange(1),
+    default=mapping.STEP,
+    show_default=True,
+    metavar="N",
+    help="Addresses from sample to sample.",
+)
+@click.option(
+    "--range",
+    "span",
+    type=_span,
+    default="0-65535",
+    show_default=True,
+    metavar="FIRST-LAST",
+    help="Only these addresses.",
+)
+@device.device_options
+@device.json_option
+def map_(
+    url: str,
+    areas: tuple[Area, ...] | None,
+    exact: bool,
+    max_quantity: int | None,
+    step: int,
+    span: range,
+    unit: int,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    """Find out which addresses the device at URL has, by reading; nothing is written.
+
+    An address that is answered with exception 02 is outside. Other exceptions, silence and replies
+    that are none are told apart.
+
+    Without --exact, it reads samples: every 256th address (--step) and some where devices like to
+    begin, and follows the range around each that is there to both ends. All addresses that are
+    shown have been read, and holes in them are found. Missed is a range that lies between two
+    samples. This takes some hundred requests an area, more for large ranges.
+
+    With --exact, it reads every address: in blocks where there are any, halved where a block fails,
+    and one by one where there are none. Nothing is missed, but each address that the device does
+    not have takes a request, up to 65536 an area: minutes over TCP, hours on a serial line. --range
+    and --areas make it shorter.
+
+    Exit codes: 0 done, 1 the device did not answer or it was interrupted, 2 wrong usage.
+    """
+    survey = Survey(areas or AREAS, exact=exact, max_quantity=max_quantity, step=step, span=span)
+    began = time.monotonic()
+    why = None
+    with device.connect(url, unit, timeout) as client:
+        try:
+            with bar("Mapping", survey.total, lambda: _requests(survey)) as advance:
+                mapping.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
+        except ModbusError as error:
+            why = str(error)
+        except KeyboardInterrupt:
+            why = "interrupted"
+    seconds = time.monotonic() - began
+    if as_json:
+        about = {"ok": why is None, "url": url, "unit": unit}
+        click.echo(json.dumps(about | _told(survey, seconds, why), indent=2))
+    else:
+        if why is None or any(each.ranges or each.failures for each in survey.areas):
+            found = showing.counted(sum(each.addresses for each in survey.areas), "address")
+            how = "every address read" if exact else "samples read"
+            click.echo(
+                f"{url}, unit {unit}: {found}; {how}, {_requests(survey)} in {seconds:.1f} s\n"
+            )
+            click.echo("\n".join([*_picture(survey), "", *_ranges(survey), *_others(survey)]))
+        if why is not None:
+            click.echo(f"holdfast: {url}: {why}", err=True)
+    if why is not None:
+        sys.exit(device.FAILED)
+
+
+def _requests(survey: Survey) -> str:
+    return showing.counted(survey.requests, "request")
+
+
+def _picture(survey: Survey) -> list[str]:
+    """The areas one below the other, each scaled to a line."""
+    labels = [showing.words(found.area) for found in survey.areas]
+    margin = max(map(len, labels)) + 2
+    columns = min(shutil.get_terminal_size().columns, WIDEST)
+    cells = max(8, min(columns - margin - 1, len(survey.span)))
+    lines = [
+        f"{label:{margin}}{_line(found, survey.span, cells)}"
+        for label, found in zip(labels, survey.areas, strict=True)
+    ]
+    scale = ""
+    for quarter in range(4):
+        at = cells * quarter // 4
+        scale = f"{scale:{at}}{_bounds(survey.span, cells, at)[0]}"
+    last = str(survey.span.stop - 1)
+    scale = f"{scale:{cells - len(last)}}{last}" if len(scale) < cells - len(last) else scale
+    return [*lines, " " * margin + scale]
+
+
+def _line(found: AreaMap, span: range, cells: int) -> str:
+    """An area: the more of a cell's addresses are there, the higher its block."""
+    blocks, nothing = (BLOCKS, NOTHING) if showing.fits(BLOCKS + NOTHING) else ASCII
+    there = _counts(found.ranges, span, cells)
+    failed = _counts((each for some in found.failures.values() for each in some), span, cells)
+    line = []
+    for cell in range(cells):
+        first, stop = _bounds(span, cells, cell)
+        if there[cell]:
+            full = there[cell] == stop - first
+            level = len(blocks) - 1 if full else there[cell] * (len(blocks) - 1) // (stop - first)
+            line.append(showing.styled(blocks[level], fg="green"))
+        else:
+            line.append(showing.styled("!", fg="red") if failed[cell] else nothing)
+    return "".join(line)
+
+
+def _counts(ranges: Iterable[range], span: range, cells: int) -> list[int]:
+    """How many addresses of ranges are in each cell."""
+    counts = [0] * cells
+    for each in ranges:
+        cell = (each.start - span.start) * cells // len(span)
+        while cell < cells:
+            first, stop = _bounds(span, cells, cell)
+            counts[cell] += max(0, min(stop, each.stop) - max(first, each.start))
+            if stop >= each.stop:
+                break
+            cell += 1
+    return counts
+
+
+def _bounds(span: range, cells: int, cell: int) -> tuple[int, int]:
+    """The first address of a cell, and that behind its last."""
+    size = len(span)
+    return span.start + -(-cell * size // cells), span.start + -(-(cell + 1) * size // cells)
+
+
+def _ranges(survey: Survey) -> list[str]:
+    rows = [
+        (found.area, str(each.start), str(each.stop - 1), str(len(each)))
+        for found in survey.areas
+        for each in found.ranges
+    ]
+    if not rows:
+        return ["No address was found."]
+    return showing.table(("area", "first", "last", "count"), rows, "<>>>")
+
+
+def _others(survey: Survey) -> list[str]:
+    """What was neither there nor outside, a line each."""
+    lines = []
+    for found in survey.areas:
+        if found.given_up is not None:
+            lines.append(f"{found.area}: {_words(survey, found.given_up)}; not looked at further")
+            continue
+        for failure, ranges in found.failures.items():
+            where = ", ".join(
+                str(each.start) if len(each) == 1 else f"{each.start}-{each.stop - 1}"
+                for each in ranges[:8]
+            )
+            more = f", and {len(ranges) - 8} more" if len(ranges) > 8 else ""
+            lines.append(f"{found.area}: {_words(survey, failure)} at {where}{more}")
+    return ["", *lines] if lines else []
+
+
+def _words(survey: Survey, failure: Failure) -> str:
+    text = survey.texts.get(failure, str(failure))
+    return showing.styled(re.sub(r"\s+", " ", text), fg="red")
+
+
+def _told(survey: Survey, seconds: float, why: str | None) -> dict[str, object]:
+    """The survey for programs."""
+    return {
+        **({} if why is None else {"detail": why}),
+        "exact": survey.exact,
+        "first": survey.span.start,
+        "last": survey.span.stop - 1,
+        "requests": survey.requests,
+        "seconds": round(seconds, 3),
+        "areas": {found.area: _area(survey, found) for found in survey.areas},
+    }
+
+
+def _area(survey: Survey, found: AreaMap) -> dict[str, object]:
+    return {
+        "ranges": _pairs(found.ranges),
+        "addresses": found.addresses,
+        "failures": [
+            {**_reason(survey, failure), "ranges": _pairs(ranges)}
+            for failure, ranges in found.failures.items()
+        ],
+        "given_up": None if found.given_up is None else _reason(survey, found.given_up),
+        "largest_read": found.largest,
+        "requests": found.requests,
+    }
+
+
+def _reason(survey: Survey, failure: Failure) -> dict[str, object]:
+    detail = {"detail": survey.texts.get(failure, str(failure))}
+    if isinstance(failure, int):
+        return {"reason": "exception", "code": failure, **detail}
+    return {"reason": failure, **detail}
+
+
+def _pairs(ranges: Iterable[range]) -> list[list[int]]:
+    """First and last address of each range."""
+    return [[each.start, each.stop - 1] for each in ranges]

@@ -1,0 +1,43 @@
+"""How far something is that takes long: a bar on standard error, if that is a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from typing import TYPE_CHECKING, TypeAlias
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from click._termui_impl import ProgressBar
+
+    Advance: TypeAlias = Callable[[int], None]
+
+BETWEEN = 0.1
+"""Seconds between two looks of the bar."""
+
+
+@contextlib.contextmanager
+def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Advance | None]:
+    """A function to be told how far it is, of `length`; `None` where nobody would see it."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    shown: ProgressBar[int] = click.progressbar(
+        length=length, label=label, file=sys.stderr, item_show_func=lambda _: note()
+    )
+    seen = 0.0
+    with shown:
+
+        def advance(at: int) -> None:
+            nonlocal seen
+            now = time.monotonic()
+            if now - seen >= BETWEEN:
+                seen = now
+                shown.update(min(at, length) - shown.pos)
+
+        yield advance
+        shown.update(length - shown.pos)

@@ -1,0 +1,315 @@
+"""`holdfast read`: values of a device, once or again and again."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from holdfast import mapping
+from holdfast.cli import device, pace, places, showing
+from holdfast.cli.typed import typed, typed_options
+from holdfast.errors import ModbusError, ModbusException
+from holdfast.types import BIT_AREAS
+from holdfast.values import ConversionError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.cli.places import Place
+    from holdfast.cli.typed import Typed
+    from holdfast.client import SyncClient
+
+BITS_A_LINE = 16
+WIDEST = 14
+"""The width of a column of typed values, where lines follow each other."""
+
+
+@click.command(
+    epilog="Example: holdfast read tcp://192.168.0.10 hr 100 4 --type float32 --order CDAB"
+)
+@device.url_argument
+@click.argument(
+    "words",
+    nargs=-1,
+    required=True,
+    metavar="AREA ADDRESS [COUNT]",
+    shell_complete=places.complete,
+)
+@typed_options
+@click.option("--count", type=click.IntRange(1, 65536), metavar="N", help="The same as COUNT.")
+@click.option(
+    "--every", type=device.seconds, metavar="SECONDS", help="Read again and again, until Ctrl-C."
+)
+@click.option(
+    "--times", type=click.IntRange(1), metavar="N", help="With --every: so many times, then end."
+)
+@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as 40001 or 4x0001.")
+@device.device_options
+@device.json_option
+def read(
+    url: str,
+    words: tuple[str, ...],
+    kind: str | None,
+    order: str,
+    encoding: str | None,
+    count: int | None,
+    every: float | None,
+    times: int | None,
+    modicon: bool,
+    unit: int,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    """Read COUNT values, 1 if not given, from ADDRESS on in AREA of the device at URL.
+
+    AREA is coils, discrete_inputs, holding_registers or input_registers; co, di, hr, ir or any
+    beginning that only one of them has will do. ADDRESS counts from 0, decimal or 0x. With
+    --modicon it is 40001, 400001 or 4x0001, which counts from 1 and names the area (0, 1, 3, 4), so
+    that AREA can be left out.
+
+    URL is tcp://host:502, udp://host:502, rtu+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200 or
+    ascii:///dev/ttyUSB0.
+
+    Exit codes: 0 read, 1 not all could be read, 2 wrong usage.
+    """
+    if times is not None and every is None:
+        raise click.UsageError("--times goes with --every.")
+    place, left = places.taken(words, modicon=modicon)
+    query = _query(place, _count(left, count), kind, order, encoding)
+    told = {"url": url, "unit": unit, **query.told()}
+    with device.connect(url, unit, timeout) as client:
+        if every is not None:
+            sys.exit(_again(client, query, told if as_json else None, every, times))
+        try:
+            raw = query.read(client)
+        except ModbusError as error:
+            device.fail(error, url, told if as_json else None, _hint(error, query))
+    if as_json:
+        click.echo(json.dumps({"ok": True, **told, **query.found(raw)}))
+    else:
+        click.echo("\n".join(query.lines(raw)))
+    if query.undecodable(raw):
+        sys.exit(device.FAILED)
+
+
+def _count(words: Sequence[str], count: int | None) -> int:
+    """The number of values that is asked for."""
+    if count is None or len(words) > 1:
+        return places.counted(words)
+    if words:
+        raise click.UsageError("COUNT and --count are the same, give one of them.")
+    return count
+
+
+def _query(place: Place, count: int, kind: str | None, order: str, encoding: str | None) -> _Query:
+    asked = typed(kind, order, encoding, place.area, count)
+    query = _Query(place, count if asked is None else asked.registers, asked)
+    if place.address + query.size > places.LAST + 1:
+        items = showing.counted(query.size, query.noun)
+        raise click.UsageError(f"{items} from {place.address} on: the last address is 65535.")
+    return query
+
+
+@dataclass(frozen=True)
+class _Query:
+    """What is read, and how it is shown."""
+
+    place: Place
+    size: int
+    """In bits or registers."""
+    typed: Typed | None
+
+    @property
+    def of_bits(self) -> bool:
+        return self.place.area in BIT_AREAS
+
+    @property
+    def noun(self) -> str:
+        return "bit" if self.of_bits else "register"
+
+    def read(self, client: SyncClient) -> list[int]:
+        return device.read_raw(client, self.place.area, self.place.address, self.size)
+
+    def told(self) -> dict[str, object]:
+        """What is asked for, for programs."""
+        told: dict[str, object] = {
+            "area": self.place.area,
+            "address": self.place.address,
+            "count": self.size,
+        }
+        if self.typed is not None:
+            told |= {"type": self.typed.element, "order": self.typed.order}
+        return told
+
+    def found(self, raw: Sequence[int]) -> dict[str, object]:
+        """What came, for programs."""
+        items: dict[str, object] = {f"{self.noun}s": list(raw)}
+        if self.typed is not None:
+            found = self.typed.decode(raw)
+            items["values"] = [
+                None if isinstance(each, ConversionError) else showing.jsonable(each)
+                for each in found
+            ]
+            wrong = {
+                index: str(each)
+                for index, each in enumerate(found)
+                if isinstance(each, ConversionError)
+            }
+            if wrong:
+                items["undecodable"] = wrong
+        return items
+
+    def undecodable(self, raw: Sequence[int]) -> bool:
+        """Whether there is something that is no value of the type."""
+        if self.typed is None:
+            return False
+        return any(isinstance(each, ConversionError) for each in self.typed.decode(raw))
+
+    def lines(self, raw: Sequence[int]) -> list[str]:
+        """What came, as a table."""
+        if self.typed is not None:
+            return self._values(raw)
+        return self._bits(raw) if self.of_bits else self._registers(raw)
+
+    def _registers(self, raw: Sequence[int]) -> list[str]:
+        rows = [
+            (str(self.place.address + index), str(each), f"0x{each:04X}", _binary(each))
+            for index, each in enumerate(raw)
+        ]
+        return showing.table(("address", "decimal", "hex", "binary"), rows, ">>>>")
+
+    def _bits(self, raw: Sequence[int]) -> list[str]:
+        width = min(BITS_A_LINE, len(raw))
+        head = ["address", *(f"+{offset}" for offset in range(width))]
+        rows = []
+        for start in range(0, len(raw), width):
+            bits = [str(int(bit)) for bit in raw[start : start + width]]
+            rows.append(
+                [str(self.place.address + start), *bits, *[""] * (width - len(bits))],
+            )
+        return showing.table(head, rows, ">" * (width + 1))
+
+    def _values(self, raw: Sequence[int]) -> list[str]:
+        assert self.typed is not None
+        if self.of_bits:
+            rows = [
+                (str(self.place.address + index), _said(each, "bool"))
+                for index, each in enumerate(self.typed.decode(raw))
+            ]
+            return showing.table(("address", "bool"), rows, "><")
+        lines = []
+        width = self.typed.width
+        for index, value in enumerate(self.typed.decode(raw)):
+            at = index * width
+            own = " ".join(f"{each:04X}" for each in raw[at : at + width])
+            lines.append((self._where(at, width), own, _said(value, self.typed.element)))
+        return showing.table(("address", "registers", self.typed.element), lines, ">")
+
+    def _where(self, at: int, width: int) -> str:
+        first = self.place.address + at
+        return str(first) if width == 1 else f"{first}-{first + width - 1}"
+
+    def columns(self) -> list[str]:
+        """The heads of the columns, where every reading is a line."""
+        step = 1 if self.typed is None else self.typed.width
+        return [str(self.place.address + at) for at in range(0, self.size, step)]
+
+    def cells(self, raw: Sequence[int]) -> list[str]:
+        """The columns of a reading."""
+        if self.typed is None:
+            return [str(int(each)) for each in raw]
+        return [
+            "?" if isinstance(each, ConversionError) else showing.shown(each, self.typed.element)
+            for each in self.typed.decode(raw)
+        ]
+
+
+def _again(
+    client: SyncClient,
+    query: _Query,
+    told: dict[str, object] | None,
+    every: float,
+    times: int | None,
+) -> int:
+    """Reads at every tick; the exit code. Errors are shown, and it goes on."""
+    code = 0
+    lines = _Lines(query)
+    try:
+        for _ in pace.ticks(every, times):
+            now = {"time": showing.timestamp()}
+            try:
+                raw = query.read(client)
+            except ModbusError as error:
+                code = device.FAILED
+                if told is None:
+                    lines.wrong(error)
+                else:
+                    click.echo(json.dumps(now | {"ok": False} | told | device.problem(error)))
+                continue
+            if told is None:
+                lines.reading(raw)
+            else:
+                click.echo(json.dumps(now | {"ok": True} | told | query.found(raw)))
+    except KeyboardInterrupt:
+        if told is None and sys.stdout.isatty():
+            click.echo()
+    return code
+
+
+class _Lines:
+    """Every reading a line, what has changed highlighted."""
+
+    def __init__(self, query: _Query) -> None:
+        self._query = query
+        self._before: list[str] = []
+        self._widths: list[int] = []
+
+    def reading(self, raw: Sequence[int]) -> None:
+        """The line of a reading; before the first, the heads."""
+        cells = self._query.cells(raw)
+        if not self._widths:
+            self._begin(cells)
+        before = self._before or cells
+        columns = [
+            showing.styled(text, fg="yellow", bold=True) if cell != was else text
+            for cell, was, text in zip(cells, before, self._filled(cells), strict=True)
+        ]
+        self._before = cells
+        click.echo("  ".join([showing.clock(), *columns]).rstrip())
+
+    def wrong(self, error: ModbusError) -> None:
+        """The line of a reading that failed."""
+        click.echo(f"{showing.clock()}  {showing.styled(str(error), fg='red')}")
+
+    def _begin(self, cells: Sequence[str]) -> None:
+        heads = self._query.columns()
+        least = 1 if self._query.of_bits else 5 if self._query.typed is None else WIDEST
+        self._widths = [
+            max(least, len(head), len(cell)) for head, cell in zip(heads, cells, strict=True)
+        ]
+        filled = self._filled(heads)
+        click.echo(showing.styled("  ".join([f"{'time':<12}", *filled]).rstrip(), bold=True))
+
+    def _filled(self, cells: Sequence[str]) -> list[str]:
+        return [cell.rjust(width) for cell, width in zip(cells, self._widths, strict=True)]
+
+
+def _hint(error: ModbusError, query: _Query) -> str | None:
+    if isinstance(error, ModbusException) and error.code == mapping.OUTSIDE:
+        return places.modicon_hint(query.place)
+    return None
+
+
+def _binary(register: int) -> str:
+    text = f"{register:016b}"
+    return " ".join(text[at : at + 4] for at in range(0, 16, 4))
+
+
+def _said(value: Any, kind: str) -> str:
+    if isinstance(value, ConversionError):
+        return showing.styled(f"? {value}", fg="red")
+    return showing.shown(value, kind)

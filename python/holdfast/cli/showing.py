@@ -1,0 +1,102 @@
+"""What people see: aligned tables, colour where it is wanted, text that can do no harm."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import os
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from holdfast import logs
+from holdfast.guessing import shortest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+
+def styled(text: str, **style: Any) -> str:
+    """Text with colour, unless NO_COLOR is set; off a terminal `click.echo` removes it."""
+    return text if os.environ.get("NO_COLOR") else click.style(text, **style)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> list[str]:
+    """Lines with aligned columns, the head first; a letter of `align` each, `>` is to the right."""
+    cells = [list(head), *map(list, rows)]
+    widths = [max(len(click.unstyle(row[at])) for row in cells) for at in range(len(head))]
+    sides = align.ljust(len(head), "<")
+    lines = [
+        "  ".join(_filled(*each) for each in zip(row, widths, sides, strict=True)).rstrip()
+        for row in cells
+    ]
+    return [styled(lines[0], bold=True), *lines[1:]]
+
+
+def _filled(text: str, width: int, side: str) -> str:
+    space = " " * (width - len(click.unstyle(text)))
+    return space + text if side == ">" else text + space
+
+
+def counted(count: int, noun: str) -> str:
+    """`1 register`, `2 registers`, `2 addresses`."""
+    return f"{count} {noun}{'' if count == 1 else 'es' if noun.endswith('s') else 's'}"
+
+
+def words(area: str) -> str:
+    """The name of an area, or of a key, for people."""
+    return area.replace("_", " ")
+
+
+def plain(text: str) -> str:
+    """Text from outside, with nothing in it that a terminal acts upon."""
+    return "".join(letter if letter.isprintable() else _escaped(letter) for letter in text)
+
+
+def _escaped(letter: str) -> str:
+    code = ord(letter)
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
+def shown(value: Any, kind: str) -> str:
+    """A typed value for people."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return shortest(value, kind)
+    if isinstance(value, bytes):
+        return value.hex(" ")
+    if isinstance(value, str):
+        return plain(json.dumps(value, ensure_ascii=False))
+    return str(value)
+
+
+def jsonable(value: Any) -> Any:
+    """A typed value for programs: bytes in hex, and `None` for what JSON has no number for."""
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def fits(text: str) -> bool:
+    """Whether standard output can show these letters."""
+    try:
+        text.encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
+
+
+def clock() -> str:
+    """The time of day, for people."""
+    return datetime.datetime.now().strftime("%H:%M:%S.%f")[:-3]
+
+
+def timestamp() -> str:
+    """The time, for programs."""
+    return logs.timestamp(time.time())

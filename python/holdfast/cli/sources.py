@@ -1,0 +1,230 @@
+"""Where `holdfast watch` reads: a device, or the memories of an appliance that runs."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import ipaddress
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+from urllib.parse import urlencode
+
+from holdfast.cli.device import read_raw
+from holdfast.config import ModbusTcpListener
+from holdfast.types import AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.client import SyncClient
+    from holdfast.config import Config
+    from holdfast.config.addresses import Bind
+    from holdfast.types import Area
+
+MOST = 8192
+"""Addresses that are watched at most: more nobody can look at, and reading them takes long."""
+
+READ_FUNCTIONS: dict[Area, int] = dict(zip(AREAS, (1, 2, 3, 4), strict=True))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A range of addresses that is watched."""
+
+    memory: str | None
+    """Its memory; a device has none."""
+    unit: int
+    """The unit id that a device, or a listener, knows it by."""
+    area: Area
+    address: int
+    count: int
+
+
+class Unreadable(Exception):
+    """The source answered that it would not, in words."""
+
+
+class Unwatchable(Exception):
+    """A configuration whose appliance can't be watched, and why."""
+
+
+class Source(Protocol):
+    """What is watched. `read` raises `ModbusError`, `Unreadable` or `OSError`."""
+
+    where: str
+    blocks: list[Block]
+
+    def read(self) -> list[list[int]]:
+        """The values of each block."""
+
+    def close(self) -> None:
+        """Ends the connection."""
+
+
+class Device:
+    """Blocks of a device, read over Modbus."""
+
+    def __init__(self, where: str, client: SyncClient, blocks: Sequence[Block]) -> None:
+        self.where = where
+        self.blocks = list(blocks)
+        self._client = client
+
+    def read(self) -> list[list[int]]:
+        """The values of each block."""
+        return [
+            read_raw(self._client, block.area, block.address, block.count, unit=block.unit)
+            for block in self.blocks
+        ]
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._client.close()
+
+
+class Rest:
+    """Blocks of memories, read over the REST interface of an appliance."""
+
+    def __init__(
+        self, bind: Bind, blocks: Sequence[Block], token: str | None, timeout: float
+    ) -> None:
+        self.where = f"REST at http://{_shown(bind)}"
+        self.blocks = list(blocks)
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._connection = http.client.HTTPConnection(reachable(bind), bind.port, timeout=timeout)
+
+    def read(self) -> list[list[int]]:
+        """The values of each block."""
+        try:
+            return [self._values(block) for block in self.blocks]
+        except (OSError, http.client.HTTPException, ValueError, KeyError) as error:
+            self.close()
+            if isinstance(error, OSError):
+                raise
+            raise Unreadable(f"not an answer of REST: {error!r}") from error
+
+    def _values(self, block: Block) -> list[int]:
+        query = {
+            "memory": block.memory,
+            "area": block.area,
+            "address": block.address,
+            "count": block.count,
+        }
+        self._connection.request(
+            "GET", f"/api/v1/memory/read?{urlencode(query)}", headers=self._headers
+        )
+        response = self._connection.getresponse()
+        answer = json.loads(response.read())
+        if response.status != http.client.OK:
+            raise Unreadable(f"{response.status} {answer['reason']}: {answer.get('detail', '')}")
+        values: list[int] = answer["values"]
+        return values
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._connection.close()
+
+
+def by_rest(config: Config, token: str | None) -> list[Block]:
+    """The memories that a token lets one read. Raises `Unwatchable`."""
+    rest = config.rest
+    assert rest is not None
+    _check_port("rest", rest.bind)
+    memories, areas = set(config.memories), set(AREAS)
+    if rest.tokens != "none":
+        if token is None:
+            raise Unwatchable("rest asks for a token; give it in HOLDFAST_TOKEN")
+        digest = hashlib.sha256(token.encode()).hexdigest()
+        granted = [each for each in rest.tokens if each.sha256.lower() == digest]
+        if not granted:
+            raise Unwatchable("rest knows no token like that in HOLDFAST_TOKEN")
+        memories, areas = set(granted[0].memories), set(granted[0].areas)
+    return [
+        block
+        for name in config.memories
+        if name in memories
+        for block in _areas(config, name, 0)
+        if block.area in areas
+    ]
+
+
+def by_modbus(config: Config) -> tuple[str, Bind, list[Block]]:
+    """The first Modbus TCP listener, and the memories that it shows. Raises `Unwatchable`."""
+    found = [
+        (name, listener)
+        for name, listener in config.listeners.items()
+        if isinstance(listener, ModbusTcpListener)
+    ]
+    if not found:
+        raise Unwatchable("there is neither rest nor a listener of type modbus-tcp")
+    name, listener = found[0]
+    _check_port(f"listener {name}", listener.bind)
+    host = ipaddress.ip_address(reachable(listener.bind))
+    rules = [rule for rule in listener.rules if any(host in source for source in rule.sources)]
+    if not rules:
+        raise Unwatchable(f"no rule of listener {name} lets {host} in")
+    rule = rules[0]
+    blocks: list[Block] = []
+    seen: set[str] = set()
+    for unit, memory in rule.units.items():
+        if memory not in seen:
+            seen.add(memory)
+            blocks += [
+                block
+                for block in _areas(config, memory, unit)
+                if _may_read(block.area, rule.functions, rule.deny)
+            ]
+    return name, listener.bind, blocks
+
+
+def within(blocks: Sequence[Block], area: Area, address: int, count: int) -> list[Block]:
+    """What of blocks is in a range of an area."""
+    found = []
+    for block in blocks:
+        first = max(block.address, address)
+        end = min(block.address + block.count, address + count)
+        if block.area == area and first < end:
+            found.append(Block(block.memory, block.unit, area, first, end - first))
+    return found
+
+
+def cut(blocks: Sequence[Block], most: int = MOST) -> tuple[list[Block], int]:
+    """The first blocks that together have no more than `most` addresses; how many were cut off."""
+    left, kept = most, []
+    for block in blocks:
+        count = min(block.count, left)
+        if count:
+            kept.append(Block(block.memory, block.unit, block.area, block.address, count))
+        left -= count
+    total = sum(block.count for block in blocks)
+    return kept, total - sum(block.count for block in kept)
+
+
+def reachable(bind: Bind) -> str:
+    """The address that a client on this machine connects to."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(bind.host, bind.host)
+
+
+def url_of(bind: Bind) -> str:
+    """The URL of a listener, for a client on this machine."""
+    return f"tcp://{_shown(bind)}"
+
+
+def _shown(bind: Bind) -> str:
+    host = reachable(bind)
+    return f"[{host}]:{bind.port}" if ":" in host else f"{host}:{bind.port}"
+
+
+def _check_port(what: str, bind: Bind) -> None:
+    if bind.port == 0:
+        raise Unwatchable(f"{what} is bound to port 0, so that its port is not known")
+
+
+def _areas(config: Config, memory: str, unit: int) -> list[Block]:
+    spans = [(area, getattr(config.memories[memory], area)) for area in AREAS]
+    return [Block(memory, unit, area, span.start, span.size) for area, span in spans if span]
+
+
+def _may_read(area: Area, functions: Sequence[int] | None, deny: Sequence[int] | None) -> bool:
+    function = READ_FUNCTIONS[area]
+    return (functions is None or function in functions) and function not in (deny or ())

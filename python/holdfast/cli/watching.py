@@ -1,0 +1,117 @@
+"""What has changed from one reading to the next, when, and how fast."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from holdfast.types import BIT_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.cli.sources import Block
+
+WINDOW = 10.0
+"""Seconds that a rate is taken over."""
+
+LONGEST = 64
+"""Changes of an address that a rate is taken from."""
+
+
+@dataclass
+class History:
+    """The changes of an address."""
+
+    changes: int = 0
+    last: float = 0.0
+    """When it changed last."""
+    reading: int = 0
+    """In which reading that was."""
+    steps: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LONGEST))
+    """When it changed, and by how much."""
+    since: float = 0.0
+    """When the first of these steps began."""
+
+    def rate(self, now: float) -> float:
+        """How much it changes in a second, over the last time; 0 when it has ceased to."""
+        if now - self.last > WINDOW or now <= self.since:
+            return 0.0
+        return sum(step for _, step in self.steps) / (now - self.since)
+
+
+@dataclass(frozen=True)
+class Change:
+    """An address that has another value than before."""
+
+    block: Block
+    address: int
+    was: int
+    now: int
+
+
+class Tracker:
+    """Compares readings of blocks."""
+
+    def __init__(self, blocks: Sequence[Block]) -> None:
+        self.blocks = blocks
+        self.values: list[list[int]] = []
+        """The last reading of each block."""
+        self.readings = 0
+        self.histories: dict[tuple[int, int], History] = {}
+        """By the index of the block and the address, of those that ever changed."""
+        self.at = 0.0
+        """When the last reading was."""
+
+    def update(self, moment: float, values: Sequence[Sequence[int]]) -> list[Change]:
+        """Takes a reading; what is not as it was in the last."""
+        self.readings += 1
+        changes = []
+        for index, (block, now) in enumerate(zip(self.blocks, values, strict=True)):
+            if not self.values or self.values[index] == now:
+                continue
+            pairs = enumerate(zip(self.values[index], now, strict=True), block.address)
+            for address, (was, value) in pairs:
+                if was != value:
+                    self._note(index, address, moment, _step(block, was, value))
+                    changes.append(Change(block, address, int(was), int(value)))
+        self.values = [list(each) for each in values]
+        self.at = moment
+        return changes
+
+    def age(self, index: int, address: int) -> int | None:
+        """How many readings ago an address of a block changed; `None` if never."""
+        history = self.histories.get((index, address))
+        return None if history is None else self.readings - history.reading
+
+    def latest(self, most: int) -> list[tuple[Block, int, int, History]]:
+        """Block, address, value and history of what changed last, in order of addresses."""
+        places = sorted(self.histories, key=lambda place: -self.histories[place].reading)
+        found = []
+        for index, address in sorted(places[:most]):
+            block = self.blocks[index]
+            value = int(self.values[index][address - block.address])
+            found.append((block, address, value, self.histories[index, address]))
+        return found
+
+    def _note(self, index: int, address: int, moment: float, step: int) -> None:
+        history = self.histories.setdefault((index, address), History())
+        if not history.steps or moment - history.last > WINDOW:
+            history.steps.clear()
+            history.since = self.at
+        elif len(history.steps) == LONGEST:
+            history.since = history.steps[0][0]
+        while history.steps and moment - history.steps[0][0] > WINDOW:
+            history.since, _ = history.steps.popleft()
+        history.steps.append((moment, step))
+        history.changes += 1
+        history.last = moment
+        history.reading = self.readings
+
+
+def _step(block: Block, was: int, now: int) -> int:
+    """By how much a register changed, round the corner if that is nearer; 1 for a bit."""
+    if block.area in BIT_AREAS:
+        return 1
+    return (now - was + 0x8000) % 0x10000 - 0x8000

@@ -1,0 +1,228 @@
+"""`holdfast write`: values into coils and holding registers of a device."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from holdfast import operations, values
+from holdfast.cli import device, places, showing
+from holdfast.cli.typed import typed, typed_options
+from holdfast.errors import ModbusError, ModbusException
+from holdfast.types import BIT_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast._core import Request
+    from holdfast.cli.places import Place
+    from holdfast.cli.typed import Typed
+    from holdfast.client import SyncClient
+
+TRUTHS = {"true": True, "on": True, "1": True, "false": False, "off": False, "0": False}
+WHOLE = re.compile(r"([+-]?)(0[xX][0-9a-fA-F]{1,20}|[0-9]{1,20})")
+NEGATIVE = re.compile(r"-(\.?[0-9]|inf|nan)", re.I)
+
+
+@click.command(
+    epilog="Example: holdfast write tcp://192.168.0.10 hr 100 21.5 --type float32 --order CDAB",
+    # So that -5 is a value, and no option.
+    context_settings={"ignore_unknown_options": True},
+)
+@device.url_argument
+@click.argument(
+    "words",
+    nargs=-1,
+    required=True,
+    metavar="AREA ADDRESS VALUE...",
+    shell_complete=places.complete,
+)
+@typed_options
+@click.option("--split", is_flag=True, help="Use several requests for what one can't hold.")
+@click.option("--verify", is_flag=True, help="Read back, and compare.")
+@click.option("--dry-run", is_flag=True, help="Print the requests (PDU) in hex and send nothing.")
+@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as 40001 or 4x0001.")
+@device.device_options
+@device.json_option
+def write(
+    url: str,
+    words: tuple[str, ...],
+    kind: str | None,
+    order: str,
+    encoding: str | None,
+    split: bool,
+    verify: bool,
+    dry_run: bool,
+    modicon: bool,
+    unit: int,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    """Write VALUEs to AREA of the device at URL, from ADDRESS on.
+
+    AREA is coils or holding_registers; co, hr or any beginning will do. ADDRESS counts from 0,
+    decimal or 0x. With --modicon it is 40001, 400001 or 4x0001, which counts from 1 and names the
+    area, so that AREA can be left out.
+
+    Values of coils are true, false, on, off, 1, 0; those of registers 0 to 65535, decimal or 0x.
+    With --type they are what the type holds: text for a string, hex for bytes. One bit of a
+    register (bit:N) is written by function 22, which leaves the others as they are.
+
+    One coil or register is written by function 5 or 6, more by 15 or 16.
+
+    Exit codes: 0 written, 1 not written, not known to be or not read back alike, 2 wrong usage.
+    """
+    place, left = places.taken(words, modicon=modicon)
+    for word in left:
+        if word.startswith("--") or (word.startswith("-") and not NEGATIVE.match(word)):
+            raise click.NoSuchOption(word)
+    if place.area not in operations.WRITE_LIMITS:
+        raise click.UsageError(f"{place.area} can't be written, only read.")
+    if not left:
+        raise click.UsageError("Missing argument 'VALUE...'.")
+    job = _job(place, left, kind, order, encoding, split)
+    told: dict[str, object] = {"url": url, "unit": unit, **job.told()}
+    if dry_run:
+        pdus = [request.pdu.hex() for request in job.requests]
+        click.echo(json.dumps({"requests": pdus}) if as_json else "\n".join(pdus))
+        return
+    differing: dict[int, tuple[int, int]] = {}
+    with device.connect(url, unit, timeout) as client:
+        try:
+            job.write(client)
+        except ModbusError as error:
+            refused = isinstance(error, ModbusException) and len(job.requests) == 1
+            device.fail(error, url, told | {"maybe_written": not refused} if as_json else None)
+        try:
+            differing = job.differing(client) if verify else {}
+        except ModbusError as error:
+            if not as_json:
+                click.echo(f"{job.said}; could not be read back", err=True)
+            device.fail(error, url, told | {"maybe_written": True} if as_json else None)
+    if as_json:
+        verified = {"verified": not differing} if verify else {}
+        click.echo(json.dumps({"ok": not differing, **told, **verified}))
+    else:
+        click.echo(job.said + ("" if not verify or differing else "; read back alike") + ".")
+        for address, (was, now) in differing.items():
+            click.echo(f"holdfast: {place.area} {address}: wrote {was}, read back {now}", err=True)
+    if differing:
+        sys.exit(device.FAILED)
+
+
+def _job(
+    place: Place,
+    words: Sequence[str],
+    kind: str | None,
+    order: str,
+    encoding: str | None,
+    split: bool,
+) -> _Job:
+    """What is to be written, checked. Raises `click.UsageError`."""
+    asked = typed(kind, order, encoding, place.area, 1)
+    if asked is None:
+        own = "bool" if place.area in BIT_AREAS else "uint16"
+        asked = typed(own, "ABCD", None, place.area, len(words))
+        assert asked is not None
+    elif kind == asked.element:
+        asked = typed(f"{kind}[{len(words)}]", order, encoding, place.area, 1) or asked
+    if len(words) != asked.count:
+        takes = showing.counted(asked.count, "value")
+        raise click.UsageError(f"{kind} takes {takes}, found {len(words)}.")
+    found = [_value(word, asked.element) for word in words]
+    try:
+        if asked.element.startswith("bit:") and len(found) > 1:
+            raise ValueError(f"{asked.element} takes one value, found {len(found)}")
+        value = found[0] if asked.count == 1 else found
+        name = asked.element if asked.count == 1 else f"{asked.element}[{asked.count}]"
+        steps = operations.write_typed(
+            place.area, place.address, value, name, order, encoding, split=split
+        )
+        return _Job(place, asked, value, split, list(steps))
+    except ValueError as error:
+        raise click.UsageError(f"{error}.".replace("split=True", "--split")) from error
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is written where, and the requests that do it."""
+
+    place: Place
+    typed: Typed
+    value: Any
+    split: bool
+    requests: list[Request]
+
+    @property
+    def said(self) -> str:
+        """What was done, for people."""
+        first, count = self.place.address, self.typed.registers
+        where = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
+        return (
+            f"Written: {self.place.area} {where}, {showing.counted(len(self.requests), 'request')}"
+        )
+
+    def told(self) -> dict[str, object]:
+        """What was asked for, for programs."""
+        return {
+            "area": self.place.area,
+            "address": self.place.address,
+            "count": self.typed.registers,
+        }
+
+    def write(self, client: SyncClient) -> None:
+        """Writes it."""
+        place, kind = self.place, self.typed
+        name = kind.element if kind.count == 1 else f"{kind.element}[{kind.count}]"
+        client.write(
+            place.area,
+            place.address,
+            self.value,
+            name,
+            kind.order,
+            encoding=kind.encoding,
+            split=self.split,
+        )
+
+    def differing(self, client: SyncClient) -> dict[int, tuple[int, int]]:
+        """What was written and what is there now, where that is not the same, by address."""
+        place, kind = self.place, self.typed
+        now = device.read_raw(client, place.area, place.address, kind.registers)
+        if kind.element.startswith("bit:"):
+            [mask] = values.encode(self.value, kind.element, kind.order)
+            wrote = [now[0] | mask if self.value else now[0] & mask]
+        else:
+            name = kind.element if kind.count == 1 else f"{kind.element}[{kind.count}]"
+            wrote = values.encode(self.value, name, kind.order, encoding=kind.encoding)
+        pairs = enumerate(zip(wrote, now, strict=True), place.address)
+        return {address: (int(a), int(b)) for address, (a, b) in pairs if a != b}
+
+
+def _value(text: str, kind: str) -> Any:
+    """A value of a type, as it is written on a command line."""
+    base = kind.partition(":")[0].rstrip("0123456789")
+    if base == "string":
+        return text
+    if base in ("bool", "bit"):
+        if text.lower() not in TRUTHS:
+            raise click.UsageError(f"{text!r} is not true, false, on, off, 1 or 0.")
+        return TRUTHS[text.lower()]
+    if base == "bytes":
+        try:
+            return bytes.fromhex(text.removeprefix("0x"))
+        except ValueError:
+            raise click.UsageError(f"{text!r} is not pairs of hex digits.") from None
+    if base == "float":
+        try:
+            return float(text)
+        except ValueError:
+            raise click.UsageError(f"{text!r} is no number.") from None
+    match = WHOLE.fullmatch(text)
+    if match is None:
+        raise click.UsageError(f"{text!r} is no integer, decimal or 0x; others need --type.")
+    return int(match[1] + match[2], 0 if match[2][:2] in ("0x", "0X") else 10)
