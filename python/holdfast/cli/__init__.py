@@ -13,12 +13,20 @@ import click
 from holdfast import __version__
 
 COMMANDS = {
+    "bench": "holdfast.cli.bench:bench",
     "check": "holdfast.cli.check:check",
+    "completion": "holdfast.cli.completion:completion",
+    "guess": "holdfast.cli.guess:guess",
+    "identify": "holdfast.cli.identify:identify",
     "import": "holdfast.cli.import_:import_",
+    "map": "holdfast.cli.map_:map_",
     "raw-send": "holdfast.cli.raw_send:raw_send",
+    "read": "holdfast.cli.read:read",
     "run": "holdfast.cli.run:run",
     "schema": "holdfast.cli.schema:schema",
     "token": "holdfast.cli.token:token",
+    "watch": "holdfast.cli.watch:watch",
+    "write": "holdfast.cli.write:write",
 }
 
 
