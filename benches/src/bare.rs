@@ -8,9 +8,8 @@ use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream};
 
-use lexopt::ValueExt;
-
-use crate::{Failure, Poller};
+use crate::poller::Poller;
+use crate::{Failure, options, unhex};
 
 const LISTENER: usize = usize::MAX;
 
@@ -24,18 +23,16 @@ struct Peer {
 }
 
 /// `--request-len N --reply HEX`: answers every N bytes with the reply, until it is killed.
-pub fn main() -> Result<(), Failure> {
+pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
     let (mut request_len, mut reply) = (12, Vec::new());
-    let mut arguments = lexopt::Parser::from_env();
-    while let Some(argument) = arguments.next()? {
-        match argument {
-            lexopt::Arg::Long("request-len") => {
-                request_len = arguments.value()?.string()?.parse()?
-            }
-            lexopt::Arg::Long("reply") => reply = unhex(&arguments.value()?.string()?)?,
-            other => return Err(other.unexpected().into()),
+    options(arguments, |name, value| {
+        match name {
+            "request-len" => request_len = value.parse()?,
+            "reply" => reply = unhex(&value)?,
+            _ => return Ok(false),
         }
-    }
+        Ok(true)
+    })?;
     let replies = reply.repeat(INPUT / request_len + 1);
     let listener = TcpListener::bind("127.0.0.1:0")?;
     println!("listening {}", listener.local_addr()?);
@@ -86,12 +83,4 @@ fn serve(
             next += 1;
         }
     }
-}
-
-fn unhex(text: &str) -> Result<Vec<u8>, Failure> {
-    if !text.is_ascii() || !text.len().is_multiple_of(2) {
-        return Err(format!("not hexadecimal: {text}").into());
-    }
-    let pairs = (0..text.len()).step_by(2);
-    Ok(pairs.map(|at| u8::from_str_radix(&text[at..at + 2], 16)).collect::<Result<_, _>>()?)
 }

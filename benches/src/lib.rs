@@ -1,58 +1,71 @@
-//! What servers are measured with: a closed-loop load, and a loop that shows the limit.
+//! What servers are measured with: loads, and loops that show the limit.
 //!
-//! Both are one thread over epoll and make one read and one write a connection and wake-up, so that
-//! what differs between two runs is the server.
+//! A load and the loop that it is compared with make the same system calls a request where they
+//! can, so that what differs between two runs is the server.
 
 #![forbid(unsafe_code)]
 #![cfg(target_os = "linux")]
 
-pub mod bare;
-pub mod load;
+mod bare;
+mod bare_once;
+mod flood;
+mod load;
+mod load_once;
+mod outcome;
+mod polite;
+mod poller;
+mod post;
 
-use std::io;
-use std::os::fd::{AsFd, OwnedFd};
 use std::time::Duration;
 
-use rustix::event::{Timespec, epoll};
+use lexopt::ValueExt;
 
 /// Something went wrong that makes a measurement worthless.
 pub type Failure = Box<dyn std::error::Error>;
 
-/// Level-triggered readiness to read, by number.
-struct Poller {
-    epoll: OwnedFd,
-    events: Vec<epoll::Event>,
+/// A server that is silent for so long fails the run.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Runs the load or the loop that the first argument names; the others are its options.
+pub fn main() -> Result<(), Failure> {
+    let mut arguments = lexopt::Parser::from_env();
+    match arguments.value()?.string()?.as_str() {
+        "bare" => bare::main(arguments),
+        "bare-once" => bare_once::main(arguments),
+        "flood" => flood::main(arguments),
+        "load" => load::main(arguments),
+        "load-once" => load_once::main(arguments),
+        "polite" => polite::main(arguments),
+        "post" => post::main(arguments),
+        other => Err(format!("no load or loop {other}").into()),
+    }
 }
 
-impl Poller {
-    fn new() -> io::Result<Poller> {
-        let epoll = epoll::create(epoll::CreateFlags::CLOEXEC)?;
-        Ok(Poller { epoll, events: Vec::with_capacity(256) })
-    }
-
-    fn add(&self, source: impl AsFd, number: usize) -> io::Result<()> {
-        let data = epoll::EventData::new_u64(number as u64);
-        Ok(epoll::add(&self.epoll, source, data, epoll::EventFlags::IN)?)
-    }
-
-    /// Waits until something can be read, and says what: nothing, when `patience` ends first.
-    fn wait(
-        &mut self,
-        patience: Option<Duration>,
-    ) -> io::Result<impl ExactSizeIterator<Item = usize> + '_> {
-        self.events.clear();
-        let patience = patience.map(|patience| Timespec {
-            tv_sec: patience.as_secs().try_into().unwrap_or(i64::MAX),
-            tv_nsec: patience.subsec_nanos().into(),
-        });
-        loop {
-            let room = rustix::buffer::spare_capacity(&mut self.events);
-            match epoll::wait(&self.epoll, room, patience.as_ref()) {
-                Ok(_) => break,
-                Err(rustix::io::Errno::INTR) => {}
-                Err(error) => return Err(error.into()),
-            }
+/// Hands each option to `set`, which says whether there is one of that name.
+fn options(
+    mut arguments: lexopt::Parser,
+    mut set: impl FnMut(&str, String) -> Result<bool, Failure>,
+) -> Result<(), Failure> {
+    while let Some(argument) = arguments.next()? {
+        let lexopt::Arg::Long(name) = argument else {
+            return Err(argument.unexpected().into());
+        };
+        let name = name.to_owned();
+        if !set(&name, arguments.value()?.string()?)? {
+            return Err(format!("unknown option --{name}").into());
         }
-        Ok(self.events.iter().map(|event| event.data.u64() as usize))
     }
+    Ok(())
+}
+
+fn seconds(text: &str) -> Result<Duration, Failure> {
+    Ok(Duration::try_from_secs_f64(text.parse()?)?)
+}
+
+fn unhex(text: &str) -> Result<Vec<u8>, Failure> {
+    if !text.is_ascii() || !text.len().is_multiple_of(2) {
+        return Err(format!("not hexadecimal: {text}").into());
+    }
+    let pairs = (0..text.len()).step_by(2);
+    Ok(pairs.map(|at| u8::from_str_radix(&text[at..at + 2], 16)).collect::<Result<_, _>>()?)
 }

@@ -7,21 +7,17 @@
 use std::collections::VecDeque;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use hdrhistogram::Histogram;
 use holdfast_protocol::frame::mbap::{self, Next};
 use holdfast_protocol::pdu::{self, Range, Request};
-use lexopt::ValueExt;
-use rustix::time::{ClockId, clock_gettime};
 
-use crate::{Failure, Poller};
+use crate::outcome::{Outcome, Period};
+use crate::poller::Poller;
+use crate::{Failure, PATIENCE, options};
 
 /// Every request has it, so that every reply is the same.
 const TRANSACTION_ID: u16 = 0x1234;
-
-/// A server that is silent for so long fails the run.
-const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What is in flight must fit into a socket's buffers, or both sides wait for the other to read.
 const MAX_IN_FLIGHT: usize = 4096;
@@ -32,8 +28,7 @@ struct Options {
     connections: usize,
     in_flight: usize,
     quantity: u16,
-    warmup: Duration,
-    measured: Duration,
+    period: Period,
 }
 
 struct Connection {
@@ -47,12 +42,11 @@ struct Connection {
 }
 
 /// `--address A --connections C --in-flight K --request read-registers|read-coils|write-registers
-/// --quantity Q --warmup S --seconds S`: prints the rate, latencies in microseconds and its own
-/// processor time as JSON.
-pub fn main() -> Result<(), Failure> {
-    let options = parse()?;
-    let request = request(&options)?;
-    let reply = first_reply(&options, &request)?;
+/// --quantity Q --warmup S --seconds S`.
+pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
+    let options = parse(arguments)?;
+    let request = request(&options.request, options.quantity)?;
+    let reply = first_reply(options.address, &request)?;
     let mut load = Load {
         poller: Poller::new()?,
         connections: Vec::with_capacity(options.connections),
@@ -61,15 +55,13 @@ pub fn main() -> Result<(), Failure> {
         buffer: vec![0; reply.len() * options.in_flight],
         request_len: request.len(),
         reply_len: reply.len(),
-        latencies: Histogram::new_with_bounds(1, 60_000_000_000, 3)?,
-        answered: 0,
     };
     load.connect(&options)?;
-    let (cpu, start) = (cpu_seconds(), Instant::now());
-    load.run(start + options.warmup, start + options.warmup + options.measured)?;
-    let busy = (cpu_seconds() - cpu) / start.elapsed().as_secs_f64();
-    load.finish()?;
-    load.report(&options, busy);
+    let mut outcome = Outcome::new(options.period)?;
+    load.run(&mut outcome)?;
+    outcome.ended();
+    load.finish(&mut outcome)?;
+    outcome.report();
     Ok(())
 }
 
@@ -82,9 +74,6 @@ struct Load {
     buffer: Vec<u8>,
     request_len: usize,
     reply_len: usize,
-    latencies: Histogram<u64>,
-    /// Requests that got their reply, whether they count or not.
-    answered: usize,
 }
 
 impl Load {
@@ -105,8 +94,9 @@ impl Load {
         Ok(())
     }
 
-    /// Keeps the requests in flight until `end`; replies from `measure_from` on count.
-    fn run(&mut self, measure_from: Instant, end: Instant) -> Result<(), Failure> {
+    /// Keeps the requests in flight until the period ends.
+    fn run(&mut self, outcome: &mut Outcome) -> Result<(), Failure> {
+        let end = outcome.end();
         let mut now = Instant::now();
         while now < end {
             let ready = self.poller.wait(Some(PATIENCE))?;
@@ -120,20 +110,17 @@ impl Load {
                 let answered = left;
                 now = Instant::now();
                 while let Some((sent, count)) = connection.take(&mut left) {
-                    if now >= measure_from && now < end {
-                        self.latencies.record_n((now - sent).as_nanos() as u64, count as u64)?;
-                    }
+                    outcome.record(sent, now, count)?;
                 }
                 let requests = &self.requests[..answered * self.request_len];
                 connection.send(requests, answered, now)?;
-                self.answered += answered;
             }
         }
         Ok(())
     }
 
     /// Waits for the replies that are still to come.
-    fn finish(&mut self) -> Result<(), Failure> {
+    fn finish(&mut self, outcome: &mut Outcome) -> Result<(), Failure> {
         let deadline = Instant::now() + PATIENCE;
         let mut open: usize = self.connections.iter().map(|connection| connection.open).sum();
         while open > 0 {
@@ -147,26 +134,10 @@ impl Load {
                 let answered =
                     connection.receive(&self.replies, self.reply_len, &mut self.buffer)?;
                 open -= answered;
-                self.answered += answered;
+                outcome.late(answered);
             }
         }
         Ok(())
-    }
-
-    fn report(&self, options: &Options, busy: f64) {
-        let micros = |nanos: u64| nanos as f64 / 1e3;
-        let at = |quantile| micros(self.latencies.value_at_quantile(quantile));
-        let (requests, seconds) = (self.latencies.len(), options.measured.as_secs_f64());
-        println!(
-            r#"{{"requests": {requests}, "answered": {}, "seconds": {seconds}, "rate": {:.1}, "p50": {:.2}, "p99": {:.2}, "p999": {:.2}, "max": {:.2}, "cpu": {:.3}, "busy": {busy:.3}}}"#,
-            self.answered,
-            requests as f64 / seconds,
-            at(0.5),
-            at(0.99),
-            at(0.999),
-            micros(self.latencies.max()),
-            cpu_seconds(),
-        );
     }
 }
 
@@ -219,45 +190,37 @@ impl Connection {
     }
 }
 
-fn parse() -> Result<Options, Failure> {
-    let mut options = Options {
+fn parse(arguments: lexopt::Parser) -> Result<Options, Failure> {
+    let mut parsed = Options {
         address: SocketAddr::from(([127, 0, 0, 1], 502)),
         request: "read-registers".into(),
         connections: 1,
         in_flight: 1,
         quantity: 10,
-        warmup: Duration::from_millis(300),
-        measured: Duration::from_secs(2),
+        period: Period::DEFAULT,
     };
-    let mut arguments = lexopt::Parser::from_env();
-    while let Some(argument) = arguments.next()? {
-        let lexopt::Arg::Long(name) = argument else {
-            return Err(argument.unexpected().into());
-        };
-        let name = name.to_owned();
-        let value = arguments.value()?.string()?;
-        match name.as_str() {
-            "address" => options.address = value.parse()?,
-            "request" => options.request = value,
-            "connections" => options.connections = value.parse()?,
-            "in-flight" => options.in_flight = value.parse()?,
-            "quantity" => options.quantity = value.parse()?,
-            "warmup" => options.warmup = Duration::try_from_secs_f64(value.parse()?)?,
-            "seconds" => options.measured = Duration::try_from_secs_f64(value.parse()?)?,
-            _ => return Err(format!("unknown option --{name}").into()),
+    options(arguments, |name, value| {
+        match name {
+            "address" => parsed.address = value.parse()?,
+            "request" => parsed.request = value,
+            "connections" => parsed.connections = value.parse()?,
+            "in-flight" => parsed.in_flight = value.parse()?,
+            "quantity" => parsed.quantity = value.parse()?,
+            _ => return parsed.period.set(name, &value),
         }
-    }
-    if options.connections == 0 || !(1..=MAX_IN_FLIGHT).contains(&options.in_flight) {
+        Ok(true)
+    })?;
+    if parsed.connections == 0 || !(1..=MAX_IN_FLIGHT).contains(&parsed.in_flight) {
         return Err(format!("1 connection or more, 1 to {MAX_IN_FLIGHT} in flight").into());
     }
-    Ok(options)
+    Ok(parsed)
 }
 
 /// One frame: `quantity` items from address 0 of unit 1. What is written is 0, 1, 2, ...
-fn request(options: &Options) -> Result<Vec<u8>, Failure> {
-    let range = Range { address: 0, quantity: options.quantity };
-    let registers: Vec<u8> = (0..options.quantity).flat_map(u16::to_be_bytes).collect();
-    let request = match options.request.as_str() {
+pub(crate) fn request(kind: &str, quantity: u16) -> Result<Vec<u8>, Failure> {
+    let range = Range { address: 0, quantity };
+    let registers: Vec<u8> = (0..quantity).flat_map(u16::to_be_bytes).collect();
+    let request = match kind {
         "read-registers" => Request::ReadHoldingRegisters(range),
         "read-coils" => Request::ReadCoils(range),
         "write-registers" => Request::WriteMultipleRegisters { range, registers: &registers },
@@ -269,8 +232,8 @@ fn request(options: &Options) -> Result<Vec<u8>, Failure> {
 }
 
 /// What the server answers, which must not be an exception.
-fn first_reply(options: &Options, request: &[u8]) -> Result<Vec<u8>, Failure> {
-    let mut stream = TcpStream::connect(options.address)?;
+pub(crate) fn first_reply(address: SocketAddr, request: &[u8]) -> Result<Vec<u8>, Failure> {
+    let mut stream = TcpStream::connect(address)?;
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.write_all(request)?;
     let mut reply = [0; mbap::MAX_LEN];
@@ -292,10 +255,4 @@ fn first_reply(options: &Options, request: &[u8]) -> Result<Vec<u8>, Failure> {
         return Err("the server did not answer the request".into());
     }
     Ok(reply[..len].to_vec())
-}
-
-/// Processor time of this process so far.
-fn cpu_seconds() -> f64 {
-    let cpu = clock_gettime(ClockId::ProcessCPUTime);
-    cpu.tv_sec as f64 + cpu.tv_nsec as f64 / 1e9
 }

@@ -25,7 +25,7 @@ use crate::listener::{Admitted, Front, Limits, Service};
 use crate::policy::Policy;
 
 /// Bytes that are read at once.
-const CHUNK: usize = 4096;
+const CHUNK: usize = 16 * 1024;
 
 /// How long a refused peer is read, at most.
 const DRAIN: Duration = Duration::from_secs(5);
@@ -279,7 +279,7 @@ async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
         return;
     }
     let deadline = Instant::now() + DRAIN;
-    let mut chunk = [0; CHUNK];
+    let mut chunk = vec![0; CHUNK];
     loop {
         let readable = tokio::select! {
             readable = timeout_at(deadline, stream.readable()) => readable,

@@ -10,7 +10,7 @@
 //!   leaves every byte as it was.
 //! * The seal is judged under the same lock as the operation it guards.
 //! * Memory is allocated once. No operation allocates, except a write over several memories, which
-//!   keeps a list of its locks.
+//!   keeps a list of its locks, and flattens a large batch before it takes them.
 //!
 //! It does no I/O, keeps no clock, and knows no protocol: an address is a number, a bit is a bit,
 //! a register is two bytes.
@@ -18,6 +18,7 @@
 #![forbid(unsafe_code)]
 
 mod area;
+mod batch;
 mod bits;
 mod error;
 mod memory;

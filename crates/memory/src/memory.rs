@@ -1,9 +1,11 @@
 //! The memory itself: reads and writes under one lock, and the seal.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use crate::area::{Area, Layout, Span};
+use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
 
@@ -320,6 +322,19 @@ pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(
             .writable(access, std::slice::from_ref(write))
             .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
     }
+    if access == Access::Ingest && batch::is_large(writes.iter().map(|(_, write)| write)) {
+        let flat = flattened(writes);
+        let runs: Vec<(&Memory, Write<'_>)> = flat
+            .iter()
+            .flat_map(|(memory, area, runs)| runs.iter().map(|run| (*memory, run.writing(*area))))
+            .collect();
+        return apply_across(access, &runs);
+    }
+    apply_across(access, writes)
+}
+
+/// Writes that have been checked, over several memories.
+fn apply_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     let mut memories: Vec<&Memory> = writes.iter().map(|(memory, _)| *memory).collect();
     memories.sort_unstable_by_key(|memory| memory.rank);
     memories.dedup_by_key(|memory| memory.rank);
@@ -337,4 +352,17 @@ pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(
         memory.settle(access, content);
     }
     Ok(())
+}
+
+/// What many writes come to, area by area.
+fn flattened<'m>(writes: &[(&'m Memory, Write<'_>)]) -> Vec<(&'m Memory, Area, Vec<Run>)> {
+    let mut groups: BTreeMap<(u64, Area), (&'m Memory, Vec<Write<'_>>)> = BTreeMap::new();
+    for (memory, write) in writes {
+        let key = (memory.rank, write.area);
+        groups.entry(key).or_insert_with(|| (memory, Vec::new())).1.push(*write);
+    }
+    let groups = groups.into_iter();
+    groups
+        .map(|((_, area), (memory, writes))| (memory, area, batch::flatten(area, &writes)))
+        .collect()
 }

@@ -300,6 +300,33 @@ proptest! {
             prop_assert_eq!(contents(memory), expected);
         }
     }
+
+    #[test]
+    fn a_large_batch_leaves_what_its_writes_leave_one_by_one(
+        batch in prop::collection::vec((0..3usize, some_values()), 17..120),
+    ) {
+        let memories: Vec<Memory> = (0..3).map(|_| Memory::new(layout(), None).unwrap()).collect();
+        let mut models: Vec<Model> = (0..3).map(|_| Model::new(&layout(), None)).collect();
+        let valid: Vec<_> = batch
+            .iter()
+            .filter(|(which, write)| {
+                models[*which].write(Access::Ingest, std::slice::from_ref(write)).is_ok()
+            })
+            .map(|(which, write)| (*which, write, write.pack()))
+            .collect();
+        let writes: Vec<(&Memory, Write)> = valid.iter().map(|(which, write, bytes)| {
+            let count = write.values.len();
+            (&memories[*which], Write { area: write.area, address: write.address, count, bytes })
+        }).collect();
+        prop_assert_eq!(write_across(Access::Ingest, &writes), Ok(()));
+        for (memory, model) in memories.iter().zip(&models) {
+            let expected: Vec<Vec<u16>> = LAYOUT
+                .iter()
+                .map(|&(area, ..)| model.areas[area as usize].values().copied().collect())
+                .collect();
+            prop_assert_eq!(contents(memory), expected);
+        }
+    }
 }
 
 #[test]

@@ -1,13 +1,13 @@
-//! `holdfast_benches::bare`, as a program.
+//! `holdfast_benches`, as a program.
 
 use std::process::ExitCode;
 
 #[cfg(target_os = "linux")]
 fn main() -> ExitCode {
-    match holdfast_benches::bare::main() {
+    match holdfast_benches::main() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("bare: {error}");
+            eprintln!("{error}");
             ExitCode::FAILURE
         }
     }
@@ -15,6 +15,6 @@ fn main() -> ExitCode {
 
 #[cfg(not(target_os = "linux"))]
 fn main() -> ExitCode {
-    eprintln!("bare: the benchmarks need Linux");
+    eprintln!("the benchmarks need Linux");
     ExitCode::FAILURE
 }

@@ -1,0 +1,15 @@
+"""The appliance that is measured: what the configuration says that is given."""
+
+from __future__ import annotations
+
+import sys
+
+from holdfast import config
+from holdfast.adapters.supervisor import give_way
+from holdfast.appliance import Appliance
+
+give_way()
+with Appliance(config.load(sys.argv[1])) as appliance:
+    for endpoint in appliance.endpoints():
+        print(f"listening {endpoint.name} {endpoint.host}:{endpoint.port}", flush=True)
+    sys.stdin.read()

@@ -1,0 +1,126 @@
+"""Measures ingest over REST against a loop that parses the same JSON and does nothing else.
+
+The appliance has one core, the load (in Rust: kept connections, one request in flight on each, all
+answers checked) has the other. The loop runs on the appliance's core while that is idle. It has no
+socket and no HTTP: it parses the body with msgspec, as the appliance does, and packs the values
+with `struct`. The same with the `json` of the standard library is there for information.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import common
+from common import Result, Server
+
+TOKEN = "a token that protects nothing"
+CONNECTIONS = (1, 8)
+VALUES = 1000
+# How many commands the values come in.
+BODIES = {"one command": 1, "10 commands": 10}
+CONFIGURATION = f"""
+memories:
+  plant: {{holding_registers: {VALUES}}}
+rest:
+  bind: 127.0.0.1:0
+  sources: [127.0.0.1]
+  tokens:
+    - name: benchmark
+      sha256: {hashlib.sha256(TOKEN.encode()).hexdigest()}
+      memories: [plant]
+      areas: [holding_registers]
+      access: read-write
+"""
+
+
+@dataclass
+class Scenario:
+    """What was measured with one kind of body, and a number of connections."""
+
+    body: str
+    connections: int
+    bytes: int
+    rounds: list[dict[str, Result]] = field(default_factory=list)
+
+
+def main() -> None:
+    """Prints a table for each scenario, and writes all results where `--json` says."""
+    options = common.parsed(common.parser(__doc__, seconds=2, rounds=7))
+    scenarios = []
+    with (
+        common.appliance(CONFIGURATION, options.core, listeners=1) as holdfast,
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        for kind, commands in BODIES.items():
+            file = Path(folder) / "body.json"
+            file.write_bytes(body(commands))
+            for connections in CONNECTIONS:
+                scenario = Scenario(kind, connections, file.stat().st_size)
+                measure(scenario, file, holdfast, options)
+                show(scenario)
+                scenarios.append(scenario)
+    if options.json:
+        options.json.write_text(json.dumps([asdict(one) for one in scenarios], indent=1))
+
+
+def body(commands: int) -> bytes:
+    """All values, in this many commands: every length from one digit to five."""
+    values = [(address * 7919) % 65536 >> address % 16 for address in range(VALUES)]
+    each = VALUES // commands
+    batch = [
+        {
+            "memory": "plant",
+            "area": "holding_registers",
+            "address": at,
+            "values": values[at : at + each],
+        }
+        for at in range(0, VALUES, each)
+    ]
+    return json.dumps(batch if commands > 1 else batch[0], separators=(",", ":")).encode()
+
+
+def measure(scenario: Scenario, file: Path, holdfast: Server, options: argparse.Namespace) -> None:
+    """The appliance and both loops once a round."""
+    post = common.bench(
+        "post",
+        *("--address", holdfast.address),
+        *("--path", "/api/v1/ingest"),
+        *("--token", TOKEN),
+        *("--body", file),
+        *("--connections", scenario.connections),
+    )
+    for index in range(options.rounds):
+        results = {}
+        for name in common.turns(["holdfast", "msgspec", "json"], index):
+            if name == "holdfast":
+                results[name] = common.load(post, options.seconds, options.other, holdfast)
+            else:
+                command = common.python("parse_loop.py", file, name, options.seconds)
+                results[name] = common.outcome(command, options.seconds, options.core)
+        scenario.rounds.append(results)
+
+
+def show(scenario: Scenario) -> None:
+    """One table."""
+    rounds = scenario.rounds
+    print(f"\n{scenario.body}, {VALUES} values, {scenario.bytes:,} bytes,", end=" ")
+    print(f"{scenario.connections} connections:")
+    print("              values/s   us/request  holdfast against it (min to max)")
+    for name in ("holdfast", "msgspec", "json"):
+        [rate] = common.medians(rounds, name, "rate")
+        against = "" if name == "holdfast" else common.ratio(rounds, "holdfast", name)
+        print(f"  {name:8}  {rate * VALUES:12,.0f}   {1e6 / rate:10.1f}  {against}".rstrip())
+    p50, p99, cpu, busy = common.medians(rounds, "holdfast", "p50", "p99", "server_us", "busy")
+    print(f"  holdfast: p50 {p50:,.0f} us, p99 {p99:,.0f} us, cpu {cpu:,.0f} us a request;", end="")
+    print(f" the load was busy for {busy:.0%}.")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+//! Large batches, flattened before any lock is taken: what is copied under the lock is then no more
+//! than memory holds, in as few pieces as there can be.
+
+use crate::area::Area;
+use crate::bits;
+use crate::memory::Write;
+
+/// Batches of up to this many writes, and of up to this many bytes, are copied as they are.
+const FEW: usize = 16;
+const SHORT: usize = 16 * 1024;
+
+/// Neighbours of one area, each as the last write left it.
+#[derive(Debug)]
+pub(crate) struct Run {
+    address: u16,
+    count: usize,
+    bytes: Vec<u8>,
+}
+
+impl Run {
+    pub(crate) fn writing(&self, area: Area) -> Write<'_> {
+        Write { area, address: self.address, count: self.count, bytes: &self.bytes }
+    }
+}
+
+/// Whether flattening writes pays for itself.
+pub(crate) fn is_large<'w>(writes: impl ExactSizeIterator<Item = &'w Write<'w>>) -> bool {
+    writes.len() > FEW
+        || (writes.len() > 1 && writes.map(|write| write.bytes.len()).sum::<usize>() > SHORT)
+}
+
+/// What writes to one area come to. They have been checked.
+pub(crate) fn flatten(area: Area, writes: &[Write<'_>]) -> Vec<Run> {
+    let starts = writes.iter().map(|write| usize::from(write.address));
+    let ends = writes.iter().map(|write| usize::from(write.address) + write.count);
+    let (Some(start), Some(end)) = (starts.min(), ends.max()) else {
+        return Vec::new();
+    };
+    let mut image = vec![0; area.byte_len(end - start)];
+    let mut written = vec![false; end - start];
+    for write in writes {
+        let at = usize::from(write.address) - start;
+        written[at..at + write.count].fill(true);
+        if area.is_bits() {
+            bits::copy_in(&mut image, at, write.count, write.bytes);
+        } else {
+            image[at * 2..(at + write.count) * 2].copy_from_slice(write.bytes);
+        }
+    }
+    let mut runs = Vec::new();
+    let mut at = 0;
+    for stretch in written.chunk_by(|a, b| a == b) {
+        let count = stretch.len();
+        if stretch[0] {
+            let mut bytes = vec![0; area.byte_len(count)];
+            if area.is_bits() {
+                bits::copy_out(&image, at, count, &mut bytes);
+            } else {
+                bytes.copy_from_slice(&image[at * 2..(at + count) * 2]);
+            }
+            runs.push(Run { address: (start + at) as u16, count, bytes });
+        }
+        at += count;
+    }
+    runs
+}
