@@ -29,9 +29,11 @@ format: .venv/dev.stamp
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+# NAME is a benchmark of benches/, BENCH its options.
+NAME ?= server
 bench: .venv/core.stamp .venv/dev.stamp
 	cargo build --locked --quiet --release -p holdfast-benches
-	$(BIN)/python benches/server.py $(BENCH)
+	$(BIN)/python benches/$(NAME).py $(BENCH)
 
 # Writes what is made from the program: the schema of the configuration.
 docs: .venv/core.stamp
