@@ -10,35 +10,56 @@ the next one makes a new connection; no call is repeated.
 from __future__ import annotations
 
 import asyncio
-import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import operations
 from holdfast._core import BlockingClient, Endpoint, Request
-from holdfast.errors import ModbusException
-from holdfast.link import Link
+from holdfast.errors import ConnectionLost, ModbusException
+from holdfast.link import CLOSED, Link
 from holdfast.target import NetworkTarget, SerialTarget, parse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Awaitable, Sequence
 
-    from holdfast.operations import Identification, Result, ServerId, Steps
+    from holdfast.operations import Identification, Plan, Result, ServerId, Steps
     from holdfast.target import Target
     from holdfast.types import Area
 
 LONGEST_TIMEOUT = 86_400.0
 MOST_IN_FLIGHT = 1024
 
+BROADCASTS = (5, 6, 15, 16, 22)
+"""The functions that may be sent to all units of a serial line (V1.02, 2.1)."""
 
-class SyncClient:
+
+class _Common:
+    """What both clients are made of."""
+
+    def __init__(self, url: str, unit: int, timeout: float) -> None:
+        self.target = parse(url)
+        self.unit = _unit(unit)
+        self.timeout = _timeout(timeout)
+
+    def _unit_for(self, request: Request, unit: int | None) -> int:
+        unit = self.unit if unit is None else _unit(unit)
+        if unit == 0 and isinstance(self.target, SerialTarget):
+            code = request.pdu[0]
+            if code not in BROADCASTS:
+                raise ValueError(
+                    f"unit 0 of a serial line is the broadcast, not for function {code}"
+                )
+        return unit
+
+
+class SyncClient(_Common):
     """A client that waits: every method returns when the device has answered.
 
     `url` names the device: `tcp://host:502`, `udp://host:502`, `rtu+tcp://host:502`,
     `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`. `unit` is the unit id, 0
     to 255, that a call can replace. `timeout` in seconds covers connecting, sending and receiving.
 
-    Threads may share a client; their calls take turns.
+    Threads may share a client; their calls take turns, for which `timeout` does not count.
 
     Methods raise `ValueError` or `TypeError` before anything is sent, and `ModbusException`,
     `ConnectionLost`, `RequestTimeout` or `InvalidResponse` after; all four are `ModbusError`.
@@ -49,9 +70,7 @@ class SyncClient:
     """
 
     def __init__(self, url: str, *, unit: int = 1, timeout: float = 1.0) -> None:
-        self.target = parse(url)
-        self.unit = _unit(unit)
-        self.timeout = _timeout(timeout)
+        super().__init__(url, unit, timeout)
         self._core = blocking(self.target)
 
     def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:
@@ -111,8 +130,9 @@ class SyncClient:
     ) -> None:
         """A typed value, as `holdfast.values.encode` makes it, into coils or holding registers.
 
-        One bit or register is written by function 5 or 6, more by 15 or 16. What does not fit into
-        one request needs `split`, and is not one step on the device then.
+        One bit or register is written by function 5 or 6, more by 15 or 16, one bit of a register
+        (`bit:3`) by 22. What does not fit into one request needs `split`, and is not one step on
+        the device then.
         """
         steps = operations.write_typed(area, address, value, type, order, encoding, split=split)
         self._run(steps, unit)
@@ -200,27 +220,29 @@ class SyncClient:
         return self._core.late
 
     def close(self) -> None:
-        """Ends the connection. A later call makes a new one."""
+        """Ends the connection after the calls that came before. A later call makes a new one."""
         self._core.close()
 
-    def _run(self, steps: Steps[Result], unit: int | None) -> Result:
-        """Carries out steps."""
+    def _run(self, plan: Plan[Result], unit: int | None) -> Result:
+        """Carries out a plan."""
+        if isinstance(plan, Request):
+            result: Result = self._call(plan, unit)
+            return result
         try:
-            request = next(steps)
+            request = next(plan)
             while True:
                 try:
-                    result = self._call(request, unit)
+                    reply = self._call(request, unit)
                 except ModbusException as error:
-                    request = steps.throw(error)
+                    request = plan.throw(error)
                 else:
-                    request = steps.send(result)
+                    request = plan.send(reply)
         except StopIteration as end:
             value: Result = end.value
             return value
 
     def _call(self, request: Request, unit: int | None) -> Any:
-        unit = self.unit if unit is None else _unit(unit)
-        return self._core.call(request, unit, self.timeout)
+        return self._core.call(request, self._unit_for(request, unit), self.timeout)
 
     def __enter__(self) -> Self:
         return self
@@ -229,7 +251,7 @@ class SyncClient:
         self.close()
 
 
-class Client:
+class Client(_Common):
     """A client for asyncio: every method is awaited.
 
     `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP up to
@@ -237,8 +259,8 @@ class Client:
     more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers only
     one at a time. On other transports one request is on its way at once.
 
-    Any number of tasks may share a client, in one event loop. A call that is cancelled leaves the
-    connection usable.
+    Any number of tasks may share a client, in one event loop; in another one after `close`, or
+    when the first is closed. A call that is cancelled leaves the connection usable.
 
     >>> async with holdfast.Client("tcp://plc") as plc:
     ...     await plc.read("holding_registers", 100, "float32", order="CDAB")
@@ -248,18 +270,16 @@ class Client:
     def __init__(
         self, url: str, *, unit: int = 1, timeout: float = 1.0, max_in_flight: int = 16
     ) -> None:
-        self.target = parse(url)
-        self.unit = _unit(unit)
-        self.timeout = _timeout(timeout)
+        super().__init__(url, unit, timeout)
         if type(max_in_flight) is not int or not 1 <= max_in_flight <= MOST_IN_FLIGHT:
             raise ValueError(
                 f"max_in_flight is {max_in_flight!r}, allowed are 1 to {MOST_IN_FLIGHT}"
             )
         self._transport: Link | _Thread
         if isinstance(self.target, NetworkTarget) and self.target.transport == "tcp":
-            self._transport = Link(self.target, self.timeout, max_in_flight)
+            self._transport = Link(self.target, max_in_flight)
         else:
-            self._transport = _Thread(self.target, self.timeout)
+            self._transport = _Thread(self.target)
 
     async def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:
         """`count` coils (function 1); more than 2000 take several requests."""
@@ -318,8 +338,9 @@ class Client:
     ) -> None:
         """A typed value, as `holdfast.values.encode` makes it, into coils or holding registers.
 
-        One bit or register is written by function 5 or 6, more by 15 or 16. What does not fit into
-        one request needs `split`, and is not one step on the device then.
+        One bit or register is written by function 5 or 6, more by 15 or 16, one bit of a register
+        (`bit:3`) by 22. What does not fit into one request needs `split`, and is not one step on
+        the device then.
         """
         steps = operations.write_typed(area, address, value, type, order, encoding, split=split)
         await self._run(steps, unit)
@@ -408,27 +429,32 @@ class Client:
         return self._transport.late
 
     async def close(self) -> None:
-        """Ends the connection. A later call makes a new one."""
+        """Ends the connection: calls that wait get `ConnectionLost`, a later one connects anew."""
         await self._transport.close()
 
-    async def _run(self, steps: Steps[Result], unit: int | None) -> Result:
-        """Carries out steps."""
+    def _run(self, plan: Plan[Result], unit: int | None) -> Awaitable[Result]:
+        """Carries out a plan."""
+        if isinstance(plan, Request):
+            return self._call(plan, unit)
+        return self._take(plan, unit)
+
+    async def _take(self, steps: Steps[Result], unit: int | None) -> Result:
+        """Takes steps."""
         try:
             request = next(steps)
             while True:
                 try:
-                    result = await self._call(request, unit)
+                    reply = await self._call(request, unit)
                 except ModbusException as error:
                     request = steps.throw(error)
                 else:
-                    request = steps.send(result)
+                    request = steps.send(reply)
         except StopIteration as end:
             value: Result = end.value
             return value
 
-    async def _call(self, request: Request, unit: int | None) -> Any:
-        unit = self.unit if unit is None else _unit(unit)
-        return await self._transport.call(request, unit)
+    def _call(self, request: Request, unit: int | None) -> Awaitable[Any]:
+        return self._transport.call(request, self._unit_for(request, unit), self.timeout)
 
     async def __aenter__(self) -> Self:
         return self
@@ -440,22 +466,27 @@ class Client:
 class _Thread:
     """A transport that carries one request at a time, in a thread of its own."""
 
-    def __init__(self, target: Target, timeout: float) -> None:
+    def __init__(self, target: Target) -> None:
         self._core = blocking(target)
-        self._timeout = timeout
         self._executor: ThreadPoolExecutor | None = None
 
-    async def call(self, request: Request, unit: int) -> Any:
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request when its turn has come, and waits for the result."""
         if self._executor is None:
-            self._executor = ThreadPoolExecutor(1, f"holdfast-{unit}")
+            self._executor = ThreadPoolExecutor(1, "holdfast-client")
         loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(
-            self._executor, self._core.call, request, unit, self._timeout
-        )
+        executor = self._executor
+        return await loop.run_in_executor(executor, self._carry, executor, request, unit, timeout)
+
+    def _carry(
+        self, executor: ThreadPoolExecutor, request: Request, unit: int, timeout: float
+    ) -> Any:
+        if executor is not self._executor:
+            raise ConnectionLost(CLOSED)
+        return self._core.call(request, unit, timeout)
 
     async def close(self) -> None:
-        """Ends the connection, once the call under way has ended."""
+        """Ends the connection, once the call under way has ended; those that wait fail."""
         executor, self._executor = self._executor, None
         if executor is not None:
             executor.submit(self._core.close)
@@ -495,6 +526,6 @@ def _unit(unit: int) -> int:
 
 
 def _timeout(seconds: float) -> float:
-    if not (math.isfinite(seconds) and 0 < seconds <= LONGEST_TIMEOUT):
+    if not 0 < seconds <= LONGEST_TIMEOUT:
         raise ValueError(f"timeout is {seconds!r}, allowed are more than 0 to 86400 seconds")
     return float(seconds)

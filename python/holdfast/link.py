@@ -1,76 +1,142 @@
-"""A Modbus TCP connection of asyncio: many requests in flight, none of them in a thread.
+"""Modbus TCP in asyncio: many requests in flight on one connection, none of them in a thread.
 
 The native session frames requests and matches replies; here are the socket, the deadlines and the
-futures. The first request of a turn of the event loop leaves at once, those behind it with one
-write; replies that arrive together are handed out together. A busy connection costs few wake-ups.
+futures. Requests that are made in one turn of the event loop leave with one write, replies that
+arrive together are handed out together: a busy connection costs few wake-ups.
 """
 
 from __future__ import annotations
 
 import asyncio
+from bisect import insort
 from collections import deque
+from math import inf
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from holdfast._core import Session
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, RequestTimeout
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable
+
     from holdfast._core import Request
     from holdfast.target import NetworkTarget
 
+CLOSED = "connection lost: closed by this side"
+
 
 class Link:
-    """A connection that is made when it is needed, and again after it was lost."""
+    """The connection of a client, in one event loop at a time."""
 
-    def __init__(self, target: NetworkTarget, timeout: float, max_in_flight: int) -> None:
+    def __init__(self, target: NetworkTarget, max_in_flight: int) -> None:
         self._target = target
-        self.timeout = timeout
-        self._free = max_in_flight
+        self._max_in_flight = max_in_flight
+        self._late = 0
+        self._here: _LoopLink | None = None
+
+    def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
+        """Sends a request when there is room for it, and waits for the result.
+
+        Raises `RuntimeError` while the client is in use in another event loop.
+        """
+        loop = asyncio.get_running_loop()
+        here = self._here
+        if here is None or here.loop is not loop:
+            here = self._move(loop)
+        return here.call(request, unit, timeout)
+
+    async def close(self) -> None:
+        """Ends the connection; calls that wait for anything fail."""
+        loop = asyncio.get_running_loop()
+        here = self._here
+        if here is None or here.loop is not loop:
+            here = self._move(loop)
+        await here.close()
+
+    @property
+    def late(self) -> int:
+        """Replies that came after their requests had been given up."""
+        return self._late + (0 if self._here is None else self._here.late)
+
+    def _move(self, loop: asyncio.AbstractEventLoop) -> _LoopLink:
+        """Begins anew in another loop: what was left behind in one that is closed is gone."""
+        old = self._here
+        if old is not None:
+            if old.in_use and not old.loop.is_closed():
+                raise RuntimeError("the client is in use in another event loop: close it there")
+            self._late += old.late
+        self._here = here = _LoopLink(self._target, self._max_in_flight, loop)
+        return here
+
+
+class _LoopLink:
+    """A connection in its loop, made when it is needed, and again after it was lost."""
+
+    def __init__(
+        self, target: NetworkTarget, max_in_flight: int, loop: asyncio.AbstractEventLoop
+    ) -> None:
+        self.loop = loop
+        self._target = target
+        self._max_in_flight = self._free = max_in_flight
         self._queue: deque[asyncio.Future[None]] = deque()
         self._connection: _Connection | None = None
         self._connecting: asyncio.Task[_Connection] | None = None
         self._late = 0
 
-    async def call(self, request: Request, unit: int) -> Any:
-        """Sends a request when there is room for it, and waits for the result."""
-        if self._free == 0 or self._queue:
-            await self._turn()
-        else:
+    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+        if self._free:
             self._free -= 1
+        else:
+            await self._turn()
         try:
-            loop = asyncio.get_running_loop()
-            deadline = loop.time() + self.timeout
+            deadline = self.loop.time() + timeout
             connection = self._connection
             if connection is None:
-                connection = await self._connected(deadline)
-            return await connection.call(request, unit, deadline)
+                connection = await self._connected(deadline, timeout)
+            number, future = connection.send(request, unit, deadline, timeout)
+            try:
+                return await future
+            except asyncio.CancelledError:
+                connection.give_up(number)
+                raise
         finally:
-            self._next_turn()
+            if self._queue:
+                self._next_turn()
+            else:
+                self._free += 1
 
     async def close(self) -> None:
-        """Ends the connection; calls that wait for a reply fail."""
-        connecting, self._connecting = self._connecting, None
-        if connecting is not None:
-            connecting.cancel()
-            await asyncio.wait([connecting])
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.end(ConnectionLost("connection lost: closed by this side"))
-            await connection.closed
+        for turn in self._queue:
+            if not turn.done():
+                turn.set_exception(ConnectionLost(CLOSED))
+        self._queue.clear()
+        if self._connecting is not None:
+            self._connecting.cancel()
+            await asyncio.wait([self._connecting])
+        if self._connection is not None:
+            closed = self._connection.closed
+            self._connection.end(ConnectionLost(CLOSED))
+            await closed
+
+    @property
+    def in_use(self) -> bool:
+        """Whether there is a connection, or a call that wants one."""
+        connected = self._connection is not None or self._connecting is not None
+        return connected or self._free < self._max_in_flight
 
     @property
     def late(self) -> int:
-        """Replies that came after their requests had been given up."""
         return self._late + (0 if self._connection is None else self._connection.session.late)
 
     async def _turn(self) -> None:
         """Waits for one of the places in flight, first come first served."""
-        turn = asyncio.get_running_loop().create_future()
+        turn = self.loop.create_future()
         self._queue.append(turn)
         try:
             await turn
         except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():
+            if turn.done() and not turn.cancelled() and turn.exception() is None:
                 self._next_turn()
             raise
 
@@ -83,105 +149,116 @@ class Link:
                 return
         self._free += 1
 
-    async def _connected(self, deadline: float) -> _Connection:
+    async def _connected(self, deadline: float, timeout: float) -> _Connection:
         """The connection, made if need be; several calls may wait for the same one."""
         if self._connecting is None:
-            self._connecting = asyncio.create_task(self._connect())
+            self._connecting = self.loop.create_task(self._connect(timeout))
             self._connecting.add_done_callback(self._connect_ended)
         connecting = self._connecting
-        try:
-            async with asyncio.timeout_at(deadline):
-                await asyncio.wait([connecting])
-        except TimeoutError:
-            raise RequestTimeout(
-                f"no connection to {self._target} within {self.timeout} s"
-            ) from None
+        done, _ = await asyncio.wait([connecting], timeout=deadline - self.loop.time())
+        if not done:
+            raise self._not_in_time(timeout)
         if connecting.cancelled():
-            raise ConnectionLost("connection lost: closed by this side")
+            raise ConnectionLost(CLOSED)
+        failure = connecting.exception()
+        if isinstance(failure, ModbusError):
+            raise _again(failure) from failure.__cause__
         return connecting.result()
 
-    async def _connect(self) -> _Connection:
+    async def _connect(self, timeout: float) -> _Connection:
         target = self._target
         try:
-            async with asyncio.timeout(self.timeout):
-                loop = asyncio.get_running_loop()
-                _, connection = await loop.create_connection(
+            async with asyncio.timeout(timeout):
+                _, connection = await self.loop.create_connection(
                     lambda: _Connection(self), target.host, target.port
                 )
         except TimeoutError:
-            raise self._not_in_time() from None
-        except OSError as error:
+            raise self._not_in_time(timeout) from None
+        except (OSError, UnicodeError) as error:
             raise ConnectionLost(f"can't connect to {target}: {error}") from error
         return connection
 
-    def _not_in_time(self) -> RequestTimeout:
-        return RequestTimeout(f"no connection to {self._target} within {self.timeout} s")
+    def _not_in_time(self, timeout: float) -> RequestTimeout:
+        return RequestTimeout(f"no connection to {self._target} within {timeout:g} s")
 
     def _connect_ended(self, task: asyncio.Task[_Connection]) -> None:
-        if self._connecting is task:
-            self._connecting = None
-        if not task.cancelled() and task.exception() is None:
+        self._connecting = None
+        # It may be lost already.
+        if not task.cancelled() and task.exception() is None and task.result().ended is None:
             self._connection = task.result()
 
     def lost(self, connection: _Connection) -> None:
         """The connection has ended: the next call makes a new one."""
+        self._late += connection.session.late
         if self._connection is connection:
             self._connection = None
-            self._late += connection.session.late
 
 
 class _Connection(asyncio.Protocol):
     """One connection: requests out, replies in."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, here: _LoopLink) -> None:
         self.session = Session()
-        self._link = link
-        self._loop = asyncio.get_running_loop()
+        self.ended: ModbusError | None = None
+        """Why it is over."""
+        self._here = here
+        self._loop = here.loop
         self.closed: asyncio.Future[None] = self._loop.create_future()
-        self._waiting: dict[int, asyncio.Future[Any]] = {}
-        self._deadlines: deque[tuple[float, int, asyncio.Future[Any]]] = deque()
+        self._futures: dict[int, asyncio.Future[Any]] = {}
+        self._by_deadline: deque[tuple[float, int, asyncio.Future[Any], float]] = deque()
+        """The earliest first: deadline, transaction id, future, and the timeout that it had."""
         self._alarm: asyncio.TimerHandle | None = None
+        self._alarm_at = inf
         self._flushing = False
         self._transport: asyncio.Transport
-        self._ended: ModbusError | None = None
 
-    async def call(self, request: Request, unit: int, deadline: float) -> Any:
-        if self._ended is not None:
-            raise self._ended
+    def send(
+        self, request: Request, unit: int, deadline: float, timeout: float
+    ) -> tuple[int, asyncio.Future[Any]]:
+        """Sends a request: alone at once, beside others with those of this turn of the loop.
+
+        Returns its transaction id, and what will have the result.
+        """
+        if self.ended is not None:
+            raise _again(self.ended)
         number = self.session.send(request, unit)
         if number is None:
             self.end(ConnectionLost("connection lost: no transaction id is free"))
             raise ConnectionLost("connection lost: no transaction id is free")
-        future: asyncio.Future[Any] = self._loop.create_future()
-        self._waiting[number] = future
-        self._deadlines.append((deadline, number, future))
-        if self._alarm is None:
-            self._alarm = self._loop.call_at(deadline, self._look_at_deadlines)
-        if not self._flushing:
+        if not self._futures:
             self._transport.write(self.session.outgoing())
+        elif not self._flushing:
             self._flushing = True
             self._loop.call_soon(self._flush)
-        try:
-            return await future
-        except asyncio.CancelledError:
-            if self._waiting.pop(number, None) is not None:
-                self.session.give_up(number)
-            raise
+        future = self._futures[number] = self._loop.create_future()
+        queue = self._by_deadline
+        if queue and deadline < queue[-1][0]:
+            insort(queue, (deadline, number, future, timeout), key=itemgetter(0))
+        else:
+            queue.append((deadline, number, future, timeout))
+        if deadline < self._alarm_at:
+            self._set_alarm(deadline)
+        return number, future
+
+    def give_up(self, number: int) -> None:
+        """Nobody waits for the reply any more."""
+        if self._futures.pop(number, None) is not None:
+            self.session.give_up(number)
 
     def end(self, error: ModbusError) -> None:
         """Closes the connection; whoever waits for a reply gets the error."""
-        if self._ended is not None:
+        if self.ended is not None:
             return
-        self._ended = error
+        self.ended = error
         if self._alarm is not None:
             self._alarm.cancel()
-        self._link.lost(self)
+        self._here.lost(self)
         self._transport.abort()
-        for future in self._waiting.values():
+        for future in self._futures.values():
             if not future.done():
-                future.set_exception(type(error)(*error.args))
-        self._waiting.clear()
-        self._deadlines.clear()
+                future.set_exception(_again(error))
+        self._futures.clear()
+        self._by_deadline.clear()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -190,15 +267,15 @@ class _Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         completed, broken = self.session.receive(data)
         for number, result in completed:
-            future = self._waiting.pop(number)
+            future = self._futures.pop(number)
             if future.done():
                 continue
             if isinstance(result, ModbusError):
                 future.set_exception(result)
             else:
                 future.set_result(result)
-        while self._deadlines and self._deadlines[0][2].done():
-            self._deadlines.popleft()
+        while self._by_deadline and self._by_deadline[0][2].done():
+            self._by_deadline.popleft()
         if broken is not None:
             self.end(InvalidResponse(f"invalid response: {broken}"))
 
@@ -208,22 +285,35 @@ class _Connection(asyncio.Protocol):
         self.closed.set_result(None)
 
     def _flush(self) -> None:
-        """Sends what was queued behind the first request of this turn, with one write."""
         self._flushing = False
-        if self._ended is None:
+        if self.ended is None:
             self._transport.write(self.session.outgoing())
+
+    def _set_alarm(self, at: float) -> None:
+        if self._alarm is not None:
+            self._alarm.cancel()
+        self._alarm_at = at
+        self._alarm = self._loop.call_at(at, self._look_at_deadlines)
 
     def _look_at_deadlines(self) -> None:
         """Ends the calls whose time is over, and sets the alarm for the next."""
-        self._alarm = None
+        self._alarm, self._alarm_at = None, inf
         now = self._loop.time()
-        while self._deadlines:
-            deadline, number, future = self._deadlines[0]
+        timed_out = False
+        while self._by_deadline:
+            deadline, number, future, timeout = self._by_deadline[0]
             if not future.done():
                 if deadline > now:
-                    self._alarm = self._loop.call_at(deadline, self._look_at_deadlines)
-                    return
-                self.session.give_up(number)
-                self._waiting.pop(number, None)
-                future.set_exception(RequestTimeout(f"no reply within {self._link.timeout} s"))
-            self._deadlines.popleft()
+                    self._set_alarm(deadline)
+                    break
+                self.give_up(number)
+                future.set_exception(RequestTimeout(f"no reply within {timeout:g} s"))
+                timed_out = True
+            self._by_deadline.popleft()
+        if timed_out and self.session.is_amid_reply:
+            self.end(ConnectionLost("connection lost: a reply broke off"))
+
+
+def _again(error: ModbusError) -> ModbusError:
+    """The same error for another caller: a traceback belongs to one."""
+    return type(error)(*error.args)

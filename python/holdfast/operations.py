@@ -1,4 +1,4 @@
-"""What a client can do, as steps: each yields a request and is given its result.
+"""What a client can do, as one request, or as steps that yield requests and are given results.
 
 The same steps serve the client that waits and the one that awaits. Nothing here does I/O. Arguments
 are checked when a request is made, which is before anything is sent.
@@ -8,20 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from operator import index
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from holdfast import values
 from holdfast._core import Request
 from holdfast.errors import InvalidResponse, ModbusException
 from holdfast.types import BIT_AREAS
+from holdfast.values.codec import codec_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.types import Area
+    from holdfast.values.codec import Codec
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Request, Any, Result]
+Plan: TypeAlias = Request | Steps[Result]
+"""One request whose result is that of the whole, or steps."""
 
 ADDRESSES = 65536
 READ_LIMITS: dict[str, int] = {
@@ -85,25 +89,31 @@ class ServerId:
         return self.data[2:]
 
 
-def read_range(area: Area, address: int, count: int) -> Steps[list[Any]]:
+def read_range(area: Area, address: int, count: int) -> Plan[list[Any]]:
     """`count` bits or registers, in as many requests as that takes."""
-    limit = READ_LIMITS.get(area, 0)
-    if type(count) is not int or count <= limit:
-        result: list[Any] = yield Request.read(area, address, count)
-        return result
-    requests = [
-        Request.read(area, start, min(limit, address + count - start))
-        for start in _starts(address, count, limit)
-    ]
+    address, count = index(address), index(count)
+    limit = READ_LIMITS.get(area)
+    if limit is None or count <= limit:
+        return Request.read(area, address, count)
+    return _in_turn(
+        [
+            Request.read(area, start, min(limit, address + count - start))
+            for start in _starts(address, count, limit)
+        ]
+    )
+
+
+def _in_turn(reads: list[Request]) -> Steps[list[Any]]:
     whole: list[Any] = []
-    for request in requests:
-        whole += yield request
+    for read in reads:
+        whole += yield read
     return whole
 
 
 def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) -> Steps[None]:
     """Bits or registers, in one request; in more only if that is allowed."""
     limit = WRITE_LIMITS[area]
+    address = index(address)
     make = Request.write_coils if area == "coils" else Request.write_registers
     if len(items) <= limit or not split:
         if len(items) > limit:
@@ -122,10 +132,10 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
     """A typed value, or an array of them."""
-    count = values.register_count(kind)
-    raw = yield from read_range(area, address, count)
-    options = {} if encoding is None else {"encoding": encoding}
-    return values.decode(raw, kind, order, **options)
+    codec = _codec(area, kind, order, encoding)
+    plan = read_range(area, address, codec.type.registers)
+    raw = (yield plan) if isinstance(plan, Request) else (yield from plan)
+    return codec.unpack(codec.to_bytes(raw))
 
 
 def write_typed(
@@ -138,17 +148,31 @@ def write_typed(
     *,
     split: bool,
 ) -> Steps[None]:
-    """A typed value: one bit or register by functions 5 and 6, more by 15 and 16."""
+    """A typed value: one bit or register by functions 5 and 6, more by 15 and 16; one bit of a
+    register by function 22, which leaves the others alone.
+    """
     if area not in WRITE_LIMITS:
         raise ValueError(f"area is {area!r}, only {' and '.join(WRITE_LIMITS)} can be written")
-    options = {} if encoding is None else {"encoding": encoding}
-    raw = values.encode(value, kind, order, **options)
-    if len(raw) > 1:
+    codec = _codec(area, kind, order, encoding)
+    raw = codec.encode(value)
+    if codec.type.base == "bit":
+        if codec.type.count is not None:
+            raise ValueError(f"{kind} is bits of several registers, only one bit can be written")
+        [mask] = raw
+        yield Request.mask_write(address, *((0xFFFF ^ mask, mask) if value else (mask, 0)))
+    elif len(raw) > 1:
         yield from write_range(area, address, raw, split=split)
     elif area in BIT_AREAS:
         yield Request.write_coil(address, bool(raw[0]))
     else:
         yield Request.write_register(address, raw[0])
+
+
+def _codec(area: Area, kind: str, order: str, encoding: str | None) -> Codec:
+    codec = codec_of(kind, order, encoding)
+    if area in BIT_AREAS and codec.type.base != "bool":
+        raise ValueError(f"type is {kind!r}, {area} hold only bool")
+    return codec
 
 
 def identify() -> Steps[Identification]:
@@ -194,6 +218,6 @@ def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
 
 
 def _starts(address: int, count: int, limit: int) -> range:
-    if type(address) is not int or not 0 <= address < ADDRESSES or address + count > ADDRESSES:
+    if not 0 <= address < ADDRESSES or address + count > ADDRESSES:
         raise ValueError(f"{count} from address {address}: the last address is 65535")
     return range(address, address + count, limit)

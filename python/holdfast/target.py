@@ -60,6 +60,8 @@ Target: TypeAlias = NetworkTarget | SerialTarget
 
 def parse(url: str) -> Target:
     """The target that a URL names. Raises `ValueError`, which says what is allowed."""
+    if not isinstance(url, str):
+        raise TypeError(f"{url!r} is no URL of a device; allowed are {FORMS}")
     try:
         parts = urlsplit(url)
         port = parts.port

@@ -73,13 +73,14 @@ impl Line for TcpStream {
 impl Line for serial2::SerialPort {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
         read(|| {
-            self.set_read_timeout(left(deadline)?)?;
+            // A port counts whole milliseconds, and leaves the rest away.
+            self.set_read_timeout(left(deadline)? + Duration::from_micros(999))?;
             Read::read(self, buffer)
         })
     }
 
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
-        self.set_write_timeout(left(deadline)?)?;
+        self.set_write_timeout(left(deadline)? + Duration::from_micros(999))?;
         Write::write_all(self, bytes)
     }
 

@@ -98,7 +98,7 @@ impl Session {
     /// answer, in the order of the replies.
     ///
     /// # Errors
-    /// [`Broken`]: the connection is to be closed. A request whose reply broke it has been told.
+    /// [`Broken`]: the connection is to be closed.
     pub fn receive(
         &mut self,
         bytes: &[u8],
@@ -149,14 +149,12 @@ impl Session {
             return Ok(());
         }
         self.waiting -= 1;
-        let response = if unit_id == pending.unit_id {
-            // It was encoded from a request.
-            let request = Request::parse(&pending.pdu).map_err(ResponseError::Exception);
-            request.and_then(|request| request.response(pdu))
-        } else {
-            reply(id, Err(ResponseError::Echo));
+        if unit_id != pending.unit_id {
             return Err(Broken::Unit { expected: pending.unit_id, found: unit_id });
-        };
+        }
+        // It was encoded from a request.
+        let request = Request::parse(&pending.pdu).map_err(ResponseError::Exception);
+        let response = request.and_then(|request| request.response(pdu));
         reply(id, response);
         match response {
             Err(
