@@ -185,9 +185,9 @@ class Runs(Protocol):
 
 
 @contextlib.contextmanager
-def in_a_thread(what: Runs) -> Iterator[None]:
+def in_a_thread(what: Runs, stop: Stop | None = None) -> Iterator[None]:
     """Runs it; when it is over, its thread must have ended without an error."""
-    stop = Stop()
+    stop = stop or Stop()
     with ThreadPoolExecutor(1) as threads:
         running = threads.submit(what.run, stop)
         try:

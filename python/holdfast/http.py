@@ -120,6 +120,9 @@ class Host:
     The application finds its peer, as text for logs, in `scope["state"]["peer"]`. When a request
     did not arrive in time, `scope["state"]["late"]` is set and `receive` returns: the application
     has a moment to answer, then the connection is dropped.
+
+    A peer that has sent its last byte still gets its answers, unless `leaving` says that it has
+    left then: the end of what it sends is all that tells that it closed the connection.
     """
 
     def __init__(
@@ -131,8 +134,10 @@ class Host:
         sources: Iterable[IPv4Network | IPv6Network],
         max_connections: int,
         request_timeout: float,
+        leaving: bool = False,
     ) -> None:
         self.name = name
+        self.leaving = leaving
         self.max_connections = max_connections
         self.request_timeout = request_timeout
         self.sources = tuple(sources)
@@ -367,6 +372,8 @@ class _Connection(HttpToolsProtocol):
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """A peer that sends no more may still want its answers."""
+        if self.host.leaving:
+            return False
         self._ended = True
         whole = self._busy() and not self.cycle.more_body
         return bool(whole or self.pipeline or self.held)

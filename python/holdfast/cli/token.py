@@ -33,13 +33,17 @@ _ENTRY = """\
 @click.command(epilog="Example: holdfast token --name edge-gateway")
 @click.option("--name", default="edge-gateway", show_default=True, help="The name of the client.")
 @click.option("--stdin", is_flag=True, help="Take the secret from standard input.")
+@click.option("--line", is_flag=True, help="A line for a gateway's token file.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
-def token(name: str, stdin: bool, as_json: bool) -> None:
+def token(name: str, stdin: bool, line: bool, as_json: bool) -> None:
     """Make a secret for a client of REST, and the entry of the configuration that lets it in.
 
     The secret is shown once and kept nowhere: the configuration holds only its SHA-256. With
-    --stdin the secret is the one line of standard input, and is not shown again.
+    --stdin the secret is the one line of standard input, and is not shown again. With --line there
+    is a line of a token file, for `holdfast gateway`, and the secret goes to standard error.
     """
+    if line and as_json:
+        raise click.UsageError("--line and --json don't go together.")
     if not is_name(name):
         raise click.BadParameter(f"found {name!r}, allowed: {NAME_FORM}", param_hint="'--name'")
     secret = _read() if stdin else secrets.token_urlsafe(BYTES)
@@ -47,6 +51,11 @@ def token(name: str, stdin: bool, as_json: bool) -> None:
     if as_json:
         shown = {} if stdin else {"token": secret}
         click.echo(json.dumps({"name": name, **shown, "sha256": digest}, indent=2))
+        return
+    if line:
+        if not stdin:
+            click.echo(f"The secret, shown this once: {secret}", err=True)
+        click.echo(f"{name} {digest}")
         return
     if not stdin:
         click.echo(f"The secret, shown this once: {secret}\n")

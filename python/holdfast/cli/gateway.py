@@ -1,0 +1,175 @@
+"""`holdfast gateway`: Modbus devices over HTTP, and a console, until a signal ends it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import click
+
+from holdfast import logs
+from holdfast.adapters import Stop
+from holdfast.cli.run import PATIENCE, Signals
+from holdfast.config.addresses import parse_bind, parse_source
+from holdfast.gateway import Gateway, Limits, Settings, egress, tokens
+from holdfast.gateway.settings import LOOPBACK
+from holdfast.http import listen
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+    from concurrent.futures import Future
+
+    from holdfast.config.addresses import Bind, Network
+
+FAILED = 1
+
+Parsed = TypeVar("Parsed")
+
+
+def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
+    """The type of an option: what `parse` makes of its text."""
+
+    def parsed(text: str) -> Parsed:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise click.BadParameter(f"{error}.") from error
+
+    return parsed
+
+
+@click.command(epilog="Example: holdfast gateway --allow 10.0.0.0/8 --allow 10.0.0.5:5020")
+@click.option(
+    "--bind",
+    type=_by(parse_bind),
+    default="127.0.0.1:8090",
+    show_default=True,
+    metavar="ADDRESS:PORT",
+    help="Where to listen.",
+)
+@click.option(
+    "--allow",
+    type=_by(egress.parse),
+    multiple=True,
+    required=True,
+    metavar="NETWORK[:PORTS]",
+    help="Whom it may connect to; again for more. Without ports it is port 502; `*` is all.",
+)
+@click.option("--writes", is_flag=True, help="Let requests change devices.")
+@click.option(
+    "--token-file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Lines `NAME SHA256`, as `holdfast token --line` prints them: every request needs one.",
+)
+@click.option(
+    "--sources",
+    type=_by(parse_source),
+    multiple=True,
+    default=[str(each) for each in LOOPBACK],
+    show_default="this machine",
+    metavar="NETWORK",
+    help="Who may connect to it; again for more.",
+)
+@click.option(
+    "--in-flight",
+    type=click.IntRange(1, 64),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Requests on their way to one device at once.",
+)
+@click.option("--json-log", is_flag=True, help="Log JSON, an object a line.")
+def gateway(
+    bind: Bind,
+    allow: tuple[egress.Allowed, ...],
+    writes: bool,
+    token_file: Path | None,
+    sources: tuple[Network, ...],
+    in_flight: int,
+    json_log: bool,
+) -> None:
+    """Serve Modbus devices over HTTP, with a console for a browser.
+
+    Only devices in the networks of --allow are connected to, and only on their ports:
+    10.0.0.0/8, 10.0.0.5:5020, 10.0.0.0/24:502-510, 10.0.0.5:*, [fd00::]/8:502. Names are resolved,
+    and their addresses must be in there. Without --writes it only reads.
+
+    Who may connect, --sources says: this machine, if nothing else. Anyone else needs a token.
+
+    Exit codes: 0 stopped by a signal, 1 it could not listen, 2 wrong usage.
+    """
+    settings = Settings(
+        allow=allow,
+        writes=writes,
+        tokens=() if token_file is None else _tokens(token_file),
+        sources=sources,
+        limits=replace(Limits(), in_flight=in_flight),
+    )
+    if not settings.tokens and any(not each.is_loopback for each in sources):
+        raise click.UsageError("--sources beyond this machine go with --token-file.")
+    logs.configure("info", "json" if json_log else "text")
+    signals = Signals()
+    try:
+        listener = listen(bind.host, bind.port)
+    except OSError as error:
+        click.echo(f"holdfast: can't listen on {bind}: {error.strerror or error}", err=True)
+        sys.exit(FAILED)
+    with listener:
+        _serve(settings, listener, signals)
+
+
+def _serve(settings: Settings, listener: socket.socket, signals: Signals) -> None:
+    """Serves in a thread, until a signal comes."""
+    served = Gateway(settings, listener)
+    stop = Stop()
+    with ThreadPoolExecutor(1, "gateway") as threads:
+        running: Future[None] = threads.submit(served.run, stop)
+        click.echo(_greeting(served.address, settings))
+        while not signals.received and not running.done():
+            wait_for([running], PATIENCE)
+        stop.set()
+        running.result()
+
+
+def _tokens(file: Path) -> tuple[tokens.Token, ...]:
+    try:
+        return tuple(tokens.load(file))
+    except OSError as error:
+        raise click.BadParameter(
+            f"{file}: {error.strerror or error}.", param_hint="'--token-file'"
+        ) from error
+    except tokens.WrongTokens as error:
+        raise click.BadParameter(f"{error}.", param_hint="'--token-file'") from error
+
+
+def _greeting(address: str, settings: Settings) -> str:
+    url = f"http://{address}"
+    can = "reads and writes" if settings.writes else "reads"
+    who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
+    [first, *_] = settings.allow
+    host = first.network[1] if first.network.num_addresses > 2 else first.network[0]
+    body = f'{{"host":"{host}","port":{first.first}}}'
+    header = "-H 'Content-Type: application/json'"
+    if settings.tokens:
+        header += ' -H "Authorization: Bearer $TOKEN"'
+    return "\n".join(
+        [
+            f"The console is at {url}/, the API is described at {url}/docs",
+            "",
+            f"  {can} devices at {', '.join(map(str, settings.allow))}",
+            f"  asked from {', '.join(map(str, settings.sources))}; {who}",
+            "",
+            "Try:",
+            "",
+            f"  curl {url}/api/modbus/connect {header} -d {shlex.quote(body)}",
+            "",
+            "Ctrl-C stops it.",
+        ]
+    )

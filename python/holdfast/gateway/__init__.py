@@ -1,0 +1,58 @@
+"""The gateway: Modbus devices over HTTP, and a console, see docs/gateway.md."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.gateway.app import App
+from holdfast.gateway.egress import Allowed
+from holdfast.gateway.pool import dial
+from holdfast.gateway.settings import Limits, Settings
+from holdfast.http import Host, address_of
+
+if TYPE_CHECKING:
+    import socket
+
+    from holdfast.adapters import Stop
+    from holdfast.gateway.egress import Resolve
+    from holdfast.gateway.pool import Dial
+
+__all__ = ["Allowed", "Gateway", "Limits", "Settings"]
+
+
+class Gateway:
+    """A gateway on a socket that listens already.
+
+    `resolve` makes a name addresses, `dial` makes the client of an address.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        listener: socket.socket,
+        *,
+        resolve: Resolve | None = None,
+        dial: Dial = dial,
+    ) -> None:
+        host, port, *_ = listener.getsockname()
+        self.address = address_of(host, port)
+        """Where it listens."""
+        self._app = App(settings, self.address, resolve=resolve, dial=dial)
+        self._host = Host(
+            "gateway",
+            self._app,
+            listener,
+            sources=settings.sources,
+            max_connections=settings.limits.connections,
+            request_timeout=settings.limits.request_timeout,
+            leaving=True,
+        )
+
+    def run(self, stop: Stop) -> None:
+        """Serves in this thread until `stop`."""
+        stop.then(self._app.end)
+        self._host.run(stop)
+
+    def counts(self) -> dict[str, int]:
+        """What became of connections, from any thread."""
+        return self._host.counts()

@@ -1,0 +1,339 @@
+"""The routes: who asks for what, and how that is answered.
+
+A plain ASGI application. Nothing here talks to a device: that is `device`'s work, for as long as
+the client is there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import msgspec
+
+from holdfast import __version__, logs
+from holdfast.adapters.rest import page
+from holdfast.errors import ModbusException
+from holdfast.gateway import assets, identifying, openapi, reading, surveying, watching, writing
+from holdfast.gateway.device import Device, Failed
+from holdfast.gateway.egress import Egress
+from holdfast.gateway.events import Stream
+from holdfast.gateway.fields import from_json, from_query, timeout
+from holdfast.gateway.pool import Pool, dial
+from holdfast.http import SAFE, headers_of, respond
+from holdfast.http_requests import Gone, Request, Unfit, respond_to_its_end, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine, Iterator
+
+    from holdfast.gateway.egress import Resolve
+    from holdfast.gateway.endpoint import Endpoint
+    from holdfast.gateway.pool import Dial
+    from holdfast.gateway.settings import Settings
+    from holdfast.http import Headers, Receive, Scope, Send
+
+    Handler: TypeAlias = Callable[[Request, Send], Awaitable[None]]
+
+ENDPOINTS: tuple[Endpoint, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
+
+JSON = b"application/json"
+REASON = b"holdfast-reason"
+FORM = b"application/x-www-form-urlencoded"
+"""What curl calls a body when it is not told: taken for JSON, as if it said so."""
+
+STATUSES = {
+    "malformed": 400,
+    "unauthorized": 401,
+    "refused_target": 403,
+    "writes_off": 403,
+    "foreign_page": 403,
+    "not_found": 404,
+    "method_not_allowed": 405,
+    "too_late": 408,
+    "too_large": 413,
+    "not_json": 415,
+    "busy": 503,
+}
+"""The status of a refusal by its reason; everything else is 500."""
+
+
+class App:
+    """The ASGI application."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        address: str,
+        *,
+        resolve: Resolve | None = None,
+        dial: Dial = dial,
+    ) -> None:
+        self._settings = settings
+        limits = self._limits = settings.limits
+        self._egress = Egress(settings.allow, resolve)
+        self._pool = Pool(
+            most=limits.devices,
+            in_flight=limits.in_flight,
+            idle=limits.idle,
+            longest=limits.timeout,
+            dial=dial,
+        )
+        self._running = {"requests": 0, "streams": 0}
+        self._ending = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        document = openapi.document(__version__, ENDPOINTS, settings)
+        self._document = msgspec.json.encode(document)
+        self._page = page.render(document, f"http://{address}")
+        self.routes: dict[str, tuple[str, Handler]] = {
+            **{each.path: ("POST", self._handler(each)) for each in ENDPOINTS},
+            surveying.PATH: ("POST", self._map),
+            watching.PATH: ("GET", self._watch),
+            openapi.STATUS: ("GET", self._status),
+            "/openapi.json": ("GET", self._openapi),
+            "/docs": ("GET", self._docs),
+            **dict.fromkeys(assets.FILES, ("GET", self._asset)),
+        }
+
+    def end(self) -> None:
+        """Ends all streams. From any thread."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # It has ended.
+                self._loop.call_soon_threadsafe(self._ending.set)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answers one request."""
+        self._loop = asyncio.get_running_loop()
+        request = Request(scope, receive)
+        try:
+            await self._answer(request, send)
+        except Unfit as unfit:
+            await self._refuse(request, send, unfit)
+        except Failed as failed:
+            body = _error(failed.detail)
+            await self._reply(request, send, body, status=500, reason=failed.reason)
+        except Gone:
+            pass
+        except Exception:
+            logs.problem("request_failed", listener="gateway", peer=request.peer)
+            with contextlib.suppress(RuntimeError):  # The answer has begun: it ends unfinished.
+                body = _error("internal error, see the log")
+                await self._reply(request, send, body, status=500, reason="internal_error")
+
+    async def _answer(self, request: Request, send: Send) -> None:
+        route = self.routes.get(request.path)
+        if route is None:
+            raise Unfit("not_found", f"there is nothing at {shown(request.path)}")
+        allowed, handler = route
+        head = request.method == "HEAD" and allowed == "GET" and request.path != watching.PATH
+        if request.method == allowed or head:
+            await handler(request, send)
+            return
+        methods = f"{allowed}, OPTIONS"
+        if allowed == "GET" and request.path != watching.PATH:
+            methods = "GET, HEAD, OPTIONS"
+        request.more_headers.append((b"allow", methods.encode()))
+        if request.method != "OPTIONS":
+            raise Unfit("method_not_allowed", f"Method not allowed: allowed are {methods}")
+        await respond(send, 204, [*SAFE, *request.more_headers])
+
+    async def _refuse(self, request: Request, send: Send, unfit: Unfit) -> None:
+        status = STATUSES[unfit.reason]
+        logs.refused(
+            "gateway_refused",
+            kind=unfit.reason,
+            peer=request.peer,
+            who=request.who,
+            path=request.path[:100],
+            reason=unfit.reason,
+            detail=unfit.detail,
+        )
+        if status == 401:
+            request.more_headers.append((b"www-authenticate", b"Bearer"))
+        if status == 503:
+            request.more_headers.append((b"retry-after", b"1"))
+        body = _error(unfit.detail)
+        if status in (408, 413):
+            headers = [*headers_of(JSON, body), (REASON, unfit.reason.encode())]
+            await respond_to_its_end(request, send, status, headers, body)
+            return
+        await self._reply(request, send, body, status=status, reason=unfit.reason)
+
+    async def _reply(
+        self,
+        request: Request,
+        send: Send,
+        body: bytes,
+        *,
+        kind: bytes = JSON,
+        status: int = 200,
+        reason: str | None = None,
+    ) -> None:
+        headers: Headers = headers_of(kind, body) + request.more_headers
+        if reason is not None:
+            headers.append((REASON, reason.encode()))
+        if request.header(b"expect") is not None:
+            headers.append((b"connection", b"close"))
+        await respond(send, status, headers, body)
+
+    # Who asks, and how much at once.
+
+    def _admit(self, request: Request) -> None:
+        """Raises `Unfit` for a request of nobody who may ask."""
+        if request.is_foreign:
+            raise Unfit("foreign_page", "a page of another site asks for this")
+        if self._settings.tokens:
+            request.who = request.owner(self._settings.tokens)
+        elif not request.is_direct:
+            detail = "Host is a name, without tokens allowed are IP addresses and localhost"
+            raise Unfit("foreign_page", detail)
+
+    @contextlib.contextmanager
+    def _place(self, kind: str, most: int) -> Iterator[None]:
+        """One of the places for what runs at once. Raises `Unfit`."""
+        if self._running[kind] >= most:
+            raise Unfit("busy", f"{most} {kind} are under way, which is the limit")
+        self._running[kind] += 1
+        try:
+            yield
+        finally:
+            self._running[kind] -= 1
+
+    async def _while_there(
+        self, request: Request, work: Coroutine[Any, Any, None], *, until_the_end: bool = False
+    ) -> None:
+        """Work that is given up when the client is gone, or when the gateway ends."""
+        task = asyncio.create_task(work)
+        others: list[asyncio.Task[Any]] = [asyncio.create_task(request.gone())]
+        if until_the_end:
+            others.append(asyncio.create_task(self._ending.wait()))
+        try:
+            await asyncio.wait([task, *others], return_when=asyncio.FIRST_COMPLETED)
+            if not task.done():
+                raise Gone
+            task.result()
+        finally:
+            for each in (task, *others):
+                each.cancel()
+            await asyncio.gather(task, *others, return_exceptions=True)
+
+    # Requests of devices.
+
+    def _handler(self, endpoint: Endpoint) -> Handler:
+        longest = round(1000 * self._limits.timeout)
+        fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
+
+        async def handle(request: Request, send: Send) -> None:
+            self._admit(request)
+            request.check_json(b"", FORM)
+            with self._place("requests", self._limits.requests):
+                given = from_json(await request.body(self._limits.body), fields)
+                changes = endpoint.writes(given)
+                if changes and not self._settings.writes:
+                    raise Unfit("writes_off", "writes are off: this gateway runs without --writes")
+                device = Device(self._egress, self._pool, given)
+                work = self._carry_out(request, send, endpoint, given, device, changes)
+                await self._while_there(request, work)
+
+        return handle
+
+    async def _carry_out(
+        self,
+        request: Request,
+        send: Send,
+        endpoint: Endpoint,
+        given: dict[str, Any],
+        device: Device,
+        changes: bool,
+    ) -> None:
+        outcome = "failed"
+        try:
+            answer = await endpoint.carry_out(given, device)
+            outcome = "done"
+        except ModbusException as error:
+            outcome = f"exception {error.code:02X}"
+            answer = endpoint.on_exception(given, device, error)
+        finally:
+            if changes:
+                self._note_write(request, given, outcome)
+        await self._reply(request, send, msgspec.json.encode(answer))
+
+    def _note_write(self, request: Request, given: dict[str, Any], outcome: str) -> None:
+        """Who wrote where, without the values."""
+        logs.write(
+            logging.INFO,
+            "gateway_write",
+            peer=request.peer,
+            who=request.who,
+            path=request.path,
+            target=f"{given['host']}:{given['port']}",
+            unit=given["unitId"],
+            address=given.get("address", given.get("writeAddress", "-")),
+            outcome=outcome,
+        )
+
+    async def _map(self, request: Request, send: Send) -> None:
+        self._admit(request)
+        request.check_json(b"", FORM)
+        with self._place("streams", self._limits.streams):
+            body = await request.body(self._limits.body)
+            given = from_json(body, surveying.fields(self._limits))
+            device = Device(self._egress, self._pool, given)
+            survey = surveying.planned(given)
+            stream = Stream(send, self._limits.heartbeat)
+            work = surveying.survey(survey, device, stream, self._limits.mapping)
+            await self._while_streaming(request, stream, work)
+
+    async def _watch(self, request: Request, send: Send) -> None:
+        self._admit(request)
+        with self._place("streams", self._limits.streams):
+            given = from_query(request.scope["query_string"], watching.fields(self._limits))
+            device = Device(self._egress, self._pool, given)
+            stream = Stream(send, self._limits.heartbeat)
+            await self._while_streaming(request, stream, watching.watch(given, device, stream))
+
+    async def _while_streaming(
+        self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
+    ) -> None:
+        try:
+            await self._while_there(request, work, until_the_end=True)
+        except Gone:
+            if self._ending.is_set() and not stream.began:
+                raise Unfit("busy", "the gateway is about to end") from None
+            if self._ending.is_set():
+                await stream.end()
+
+    # Everything else.
+
+    async def _status(self, request: Request, send: Send) -> None:
+        self._admit(request)
+        limits = self._limits
+        status = {
+            "version": __version__,
+            "writes": self._settings.writes,
+            "tokens": bool(self._settings.tokens),
+            "allow": [str(entry) for entry in self._settings.allow],
+            "limits": {
+                "timeout": round(1000 * limits.timeout),
+                "interval": round(1000 * limits.interval),
+            },
+            "connections": len(self._pool),
+        }
+        await self._reply(request, send, msgspec.json.encode(status))
+
+    async def _openapi(self, request: Request, send: Send) -> None:
+        await self._reply(request, send, self._document)
+
+    async def _docs(self, request: Request, send: Send) -> None:
+        request.more_headers.append((b"content-security-policy", page.POLICY))
+        await self._reply(request, send, self._page, kind=page.KIND)
+
+    async def _asset(self, request: Request, send: Send) -> None:
+        kind, body = assets.read(request.path)
+        request.more_headers += assets.HEADERS
+        await self._reply(request, send, body, kind=kind)
+
+
+def _error(detail: str) -> bytes:
+    return msgspec.json.encode({"success": False, "error": detail})

@@ -1,0 +1,182 @@
+// The map of a device: its four areas as pictures, and its ranges as a list.
+
+import { notice, stream } from "./api.js";
+import { $, colour, h, onTheme, say } from "./dom.js";
+
+const AREAS = {
+  coils: ["Coils", 1, 2000],
+  discrete_inputs: ["Discrete inputs", 2, 2000],
+  holding_registers: ["Holding registers", 3, 125],
+  input_registers: ["Input registers", 4, 125],
+};
+const FAILURES = { timeout: "no answer", connection: "connection lost", invalid: "wrong reply" };
+const CELLS = 1024;
+const NARROW = 640;
+const MOST_LISTED = 200;
+
+/** The view of the map of the device that `target()` is; `open` shows a range in the other view. */
+export class Map_ {
+  constructor(target, open) {
+    this.target = target;
+    this.open = open;
+    this.running = null;
+    this.pictures = [];
+    $("survey").addEventListener("submit", (event) => {
+      event.preventDefault();
+      if (this.running) this.stop();
+      else this.start(new FormData($("survey")));
+    });
+    onTheme(() => this.pictures.forEach((each) => each.draw()));
+  }
+
+  async start(form) {
+    const areas = form.getAll("areas");
+    if (areas.length === 0) {
+      say($("survey-state"), "Choose at least one area.");
+      return;
+    }
+    const first = Number(form.get("first"));
+    const last = Number(form.get("last"));
+    const stopping = new AbortController();
+    this.running = stopping;
+    this.prepare(areas, first, last);
+    const body = JSON.stringify({ ...this.target(), areas, first, last, exact: form.has("exact") });
+    try {
+      await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal }, (name, data) => {
+        if (this.running === stopping) this.happened(name, data);
+      });
+    } catch (error) {
+      if (this.running === stopping) say($("survey-state"), notice(error));
+    }
+    if (this.running === stopping) this.end();
+  }
+
+  prepare(areas, first, last) {
+    this.pictures = areas.map((area) => new Picture(area, first, last, this.open));
+    $("pictures").replaceChildren(...this.pictures.map((each) => each.root));
+    this.pictures.forEach((each) => each.draw());
+    $("survey-progress").hidden = false;
+    $("survey-progress").removeAttribute("value");
+    $("survey-go").textContent = "Stop";
+    say($("survey-state"), "Looking…");
+  }
+
+  happened(name, data) {
+    data.areas.forEach((area, at) => this.pictures[at].update(area));
+    const found = data.areas.reduce((sum, area) => sum + area.addresses, 0);
+    const counted = `${found.toLocaleString("en")} addresses, ${data.requests.toLocaleString("en")} requests`;
+    if (name === "progress") {
+      $("survey-progress").value = data.at / data.total;
+      $("survey-state").firstChild.textContent = `Looking… ${counted}`;
+      return;
+    }
+    this.pictures.forEach((each) => each.list());
+    if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`);
+    else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: "timeout" })), `Until then: ${counted}.`);
+  }
+
+  stop() {
+    this.running.abort();
+    say($("survey-state"), "Stopped; what was found is shown.");
+    this.pictures.forEach((each) => each.list());
+    this.end();
+  }
+
+  end() {
+    this.running = null;
+    $("survey-progress").hidden = true;
+    $("survey-go").textContent = "Map device";
+  }
+}
+
+/** One area: every cell is some addresses, the darker the more of them are there. */
+class Picture {
+  constructor(area, first, last, open) {
+    [this.title, this.code, this.limit] = AREAS[area];
+    this.first = first;
+    this.columns = innerWidth < NARROW ? 32 : 64;
+    this.each = Math.max(1, Math.ceil((last - first + 1) / CELLS));
+    this.rows = Math.ceil((last - first + 1) / this.each / this.columns);
+    this.open = open;
+    this.ranges = [];
+    this.failures = {};
+    this.count = h("span", { class: "dim" }, "…");
+    this.canvas = h("canvas", { role: "img" });
+    this.ranged = h("ul", { class: "ranges" });
+    this.canvas.addEventListener("pointermove", (event) => this.point(event));
+    const per = this.each === 1 ? "1 address a cell" : `${this.each} addresses a cell`;
+    this.root = h("article", { class: "card picture" },
+      h("header", {}, h("h3", {}, this.title), this.count),
+      this.canvas,
+      h("div", { class: "scale" }, h("span", {}, String(first)), h("span", {}, per), h("span", {}, String(last))),
+      this.ranged);
+    new ResizeObserver(() => this.draw()).observe(this.root);
+  }
+
+  update({ addresses, ranges, failures, givenUp }) {
+    if (ranges) this.ranges = ranges;
+    this.failures = failures ?? {};
+    this.givenUp = givenUp;
+    this.count.textContent = addresses === 1 ? "1 address" : `${addresses.toLocaleString("en")} addresses`;
+    this.canvas.setAttribute("aria-label", `${this.title}: ${this.count.textContent} in ${this.ranges.length} ranges`);
+    this.draw();
+  }
+
+  /** How many addresses of each cell are in some ranges. */
+  filled(ranges) {
+    const cells = new Float32Array(this.columns * this.rows);
+    for (const [from, to] of ranges) {
+      for (let at = from; at <= to; ) {
+        const cell = Math.floor((at - this.first) / this.each);
+        const end = Math.min(to, this.first + (cell + 1) * this.each - 1);
+        cells[cell] += end - at + 1;
+        at = end + 1;
+      }
+    }
+    return cells;
+  }
+
+  /** Draws it in whole pixels of the screen. */
+  draw() {
+    const room = this.root.clientWidth - 2 * parseFloat(getComputedStyle(this.root).paddingLeft);
+    const size = Math.max(3, Math.floor((room * devicePixelRatio) / this.columns));
+    this.canvas.width = this.columns * size;
+    const height = this.columns < 64 ? Math.ceil(size / 2) : size;
+    this.canvas.height = this.rows * height;
+    this.canvas.style.width = `${this.canvas.width / devicePixelRatio}px`;
+    const context = this.canvas.getContext("2d");
+    this.there = this.filled(this.ranges);
+    const wrong = this.filled(Object.values(this.failures).flat());
+    const [soft, accent, warm] = [colour("--line"), colour("--accent"), colour("--warm-ink")];
+    for (let cell = 0; cell < this.there.length; cell += 1) {
+      const part = this.there[cell] / this.each;
+      context.globalAlpha = part > 0 ? 0.4 + 0.6 * part : wrong[cell] > 0 ? 0.8 : 0.6;
+      context.fillStyle = part > 0 ? accent : wrong[cell] > 0 ? warm : soft;
+      context.fillRect((cell % this.columns) * size, Math.floor(cell / this.columns) * height, size - 1, height - 1);
+    }
+  }
+
+  point(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const column = Math.floor(((event.clientX - box.left) / box.width) * this.columns);
+    const cell = Math.floor(((event.clientY - box.top) / box.height) * this.rows) * this.columns + column;
+    const from = this.first + cell * this.each;
+    this.canvas.title = `${from}${this.each > 1 ? ` to ${from + this.each - 1}` : ""}: ${this.there[cell] ?? 0} there`;
+  }
+
+  /** The ranges, each to be read with a click. */
+  list() {
+    const items = this.ranges.slice(0, MOST_LISTED).map(([from, to]) => {
+      const onclick = () => this.open(this.code, from, Math.min(to - from + 1, this.limit));
+      const text = from === to ? `${from}` : `${from}–${to}`;
+      return h("li", {}, h("button", { type: "button", "aria-label": `Read ${this.title.toLowerCase()} ${text}`, onclick }, text));
+    });
+    if (this.ranges.length > MOST_LISTED) items.push(h("li", { class: "dim" }, `and ${this.ranges.length - MOST_LISTED} more`));
+    for (const [kind, ranges] of Object.entries(this.failures)) {
+      const count = ranges.reduce((sum, [from, to]) => sum + to - from + 1, 0);
+      items.push(h("li", { class: "wrong" }, `${count} with ${FAILURES[kind] ?? `exception ${kind}`}`));
+    }
+    if (items.length === 0) items.push(h("li", { class: "dim" }, this.givenUp === 1 ? "The device does not know this area." : "None found."));
+    this.ranged.replaceChildren(...items);
+  }
+}

@@ -1,0 +1,184 @@
+"""Whom the gateway may connect to: networks and ports, and names made addresses.
+
+A name is resolved once. Only addresses that are in the list are kept, and the connection is made to
+one of those, never to the name: what it means to a name server a moment later does not matter.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import socket
+import threading
+from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import TYPE_CHECKING, TypeAlias
+
+from holdfast.config.addresses import parse_source
+from holdfast.target import PORT
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+
+    from holdfast.config.addresses import Network
+    from holdfast.target import Transport
+
+    Address: TypeAlias = IPv4Address | IPv6Address
+    Resolve: TypeAlias = Callable[[str], Awaitable[list[str]]]
+
+FORM = (
+    "NETWORK[:PORTS] as 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
+    "[fd00::]/8:502; without ports it is 502"
+)
+LAST_PORT = 65535
+
+MOST_LOOKUPS = 32
+"""Names that are looked up at once; more wait."""
+
+_ENTRY = re.compile(
+    r"(?:\[(?P<six>[0-9a-fA-F:.]*)\](?P<prefix>/[0-9]{1,3})?|(?P<four>[0-9./]+))"
+    r"(?::(?P<ports>\*|[0-9]{1,5}(?:-[0-9]{1,5})?))?",
+    re.ASCII,
+)
+
+
+class Refused(Exception):
+    """The target is not in the egress list."""
+
+
+class NoSuchName(Exception):
+    """A name that means no address."""
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """A network and the ports in it."""
+
+    network: Network
+    first: int
+    last: int
+
+    def holds(self, address: Address, port: int) -> bool:
+        """Whether a connection to this port of this address is one of them."""
+        return self.first <= port <= self.last and address in self.network
+
+    def __str__(self) -> str:
+        network = self.network
+        whole = network.prefixlen == network.max_prefixlen
+        prefix = "" if whole else f"/{network.prefixlen}"
+        host = str(network.network_address)
+        ports = str(self.first) if self.first == self.last else f"{self.first}-{self.last}"
+        if (self.first, self.last) == (1, LAST_PORT):
+            ports = "*"
+        return f"[{host}]{prefix}:{ports}" if network.version == 6 else f"{host}{prefix}:{ports}"
+
+
+def parse(text: str) -> Allowed:
+    """An entry of the list. Raises `ValueError`, which says what is allowed."""
+    match = _ENTRY.fullmatch(text)
+    if match is None:
+        raise ValueError(f"found {text!r}, allowed: {FORM}")
+    host = match["four"] or f"{match['six']}{match['prefix'] or ''}"
+    network = parse_source(host)
+    if match["six"] is not None and network.version != 6:
+        raise ValueError(f"found {text!r}, brackets are for IPv6")
+    first, last = _ports(match["ports"])
+    if not 1 <= first <= last <= LAST_PORT:
+        raise ValueError(f"found {text!r}, allowed are ports 1 to 65535, lower ones first")
+    return Allowed(network, first, last)
+
+
+def _ports(text: str | None) -> tuple[int, int]:
+    if text is None:
+        return PORT, PORT
+    if text == "*":
+        return 1, LAST_PORT
+    first, _, last = text.partition("-")
+    return int(first), int(last or first)
+
+
+@dataclass(frozen=True)
+class Route:
+    """A way to a device that may be gone: its addresses, each of them in the list."""
+
+    transport: Transport
+    addresses: tuple[str, ...]
+    port: int
+
+
+class Egress:
+    """The list, and how names become addresses."""
+
+    def __init__(self, entries: Iterable[Allowed], resolve: Resolve | None = None) -> None:
+        self.entries = tuple(entries)
+        self._resolve = Lookups() if resolve is None else resolve
+
+    def allows(self, address: str, port: int) -> bool:
+        """Whether a connection may be made; an IPv4 address in IPv6 is that IPv4 address."""
+        found = plain(address)
+        if found.is_multicast or found.is_unspecified:
+            return False
+        return any(entry.holds(found, port) for entry in self.entries)
+
+    async def route(self, transport: Transport, host: str, port: int) -> Route:
+        """The way to a target. Raises `Refused` and `NoSuchName`."""
+        name = host.removeprefix("[").removesuffix("]")
+        try:
+            found = [str(ip_address(name))]
+        except ValueError:
+            found = await self._resolve(host)
+        allowed = [str(plain(each)) for each in found if self.allows(each, port)]
+        if not allowed:
+            is_name = name not in found
+            where = f" ({', '.join(found[:4])})" if is_name else ""
+            raise Refused(f"{host}{where}, port {port}, is not in the egress list of this gateway")
+        # IPv4 first: a device that has both seldom answers Modbus on IPv6 only.
+        allowed.sort(key=lambda each: ":" in each)
+        return Route(transport, tuple(dict.fromkeys(allowed)), port)
+
+
+def plain(address: str) -> Address:
+    """An address; an IPv4 address in IPv6 is that IPv4 address."""
+    found = ip_address(address)
+    return getattr(found, "ipv4_mapped", None) or found
+
+
+class Lookups:
+    """The system's resolver, in threads that nobody has to wait for."""
+
+    def __init__(self) -> None:
+        self._turns = asyncio.Semaphore(MOST_LOOKUPS)
+
+    async def __call__(self, host: str) -> list[str]:
+        """The addresses of a name. Raises `NoSuchName`."""
+        await self._turns.acquire()
+        loop = asyncio.get_running_loop()
+        answer: asyncio.Future[list[str]] = loop.create_future()
+
+        def settle(found: list[str] | NoSuchName) -> None:
+            self._turns.release()
+            if answer.done():  # Nobody waits any more.
+                return
+            if isinstance(found, NoSuchName):
+                answer.set_exception(found)
+            else:
+                answer.set_result(found)
+
+        def work() -> None:
+            found = _looked_up(host)
+            with contextlib.suppress(RuntimeError):  # The loop has ended.
+                loop.call_soon_threadsafe(settle, found)
+
+        threading.Thread(target=work, name="lookup", daemon=True).start()
+        return await answer
+
+
+def _looked_up(host: str) -> list[str] | NoSuchName:
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        return NoSuchName(f"can't resolve {host}: {why}")
+    # An address of one link only, with a scope, is none that others could mean.
+    return [str(address[0]) for *_, address in found if "%" not in str(address[0])]

@@ -1,0 +1,56 @@
+"""Server-sent events: one answer that goes on, event by event."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.http import SAFE
+
+if TYPE_CHECKING:
+    from holdfast.http import Send
+
+KIND = b"text/event-stream"
+
+
+class Stream:
+    """Sends events; between them a comment, so that both ends know that the other is there."""
+
+    def __init__(self, send: Send, heartbeat: float) -> None:
+        self._send = send
+        self._heartbeat = heartbeat
+        self._loop = asyncio.get_running_loop()
+        self._last = self._loop.time()
+        self.began = False
+        """Whether there is an answer that can be ended."""
+
+    async def begin(self) -> None:
+        """The header of the answer; it leaves with the first event."""
+        start = [(b"content-type", KIND), (b"x-accel-buffering", b"no"), *SAFE]
+        self.began = True
+        await self._send({"type": "http.response.start", "status": 200, "headers": start})
+
+    async def event(self, name: str, data: Any) -> None:
+        """One event, whose data is JSON."""
+        await self._write(b"event: %b\ndata: %b\n\n" % (name.encode(), msgspec.json.encode(data)))
+
+    async def beat(self) -> None:
+        """A comment, if nothing was sent for a while."""
+        if self._loop.time() - self._last >= self._heartbeat:
+            await self._write(b":\n\n")
+
+    async def pause(self, until: float) -> None:
+        """Waits until a time of the event loop, with signs of life."""
+        while (left := until - self._loop.time()) > 0:
+            await asyncio.sleep(min(left, self._heartbeat))
+            await self.beat()
+
+    async def end(self) -> None:
+        """Ends the answer."""
+        await self._send({"type": "http.response.body", "body": b""})
+
+    async def _write(self, data: bytes) -> None:
+        self._last = self._loop.time()
+        await self._send({"type": "http.response.body", "body": data, "more_body": True})

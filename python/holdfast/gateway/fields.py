@@ -1,0 +1,237 @@
+"""The fields of requests: what they are in JSON, in a query, and in the OpenAPI document.
+
+One description serves all three. Nothing is converted: an integer is written as one, and what is
+not a field is refused, so that no slip of the pen is taken for a default.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import parse_qsl
+
+import msgspec
+
+from holdfast.http_requests import Unfit, shown
+from holdfast.types import AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+Schema: TypeAlias = dict[str, Any]
+
+LAST = 65535
+REQUIRED: Any = object()
+"""In place of a default: there is none."""
+
+MOST_PARAMETERS = 32
+
+_HOST = r"^(\[[0-9A-Fa-f:.]{2,45}\]|[0-9A-Fa-f:.]{2,45}|[A-Za-z0-9_]([A-Za-z0-9._-]{0,252}))$"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field, with a default unless it is `REQUIRED`; `None` means that it may be left out."""
+
+    name: str
+    schema: Schema
+    text: str
+    default: Any = REQUIRED
+    refusal: Callable[[Any], str] | None = None
+    """What is said of a wrong value, where the usual words won't do."""
+
+    def check(self, value: Any) -> Any:
+        """The value. Raises `Unfit`."""
+        flaw = _flaw(value, self.schema)
+        if flaw is not None:
+            usual = f"{self.name}{flaw}"
+            raise malformed(usual if self.refusal is None else self.refusal(value))
+        return value
+
+    def read(self, text: str) -> Any:
+        """A value from a query. Raises `Unfit`."""
+        kind = self.schema["type"]
+        if kind == "integer" and re.fullmatch("(0|[1-9][0-9]{0,9})", text):
+            return self.check(int(text))
+        return self.check(text)
+
+    @property
+    def required(self) -> bool:
+        """Whether it must be given."""
+        return self.default is REQUIRED
+
+    @property
+    def described(self) -> Schema:
+        """Its schema with its text and its default."""
+        optional = {} if self.required or self.default is None else {"default": self.default}
+        return {**self.schema, **optional, "description": self.text}
+
+
+def integer(least: int, most: int) -> Schema:
+    """The schema of an integer."""
+    return {"type": "integer", "minimum": least, "maximum": most}
+
+
+def array(items: Schema, most: int) -> Schema:
+    """The schema of a list that is not empty."""
+    return {"type": "array", "minItems": 1, "maxItems": most, "items": items}
+
+
+REGISTER = integer(0, LAST)
+BIT: Schema = {"enum": [False, True, 0, 1]}
+TEXT: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
+ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
+
+HOST = Field(
+    "host",
+    {"type": "string", "maxLength": 253, "pattern": _HOST},
+    "Name or IP address of the device; it must be in the egress list",
+)
+PORT = Field("port", integer(1, LAST), "Port", 502)
+UNIT = Field("unitId", integer(0, 255), "Unit id (slave address)", 1)
+TRANSPORT = Field(
+    "transport",
+    {"type": "string", "enum": ["tcp", "udp", "rtu+tcp", "tls"]},
+    "How to talk to it; `tls` is not available in this version",
+    "tcp",
+)
+ADDRESS = Field("address", REGISTER, "The first address, from 0")
+DATATYPE = Field(
+    "datatype",
+    TEXT,
+    "Type of the values: `int16`, `uint32`, `float32`, `bcd16`, `bit:3`, `string:20`, `bytes:4`, "
+    "`bool`, or an array as `float32[10]`",
+    None,
+)
+BYTE_ORDER = Field(
+    "byteOrder",
+    ORDER,
+    "Order of bytes: `ABCD`, `CDAB`, `BADC`, `DCBA`, or eight letters for eight bytes",
+    "ABCD",
+)
+AREA_LIST = Field(
+    "areas",
+    {
+        "type": "array",
+        "minItems": 1,
+        "maxItems": 4,
+        "uniqueItems": True,
+        "items": {"type": "string", "enum": list(AREAS)},
+    },
+    "The areas to look at; all four if left out",
+    None,
+)
+
+
+def timeout(default: int, longest: int, text: str = "Milliseconds for all of it") -> Field:
+    """The field for a time limit."""
+    return Field("timeout", integer(1, longest), text, default)
+
+
+def with_default(field: Field, default: Any) -> Field:
+    """The same field with another default."""
+    return replace(field, default=default)
+
+
+def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
+    """The fields of a JSON object, defaults filled in. Raises `Unfit`."""
+    try:
+        given = msgspec.json.decode(body)
+    except (msgspec.MsgspecError, RecursionError, UnicodeError, ValueError) as error:
+        raise malformed(f"the body is not JSON: {str(error)[:100]}") from None
+    if not isinstance(given, dict):
+        raise malformed("the body is not a JSON object")
+    return _filled(given, fields)
+
+
+def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
+    """The fields of a query, defaults filled in. Raises `Unfit`."""
+    try:
+        pairs = parse_qsl(
+            query.decode("latin-1"), keep_blank_values=True, max_num_fields=MOST_PARAMETERS
+        )
+    except ValueError:
+        raise malformed(f"there are more than {MOST_PARAMETERS} parameters") from None
+    known = {field.name: field for field in fields}
+    given: dict[str, Any] = {}
+    for name, text in pairs:
+        if name in given:
+            raise malformed(f"{name} is given more than once")
+        given[name] = known[name].read(text) if name in known else text
+    return _filled(given, fields)
+
+
+def malformed(detail: str) -> Unfit:
+    """A wrong request."""
+    return Unfit("malformed", detail)
+
+
+def _filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]:
+    missing = [field.name for field in fields if field.required]
+    missing = [name for name in missing if name not in given]
+    if missing:
+        raise malformed(f"Missing required parameter{'s'[: len(missing) > 1]}: {_and(missing)}")
+    names = [field.name for field in fields]
+    for name in given:
+        if name not in names:
+            raise malformed(f"{shown(name)} is not a parameter, allowed are {', '.join(names)}")
+    return {
+        field.name: field.check(given[field.name]) if field.name in given else field.default
+        for field in fields
+    }
+
+
+def _flaw(value: Any, schema: Schema) -> str | None:
+    """What is wrong with a value, to be put behind its name; `None` if nothing is."""
+    kind = schema.get("type")
+    if kind == "array":
+        return _flaw_of_array(value, schema)
+    if "enum" in schema:
+        allowed = schema["enum"]
+        fits = any(type(value) is type(each) and value == each for each in allowed)
+        return None if fits else f" is {told(value)}, allowed are {_words(allowed)}"
+    if kind == "integer":
+        least, most = schema["minimum"], schema["maximum"]
+        fits = type(value) is int and least <= value <= most
+        return None if fits else f" is {told(value)}, allowed is an integer {least} to {most}"
+    if kind == "boolean":
+        return None if type(value) is bool else f" is {told(value)}, allowed are true and false"
+    if kind != "string":
+        return None
+    fits = isinstance(value, str) and re.search(schema.get("pattern", ""), value) is not None
+    long = isinstance(value, str) and not 1 <= len(value) <= schema.get("maxLength", 8)
+    return f" is {told(value)}, which it can't be" if long or not fits else None
+
+
+def _flaw_of_array(value: Any, schema: Schema) -> str | None:
+    if not isinstance(value, list):
+        return f" is {told(value)}, allowed is an array"
+    least, most = schema["minItems"], schema["maxItems"]
+    if not least <= len(value) <= most:
+        return f" has {len(value)} elements, allowed are {least} to {most}"
+    if schema.get("uniqueItems") and any(value.count(each) > 1 for each in value):
+        return " names something twice"
+    for index, item in enumerate(value):
+        flaw = _flaw(item, schema["items"])
+        if flaw is not None:
+            return f"[{index}]{flaw}"
+    return None
+
+
+def told(value: Any) -> str:
+    """A value from outside, cut short."""
+    if isinstance(value, str):
+        return shown(value)
+    if isinstance(value, dict | list):
+        return "an object" if isinstance(value, dict) else "an array"
+    text = msgspec.json.encode(value).decode() if type(value) is not int else str(value)[:40]
+    return text[:40]
+
+
+def _words(allowed: Sequence[Any]) -> str:
+    return ", ".join(each if isinstance(each, str) else told(each) for each in allowed)
+
+
+def _and(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]

@@ -1,0 +1,143 @@
+"""What a device says of itself: diagnostics, its server id, its identification."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.gateway.endpoint import EXAMPLE, MILLISECONDS, REGISTERS, TARGET, Endpoint
+from holdfast.gateway.fields import REGISTER, Field, array, integer
+from holdfast.operations import OBJECT_NAMES
+
+if TYPE_CHECKING:
+    from holdfast.gateway.device import Device
+    from holdfast.gateway.endpoint import Answer, Given
+
+HARMLESS = {0, 2, *range(11, 19)}
+"""Sub-functions that change nothing: the echo, the diagnostic register, the counters."""
+
+MOST_WORDS = 125
+
+_NAMES = {
+    name: "".join(word if at == 0 else word.title() for at, word in enumerate(name.split("_")))
+    for name in OBJECT_NAMES
+}
+_TEXT_OR_NULL = {"type": ["string", "null"]}
+_HEX = {"type": "string", "pattern": "^([0-9a-f]{2})*$"}
+
+
+async def _diagnostics(given: Given, device: Device) -> Answer:
+    number, words = given["subFunction"], given["data"]
+    found = await device.ask(
+        lambda client: client.diagnostics(number, words, unit=device.unit),
+        repeat=number in HARMLESS,
+    )
+    return {
+        "success": True,
+        **device.told,
+        "subFunction": number,
+        "data": found,
+        "rtt": device.rtt,
+    }
+
+
+async def _server_id(_: Given, device: Device) -> Answer:
+    found = await device.ask(lambda client: client.report_server_id(unit=device.unit), repeat=True)
+    return {
+        "success": True,
+        **device.told,
+        "serverId": found.server_id,
+        "running": found.running,
+        "additional": found.additional.hex(),
+        "data": found.data.hex(),
+        "rtt": device.rtt,
+    }
+
+
+async def _identify(_: Given, device: Device) -> Answer:
+    found = await device.ask(lambda client: client.identify(unit=device.unit), repeat=True)
+    names = {told: getattr(found, name) for name, told in _NAMES.items()}
+    objects = {str(number): data.hex() for number, data in sorted(found.objects.items())}
+    return {
+        "success": True,
+        **device.told,
+        **names,
+        "conformityLevel": found.conformity_level,
+        "objects": objects,
+        "rtt": device.rtt,
+    }
+
+
+ENDPOINTS = (
+    Endpoint(
+        "/api/modbus/diagnostics",
+        "diagnostics",
+        "Diagnostics of a device on a serial line",
+        (
+            *TARGET,
+            Field(
+                "subFunction", REGISTER, "0 echo, 2 diagnostic register, 11 to 18 counters, …", 0
+            ),
+            Field("data", array(REGISTER, MOST_WORDS), "Words that go with it", [0]),
+        ),
+        _diagnostics,
+        {"subFunction": integer(0, 65535), "data": REGISTERS, "rtt": MILLISECONDS},
+        {"The echo": {**EXAMPLE, "subFunction": 0, "data": [0xA537]}},
+        {**EXAMPLE, "subFunction": 0, "data": [0xA537], "rtt": 12},
+        "Function 8. Sub-functions other than 0, 2 and 11 to 18 change the device, and are refused "
+        "as writes are. 4, Force Listen Only Mode, has no reply.",
+        writes=lambda given: given["subFunction"] not in HARMLESS,
+    ),
+    Endpoint(
+        "/api/modbus/server-id",
+        "serverId",
+        "What a device calls itself",
+        TARGET,
+        _server_id,
+        {
+            "serverId": {"type": ["integer", "null"]},
+            "running": {"type": ["boolean", "null"]},
+            "additional": _HEX,
+            "data": _HEX,
+            "rtt": MILLISECONDS,
+        },
+        {"A device": EXAMPLE},
+        {
+            **EXAMPLE,
+            "serverId": 17,
+            "running": True,
+            "additional": "",
+            "data": "11ff",
+            "rtt": 12,
+        },
+        "Function 17. The layout is the device's own: `data` is all of it, in hex.",
+    ),
+    Endpoint(
+        "/api/modbus/identify",
+        "identify",
+        "Vendor, product and revision of a device",
+        TARGET,
+        _identify,
+        {
+            **dict.fromkeys(_NAMES.values(), _TEXT_OR_NULL),
+            "conformityLevel": integer(0, 255),
+            "objects": {
+                "type": "object",
+                "additionalProperties": _HEX,
+                "description": "All objects by their ids, in hex",
+            },
+            "rtt": MILLISECONDS,
+        },
+        {"A device": EXAMPLE},
+        {
+            **EXAMPLE,
+            **dict.fromkeys(_NAMES.values()),
+            "vendorName": "Acme",
+            "productCode": "F7",
+            "revision": "2.1",
+            "conformityLevel": 1,
+            "objects": {"0": "41636d65", "1": "4637", "2": "322e31"},
+            "rtt": 12,
+        },
+        "Function 43/14, as many requests as the device wants.",
+    ),
+)

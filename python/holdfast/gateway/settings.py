@@ -1,0 +1,56 @@
+"""What a gateway is told when it starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from ipaddress import ip_network
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.config.addresses import Network
+    from holdfast.gateway.egress import Allowed
+    from holdfast.gateway.tokens import Token
+
+LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a gateway takes and does at most. Times are in seconds."""
+
+    body: int = 65536
+    """Bytes of a request's body."""
+    timeout: float = 60.0
+    """What a request may ask for as its time."""
+    requests: int = 64
+    """Requests at once; more are answered 503."""
+    streams: int = 16
+    """Maps and watches at once; more are answered 503."""
+    mapping: float = 900.0
+    """For a map, which ends unfinished then."""
+    interval: float = 0.1
+    """Between two polls of a watch, at least."""
+    heartbeat: float = 5.0
+    """Between two signs of life of a stream, at most."""
+    devices: int = 256
+    """Connections that are kept."""
+    idle: float = 30.0
+    """A connection that nobody uses is kept for."""
+    in_flight: int = 1
+    """Requests on their way to one device at once."""
+    connections: int = 128
+    """Connections of HTTP clients."""
+    request_timeout: float = 10.0
+    """For a request to arrive, and for an answer to be taken."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Whom it may talk to, what it may do, and who may ask."""
+
+    allow: tuple[Allowed, ...]
+    writes: bool = False
+    tokens: tuple[Token, ...] = ()
+    """Without any, whoever may connect may ask."""
+    sources: tuple[Network, ...] = LOOPBACK
+    limits: Limits = field(default_factory=Limits)

@@ -1,0 +1,157 @@
+"""Mapping: which addresses a device has, told while it is being found out."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING, Any, cast
+
+from holdfast import mapping
+from holdfast.errors import ModbusError, ModbusException
+from holdfast.gateway.device import Failed
+from holdfast.gateway.endpoint import TARGET
+from holdfast.gateway.fields import AREA_LIST, LAST, Field, integer, malformed, timeout
+from holdfast.http_requests import Unfit
+from holdfast.mapping import Survey
+from holdfast.types import AREAS
+
+if TYPE_CHECKING:
+    from holdfast.client import Client
+    from holdfast.gateway.device import Device
+    from holdfast.gateway.endpoint import Given
+    from holdfast.gateway.events import Stream
+    from holdfast.gateway.settings import Limits
+    from holdfast.mapping import AreaMap
+    from holdfast.types import Area
+
+PATH = "/api/modbus/map"
+TIMEOUT = 2_000
+
+BETWEEN = 0.2
+"""Seconds between two events of progress."""
+
+MOST_SHOWN = 500
+"""Ranges that an event of progress tells; the result tells all."""
+
+
+def fields(limits: Limits) -> tuple[Field, ...]:
+    """What a map is asked with."""
+    return (
+        *TARGET,
+        AREA_LIST,
+        Field("first", integer(0, LAST), "The first address to look at", 0),
+        Field("last", integer(0, LAST), "The last address to look at", LAST),
+        Field("exact", {"type": "boolean"}, "Read every address, not samples", False),
+        Field("step", integer(1, LAST + 1), "Addresses between two samples", mapping.STEP),
+        Field("maxQuantity", integer(1, 2000), "The most that a read asks for", None),
+        timeout(TIMEOUT, round(1000 * limits.timeout), "Milliseconds for each read"),
+    )
+
+
+def planned(given: Given) -> Survey:
+    """What a request asks for. Raises `Unfit`."""
+    if given["first"] > given["last"]:
+        raise malformed(f"first is {given['first']}, behind last, which is {given['last']}")
+    return Survey(
+        given["areas"] or AREAS,
+        exact=given["exact"],
+        max_quantity=given["maxQuantity"],
+        step=given["step"],
+        span=range(given["first"], given["last"] + 1),
+    )
+
+
+async def survey(survey: Survey, device: Device, stream: Stream, longest: float) -> None:
+    """Maps a device. What fails before anything was answered, fails as a read does."""
+    began = time.monotonic()
+    with contextlib.suppress(ModbusException):  # Which is an answer: the device is there.
+        await device.ask(
+            lambda client: client.read_holding_registers(survey.span.start, 1, unit=device.unit),
+            repeat=True,
+        )
+    await stream.begin()
+    running = asyncio.create_task(_run(survey, _Reader(device), longest))
+    try:
+        while not running.done():
+            await stream.event("progress", _progress(survey))
+            await asyncio.wait([running], timeout=BETWEEN)
+        error = running.result()
+    finally:
+        running.cancel()
+        await asyncio.wait([running])
+    await stream.event("result", _result(survey, time.monotonic() - began, error))
+    await stream.end()
+
+
+async def _run(survey: Survey, reader: _Reader, longest: float) -> str | None:
+    """Carries a survey out; why it ended early, if it did."""
+    try:
+        async with asyncio.timeout(longest):
+            await mapping.run(survey, cast("Client", reader))
+    except TimeoutError:
+        return f"not done within {longest:g} s"
+    except ModbusError as error:
+        return str(error)
+    except (Failed, Unfit) as error:
+        return error.detail
+    return None
+
+
+class _Reader:
+    """A client as far as a survey needs one."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+
+    async def read(self, area: Area, address: int, kind: str) -> Any:
+        """A read, each with the time of the request."""
+        return await self._device.attempt(
+            lambda client: client.read(area, address, kind, unit=self._device.unit), repeat=True
+        )
+
+
+def _progress(survey: Survey) -> dict[str, Any]:
+    few = sum(len(found.ranges) for found in survey.areas) <= MOST_SHOWN
+    return {
+        "at": survey.at,
+        "total": survey.total,
+        "requests": survey.requests,
+        "areas": [
+            {
+                "area": found.area,
+                "addresses": found.addresses,
+                **({"ranges": _pairs(found.ranges)} if few else {}),
+            }
+            for found in survey.areas
+        ],
+    }
+
+
+def _result(survey: Survey, seconds: float, error: str | None) -> dict[str, Any]:
+    return {
+        "success": error is None,
+        **({} if error is None else {"error": error}),
+        "requests": survey.requests,
+        "seconds": round(seconds, 3),
+        "exact": survey.exact,
+        "first": survey.span.start,
+        "last": survey.span.stop - 1,
+        "areas": [_area(found) for found in survey.areas],
+    }
+
+
+def _area(found: AreaMap) -> dict[str, Any]:
+    return {
+        "area": found.area,
+        "addresses": found.addresses,
+        "ranges": _pairs(found.ranges),
+        "failures": {str(kind): _pairs(ranges) for kind, ranges in found.failures.items()},
+        "givenUp": found.given_up,
+        "largest": found.largest,
+        "requests": found.requests,
+    }
+
+
+def _pairs(ranges: list[range]) -> list[list[int]]:
+    return [[each.start, each.stop - 1] for each in ranges]

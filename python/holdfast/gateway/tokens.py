@@ -1,0 +1,56 @@
+"""The tokens of the gateway: a file of names and SHA-256 hashes, one token a line."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, TypeAlias
+
+from holdfast.config.values import NAME_FORM, is_name
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Token: TypeAlias = tuple[str, bytes]
+"""A name and a SHA-256."""
+
+FORM = "NAME SHA256 or SHA256, as `holdfast token --line` prints it"
+
+_HASH = re.compile("[0-9a-fA-F]{64}")
+
+
+class WrongTokens(Exception):
+    """A file that is not one of tokens. Its text names the line, never what is in it."""
+
+
+def load(file: Path) -> list[Token]:
+    """The tokens of a file; `#` begins a comment. Raises `OSError` and `WrongTokens`."""
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise WrongTokens(f"{file}: not UTF-8") from None
+    tokens: list[Token] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        try:
+            token = _token(words, number)
+        except ValueError as error:
+            raise WrongTokens(f"{file}:{number}: {error}") from None
+        for name, digest in tokens:
+            if name == token[0] or digest == token[1]:
+                raise WrongTokens(f"{file}:{number}: the same name or token as before")
+        tokens.append(token)
+    if not tokens:
+        raise WrongTokens(f"{file}: no token, allowed are lines {FORM}")
+    return tokens
+
+
+def _token(words: list[str], number: int) -> Token:
+    *names, digest = words
+    if len(names) > 1 or not _HASH.fullmatch(digest):
+        raise ValueError(f"no token, allowed is {FORM}")
+    name = names[0] if names else f"token-{number}"
+    if not is_name(name):
+        raise ValueError(f"the name of a token is {NAME_FORM}")
+    return name, bytes.fromhex(digest)

@@ -1,0 +1,297 @@
+"""Writing: coils and holding registers, one or many, masks, and a write with a read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from holdfast.gateway.endpoint import (
+    EXAMPLE,
+    MILLISECONDS,
+    REGISTERS,
+    TARGET,
+    Endpoint,
+    always,
+)
+from holdfast.gateway.fields import (
+    ADDRESS,
+    BIT,
+    BYTE_ORDER,
+    DATATYPE,
+    REGISTER,
+    Field,
+    array,
+    integer,
+    malformed,
+)
+from holdfast.gateway.typed import typed
+from holdfast.operations import ADDRESSES, WRITE_LIMITS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.gateway.device import Device
+    from holdfast.gateway.endpoint import Answer, Given
+
+ON = 0xFF00
+MOST_REGISTERS = WRITE_LIMITS["holding_registers"]
+MOST_COILS = WRITE_LIMITS["coils"]
+MOST_WITH_READ = 121
+MOST_READ = 125
+TIMEOUT = 5_000
+
+PLAIN_OR_TYPED = {"type": ["integer", "number", "string", "boolean"]}
+"""Values of any type; which, the datatype says."""
+
+
+async def _write_coil(given: Given, device: Device) -> Answer:
+    address, value = given["address"], bool(given["value"])
+    await device.ask(lambda client: client.write_coil(address, value, unit=device.unit))
+    return {
+        "success": True,
+        **device.told,
+        "address": address,
+        "coilValue": ON if value else 0,
+        "written": value,
+        "rtt": device.rtt,
+    }
+
+
+async def _write_coils(given: Given, device: Device) -> Answer:
+    address, values = given["address"], [bool(each) for each in given["values"]]
+    _check_end(address, len(values))
+    await device.ask(lambda client: client.write_coils(address, values, unit=device.unit))
+    return _written(device, address, len(values))
+
+
+async def _write_register(given: Given, device: Device) -> Answer:
+    address, value = given["address"], given["value"]
+    await device.ask(lambda client: client.write_register(address, value, unit=device.unit))
+    return {
+        "success": True,
+        **device.told,
+        "address": address,
+        "value": value,
+        "rtt": device.rtt,
+    }
+
+
+async def _write_registers(given: Given, device: Device) -> Answer:
+    address, values = given["address"], _registers(given)
+    if len(values) > MOST_REGISTERS:
+        raise malformed(f"{len(values)} registers, allowed are {MOST_REGISTERS} in a request")
+    _check_end(address, len(values))
+    await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
+    return _written(device, address, len(values))
+
+
+async def _mask(given: Given, device: Device) -> Answer:
+    address, and_mask, or_mask = given["address"], given["andMask"], given["orMask"]
+    await device.ask(
+        lambda client: client.mask_write(
+            address, and_mask=and_mask, or_mask=or_mask, unit=device.unit
+        )
+    )
+    masks = {"andMask": and_mask, "orMask": or_mask}
+    return {"success": True, **device.told, "address": address, **masks, "rtt": device.rtt}
+
+
+async def _read_write(given: Given, device: Device) -> Answer:
+    first, quantity = given["readAddress"], given["readQuantity"]
+    address, values = given["writeAddress"], given["values"]
+    _check_end(first, quantity)
+    _check_end(address, len(values))
+    found = await device.ask(
+        lambda client: client.read_write(first, quantity, address, values, unit=device.unit)
+    )
+    return {
+        "success": True,
+        **device.told,
+        "writeAddress": address,
+        "written": len(values),
+        "readAddress": first,
+        "quantity": quantity,
+        "format": "registers",
+        "values": found,
+        "rtt": device.rtt,
+    }
+
+
+def _written(device: Device, address: int, quantity: int) -> Answer:
+    return {
+        "success": True,
+        **device.told,
+        "startAddress": address,
+        "quantity": quantity,
+        "rtt": device.rtt,
+    }
+
+
+def _registers(given: Given) -> Sequence[int]:
+    """The registers to write. Raises `Unfit`."""
+    kind = typed(given["datatype"], given["byteOrder"], "holding_registers")
+    if kind is not None:
+        return kind.encode(given["values"])
+    return [Field(f"values[{at}]", REGISTER, "").check(v) for at, v in enumerate(given["values"])]
+
+
+def _check_end(address: int, count: int) -> None:
+    if address + count > ADDRESSES:
+        raise malformed(f"{count} from address {address}: the last address is 65535")
+
+
+def _values(items: dict[str, Any], most: int, text: str) -> Field:
+    return Field("values", array(items, most), text)
+
+
+_WRITTEN = {
+    "startAddress": integer(0, 65535),
+    "quantity": integer(1, MOST_COILS),
+    "rtt": MILLISECONDS,
+}
+
+ENDPOINTS = (
+    Endpoint(
+        "/api/modbus/write/coil",
+        "writeCoil",
+        "Write one coil",
+        (*TARGET, ADDRESS, Field("value", BIT, "`true` or 1 is on, `false` or 0 is off")),
+        _write_coil,
+        {
+            "address": integer(0, 65535),
+            "coilValue": {"enum": [0, ON]},
+            "written": {"type": "boolean", "description": "Whether the coil is on now"},
+            "rtt": MILLISECONDS,
+        },
+        {"Coil 17 on": {**EXAMPLE, "address": 17, "value": True}},
+        {**EXAMPLE, "address": 17, "coilValue": ON, "written": True, "rtt": 12},
+        "Function 5. `coilValue` is what is on the wire: 65280 is on.",
+        writes=always,
+        timeout=TIMEOUT,
+    ),
+    Endpoint(
+        "/api/modbus/write/registers",
+        "writeRegisters",
+        "Write holding registers",
+        (
+            *TARGET,
+            ADDRESS,
+            _values(
+                PLAIN_OR_TYPED,
+                2 * MOST_REGISTERS,
+                "Registers 0 to 65535, up to 123; with `datatype` values of that type, bytes in "
+                "hex",
+            ),
+            DATATYPE,
+            BYTE_ORDER,
+        ),
+        _write_registers,
+        _WRITTEN,
+        {
+            "Three registers": {**EXAMPLE, "address": 100, "values": [1000, 2000, 3000]},
+            "A float, low word first": {
+                **EXAMPLE,
+                "address": 100,
+                "values": [21.5],
+                "datatype": "float32",
+                "byteOrder": "CDAB",
+            },
+        },
+        {**EXAMPLE, "startAddress": 100, "quantity": 3, "rtt": 14},
+        "Function 16. A value that does not fit is refused; nothing is cut or wrapped.",
+        writes=always,
+        timeout=TIMEOUT,
+    ),
+    Endpoint(
+        "/api/modbus/write/register",
+        "writeRegister",
+        "Write one holding register",
+        (*TARGET, ADDRESS, Field("value", REGISTER, "0 to 65535")),
+        _write_register,
+        {"address": integer(0, 65535), "value": integer(0, 65535), "rtt": MILLISECONDS},
+        {"Register 5": {**EXAMPLE, "address": 5, "value": 1234}},
+        {**EXAMPLE, "address": 5, "value": 1234, "rtt": 12},
+        "Function 6.",
+        writes=always,
+        timeout=TIMEOUT,
+    ),
+    Endpoint(
+        "/api/modbus/write/coils",
+        "writeCoils",
+        "Write coils",
+        (*TARGET, ADDRESS, _values(BIT, MOST_COILS, "Up to 1968 of `true`, `false`, 1, 0")),
+        _write_coils,
+        _WRITTEN,
+        {"Three coils": {**EXAMPLE, "address": 16, "values": [True, False, True]}},
+        {**EXAMPLE, "startAddress": 16, "quantity": 3, "rtt": 12},
+        "Function 15.",
+        writes=always,
+        timeout=TIMEOUT,
+    ),
+    Endpoint(
+        "/api/modbus/write/mask",
+        "writeMask",
+        "Change bits of a holding register",
+        (
+            *TARGET,
+            ADDRESS,
+            Field("andMask", REGISTER, "Bits that are kept"),
+            Field("orMask", REGISTER, "What the others become"),
+        ),
+        _mask,
+        {
+            "address": integer(0, 65535),
+            "andMask": integer(0, 65535),
+            "orMask": integer(0, 65535),
+            "rtt": MILLISECONDS,
+        },
+        {"Set bit 3": {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8}},
+        {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8, "rtt": 12},
+        "Function 22: the register becomes `(now & andMask) | (orMask & ~andMask)`, as one step.",
+        writes=always,
+        timeout=TIMEOUT,
+    ),
+    Endpoint(
+        "/api/modbus/readwrite",
+        "readWrite",
+        "Write holding registers, then read some, as one step",
+        (
+            *TARGET,
+            Field("readAddress", REGISTER, "The first address to read"),
+            Field("readQuantity", integer(1, MOST_READ), "How many registers to read"),
+            Field("writeAddress", REGISTER, "The first address to write"),
+            _values(REGISTER, MOST_WITH_READ, "Registers to write, up to 121"),
+        ),
+        _read_write,
+        {
+            "writeAddress": integer(0, 65535),
+            "written": integer(1, MOST_WITH_READ),
+            "readAddress": integer(0, 65535),
+            "quantity": integer(1, MOST_READ),
+            "format": {"const": "registers"},
+            "values": REGISTERS,
+            "rtt": MILLISECONDS,
+        },
+        {
+            "Two out, three in": {
+                **EXAMPLE,
+                "readAddress": 0,
+                "readQuantity": 3,
+                "writeAddress": 100,
+                "values": [7, 8],
+            }
+        },
+        {
+            **EXAMPLE,
+            "writeAddress": 100,
+            "written": 2,
+            "readAddress": 0,
+            "quantity": 3,
+            "format": "registers",
+            "values": [11, 22, 33],
+            "rtt": 12,
+        },
+        "Function 23. The device writes before it reads.",
+        writes=always,
+        timeout=TIMEOUT,
+    ),
+)
