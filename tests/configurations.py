@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from hypothesis import strategies as st
 
@@ -163,6 +163,71 @@ def adapters(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
     return st.dictionaries(names, adapter, max_size=2)
 
 
+PLACES = st.sampled_from(
+    ["tcp://10.0.0.9", "udp://[fd00::1]:5020", "rtu+tcp://plc:4001", "rtu:///dev/line?baud=9600"]
+)
+STRETCHES: st.SearchStrategy[dict[str, int]] = SPANS.flatmap(
+    lambda span: st.sampled_from(
+        [
+            {"start": span["start"], "count": span["size"]},
+            {"start": span["start"], "end": span["start"] + span["size"] - 1},
+        ]
+    )
+)
+RANGES = st.lists(
+    st.builds(lambda area, span: {"area": area, **span}, st.sampled_from(["coils"]), STRETCHES),
+    max_size=2,
+)
+FORWARDS = st.sampled_from(
+    [
+        {"format": "v1", "unit": 65535},
+        {"unit": 0},
+        {"format": "crc", "memory_id": 0},
+        {"format": "crc", "crc": "none", "memory_id": 9, "timeout": 0.5},
+    ]
+).map(lambda named: {"url": "raw://[fd00::9]:9000", **cast("dict[str, Any]", named)})
+HOLES: st.SearchStrategy[dict[str, Any]] = st.sampled_from(
+    [{}, {"max_gap": 0}, {"max_gap": 65535}, {"cost": {"per_request": 12.5, "per_register": 1}}]
+)
+
+
+@st.composite
+def devices(draw: st.DrawFn, memories: dict[str, Any]) -> dict[str, Any]:
+    """Devices of which at most one read has a place in memory."""
+    made: dict[str, Any] = {}
+    for name in draw(st.lists(NAMES, max_size=3, unique=True)):
+        read = {"area": "input_registers", "address": 65535, "count": 1}
+        made[name] = {
+            "url": draw(PLACES),
+            "unit": draw(st.integers(1, 247)),
+            "interval": draw(st.floats(0.01, 31_622_400)),
+            "reads": [read, *draw(st.lists(st.just(read), max_size=2))],
+            **draw(HOLES),
+            **draw(
+                st.fixed_dictionaries(
+                    {},
+                    optional={
+                        "enabled": st.booleans(),
+                        "timeout": SECONDS,
+                        "max_registers": st.integers(1, 125),
+                        "max_bits": st.integers(1, 2000),
+                        "readable": RANGES,
+                        "forbidden": RANGES,
+                        "forward": st.lists(FORWARDS, max_size=2),
+                    },
+                )
+            ),
+        }
+    if made:
+        name, memory = next(iter(memories.items()))
+        size = memory["holding_registers"]
+        start = 0 if isinstance(size, int) else size["start"]
+        into = {"memory": name, "area": "holding_registers", "address": start}
+        first = next(iter(made.values()))
+        first["reads"][0] = {**first["reads"][0], "into": into}
+    return made
+
+
 IDENTITIES = st.fixed_dictionaries(
     {"vendor_name": TEXTS},
     optional={
@@ -198,7 +263,12 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
     optional = {"rest": rest(names), "mqtt": mqtt(names), "metrics": METRICS, "audit": AUDITS}
     sections = draw(
         st.fixed_dictionaries(
-            {"identity": IDENTITIES, "adapters": adapters(names), "workers": st.integers(1, 64)},
+            {
+                "identity": IDENTITIES,
+                "adapters": adapters(names),
+                "devices": devices(memories),
+                "workers": st.integers(1, 64),
+            },
             optional=optional,
         )
     )

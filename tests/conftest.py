@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from holdfast.identity import Identity
     from holdfast.types import Access, Area
 
+pytest_plugins = ("nats_bus",)
+
 AREAS: tuple[Area, ...] = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 
 

@@ -5,8 +5,10 @@ threads, tasks, event loops, cancellation and closing.
 from __future__ import annotations
 
 import asyncio
+import doctest
 import gc
 import itertools
+import re
 import signal
 import socket
 import threading
@@ -14,6 +16,7 @@ import time
 import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -24,12 +27,12 @@ import transports
 import wire
 from conftest import AREAS, endpoint
 from faces import FACES, Awaited, Dial, Face, dialling, run
+from holdfast.identity import Identity
 from holdfast.target import NetworkTarget, SerialTarget, parse
 from hostile import Hostile, Stream, Udp, silent
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Iterator, Sequence
-    from pathlib import Path
 
     from conftest import Run, Serve
     from holdfast.types import Area
@@ -962,3 +965,41 @@ def test_a_signal_does_not_end_a_call(kind: str) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
     assert next(beats) > 0
+
+
+# The page
+
+PAGE = Path(__file__).parent.parent / "docs" / "client.md"
+
+
+@pytest.fixture
+def page(serve: Serve) -> str:
+    """The page, with a server where it says that there is one."""
+    memory = holdfast.Memory(coils=64, holding_registers=200)
+    memory.write("holding_registers", 0, [11, 22, 33])
+    identity = Identity(vendor_name="Acme", product_code="P1", revision="1.2")
+    host, port = serve({1: memory}, identity=identity).address
+    return PAGE.read_text().replace("127.0.0.1:5020", f"{host}:{port}")
+
+
+def test_the_examples_of_the_page_print_what_it_says(page: str) -> None:
+    blocks = re.findall(r"^```pycon\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    examples = doctest.DocTestParser().get_doctest("\n".join(blocks), {}, PAGE.name, str(PAGE), 0)
+    told: list[str] = []
+
+    results = doctest.DocTestRunner().run(examples, out=told.append)
+
+    assert told == []
+    assert results.attempted == 8
+
+
+def test_the_program_of_the_page_prints_what_it_says(
+    page: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    [(program, printed)] = re.findall(
+        r"^```python\n(.*?)^```\n\nprints\n\n```text\n(.*?)^```$", page, re.MULTILINE | re.DOTALL
+    )
+
+    exec(compile(program, PAGE.name, "exec"), {})
+
+    assert capsys.readouterr().out == printed

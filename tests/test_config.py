@@ -14,6 +14,9 @@ from configurations import configurations
 from holdfast.config import (
     AuditConfig,
     Config,
+    CostConfig,
+    DestinationConfig,
+    DeviceConfig,
     InitialRun,
     Listener,
     ModbusAsciiListener,
@@ -23,6 +26,7 @@ from holdfast.config import (
     ModbusUdpListener,
     MqttConfig,
     RawIngestListener,
+    ReadConfig,
     RestConfig,
     RtuSerialConfig,
     Seal,
@@ -32,6 +36,7 @@ from holdfast.config import (
     json_schema,
     load,
 )
+from holdfast.target import parse
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -323,6 +328,79 @@ def test_an_audit_file_has_the_documented_limits(
     assert audit == AuditConfig(file=tmp_path / "a.log", max_bytes=104857600, keep=10)
 
 
+METER = "url: tcp://10.0.0.9, unit: 1, interval: 1"
+READ = "{area: coils, address: 9, count: 8, into: {memory: plant, area: coils, address: 0}}"
+
+
+def device_of(
+    loaded: Callable[..., Config], more: str = "", reads: str = READ, meter: str = METER
+) -> DeviceConfig:
+    return loaded(f"{SERVED}devices: {{a: {{{meter}, reads: [{reads}]{more}}}}}\n").devices["a"]
+
+
+def test_a_device_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
+    device = device_of(loaded)
+    assert (device.enabled, device.timeout, device.max_gap, device.cost) == (True, 1, 0, None)
+    assert (device.max_registers, device.max_bits) == (125, 2000)
+    assert (device.readable, device.forbidden, device.forward, device.status) == ((), (), (), None)
+    assert device.target == parse("tcp://10.0.0.9:502")
+    assert device.reads == (
+        ReadConfig(
+            area="coils",
+            address=9,
+            count=8,
+            into=DestinationConfig(memory="plant", area="coils", address=0),
+        ),
+    )
+
+
+def test_a_device_with_costs_has_no_gap(loaded: Callable[..., Config]) -> None:
+    device = device_of(loaded, ", cost: {per_request: 12, per_register: 0.5}")
+    assert device.max_gap is None
+    assert device.cost == CostConfig(per_request=12, per_register=0.5)
+
+
+@pytest.mark.parametrize(
+    ("written", "addresses"),
+    [
+        ("start: 10, end: 19", range(10, 20)),
+        ("start: 10, end: 10", range(10, 11)),
+        ("start: 65526, count: 10", range(65526, 65536)),
+    ],
+)
+def test_a_range_of_a_device_has_a_last_address_or_a_count(
+    loaded: Callable[..., Config], written: str, addresses: range
+) -> None:
+    device = device_of(loaded, f", forbidden: [{{area: holding_registers, {written}}}]")
+    assert device.forbidden[0].addresses == addresses
+
+
+@pytest.mark.parametrize(
+    ("written", "crc", "target"),
+    [
+        ("unit: 65535", None, 65535),
+        ("format: v1, unit: 0", None, 0),
+        ("format: crc, memory_id: 7", "required", 7),
+        ("format: crc, memory_id: 0, crc: none", "none", 0),
+    ],
+)
+def test_a_forward_names_a_unit_or_a_memory(
+    loaded: Callable[..., Config], written: str, crc: str | None, target: int
+) -> None:
+    more = f", forward: [{{url: 'raw://[fd00::9]:9000', {written}}}]"
+    (forward,) = device_of(loaded, more, "{area: coils, address: 0, count: 1}").forward
+    assert forward.receiver == ("fd00::9", 9000)
+    assert (forward.crc, forward.target, forward.timeout) == (crc, target, 5)
+
+
+def test_devices_of_one_line_drive_it_alike(loaded: Callable[..., Config]) -> None:
+    line = "url: 'rtu:///dev/ttyX?baud=9600', interval: 1"
+    reads = "forward: [{url: 'raw://a:1', unit: 1}], reads: [{area: coils, address: 0, count: 1}]"
+    both = f"a: {{unit: 1, {line}, {reads}}}, b: {{unit: 247, {line}, {reads}}}"
+    config = loaded(f"{SERVED}devices: {{{both}}}\n")
+    assert config.warnings == ()
+
+
 def test_options_of_an_adapter_are_kept_as_they_are(loaded: Callable[..., Config]) -> None:
     adapter = (
         f"{{type: b, {GRANT}, access: read-only, options: {{x: , y: {{1: [1.5, no, true]}}}}}}"
@@ -416,6 +494,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "      - sources: [10.0.0.7/32, fd00::/64]\n"
         "        units: {1: plant, 16: plant}\n"
         "        access: read-only\n"
+        "devices: {}\n"
         "adapters: {}\n"
         "log:\n"
         "  level: info\n"
@@ -506,6 +585,10 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "AdapterConfig": ["type", "memories", "areas", "access"],
         "AsciiSerialConfig": ["device"],
         "AuditConfig": ["file"],
+        "CostConfig": ["per_request", "per_register"],
+        "DestinationConfig": ["memory", "area", "address"],
+        "DeviceConfig": ["url", "unit", "interval", "reads"],
+        "ForwardConfig": ["url"],
         "IdentityConfig": None,
         "LogConfig": None,
         "MemoryConfig": None,
@@ -518,13 +601,16 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "MqttConfig": ["url", "client_id", "subscriptions"],
         "MqttTlsConfig": None,
         "RawIngestListener": ["type", "bind", "rules"],
+        "RangeConfig": ["area", "start"],
         "RawRuleConfig": ["sources", "areas"],
+        "ReadConfig": ["area", "address", "count"],
         "RestConfig": ["bind", "sources", "tokens"],
         "RtuSerialConfig": ["device"],
         "RuleConfig": ["sources", "units", "access"],
         "Seal": ["area", "address"],
         "SerialRuleConfig": ["units", "access"],
         "Span": ["size"],
+        "StatusConfig": ["memory", "area", "slot"],
         "SubscriptionConfig": ["topic", "memories", "areas"],
         "TokenConfig": ["name", "sha256", "memories", "areas", "access"],
     }

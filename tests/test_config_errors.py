@@ -49,7 +49,7 @@ AREA = "an integer from 1 to 65536 or a mapping with the keys start, size"
 SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
 CODES = "1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"
-TOP = "memories, identity, listeners, rest, mqtt, adapters, metrics, audit, log, workers"
+TOP = "memories, identity, listeners, devices, rest, mqtt, adapters, metrics, audit, log, workers"
 TYPES = "modbus-tcp, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii"
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
 RULE = "listeners.scada.rules[0]"
@@ -377,7 +377,7 @@ def test_the_rest_is_checked(folder: Folder, extra: str, problem: str) -> None:
     assert folder.problems(GOOD + extra + "\n") == [f"p.yaml:11: {problem}"]
 
 
-@pytest.mark.parametrize("section", ["devices", "nats", "gateway"])
+@pytest.mark.parametrize("section", ["nats", "gateway"])
 def test_sections_to_come_are_refused_by_name(folder: Folder, section: str) -> None:
     assert folder.problems(f"{GOOD}{section}: {{bind: x}}\n") == [
         f"p.yaml:11: {section}: this section is not available in this version"

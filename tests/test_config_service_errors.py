@@ -66,7 +66,7 @@ def test_an_appliance_serves_something(folder: Folder, text: str, found: str) ->
     (problem,) = folder.problems(MEMORIES + text)
     assert problem.partition(": ")[2] == (
         f"listeners: {found}, allowed: a mapping with at least one entry, "
-        "or none beside rest or mqtt"
+        "or none beside rest, mqtt or devices"
     )
 
 
@@ -412,6 +412,18 @@ listeners:
     rules:
       - {sources: [10.0.0.7], units: {1: plant}, access: read-write}
 """
+DEVICE = """\
+devices:
+  source:
+    url: tcp://10.0.0.9
+    unit: 1
+    interval: 1
+    reads:
+      - area: discrete_inputs
+        address: 9
+        count: 2
+        into: {memory: plant, area: coils, address: 0}
+"""
 
 
 @pytest.mark.parametrize(
@@ -422,12 +434,14 @@ listeners:
         RAW.replace("[coils]", "[input_registers]"),
         REST.replace("read-write", "read-only"),
         OTHER_MQTT + EXTRAS,
+        DEVICE.replace("address: 0}", "address: 1}"),
+        DEVICE.replace("    unit", "    enabled: false\n    unit"),
     ],
 )
 def test_a_seal_that_nothing_can_open_is_a_warning(folder: Folder, text: str) -> None:
     assert folder.warnings(SEALED + text) == [
         "p.yaml:2: memories.plant.seal: it can never be opened: no raw-ingest rule, token, "
-        "subscription or adapter may write coils of plant"
+        "subscription, adapter or device may write coils of plant"
     ]
 
 
@@ -443,6 +457,7 @@ def test_a_seal_that_nothing_can_open_is_a_warning(folder: Folder, text: str) ->
         "rest: {bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none}\n",
         MQTT,
         OTHER_MQTT + EXTRAS.replace("read-only", "read-write"),
+        DEVICE,
     ],
 )
 def test_a_seal_that_something_can_open_is_no_warning(folder: Folder, text: str) -> None:

@@ -40,6 +40,26 @@ RAW: dict[str, Any] = {
     "name": "not a number",
 }
 
+METER: dict[str, Any] = {
+    "health": "error",
+    "last_error": 0x8001,
+    "seconds_in_error": 4.5,
+    "age": 5.5,
+    "failures": 3,
+    "round_trip": 0.25,
+    "requests_per_poll": 2,
+    "polls": 30,
+    "missed": 1,
+    "requests": 60,
+    "valid": 50,
+    "exceptions": 4,
+    "timeouts": 5,
+    "transport_errors": 1,
+    "reads": 29,
+    "values": 290,
+    "forward": [{"sent": 20, "refused": 2, "failed": 3, "replaced": 4}],
+}
+
 
 @pytest.fixture
 def memories() -> dict[str, holdfast.Memory]:
@@ -71,6 +91,11 @@ def diagnostics(memories: dict[str, holdfast.Memory], door: Door) -> Diagnostics
     )
     mqtt: Any = SimpleNamespace(status=lambda: status)
     made.adapters = {"rest": (rest, door), "mqtt": (mqtt, None)}
+    polled: Any = SimpleNamespace(
+        counters=lambda: {"meter": METER, "fresh": {**METER, "health": "unknown", "age": None}}
+    )
+    made.poller = polled
+    made.disabled = ["spare"]
     return made
 
 
@@ -128,6 +153,26 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_listener_total", "fresh", "replication"), 8),
         (("holdfast_listener_total", "packets_accepted", "replication"), 9),
         (("holdfast_listener_total", "packets_refused_crc", "replication"), 1),
+        (("holdfast_device_health", "meter", "error"), 1),
+        (("holdfast_device_health", "meter", "ok"), 0),
+        (("holdfast_device_health", "fresh", "unknown"), 1),
+        (("holdfast_device_health", "spare", "disabled"), 1),
+        (("holdfast_device_requests_total", "meter", "valid"), 50),
+        (("holdfast_device_requests_total", "meter", "exceptions"), 4),
+        (("holdfast_device_requests_total", "meter", "timeouts"), 5),
+        (("holdfast_device_requests_total", "meter", "transport_errors"), 1),
+        (("holdfast_device_polls_total", "meter"), 30),
+        (("holdfast_device_missed_polls_total", "meter"), 1),
+        (("holdfast_device_reads_total", "meter"), 29),
+        (("holdfast_device_values_total", "meter"), 290),
+        (("holdfast_device_age_seconds", "meter"), 5.5),
+        (("holdfast_device_error_seconds", "meter"), 4.5),
+        (("holdfast_device_failures", "meter"), 3),
+        (("holdfast_device_last_error", "meter"), 0x8001),
+        (("holdfast_device_round_trip_seconds", "meter"), 0.25),
+        (("holdfast_device_requests_per_poll", "meter"), 2),
+        (("holdfast_device_forward_total", "meter", "sent", "0"), 20),
+        (("holdfast_device_forward_total", "meter", "replaced", "0"), 4),
         (("holdfast_adapter_state", "rest", "running"), 1),
         (("holdfast_adapter_state", "rest", "failed"), 0),
         (("holdfast_adapter_state", "mqtt", "failed"), 1),
@@ -153,6 +198,8 @@ def test_every_counter_is_there(
 
 def test_what_the_process_does_is_there(scraped: dict[tuple[str, ...], float]) -> None:
     assert ("holdfast_connections_total", "scada", "open") not in scraped
+    assert ("holdfast_device_age_seconds", "fresh") not in scraped
+    assert ("holdfast_device_polls_total", "spare") not in scraped
     assert scraped["holdfast_uptime_seconds",] >= 0
     assert ("python_gc_collections_total", "0") in scraped
     if ("process_open_fds",) in scraped:

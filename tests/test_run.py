@@ -104,6 +104,22 @@ def test_it_says_what_listens_where_and_what_to_try(
     assert " check '" in check
 
 
+def test_it_says_what_is_polled(configure: Callable[..., Path], run: Callable[[Path], Run]) -> None:
+    reads = "reads: [{area: coils, address: 0, count: 1}]"
+    forward = "forward: [{url: 'raw://127.0.0.1:1', unit: 1}]"
+    devices = "".join(
+        f"  meter{number}: {{url: 'tcp://127.0.0.1:1', unit: {number}, interval: 0.5, {reads}, "
+        f"{forward}, enabled: {'true' if number else 'false'}}}\n"
+        for number in range(12)
+    )
+    running = run(configure(more=f"devices:\n{devices}"))
+    running.wait_until_it_serves()
+    assert "  meter0  tcp://127.0.0.1:1 unit 0, not polled\n" in running.greeting
+    assert "  meter9  tcp://127.0.0.1:1 unit 9, polled every 0.5 s\n" in running.greeting
+    assert "  and 2 more devices\n" in running.greeting
+    assert "meter10" not in running.greeting
+
+
 def test_it_serves_the_initial_values(
     configure: Callable[..., Path], run: Callable[[Path], Run]
 ) -> None:

@@ -363,12 +363,13 @@ class Device:
     """A device to be polled: what is read, how often, and where it goes.
 
     `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
-    `max_gap` (0 when left out) or `cost` (of a request, of an item) says which holes are read;
-    `readable` and `forbidden` are areas with start and end. `forward` are hosts, ports, formats (`v1`, `crc`), crc
-    (`required`, `none`), unit or memory ids, and timeouts. `status` is the memory, area and slot of
-    the status block. `start_within` is when the first poll comes at the latest, an interval when
-    left out; `report` hands polls to `Poller.results`; `release` closes the connection after each.
-    Times are in seconds; interval 0 polls without a pause.
+    `max_gap` (0 when left out) or `cost` (of a request, of a register or 16 bits) says which holes
+    are read; `readable` and `forbidden` are areas with start and end, the end not included.
+    `forward` are hosts, ports, formats (`v1`, `crc`), crc (`required`, `none`), unit or memory ids,
+    and timeouts. `status` is the memory, area and slot of the status block. `start_within` is when
+    the first poll comes at the latest, an interval when left out; `report` hands polls to
+    `Poller.results`; `release` closes the connection after each. Times are in seconds; interval 0
+    polls without a pause.
     """
 
     def __new__(
@@ -412,8 +413,8 @@ class Poller:
     ) -> list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int]]]]:
         """All polls of devices with `report` since the last call, waiting for the first.
 
-        Each is a device, the seconds since 1970, and its blocks: area, address, count, the bytes
-        (`None` when there are none), and the fault as a status block tells it.
+        Each is a device, the seconds since 1970, and its blocks as they were asked: area, address,
+        count, the bytes (`None` when there are none), and the fault as a status block tells it.
         """
 
     @property
@@ -421,7 +422,10 @@ class Poller:
         """Polls that `results` misses because nobody took them."""
 
     def counters(self) -> dict[str, dict[str, Any]]:
-        """How each device does, by name: its health, counters, and those of its forwards."""
+        """How each device does, by name: its health, counters, and those of its forwards.
+
+        `age` is that of the last valid answer, `None` before the first.
+        """
 
     def stop(self) -> None:
         """Stops polling. From any thread."""

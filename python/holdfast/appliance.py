@@ -1,4 +1,5 @@
-"""The appliance: memories, listeners and adapters of a configuration, started, logged and stopped.
+"""The appliance: memories, listeners, devices and adapters of a configuration, started, logged and
+stopped.
 
 It wires parts that know their work. It parses no protocol, and once started it takes no part in
 answering a request.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
@@ -16,7 +18,7 @@ from holdfast import _core, assembly, logs
 from holdfast.adapters.supervisor import Supervisor
 from holdfast.audit import Audit
 from holdfast.config import ModbusAsciiListener, ModbusRtuListener
-from holdfast.diagnostics import Diagnostics
+from holdfast.diagnostics import Diagnostics, fault
 from holdfast.ingest import Door
 
 if TYPE_CHECKING:
@@ -36,6 +38,9 @@ LEVELS = {
 
 # How many writes the audit log takes at once.
 AUDIT_BATCH = 1000
+
+# How often it is looked whether the health of a device has changed, in seconds.
+LOOKS = 1.0
 
 # How long a thread waits for the next event or write before it looks around, in seconds.
 PATIENCE = 0.2
@@ -94,7 +99,7 @@ class Appliance:
         return self._parts().endpoints
 
     def log_events(self, timeout: float) -> None:
-        """Waits up to `timeout` seconds for an event, and logs it; also what seals did."""
+        """Waits up to `timeout` seconds for an event, and logs it; also seals and devices."""
         self._parts().log_events(timeout)
 
     def _parts(self) -> _Running:
@@ -118,14 +123,22 @@ class _Running:
         self._supervisors: list[Supervisor] = []
         self._lost_events = 0
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
+        self._health = dict.fromkeys(config.devices, "unknown")
+        self._looked = time.monotonic()
+        disabled = self._tell_disabled()
         with ExitStack() as undo:
             self._audit = self._opened_audit(undo)
             self._sockets = sockets = self._bound_sockets(undo)
             self._engine = self._started_engine()
             undo.callback(self._engine.stop)
+            self._poller = self._started_poller()
+            if self._poller is not None:
+                undo.callback(self._poller.stop)
             self.endpoints = self._listed(sockets)
             self.diagnostics = Diagnostics(memories, self._engine)
             self.diagnostics.audit = self._audit
+            self.diagnostics.poller = self._poller
+            self.diagnostics.disabled = disabled
             self._add_adapters(sockets)
             undo.pop_all()
         self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
@@ -137,6 +150,8 @@ class _Running:
 
     def stop(self) -> None:
         """Tells all parts to end, then waits for each."""
+        if self._poller is not None:
+            self._poller.stop()
         for supervisor in self._supervisors:
             supervisor.stop()
         self._engine.stop()
@@ -168,6 +183,23 @@ class _Running:
                 logs.write(
                     logging.INFO, "seal", memory=name, state=state, opened=opened, closed=closed
                 )
+        if self._poller is not None and time.monotonic() - self._looked >= LOOKS:
+            self._looked = time.monotonic()
+            self._log_health(self._poller)
+
+    def _log_health(self, poller: _core.Poller) -> None:
+        """Logs which devices do better or worse than when it was looked last."""
+        for name, told in poller.counters().items():
+            health = told["health"]
+            if health == self._health[name]:
+                continue
+            self._health[name] = health
+            fields: dict[str, object] = {"device": name, "health": health}
+            if health == "error":
+                fields |= {"error": fault(told["last_error"]), "failures": told["failures"]}
+            logs.write(
+                logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields
+            )
 
     def _log_event(self, listener: str, event: str, peer: str | None, reason: str | None) -> None:
         fields = {"listener": listener, "peer": peer or "-"}
@@ -209,6 +241,25 @@ class _Running:
             events="all" if config.log.level == "debug" else "refusals",
             audit=self._audit is not None,
         )
+
+    def _started_poller(self) -> _core.Poller | None:
+        """Polls the devices that are enabled, if there are any."""
+        config = self._config
+        names = [name for name, settings in config.devices.items() if settings.enabled]
+        if not names:
+            return None
+        return _core.Poller([assembly.device(name, config, self._memories) for name in names])
+
+    def _tell_disabled(self) -> list[str]:
+        """Writes the status blocks of the devices that are not polled; their names."""
+        devices = self._config.devices
+        disabled = [name for name, settings in devices.items() if not settings.enabled]
+        for name in disabled:
+            status = devices[name].status
+            if status is not None:
+                told = assembly.disabled_status(name)
+                self._memories[status.memory].write(status.area, status.addresses.start, told)
+        return disabled
 
     def _listed(self, sockets: dict[str, socket.socket]) -> list[Endpoint]:
         listeners = self._config.listeners.items()

@@ -1,13 +1,15 @@
-"""From a configuration to the native parts: memories, rules, listeners, identity.
+"""From a configuration to the native parts: memories, rules, listeners, devices, identity.
 
 It converts, and starts nothing.
 """
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, assert_never
 
-from holdfast import _core
+from holdfast import _core, planning
+from holdfast.client import endpoint
 from holdfast.config import (
     ModbusAsciiListener,
     ModbusRtuListener,
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from holdfast._core import Memory
     from holdfast.config import (
         Config,
+        DestinationConfig,
         IdentityConfig,
         Listener,
         MemoryConfig,
@@ -31,6 +34,19 @@ if TYPE_CHECKING:
         RuleConfig,
         SerialRuleConfig,
     )
+    from holdfast.types import Area
+
+SPREAD = 10.0
+"""Seconds over which the first polls of devices are spread, unless their interval is shorter."""
+
+DISABLED = 4
+"""The health of a device that is not polled, in its status block."""
+
+STATUS_NAME = 16
+"""Bytes of the name in a status block."""
+
+STATUS_BLOCK = 30
+"""Registers of a status block."""
 
 
 def memory(settings: MemoryConfig) -> Memory:
@@ -106,6 +122,43 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
             )
         case _:
             assert_never(settings)
+
+
+def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.Device:
+    """The native poller's device of that name."""
+    settings = config.devices[name]
+    status = settings.status
+    return _core.Device(
+        name,
+        endpoint(settings.target),
+        unit=settings.unit,
+        interval=settings.interval,
+        timeout=settings.timeout,
+        reads=[
+            (read.area, read.address, read.count, _place(read.into, memories))
+            for read in settings.reads
+        ],
+        forward=[
+            (*each.receiver, each.format, each.crc or "required", each.target, each.timeout)
+            for each in settings.forward
+        ],
+        status=None if status is None else (memories[status.memory], status.area, status.slot),
+        start_within=min(settings.interval, SPREAD),
+        **planning.rules(settings),
+    )
+
+
+def disabled_status(name: str) -> list[int]:
+    """The status block of a device that is not polled."""
+    text = name.encode("ascii", "replace")[:STATUS_NAME].ljust(STATUS_NAME, b"\0")
+    told = [DISABLED, 0, 0, *struct.unpack(f">{STATUS_NAME // 2}H", text)]
+    return told + [0] * (STATUS_BLOCK - len(told))
+
+
+def _place(
+    into: DestinationConfig | None, memories: Mapping[str, Memory]
+) -> tuple[Memory, Area, int] | None:
+    return None if into is None else (memories[into.memory], into.area, into.address)
 
 
 def _rule(rule: RuleConfig | SerialRuleConfig, memories: Mapping[str, Memory]) -> _core.Rule:

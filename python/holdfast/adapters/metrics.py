@@ -30,6 +30,9 @@ MAX_CONNECTIONS = 32
 REQUEST_TIMEOUT = 10.0
 PATH = "/metrics"
 STATES = ("running", "failed", "stopped")
+HEALTH = ("unknown", "ok", "error", "stale", "disabled")
+OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
+"""What becomes of requests to a device."""
 
 
 class Metrics:
@@ -116,6 +119,7 @@ class Figures(Collector):
                 stats["audit"]["failed"],
             )
         yield from _of_listeners(stats["listeners"])
+        yield from _of_devices(stats["devices"])
         yield from _of_adapters(stats["adapters"])
         yield from _of_memories(self._diagnostics.memories())
 
@@ -139,6 +143,45 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
             else:
                 _add(more, name, dict(_flat(key, counted)))
     yield from (requests, exceptions, connections, opened, more)
+
+
+def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    health = _gauge("device_health", "1 for how the device does.", "device", "state")
+    requests = _counter("device_requests", "By what became of them.", "device", "outcome")
+    forward = _counter(
+        "device_forward",
+        "Packets to a receiver, by what became of them.",
+        "device",
+        "receiver",
+        "outcome",
+    )
+    counters = {
+        "polls": _counter("device_polls", "Polls that were carried out.", "device"),
+        "missed": _counter("device_missed_polls", "Polls that could not begin in time.", "device"),
+        "reads": _counter("device_reads", "Reads that came whole.", "device"),
+        "values": _counter("device_values", "Bits and registers in them.", "device"),
+    }
+    gauges = {
+        "age": _gauge("device_age_seconds", "Since the last valid answer.", "device"),
+        "seconds_in_error": _gauge("device_error_seconds", "Since polls began to fail.", "device"),
+        "failures": _gauge("device_failures", "Polls in a row that failed.", "device"),
+        "last_error": _gauge("device_last_error", "As in the status block.", "device"),
+        "round_trip": _gauge("device_round_trip_seconds", "Of the last answer.", "device"),
+        "requests_per_poll": _gauge("device_requests_per_poll", "By the plan of now.", "device"),
+    }
+    for name, told in devices.items():
+        _add(health, name, {known: known == told["health"] for known in HEALTH})
+        _add(requests, name, {key: told[key] for key in OUTCOMES if key in told})
+        for key, counter in counters.items():
+            if key in told:
+                counter.add_metric([name], told[key])
+        for key, gauge in gauges.items():
+            if told.get(key) is not None:
+                gauge.add_metric([name], told[key])
+        for number, packets in enumerate(told.get("forward", ())):
+            for outcome, count in packets.items():
+                forward.add_metric([name, str(number), outcome], count)
+    yield from (health, requests, *counters.values(), *gauges.values(), forward)
 
 
 def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:

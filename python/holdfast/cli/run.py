@@ -16,6 +16,7 @@ import click
 
 from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
+from holdfast.adapters.supervisor import give_way
 from holdfast.appliance import Appliance
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.config import ModbusTcpListener
@@ -24,13 +25,16 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from holdfast.appliance import Endpoint
-    from holdfast.config import Config, RawRuleConfig, RuleConfig, SerialRuleConfig
+    from holdfast.config import Config, DeviceConfig, RawRuleConfig, RuleConfig, SerialRuleConfig
 
 # How long a signal may wait until it is noticed, in seconds.
 PATIENCE = 0.2
 
 # Open files beside the connections: listeners, readers of metrics, the interpreter's own.
 OTHER_FILES = 128
+
+# Devices that the greeting names.
+MOST_DEVICES = 10
 
 # The number that mbpoll gives each area.
 MBPOLL_TYPES = {
@@ -46,11 +50,12 @@ MBPOLL_TYPES = {
 def run(file: Path) -> None:
     """Run the appliance that FILE describes.
 
-    Prints what listens where, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped by a
-    signal, 1 a listener could not be bound, 2 the configuration has errors.
+    Prints what listens where and what is polled, then serves until Ctrl-C or SIGTERM. Exit codes:
+    0 stopped by a signal, 1 a listener could not be bound, 2 the configuration has errors.
     """
     config = load_or_exit(file)
     logs.configure(config.log.level, config.log.format)
+    give_way()
     _allow_open_files(config)
     signals = Signals()
     appliance = Appliance(config)
@@ -78,6 +83,7 @@ def _allow_open_files(config: Config) -> None:
         return
     served = [*config.listeners.values(), config.rest]
     needed = sum(getattr(each, "max_connections", 0) for each in served) + OTHER_FILES
+    needed += sum(1 + len(device.forward) for device in config.devices.values())
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
         return
@@ -109,12 +115,18 @@ def _explained(error: OSError) -> str:
 
 def _greeting(appliance: Appliance, file: Path) -> str:
     endpoints = appliance.endpoints()
-    width = max(len(endpoint.name) for endpoint in endpoints)
+    devices = list(appliance.config.devices.items())
+    shown = devices[:MOST_DEVICES]
+    names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
+    width = max(map(len, names), default=0)
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
         lines.append(f"  {endpoint.name:{width}}  {_address(endpoint)}")
         rules = getattr(endpoint.settings, "rules", ())
         lines += [f"  {'':{width}}    {_granted(rule)}" for rule in rules]
+    lines += [f"  {name:{width}}  {_polled(device)}" for name, device in shown]
+    if len(devices) > len(shown):
+        lines.append(f"  and {len(devices) - len(shown)} more devices")
     lines += ["", "Try:", ""]
     lines += [f"  {command}" for command in _suggestions(appliance, endpoints, file)]
     return "\n".join([*lines, "", "Ctrl-C stops it."])
@@ -125,6 +137,13 @@ def _address(endpoint: Endpoint) -> str:
         return f"{endpoint.type}  {endpoint.host}"
     address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
     return f"http://{address}" if endpoint.type == "http" else f"{endpoint.type}  {address}"
+
+
+def _polled(device: DeviceConfig) -> str:
+    """What becomes of a device, in a line."""
+    if not device.enabled:
+        return f"{device.url} unit {device.unit}, not polled"
+    return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
 
 
 def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:

@@ -8,6 +8,15 @@ open a socket or import the native core.
 from __future__ import annotations
 
 from holdfast.config.addresses import Bind, Network
+from holdfast.config.devices import (
+    CostConfig,
+    DestinationConfig,
+    DeviceConfig,
+    ForwardConfig,
+    RangeConfig,
+    ReadConfig,
+    StatusConfig,
+)
 from holdfast.config.initial import InitialRun
 from holdfast.config.listeners import (
     AsciiSerialConfig,
@@ -47,6 +56,10 @@ __all__ = [
     "Bind",
     "Config",
     "ConfigError",
+    "CostConfig",
+    "DestinationConfig",
+    "DeviceConfig",
+    "ForwardConfig",
     "IdentityConfig",
     "InitialRun",
     "Listener",
@@ -62,8 +75,10 @@ __all__ = [
     "MqttTlsConfig",
     "Network",
     "Problem",
+    "RangeConfig",
     "RawIngestListener",
     "RawRuleConfig",
+    "ReadConfig",
     "RestConfig",
     "RtuSerialConfig",
     "RuleConfig",
@@ -71,6 +86,7 @@ __all__ = [
     "SerialConfig",
     "SerialRuleConfig",
     "Span",
+    "StatusConfig",
     "SubscriptionConfig",
     "TokenConfig",
     "json_schema",

@@ -120,5 +120,6 @@ _WORDS: dict[str, Callable[[Node], str]] = {
     "string": _text,
     "array": _list,
     "object": _mapping,
+    "boolean": lambda _: "true or false",
     "null": lambda _: "null",
 }

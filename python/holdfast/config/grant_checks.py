@@ -13,6 +13,7 @@ from holdfast.config.words import guess, listing, show
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from holdfast.config.memories import Seal
     from holdfast.config.model import Config
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
@@ -96,13 +97,28 @@ def doubt_grants(config: Config, report: Report) -> None:
         return  # Everyone may write everything, the gate bits too.
     for name, memory in config.memories.items():
         seal = memory.seal
-        if seal is not None and not any(
-            grant.writes and name in grant.memories and seal.area in grant.areas
-            for grant in grants(config)
+        if seal is not None and not (
+            _reads_into(config, name, seal)
+            or any(
+                grant.writes and name in grant.memories and seal.area in grant.areas
+                for grant in grants(config)
+            )
         ):
-            writers = "raw-ingest rule, token, subscription or adapter"
+            writers = "raw-ingest rule, token, subscription, adapter or device"
             message = f"it can never be opened: no {writers} may write {seal.area} of {name}"
             report.doubt(("memories", name, "seal"), message)
+
+
+def _reads_into(config: Config, memory: str, gate: Seal) -> bool:
+    """Whether what is read of a device may set the gate bit of a memory."""
+    return any(
+        read.into is not None
+        and (read.into.memory, read.into.area) == (memory, gate.area)
+        and 0 <= gate.address - read.into.address < read.count
+        for device in config.devices.values()
+        if device.enabled
+        for read in device.reads
+    )
 
 
 def _have(memories: Sequence[str]) -> str:

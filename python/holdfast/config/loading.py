@@ -11,6 +11,7 @@ from typing import Any
 
 from holdfast.config import source
 from holdfast.config.allowed import allowed
+from holdfast.config.device_checks import DeviceChecks
 from holdfast.config.grant_checks import GrantChecks, doubt_grants
 from holdfast.config.listener_checks import ListenerChecks
 from holdfast.config.memory_checks import MemoryChecks
@@ -55,4 +56,5 @@ def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     grants = GrantChecks(report, [str(name) for name in memories])
     ListenerChecks(report, grants, memories).check(data.get("listeners"))
     ServiceChecks(folder, report, grants).check(data)
+    DeviceChecks(report, grants, memories).check(data)
     check_sockets(data, report)

@@ -26,6 +26,12 @@ Layout: TypeAlias = dict[Area, range | None]
 """The addresses of the areas that are there; `None` where they are not known for a mistake."""
 
 
+def addresses(extent: object) -> range | None:
+    """The addresses of an area as it is written; `None` when they can't be told."""
+    span = fitting(_EXTENT, extent)
+    return None if span is None or span.start + span.size > 65536 else span.addresses
+
+
 @dataclass
 class MemoryChecks:
     """Checks the memories of one file, and reads the files with their initial values."""

@@ -14,6 +14,7 @@ from pydantic import Field, PrivateAttr
 
 from holdfast.config import dump
 from holdfast.config.base import Model
+from holdfast.config.devices import DeviceConfig
 from holdfast.config.listeners import Listener
 from holdfast.config.memories import MemoryConfig
 from holdfast.config.services import (
@@ -92,7 +93,9 @@ class Config(Model):
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(
         default={}, json_schema_extra=NAME_KEYS
     )
-    """The servers, by name; at least one, unless there is rest or mqtt."""
+    """The servers, by name; at least one, unless there is rest, mqtt or a device."""
+    devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
+    """Devices that are polled, by name."""
     rest: Annotated[RestConfig | None, NotNull()] = None
     """The REST interface."""
     mqtt: Annotated[MqttConfig | None, NotNull()] = None

@@ -40,11 +40,12 @@ class ServiceChecks:
         self._audit(mapping(data.get("audit")).get("file"))
 
     def _served(self, data: dict[Any, Any]) -> None:
-        if data.get("listeners", {}) != {} or "rest" in data or "mqtt" in data:
+        if data.get("listeners", {}) != {} or data.keys() & {"rest", "mqtt", "devices"}:
             return
         found = "found an empty mapping" if "listeners" in data else "missing"
         message = (
-            f"{found}, allowed: a mapping with at least one entry, or none beside rest or mqtt"
+            f"{found}, allowed: a mapping with at least one entry, or none beside rest, mqtt "
+            "or devices"
         )
         self.report.add(("listeners",), message, of_key=True)
 

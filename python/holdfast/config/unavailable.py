@@ -14,7 +14,7 @@ from holdfast.config.words import choice
 if TYPE_CHECKING:
     from holdfast.config.problems import Report
 
-SECTIONS = ("devices", "nats", "gateway")
+SECTIONS = ("nats", "gateway")
 TYPES = ("modbus-tls",)
 
 

@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias, TypeGuard, get_args
+from urllib.parse import unquote
 
 from pydantic import (
     AfterValidator,
@@ -29,7 +30,9 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from holdfast.config.addresses import Bind, Network, parse_bind, parse_source
 from holdfast.config.broker import LONGEST_TEXT, parse_broker, parse_topic_filter
+from holdfast.config.receiver import parse_receiver
 from holdfast.config.words import choice, shape, show
+from holdfast.target import FORMS, parse
 
 MOST_BYTES = 244
 LONGEST_DEVICE = 4095
@@ -46,10 +49,12 @@ _WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5])
 
 Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
 BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
+RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
 Access: TypeAlias = Literal["read-only", "read-write"]
 
 AREAS: tuple[Area, ...] = get_args(Area)
 BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
+REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 FUNCTIONS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43)
 WRITES = (5, 6, 15, 16, 22, 23)
 RESERVED = ("rest", "mqtt", "metrics")
@@ -102,6 +107,21 @@ def parse_sha256(value: object) -> str:
 
 def _broker_url(value: object) -> str:
     parse_broker(value)
+    return str(value)
+
+
+def parse_url(value: object) -> str:
+    """Raises `ValueError` for anything but the URL of a device."""
+    if not isinstance(value, str):
+        raise ValueError(f"found {show(value)}, allowed: {FORMS}")
+    if "\0" in unquote(value):
+        raise ValueError(f"found {show(value)}, allowed: a URL without NUL")
+    parse(value)
+    return value
+
+
+def _receiver_url(value: object) -> str:
+    parse_receiver(value)
     return str(value)
 
 
@@ -198,7 +218,9 @@ AdapterName = Annotated[
 ]
 OptionName = Annotated[str, PlainValidator(_option_name), WithJsonSchema({"type": "string"})]
 UnitId = Annotated[
-    int, PlainValidator(_id_of("a unit id", 0, 255)), WithJsonSchema({"type": "integer"})
+    int,
+    PlainValidator(_id_of("a unit id", 0, 255)),
+    WithJsonSchema({"type": "integer", "minimum": 0, "maximum": 255}),
 ]
 SerialUnitId = Annotated[
     int,
@@ -239,6 +261,18 @@ BrokerUrl = Annotated[
         {"type": "string", "examples": ["mqtt://127.0.0.1:1883", "mqtts://broker.example"]}
     ),
 ]
+DeviceUrl = Annotated[
+    str,
+    PlainValidator(parse_url),
+    WithJsonSchema(
+        {"type": "string", "examples": ["tcp://10.0.0.9:502", "rtu:///dev/ttyUSB0?baud=9600"]}
+    ),
+]
+ReceiverUrl = Annotated[
+    str,
+    PlainValidator(_receiver_url),
+    WithJsonSchema({"type": "string", "examples": ["raw://10.0.2.9:9000"]}),
+]
 TopicFilter = Annotated[
     str,
     PlainValidator(parse_topic_filter),
@@ -265,16 +299,17 @@ BindAddress = Annotated[
     PlainSerializer(str, return_type=str),
     WithJsonSchema({"type": "string", "examples": ["0.0.0.0:502", "127.0.0.1:5020", "[::]:502"]}),
 ]
+whole_number = PlainSerializer(_whole, return_type=int | float)
+"""Writes `1.0` as `1`."""
 Duration = Annotated[
-    float,
-    Field(ge=SHORTEST_TIME, le=LONGEST_TIME, allow_inf_nan=False),
-    PlainSerializer(_whole, return_type=int | float),
+    float, Field(ge=SHORTEST_TIME, le=LONGEST_TIME, allow_inf_nan=False), whole_number
 ]
+Milliseconds = Annotated[float, Field(ge=0, le=3_600_000, allow_inf_nan=False), whole_number]
 DurationOrZero = Annotated[
     float,
     Field(ge=0, le=LONGEST_TIME, allow_inf_nan=False),
     AfterValidator(_no_instant),
-    PlainSerializer(_whole, return_type=int | float),
+    whole_number,
 ]
 FunctionCode = Annotated[
     int,

@@ -6,7 +6,7 @@
 //! because a late reply is known by its transaction id.
 
 use std::io::{self, ErrorKind};
-use std::net::{TcpStream, UdpSocket};
+use std::net::UdpSocket;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, Request, Response, ResponseError};
 
-use super::line::{self, Line};
+use super::line::{self, Line, Stream};
 use super::session::Session;
 use super::turns::Turns;
 use super::{Broken, ClientError};
@@ -70,7 +70,7 @@ struct Connection {
 
 enum Kind {
     Tcp {
-        stream: TcpStream,
+        stream: Stream,
         session: Session,
     },
     Udp {
@@ -182,11 +182,11 @@ impl BlockingClient {
         let at = |host: &str, port: u16| failed(format!("{host}:{port}"));
         let kind = match &self.endpoint {
             Endpoint::Tcp { host, port } => {
-                let stream = line::connect(host, *port, deadline).map_err(at(host, *port))?;
+                let stream = Stream::connect(host, *port, deadline).map_err(at(host, *port))?;
                 Kind::Tcp { stream, session: Session::default() }
             }
             Endpoint::RtuOverTcp { host, port } => {
-                let stream = line::connect(host, *port, deadline).map_err(at(host, *port))?;
+                let stream = Stream::connect(host, *port, deadline).map_err(at(host, *port))?;
                 Kind::Rtu { line: Box::new(stream), silence: None, echo: false }
             }
             Endpoint::Udp { host, port } => {
@@ -219,7 +219,7 @@ impl Connection {
     fn has_ended(&self) -> bool {
         match &self.kind {
             Kind::Tcp { stream, session } => {
-                session.is_broken() || (self.used.elapsed() > IDLE && line::has_ended(stream))
+                session.is_broken() || (self.used.elapsed() > IDLE && stream.has_ended())
             }
             Kind::Udp { .. } => false,
             Kind::Rtu { line, .. } | Kind::Ascii { line, .. } => !line.is_quiet(),
@@ -288,7 +288,7 @@ fn invalid(text: impl Into<String>) -> Failure {
 }
 
 fn over_tcp(
-    stream: &mut TcpStream,
+    stream: &mut Stream,
     session: &mut Session,
     call: &Call<'_>,
     give: &mut dyn FnMut(Response<'_>),

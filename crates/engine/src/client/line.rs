@@ -44,17 +44,65 @@ fn read(mut once: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
     }
 }
 
-impl Line for TcpStream {
+/// A TCP connection. It tells the system how long to wait only when that has changed, in whole
+/// milliseconds: most requests have as much time as the one before.
+pub(super) struct Stream {
+    socket: TcpStream,
+    read_timeout: Duration,
+    write_timeout: Duration,
+}
+
+impl Stream {
+    /// Connects to the first address of a name that takes the connection before the deadline.
+    pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<Stream> {
+        let socket =
+            first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
+        socket.set_nodelay(true)?;
+        Ok(Stream { socket, read_timeout: Duration::ZERO, write_timeout: Duration::ZERO })
+    }
+
+    /// Whether the peer has ended it.
+    pub(super) fn has_ended(&self) -> bool {
+        match self.peek() {
+            Ok(len) => len == 0,
+            Err(error) => error.kind() != ErrorKind::WouldBlock,
+        }
+    }
+
+    /// Looks whether there is something to read, without waiting for it.
+    fn peek(&self) -> io::Result<usize> {
+        self.socket.set_nonblocking(true)?;
+        let found = self.socket.peek(&mut [0]);
+        self.socket.set_nonblocking(false)?;
+        found
+    }
+}
+
+/// What is left until a deadline, in whole milliseconds, the last one begun.
+fn millis(deadline: Instant) -> io::Result<Duration> {
+    let micros = left(deadline)?.as_micros();
+    Ok(Duration::from_millis(u64::try_from(micros.div_ceil(1000)).unwrap_or(u64::MAX)))
+}
+
+impl Line for Stream {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
         read(|| {
-            self.set_read_timeout(Some(left(deadline)?))?;
-            Read::read(self, buffer)
+            let timeout = millis(deadline)?;
+            if timeout != self.read_timeout {
+                self.socket.set_read_timeout(Some(timeout))?;
+                self.read_timeout = timeout;
+            }
+            self.socket.read(buffer)
         })
     }
 
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
-        self.set_write_timeout(Some(left(deadline)?))?;
-        self.write_all(bytes).map_err(|error| match error.kind() {
+        let timeout = millis(deadline)?;
+        if timeout != self.write_timeout {
+            self.socket.set_write_timeout(Some(timeout))?;
+            self.write_timeout = timeout;
+        }
+        self.socket.write_all(bytes).map_err(|error| match error.kind() {
             ErrorKind::WouldBlock => ErrorKind::TimedOut.into(),
             _ => error,
         })
@@ -66,21 +114,21 @@ impl Line for TcpStream {
 
     fn is_quiet(&self) -> bool {
         let waits = |error: io::Error| error.kind() == ErrorKind::WouldBlock;
-        peek(self).is_err_and(waits)
+        self.peek().is_err_and(waits)
     }
 }
 
 impl Line for serial2::SerialPort {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
         read(|| {
-            // A port counts whole milliseconds, and leaves the rest away.
-            self.set_read_timeout(left(deadline)? + Duration::from_micros(999))?;
+            // A port leaves away what is no whole millisecond.
+            self.set_read_timeout(millis(deadline)?)?;
             Read::read(self, buffer)
         })
     }
 
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
-        self.set_write_timeout(left(deadline)? + Duration::from_micros(999))?;
+        self.set_write_timeout(millis(deadline)?)?;
         Write::write_all(self, bytes)
     }
 
@@ -98,14 +146,6 @@ impl Line for serial2::SerialPort {
     }
 }
 
-/// Connects to the first address of a name that takes the connection before the deadline.
-pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpStream> {
-    let stream =
-        first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
-    stream.set_nodelay(true)?;
-    Ok(stream)
-}
-
 /// The first address of a name that `open` succeeds with.
 pub(super) fn first<T>(
     host: &str,
@@ -120,20 +160,4 @@ pub(super) fn first<T>(
         }
     }
     Err(failure)
-}
-
-/// Whether the peer of an idle connection has ended it.
-pub(super) fn has_ended(stream: &TcpStream) -> bool {
-    match peek(stream) {
-        Ok(len) => len == 0,
-        Err(error) => error.kind() != ErrorKind::WouldBlock,
-    }
-}
-
-/// Looks whether there is something to read, without waiting for it.
-fn peek(stream: &TcpStream) -> io::Result<usize> {
-    stream.set_nonblocking(true)?;
-    let found = stream.peek(&mut [0]);
-    stream.set_nonblocking(false)?;
-    found
 }

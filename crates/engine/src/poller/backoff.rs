@@ -1,15 +1,17 @@
-//! Pauses after failures: 1 s, doubled with each, up to a minute, and never quite the same.
+//! Pauses after failures: 1 s, doubled with each, up to a limit, and never quite the same.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
 
 const FIRST: Duration = Duration::from_secs(1);
-const LONGEST: Duration = Duration::from_secs(60);
+
+/// The longest pause of those who are asked.
+pub(super) const LONGEST: Duration = Duration::from_secs(60);
 
 /// The pause after `failures` failures in a row, at least one: up to a quarter shorter by chance, so
 /// that those who failed together don't come back together.
-pub(super) fn pause(failures: u32) -> Duration {
-    let doubled = FIRST.saturating_mul(1u32 << failures.saturating_sub(1).min(6)).min(LONGEST);
+pub(super) fn pause(failures: u32, longest: Duration) -> Duration {
+    let doubled = FIRST.saturating_mul(1u32 << failures.saturating_sub(1).min(6)).min(longest);
     // A hasher's keys are random, which is all the chance that is needed.
     let chance = RandomState::new().hash_one(failures) as u32;
     doubled.mul_f64(1.0 - 0.25 * f64::from(chance) / f64::from(u32::MAX))
@@ -20,10 +22,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pauses_double_up_to_a_minute() {
+    fn pauses_double_up_to_a_limit() {
         for (failures, most) in [(1, 1), (2, 2), (3, 4), (6, 32), (7, 60), (8, 60), (4000, 60)] {
             let most = Duration::from_secs(most);
-            let found = pause(failures);
+            let found = pause(failures, LONGEST);
             assert!(found <= most && found >= most.mul_f64(0.75), "{failures}: {found:?}");
         }
     }

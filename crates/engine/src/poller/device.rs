@@ -2,7 +2,9 @@
 //!
 //! The schedule does not drift: polls are due at whole intervals from the start. One that can't begin
 //! in time is skipped and counted, not caught up. A unit that stays silent is asked less and less
-//! often, with one request, until it answers.
+//! often, with one request, until it answers; behind an address that can't be reached nothing is
+//! asked before the next attempt. A poll begins behind the block that the one before it failed at,
+//! so that a block which is never answered does not keep the others waiting.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -13,7 +15,7 @@ use std::time::{Duration, SystemTime};
 
 use holdfast_memory::Area;
 use holdfast_protocol::pdu::{self, Range, Request};
-use tokio::time::{Instant, sleep_until};
+use tokio::time::{Instant, sleep, sleep_until};
 
 use super::backoff;
 use super::forward::{Forward, ForwardSettings};
@@ -29,7 +31,13 @@ use crate::counters::Counter;
 const ILLEGAL: [u8; 2] = [2, ILLEGAL_VALUE];
 const ILLEGAL_VALUE: u8 = 3;
 
-/// Timeouts in a row after which a unit is held to be dead.
+/// Exceptions of a gateway that did not reach the unit.
+const UNREACHED: [u8; 2] = [0x0A, 0x0B];
+
+/// How often a status block is written at least.
+const TELLING: Duration = Duration::from_secs(1);
+
+/// Polls without an answer in a row after which a unit is held to be dead.
 const DEAD_AFTER: u32 = 3;
 
 /// How long a refused plan is remembered before the first one is tried again.
@@ -70,6 +78,8 @@ pub struct ReadSettings {
 #[derive(Debug, Default)]
 pub struct DeviceState {
     pub counters: DeviceCounters,
+    /// The age at which the last answer is out of date.
+    stale_after: Duration,
     health: AtomicU16,
     last_error: AtomicU16,
     failures: AtomicU32,
@@ -103,11 +113,17 @@ pub struct DeviceCounters {
 }
 
 impl DeviceState {
+    /// An answer is out of date after three intervals and the time that a reply may take.
+    pub(super) fn new(interval: Duration, timeout: Duration) -> DeviceState {
+        let stale_after = interval.saturating_mul(3).saturating_add(timeout);
+        DeviceState { stale_after, ..DeviceState::default() }
+    }
+
     pub fn health(&self) -> Health {
         match self.health.load(Ordering::Relaxed) {
+            1 if self.age().is_some_and(|age| age > self.stale_after) => Health::Stale,
             1 => Health::Ok,
             2 => Health::Error,
-            3 => Health::Stale,
             _ => Health::Unknown,
         }
     }
@@ -142,12 +158,18 @@ impl DeviceState {
         self.since.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn good(&self, health: Health) {
-        let mut times = self.times();
-        times.last_good = Some(std::time::Instant::now());
-        times.error_since = None;
+    /// A valid answer came.
+    fn answered(&self, round_trip: Duration) {
+        self.counters.valid.add();
+        self.round_trip.store(round_trip.as_micros() as u64, Ordering::Relaxed);
+        self.times().last_good = Some(std::time::Instant::now());
+    }
+
+    /// A whole poll was answered.
+    fn good(&self) {
+        self.times().error_since = None;
         self.failures.store(0, Ordering::Relaxed);
-        self.health.store(health.code(), Ordering::Relaxed);
+        self.health.store(Health::Ok.code(), Ordering::Relaxed);
     }
 
     fn bad(&self, fault: Fault) {
@@ -192,6 +214,8 @@ pub(super) struct Device {
     name: Arc<str>,
     limits: RefCell<Limits>,
     plan: RefCell<Rc<Vec<Block>>>,
+    /// The block that a poll begins with.
+    first: Cell<usize>,
     /// When the first plan is tried again.
     revise: Cell<Option<Instant>>,
     silent: Cell<u32>,
@@ -203,11 +227,9 @@ pub(super) fn fields(reads: &[ReadSettings], limits: &Limits) -> Vec<(Field, usi
     for (index, read) in reads.iter().enumerate() {
         let most =
             u32::from(if read.area.is_bits() { limits.max_bits } else { limits.max_registers });
-        // Parts of bits begin at whole bytes, so that they are put together by copying.
-        let step = if read.area.is_bits() { (most & !7).max(8) } else { most.max(1) };
         let mut at = 0;
         while at < read.count {
-            let count = step.min(read.count - at);
+            let count = most.max(1).min(read.count - at);
             let address = (u32::from(read.address) + at) as u16;
             fields.push((Field { area: read.area, address, count: count as u16 }, index, at));
             at += count;
@@ -232,6 +254,7 @@ impl Device {
             name: settings.name.as_str().into(),
             limits: RefCell::new(settings.limits.clone()),
             plan: RefCell::default(),
+            first: Cell::new(0),
             revise: Cell::new(None),
             silent: Cell::new(0),
             settings,
@@ -243,48 +266,47 @@ impl Device {
         device
     }
 
-    /// Polls for ever, first after `phase`.
+    /// Polls for ever, first after `phase`, and keeps the status block true meanwhile.
     pub(super) async fn run(self, phase: Duration) {
-        let start = Instant::now() + phase;
-        let interval = self.settings.interval;
-        let mut due = 0;
         self.tell();
+        tokio::join!(self.poll_for_ever(phase), self.tell_for_ever());
+    }
+
+    async fn poll_for_ever(&self, phase: Duration) {
+        let interval = self.settings.interval;
+        let mut due = Instant::now() + phase;
         loop {
-            let at = start + interval.saturating_mul(due);
-            sleep_until(at).await;
+            sleep_until(due).await;
             self.poll().await;
             self.tell();
+            let missed;
+            (due, missed) = first_from(Instant::now(), due + interval, interval);
+            self.state.counters.missed.add_many(missed);
+            if let Some(until) = self.rest() {
+                sleep_until(until).await;
+                // What is left out on purpose is not missed.
+                (due, _) = first_from(Instant::now(), due, interval);
+            }
             if interval.is_zero() {
                 tokio::task::yield_now().await;
-                continue;
-            }
-            let passed = (start.elapsed().as_nanos() / interval.as_nanos()) as u32;
-            let next = (due + 1).max(passed + u32::from(start.elapsed() > interval * passed));
-            for _ in due + 1..next {
-                self.state.counters.missed.add();
-            }
-            due = next;
-            if let Some(pause) = self.pause() {
-                let until = Instant::now() + pause;
-                self.wait_and_tell(until).await;
-                let passed = (start.elapsed().as_nanos() / interval.as_nanos()) as u32;
-                due = due.max(passed + 1);
             }
         }
     }
 
-    /// How long a dead unit is left alone.
-    fn pause(&self) -> Option<Duration> {
-        let silent = self.silent.get();
-        (silent >= DEAD_AFTER).then(|| backoff::pause(silent - DEAD_AFTER + 1))
-    }
-
-    /// Keeps the age in the status block true while nothing is asked.
-    async fn wait_and_tell(&self, until: Instant) {
-        while Instant::now() < until {
-            sleep_until(until.min(Instant::now() + Duration::from_secs(1))).await;
+    async fn tell_for_ever(&self) {
+        while self.settings.status.is_some() {
+            sleep(TELLING).await;
             self.tell();
         }
+    }
+
+    /// Until when nothing is asked: the address can't be reached before, or the unit is dead.
+    fn rest(&self) -> Option<Instant> {
+        let silent = self.silent.get();
+        self.link.retry_at().or_else(|| {
+            (silent >= DEAD_AFTER)
+                .then(|| Instant::now() + backoff::pause(silent - DEAD_AFTER + 1, backoff::LONGEST))
+        })
     }
 
     fn draw_plan(&self) {
@@ -310,16 +332,18 @@ impl Device {
         let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
         let (mut fault, mut answered) = (None, false);
         let plan = Rc::clone(&self.plan.borrow());
-        for block in plan.iter() {
-            match self.read(block, &mut gathered).await {
+        let first = self.first.take();
+        for index in (0..plan.len()).map(|offset| (first + offset) % plan.len()) {
+            match self.read(&plan[index], &mut gathered).await {
                 Ok(()) => answered = true,
-                Err(refused @ Fault::Exception(_)) => {
+                Err(refused @ Fault::Exception(code)) if !UNREACHED.contains(&code) => {
                     answered = true;
                     fault = Some(refused);
                 }
                 Err(other) => {
                     fault = Some(other);
                     // What one request did not bring, the next would not bring either.
+                    self.first.set(index + 1);
                     break;
                 }
             }
@@ -331,14 +355,13 @@ impl Device {
         if self.settings.release {
             self.link.release();
         }
-        match (fault, answered) {
-            (Some(Fault::Timeout | Fault::Refused | Fault::Reset), false) => {
-                self.silent.set(self.silent.get().saturating_add(1));
-            }
-            _ => self.silent.set(0),
-        }
+        let silent = match fault {
+            Some(Fault::Timeout | Fault::Refused | Fault::Reset | Fault::Exception(_)) => !answered,
+            Some(Fault::Invalid) | None => false,
+        };
+        self.silent.set(if silent { self.silent.get().saturating_add(1) } else { 0 });
         match fault {
-            None => self.state.good(self.punctual()),
+            None => self.state.good(),
             Some(fault) => self.state.bad(fault),
         }
     }
@@ -362,7 +385,9 @@ impl Device {
                 for part in &smaller {
                     match Box::pin(self.read(part, gathered)).await {
                         Ok(()) => {}
-                        Err(refused @ Fault::Exception(_)) => done = Err(refused),
+                        Err(refused @ Fault::Exception(code)) if !UNREACHED.contains(&code) => {
+                            done = Err(refused);
+                        }
                         Err(other) => return Err(other),
                     }
                 }
@@ -378,15 +403,6 @@ impl Device {
         Ok(())
     }
 
-    /// Answers that come later than three intervals are out of date.
-    fn punctual(&self) -> Health {
-        let late = self.settings.interval * 3 + self.settings.timeout;
-        match self.state.age() {
-            Some(age) if age > late && self.state.failures() == 0 => Health::Stale,
-            _ => Health::Ok,
-        }
-    }
-
     async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
         let range = Range { address: block.address, quantity: block.count };
         let request = match block.area {
@@ -400,14 +416,11 @@ impl Device {
         let counters = &self.state.counters;
         counters.requests.add();
         let began = Instant::now();
-        let answer =
-            self.link.read(self.settings.unit_id, &buffer[..len], self.settings.timeout).await;
+        let doubtful = self.silent.get() > 0;
+        let DeviceSettings { unit_id, timeout, .. } = &self.settings;
+        let answer = self.link.read(*unit_id, &buffer[..len], *timeout, doubtful).await;
         match &answer {
-            Ok(_) => {
-                counters.valid.add();
-                let micros = began.elapsed().as_micros() as u64;
-                self.state.round_trip.store(micros, Ordering::Relaxed);
-            }
+            Ok(_) => self.state.answered(began.elapsed()),
             Err(Fault::Exception(_)) => counters.exceptions.add(),
             Err(Fault::Timeout) => counters.timeouts.add(),
             Err(_) => counters.transport_errors.add(),
@@ -459,8 +472,6 @@ impl Device {
             if whole && !field.area.is_bits() {
                 let end = offset + usize::from(field.count);
                 self.hand_on(read, &bytes[offset * 2..end * 2]);
-            } else if whole && offset == 0 && block.count == field.count {
-                self.hand_on(read, bytes);
             } else if let Some(bytes) = gathered.put(settings, read, at, field, bytes, offset) {
                 self.hand_on(read, &bytes);
             }
@@ -490,6 +501,15 @@ impl Device {
             self.state.status().write(&self.settings.name, to);
         }
     }
+}
+
+/// The first time that is not before `now`, of those at whole intervals from `due`; and how many
+/// come before it.
+fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) {
+    let late = now.saturating_duration_since(due).as_nanos();
+    let passed = late.div_ceil(interval.as_nanos().max(1));
+    let skipped = interval.as_nanos() * passed;
+    (due + Duration::from_nanos(skipped as u64), if interval.is_zero() { 0 } else { passed as u64 })
 }
 
 /// What one poll brings together: reads that come in parts, and how many items are missing; and
@@ -537,5 +557,39 @@ impl Gathered {
             return None;
         }
         self.parts.remove(&read).map(|(whole, _)| whole)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn polls_are_due_at_whole_intervals_whatever_was_missed() {
+        let (due, interval) = (Instant::now(), Duration::from_millis(100));
+        let of = |now: u64| {
+            let (next, missed) = first_from(due + Duration::from_millis(now), due, interval);
+            ((next - due).as_millis(), missed)
+        };
+        assert_eq!(of(0), (0, 0));
+        assert_eq!(of(1), (100, 1));
+        assert_eq!(of(100), (100, 1));
+        assert_eq!(of(101), (200, 2));
+        assert_eq!(of(86_400_000), (86_400_000, 864_000));
+        assert_eq!(first_from(due - interval, due, interval), (due, 0));
+        assert_eq!(first_from(due + interval, due, Duration::ZERO), (due, 0));
+    }
+
+    #[test]
+    fn reads_are_parted_into_what_one_request_can_carry() {
+        let of = |area, count, limits: &Limits| {
+            let read = ReadSettings { area, address: 5, count, into: None };
+            let parts = fields(&[read], limits).into_iter();
+            parts.map(|(field, _, at)| (field.address, field.count, at)).collect::<Vec<_>>()
+        };
+        let limits = Limits { max_bits: 3, max_registers: 100, ..Limits::default() };
+        assert_eq!(of(Area::Coils, 7, &limits), [(5, 3, 0), (8, 3, 3), (11, 1, 6)]);
+        assert_eq!(of(Area::HoldingRegisters, 100, &limits), [(5, 100, 0)]);
+        assert_eq!(of(Area::InputRegisters, 65_531, &Limits::default()).len(), 525);
     }
 }

@@ -2,7 +2,7 @@
 //! nothing; when it is back, it gets the newest of each read.
 
 use std::cell::{Cell, RefCell};
-use std::collections::BTreeMap;
+use std::collections::{HashMap, VecDeque};
 use std::io;
 use std::rc::Rc;
 use std::sync::Arc;
@@ -16,6 +16,9 @@ use tokio::time::{sleep, timeout};
 
 use super::backoff;
 use crate::counters::Counter;
+
+/// The longest pause before a target that is down is tried again.
+const LONGEST: Duration = Duration::from_secs(10);
 
 /// A receiver of Raw Ingest packets.
 #[derive(Debug, Clone)]
@@ -44,10 +47,42 @@ pub struct ForwardCounters {
 pub(super) struct Forward {
     settings: ForwardSettings,
     pub(super) counters: Arc<ForwardCounters>,
-    /// The newest packet of each read that has not been sent.
-    waiting: RefCell<BTreeMap<usize, Vec<u8>>>,
+    waiting: RefCell<Waiting>,
     news: Notify,
     failures: Cell<u32>,
+}
+
+/// The newest packet of each read that has not been sent, and their order: first come, first sent.
+#[derive(Default)]
+struct Waiting {
+    order: VecDeque<usize>,
+    newest: HashMap<usize, Vec<u8>>,
+}
+
+impl Waiting {
+    /// Whether it took the place of an older one.
+    fn put(&mut self, read: usize, packet: Vec<u8>) -> bool {
+        let replaced = self.newest.insert(read, packet).is_some();
+        if !replaced {
+            self.order.push_back(read);
+        }
+        replaced
+    }
+
+    /// Takes a packet back that was not sent; whether there is a newer one by now.
+    fn put_back(&mut self, read: usize, packet: Vec<u8>) -> bool {
+        let outdated = self.newest.contains_key(&read);
+        if !outdated {
+            self.newest.insert(read, packet);
+            self.order.push_front(read);
+        }
+        outdated
+    }
+
+    fn take(&mut self) -> Option<(usize, Vec<u8>)> {
+        let read = self.order.pop_front()?;
+        Some((read, self.newest.remove(&read)?))
+    }
 }
 
 impl Forward {
@@ -66,7 +101,7 @@ impl Forward {
         let header = Header { area, target: self.settings.target, address, count };
         let mut packet = Vec::with_capacity(self.settings.format.packet_len(&header));
         self.settings.format.encode(&header, bytes, &mut packet);
-        if self.waiting.borrow_mut().insert(read, packet).is_some() {
+        if self.waiting.borrow_mut().put(read, packet) {
             self.counters.replaced.add();
         }
         self.news.notify_one();
@@ -75,7 +110,7 @@ impl Forward {
     /// Sends what was offered, one packet after the other, for ever.
     pub(super) async fn run(self: Rc<Forward>) {
         loop {
-            let next = self.waiting.borrow_mut().pop_first();
+            let next = self.waiting.borrow_mut().take();
             let Some((read, packet)) = next else {
                 self.news.notified().await;
                 continue;
@@ -88,10 +123,11 @@ impl Forward {
                 }
                 Ok(Err(_)) | Err(_) => {
                     self.counters.failed.add();
-                    // It goes first again, unless there are newer bytes by then.
-                    self.waiting.borrow_mut().entry(read).or_insert(packet);
+                    if self.waiting.borrow_mut().put_back(read, packet) {
+                        self.counters.replaced.add();
+                    }
                     self.failures.set(self.failures.get().saturating_add(1));
-                    sleep(backoff::pause(self.failures.get())).await;
+                    sleep(backoff::pause(self.failures.get(), LONGEST)).await;
                 }
             }
         }
@@ -102,5 +138,26 @@ impl Forward {
         let mut stream = TcpStream::connect(address).await?;
         stream.write_all(packet).await?;
         stream.read_u8().await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_read_has_its_turn_and_newer_bytes_take_the_place_of_older_ones() {
+        let mut waiting = Waiting::default();
+        assert!(!waiting.put(0, vec![1]) && !waiting.put(1, vec![2]));
+        let (read, packet) = waiting.take().unwrap();
+        assert_eq!((read, &packet[..]), (0, &[1][..]));
+        assert!(!waiting.put(0, vec![3]) && waiting.put(0, vec![4]));
+        assert!(waiting.put_back(read, packet));
+        let (read, packet) = waiting.take().unwrap();
+        assert_eq!((read, &packet[..]), (1, &[2][..]));
+        assert!(!waiting.put_back(read, packet));
+        assert_eq!(waiting.take(), Some((1, vec![2])));
+        assert_eq!(waiting.take(), Some((0, vec![4])));
+        assert_eq!(waiting.take(), None);
     }
 }

@@ -2,9 +2,10 @@
 //!
 //! Over Modbus TCP several requests are in flight, so that a unit that is dead does not hold up the
 //! others behind the same gateway. All other transports carry one request at a time, in a thread of
-//! their own. A link that can't be connected fails at once until its pause is over.
+//! their own. A link that can't be connected fails at once until its pause is over. A connection
+//! that has gone silent, or is left in the middle of a reply, is made anew.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
 use std::io::ErrorKind;
 use std::rc::Rc;
@@ -24,6 +25,12 @@ use crate::client::{BlockingClient, ClientError, Endpoint, Session};
 
 /// Requests in flight on one connection.
 const IN_FLIGHT: usize = 8;
+
+/// Of these, requests to units that were silent the last time: they leave room for the others.
+const DOUBTFUL: usize = 4;
+
+/// Timeouts one after the other, without a byte between them, after which a connection is given up.
+const SILENT: u32 = 3;
 
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 16 * 1024;
@@ -45,16 +52,31 @@ impl Link {
         })
     }
 
-    /// Sends a read and waits for its bytes.
-    pub(super) async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
+    /// Sends a read and waits for its bytes. `doubtful` is said of a unit that was silent.
+    pub(super) async fn read(
+        &self,
+        unit_id: u8,
+        pdu: &[u8],
+        timeout: Duration,
+        doubtful: bool,
+    ) -> Answer {
         match self {
-            Link::Tcp(link) => link.read(unit_id, pdu, timeout).await,
+            Link::Tcp(link) => link.read(unit_id, pdu, timeout, doubtful).await,
             Link::Blocking(link) => link.read(unit_id, pdu, timeout).await,
         }
     }
 }
 
 impl Link {
+    /// When an address that could not be reached is tried again; until then reads fail at once.
+    pub(super) fn retry_at(&self) -> Option<Instant> {
+        let failed = match self {
+            Link::Tcp(link) => link.failed.get().map(|(until, _)| until),
+            Link::Blocking(link) => link.retry_at.get(),
+        };
+        failed.filter(|until| Instant::now() < *until)
+    }
+
     /// Ends the connection if nobody waits for a reply; the next read makes a new one.
     pub(super) fn release(&self) {
         match self {
@@ -75,14 +97,12 @@ pub(super) struct TcpLink {
     host: String,
     port: u16,
     places: Semaphore,
-    connecting: Mutex<Attempts>,
+    doubtful: Semaphore,
+    connecting: Mutex<()>,
+    failures: Cell<u32>,
+    /// When the next attempt may be made after one that failed, and why it did.
+    failed: Cell<Option<(Instant, Fault)>>,
     open: Rc<RefCell<Option<Open>>>,
-}
-
-#[derive(Default)]
-struct Attempts {
-    failures: u32,
-    not_before: Option<Instant>,
 }
 
 /// A connection that is open.
@@ -92,6 +112,9 @@ struct Open {
     writer: tokio::net::tcp::OwnedWriteHalf,
     /// What the socket did not take yet.
     unsent: Vec<u8>,
+    /// Timeouts since something came, and when the last of them was.
+    timeouts: u32,
+    timed_out: Instant,
     reader: Option<AbortHandle>,
 }
 
@@ -101,25 +124,30 @@ impl TcpLink {
             host,
             port,
             places: Semaphore::new(IN_FLIGHT),
+            doubtful: Semaphore::new(DOUBTFUL),
             connecting: Mutex::default(),
+            failures: Cell::new(0),
+            failed: Cell::new(None),
             open: Rc::default(),
         }
     }
 
-    async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
+    async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration, doubtful: bool) -> Answer {
+        let _doubtful = if doubtful { self.doubtful.acquire().await.ok() } else { None };
         let Ok(_place) = self.places.acquire().await else { return Err(Fault::Reset) };
         let deadline = Instant::now() + timeout;
         if self.open.borrow().is_none() {
             self.connect(deadline).await?;
         }
         let (id, answer) = self.send(unit_id, pdu)?;
+        let sent = Instant::now();
         match timeout_at(deadline, answer).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) => Err(Fault::Reset),
             Err(_) => {
-                if let Some(open) = self.open.borrow_mut().as_mut() {
-                    open.waiting.remove(&id);
-                    open.session.give_up(id);
+                let mut open = self.open.borrow_mut();
+                if open.as_mut().is_some_and(|open| !open.outlives(id, sent)) {
+                    *open = None;
                 }
                 Err(Fault::Timeout)
             }
@@ -128,27 +156,30 @@ impl TcpLink {
 
     /// Makes the connection, once for all who wait for it.
     async fn connect(&self, deadline: Instant) -> Result<(), Fault> {
-        let mut attempts =
-            timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
+        let _alone = timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
         if self.open.borrow().is_some() {
             return Ok(());
         }
-        if attempts.not_before.is_some_and(|time| Instant::now() < time) {
-            return Err(Fault::Refused);
+        if let Some((until, fault)) = self.failed.get()
+            && Instant::now() < until
+        {
+            return Err(fault);
         }
         let address = (self.host.as_str(), self.port);
         let connected = timeout_at(deadline, TcpStream::connect(address)).await;
         let fault = match connected {
             Ok(Ok(stream)) => {
-                *attempts = Attempts::default();
+                self.failures.set(0);
+                self.failed.set(None);
                 self.take(stream);
                 return Ok(());
             }
             Ok(Err(_)) => Fault::Refused,
             Err(_) => Fault::Timeout,
         };
-        attempts.failures = attempts.failures.saturating_add(1);
-        attempts.not_before = Some(Instant::now() + backoff::pause(attempts.failures));
+        self.failures.set(self.failures.get().saturating_add(1));
+        let pause = backoff::pause(self.failures.get(), backoff::LONGEST);
+        self.failed.set(Some((Instant::now() + pause, fault)));
         Err(fault)
     }
 
@@ -160,6 +191,8 @@ impl TcpLink {
             waiting: HashMap::new(),
             writer,
             unsent: Vec::new(),
+            timeouts: 0,
+            timed_out: Instant::now(),
             reader: None,
         };
         *self.open.borrow_mut() = Some(open);
@@ -197,6 +230,20 @@ impl Drop for TcpLink {
 }
 
 impl Open {
+    /// Gives a request up that was not answered in time; whether the connection can be trusted
+    /// after that. Requests that were under way together count as one, and as long as another one
+    /// waits, it is left to that.
+    fn outlives(&mut self, id: u16, sent: Instant) -> bool {
+        self.waiting.remove(&id);
+        self.session.give_up(id);
+        if sent >= self.timed_out {
+            self.timeouts += 1;
+            self.timed_out = Instant::now();
+        }
+        let doubtful = self.timeouts >= SILENT || self.session.is_amid_reply();
+        !(doubtful && self.waiting.is_empty())
+    }
+
     /// Sends without waiting; what the socket does not take goes with the next. Whether the
     /// connection still works.
     fn write(&mut self, frame: &[u8]) -> bool {
@@ -235,6 +282,7 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
             Err(error) if error.kind() == ErrorKind::WouldBlock => continue,
             Err(_) => Fault::Reset,
             Ok(len) => {
+                connection.timeouts = 0;
                 let Open { session, waiting, .. } = connection;
                 let received = session.receive(&chunk[..len], |id, response| {
                     if let Some(sender) = waiting.remove(&id) {
@@ -274,6 +322,7 @@ fn bytes(response: Result<Response<'_>, ResponseError>) -> Answer {
 /// One request at a time, by blocking calls in a thread that ends with the link.
 pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
+    retry_at: Cell<Option<Instant>>,
 }
 
 enum Job {
@@ -285,7 +334,8 @@ struct Read {
     unit_id: u8,
     pdu: Vec<u8>,
     timeout: Duration,
-    answer: oneshot::Sender<Answer>,
+    /// And when an endpoint that could not be opened is tried again.
+    answer: oneshot::Sender<(Answer, Option<Instant>)>,
 }
 
 impl BlockingLink {
@@ -293,36 +343,41 @@ impl BlockingLink {
         let (jobs, queue) = mpsc::channel::<Job>();
         let client = BlockingClient::new(endpoint);
         let work = move || {
-            let mut attempts = (0, None);
+            let (mut failures, mut retry_at) = (0, None);
             for job in queue {
                 match job {
                     Job::Release => client.close(),
                     // Nobody waits any more for a read whose device was stopped.
                     Job::Read(read) if read.answer.is_closed() => {}
                     Job::Read(read) => {
-                        let answer = call(&client, &read, &mut attempts);
-                        let _ = read.answer.send(answer);
+                        let answer = call(&client, &read, &mut failures, &mut retry_at);
+                        let _ = read.answer.send((answer, retry_at));
                     }
                 }
             }
         };
         // Without a thread every job fails, which its device tells.
         let _ = std::thread::Builder::new().name("holdfast-line".into()).spawn(work);
-        BlockingLink { jobs }
+        BlockingLink { jobs, retry_at: Cell::new(None) }
     }
 
     async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
         let (answer, answered) = oneshot::channel();
         let read = Read { unit_id, pdu: pdu.to_vec(), timeout, answer };
         self.jobs.send(Job::Read(read)).or(Err(Fault::Reset))?;
-        answered.await.unwrap_or(Err(Fault::Reset))
+        let (answer, retry_at) = answered.await.unwrap_or((Err(Fault::Reset), None));
+        self.retry_at.set(retry_at);
+        answer
     }
 }
 
-type Pause = (u32, Option<std::time::Instant>);
-
-fn call(client: &BlockingClient, job: &Read, (failures, not_before): &mut Pause) -> Answer {
-    if not_before.is_some_and(|time| std::time::Instant::now() < time) {
+fn call(
+    client: &BlockingClient,
+    job: &Read,
+    failures: &mut u32,
+    retry_at: &mut Option<Instant>,
+) -> Answer {
+    if retry_at.is_some_and(|time| Instant::now() < time) {
         return Err(Fault::Refused);
     }
     let request = Request::parse(&job.pdu).or(Err(Fault::Invalid))?;
@@ -330,11 +385,11 @@ fn call(client: &BlockingClient, job: &Read, (failures, not_before): &mut Pause)
     match answer {
         Err(ClientError::Connect { .. }) => {
             *failures = failures.saturating_add(1);
-            *not_before = Some(std::time::Instant::now() + backoff::pause(*failures));
+            *retry_at = Some(Instant::now() + backoff::pause(*failures, backoff::LONGEST));
             Err(Fault::Refused)
         }
         other => {
-            (*failures, *not_before) = (0, None);
+            (*failures, *retry_at) = (0, None);
             match other {
                 Ok(bytes) => bytes,
                 Err(ClientError::Exception(code)) => Err(Fault::Exception(code)),

@@ -8,6 +8,9 @@
 use holdfast_memory::Area;
 use thiserror::Error;
 
+/// Bits that take the room of a register.
+const BITS: f64 = 16.0;
+
 /// Something to read as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Field {
@@ -41,7 +44,8 @@ pub struct Stretch {
 pub enum Strategy {
     /// Holes of up to `max_gap` items are read.
     Gap { max_gap: u16 },
-    /// Any hole is read if that is cheaper: `request` for each request and `item` for each item.
+    /// Any hole is read if that is cheaper: `request` for each request and `item` for each register
+    /// or 16 bits.
     Cost { request: f64, item: f64 },
 }
 
@@ -128,6 +132,8 @@ pub fn plan(
         match strategy {
             Strategy::Gap { max_gap } => by_gap(fields, of_area, limits, max_gap, &mut blocks),
             Strategy::Cost { request, item } => {
+                let bits = fields[of_area[0]].area.is_bits();
+                let item = if bits { item / BITS } else { item };
                 by_cost(fields, of_area, limits, (request, item), &mut blocks);
             }
         }

@@ -19,7 +19,7 @@ const CAPACITY: usize = 16_384;
 pub struct Poll {
     pub device: Arc<str>,
     pub time: SystemTime,
-    /// In the order of the plan; those behind one that was not answered are missing.
+    /// In the order in which they were asked; those behind one that was not answered are missing.
     pub blocks: Vec<BlockResult>,
 }
 

@@ -76,7 +76,11 @@ impl Poller {
             .build()
             .map_err(PollerError::Thread)?;
         let to = Arc::clone(&results);
-        let work = move || LocalSet::new().block_on(&runtime, obey(told, to));
+        let work = move || {
+            LocalSet::new().block_on(&runtime, obey(told, to));
+            // A name that is being looked up is not waited for.
+            runtime.shutdown_background();
+        };
         let thread = thread::Builder::new()
             .name("holdfast-poller".into())
             .spawn(work)
@@ -97,7 +101,7 @@ impl Poller {
         check(&device)?;
         let polled = Polled {
             name: device.name.clone(),
-            state: Arc::default(),
+            state: Arc::new(DeviceState::new(device.interval, device.timeout)),
             forwards: device.forward.iter().map(|_| Arc::default()).collect(),
         };
         let mut all = self.polled.lock().unwrap_or_else(PoisonError::into_inner);

@@ -211,7 +211,7 @@ def _paths(secured: bool) -> dict[str, Any]:
                 "security": security,
                 "responses": {
                     "200": _answer(
-                        "Listeners, adapters, log and audit",
+                        "Listeners, devices, adapters, log and audit",
                         _ref("Stats"),
                         {
                             "uptime": 3600.25,
@@ -221,6 +221,15 @@ def _paths(secured: bool) -> dict[str, Any]:
                                     "exceptions": {"2": 1},
                                     "unanswered": 0,
                                     "connections": {"accepted": 2, "open": 1},
+                                }
+                            },
+                            "devices": {
+                                "meter": {
+                                    "health": "ok",
+                                    "age": 0.4,
+                                    "requests": 7200,
+                                    "valid": 7199,
+                                    "timeouts": 1,
                                 }
                             },
                             "adapters": {
@@ -355,6 +364,18 @@ def _schemas() -> dict[str, Schema]:
                     "description": "By the name of the listener: requests by function code, "
                     "exceptions by code, connections, frames",
                     "additionalProperties": {"type": "object"},
+                },
+                "devices": {
+                    "type": "object",
+                    "description": "By the name of the device: health, seconds since the last "
+                    "valid answer, requests by their outcomes, polls, reads, packets forwarded",
+                    "additionalProperties": {
+                        "type": "object",
+                        "required": ["health"],
+                        "properties": {
+                            "health": {"enum": ["unknown", "ok", "error", "stale", "disabled"]},
+                        },
+                    },
                 },
                 "adapters": {
                     "type": "object",

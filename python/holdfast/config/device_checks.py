@@ -1,0 +1,287 @@
+"""What the keys of devices must keep together: destinations, ranges, forwards and serial lines."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
+from holdfast.config.initial import extent
+from holdfast.config.listeners import SERIAL_TYPES
+from holdfast.config.memory_checks import addresses
+from holdfast.config.tolerance import entries, integer, mapping, parsed
+from holdfast.config.values import (
+    AREAS,
+    BIT_AREAS,
+    NOT_ON_A_LINE,
+    REGISTER_AREAS,
+    Area,
+    parse_url,
+)
+from holdfast.config.words import choice, listing, show
+from holdfast.target import SerialTarget, parse
+
+if TYPE_CHECKING:
+    from holdfast.config.grant_checks import GrantChecks
+    from holdfast.config.problems import Report
+    from holdfast.config.source import KeyPath
+    from holdfast.target import Target
+
+LAST = 65535
+MOST_OF_A_PACKET = 65535
+"""The most values of one raw ingest packet."""
+
+_NAMING = {"v1": "unit", "crc": "memory_id"}
+"""The key of what a packet names, by its format."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Addresses of a memory that something is written to; `path` is its place in the file."""
+
+    path: KeyPath
+    memory: str
+    area: Area
+    addresses: range
+
+    def __str__(self) -> str:
+        return f"{self.area} {extent(self.addresses)} of {self.memory}"
+
+
+@dataclass
+class DeviceChecks:
+    """Checks the devices of one file."""
+
+    report: Report
+    grants: GrantChecks
+    memories: dict[Any, Any]
+    """The memories as they are written."""
+
+    def __post_init__(self) -> None:
+        self._claims: list[Claim] = []
+        self._lines: dict[str, tuple[KeyPath, SerialTarget]] = {}
+
+    def check(self, data: dict[Any, Any]) -> None:
+        """Reports what is wrong."""
+        taken = _serial_listeners(data)
+        for name, device in mapping(data.get("devices")).items():
+            if isinstance(device, dict):
+                self._device(("devices", name), device, taken)
+        self._overlaps()
+
+    def _device(self, path: KeyPath, device: dict[Any, Any], taken: dict[str, KeyPath]) -> None:
+        target = parsed(_target, device.get("url"))
+        if isinstance(target, SerialTarget):
+            self._line(path, target, device.get("unit"), taken)
+        if "max_gap" in device and "cost" in device:
+            message = "found beside max_gap, allowed: one of both"
+            self.report.add((*path, "cost"), message, of_key=True)
+        if device.get("readable") and not device.get("max_gap") and "cost" not in device:
+            message = "it has no effect: without max_gap or cost no holes are read"
+            self.report.doubt((*path, "readable"), message)
+        self._ranges((*path, "readable"), device.get("readable"))
+        forbidden = self._ranges((*path, "forbidden"), device.get("forbidden"))
+        for index, forward in enumerate(entries(device.get("forward"))):
+            self._forward((*path, "forward", index), mapping(forward))
+        for index, read in enumerate(entries(device.get("reads"))):
+            if isinstance(read, dict):
+                forwarded = bool(device.get("forward"))
+                self._read((*path, "reads", index), read, forbidden, forwarded=forwarded)
+        if isinstance(device.get("status"), dict):
+            self._status((*path, "status"), device["status"])
+
+    def _line(
+        self, path: KeyPath, target: SerialTarget, unit: object, taken: dict[str, KeyPath]
+    ) -> None:
+        """A serial line: it belongs to devices that drive it alike, and to no listener."""
+        number = integer(unit, 0, 255)
+        if number is not None and not 1 <= number <= 247:
+            allowed = f"allowed on a serial line: a unit id from 1 to 247{NOT_ON_A_LINE}"
+            self.report.add((*path, "unit"), f"found {number}, {allowed}")
+        port = os.path.realpath(target.device)
+        if port in taken:
+            of = self._named(taken[port])
+            message = f"found {show(target.device)}, which is the device of {of}, allowed: another"
+            self.report.add((*path, "url"), message)
+        first, other = self._lines.setdefault(port, (path, target))
+        if replace(target, device=other.device) != other:
+            message = f"found other settings of the line than {self._named(first)} has"
+            self.report.add((*path, "url"), f"{message}, allowed: the same")
+
+    def _ranges(self, path: KeyPath, ranges: object) -> list[tuple[KeyPath, object, range]]:
+        """The ranges that can be told, each with its place and its area."""
+        found = []
+        for index, each in enumerate(entries(ranges)):
+            if not isinstance(each, dict):
+                continue
+            here = (*path, index)
+            if "end" in each and "count" in each:
+                message = "found beside end, allowed: one of both"
+                self.report.add((*here, "count"), message, of_key=True)
+            elif not each.keys() & {"end", "count"}:
+                message = "found neither end nor count, allowed: one of both"
+                self.report.add(here, message, of_key=True)
+            else:
+                span = self._range(here, each)
+                if span is not None:
+                    found.append((here, each.get("area"), span))
+        return found
+
+    def _range(self, path: KeyPath, each: dict[Any, Any]) -> range | None:
+        start = integer(each.get("start"), 0, LAST)
+        if "count" in each:
+            return self._sum(path, start, each["count"], "start")
+        end = integer(each["end"], 0, LAST)
+        if start is None or end is None:
+            return None
+        if end < start:
+            message = f"found {end}, allowed: the last address, {start} or more"
+            self.report.add((*path, "end"), message)
+            return None
+        return range(start, end + 1)
+
+    def _sum(self, path: KeyPath, first: int | None, count: object, key: str) -> range | None:
+        """So many addresses from the first on, if there are that many."""
+        number = integer(count, 1, LAST + 1)
+        if first is None or number is None:
+            return None
+        if first + number > LAST + 1:
+            message = f"found {key} {first} and count {number}, allowed: a sum up to 65536"
+            self.report.add((*path, "count"), message)
+            return None
+        return range(first, first + number)
+
+    def _forward(self, path: KeyPath, forward: dict[Any, Any]) -> None:
+        form = forward.get("format", "v1")
+        if "crc" in forward and form == "v1":
+            message = "found beside format v1, allowed: beside format crc only"
+            self.report.add((*path, "crc"), message, of_key=True)
+        if form not in ("v1", "crc") or not forward:
+            return
+        needed, other = _NAMING[form], _NAMING["v1" if form == "crc" else "crc"]
+        if needed not in forward:
+            message = f"missing beside format {form}, allowed: an integer from 0 to 65535"
+            self.report.add((*path, needed), message, of_key=True)
+        if other in forward:
+            message = f"found beside format {form}, allowed: {needed}"
+            self.report.add((*path, other), message, of_key=True)
+
+    def _read(
+        self,
+        path: KeyPath,
+        read: dict[Any, Any],
+        forbidden: list[tuple[KeyPath, object, range]],
+        *,
+        forwarded: bool,
+    ) -> None:
+        area = read.get("area")
+        address = integer(read.get("address"), 0, LAST)
+        asked = self._sum(path, address, read.get("count"), "address")
+        count = integer(read.get("count"), 1, LAST + 1)
+        for where, of, span in forbidden:
+            if asked is not None and of == area and _meet(asked, span):
+                message = f"found {extent(asked)}, which meets {extent(span)} of {_last(where)}"
+                line = f"in line {self.report.line(where)}"
+                self.report.add(path, f"{message} {line}, allowed: other addresses", of_key=True)
+        if forwarded and count == LAST + 1:
+            allowed = f"allowed beside forward: up to {MOST_OF_A_PACKET}, which one packet holds"
+            self.report.add((*path, "count"), f"found {count}, {allowed}")
+        if isinstance(read.get("into"), dict):
+            into = (*path, "into")
+            self._destination(into, read["into"], area, count)
+        elif "into" not in read and not forwarded:
+            message = "it has no effect: neither into nor forward says where it goes"
+            self.report.doubt(path, message)
+
+    def _destination(
+        self, path: KeyPath, into: dict[Any, Any], of: object, count: int | None
+    ) -> None:
+        self.grants.memory((*path, "memory"), into.get("memory"))
+        area, address = into.get("area"), integer(into.get("address"), 0, LAST)
+        if area not in AREAS or (of in AREAS and (area in BIT_AREAS) != (of in BIT_AREAS)):
+            if area in AREAS:
+                kin = BIT_AREAS if of in BIT_AREAS else REGISTER_AREAS
+                message = f"found {show(area)}, allowed for {of}: {choice(kin)}"
+                self.report.add((*path, "area"), message)
+            return
+        there = self._there(path, into.get("memory"), area)
+        if there is None or address is None or count is None:
+            return
+        if address not in there or address + count - 1 not in there:
+            noun = "bits" if area in BIT_AREAS else "registers"
+            found = f"found {count} {noun} from {address} on"
+            allowed = f"allowed in {area} of {into['memory']}: {extent(there)}"
+            self.report.add((*path, "address"), f"{found}, {allowed}")
+            return
+        self._claims.append(Claim(path, into["memory"], area, range(address, address + count)))
+
+    def _status(self, path: KeyPath, status: dict[Any, Any]) -> None:
+        self.grants.memory((*path, "memory"), status.get("memory"))
+        area, slot = status.get("area"), integer(status.get("slot"), 0, LAST_SLOT)
+        if area not in REGISTER_AREAS:
+            return
+        there = self._there(path, status.get("memory"), area)
+        if there is None or slot is None:
+            return
+        block = range(slot * STATUS_BLOCK, (slot + 1) * STATUS_BLOCK)
+        if block[0] not in there or block[-1] not in there:
+            found = f"found {slot}, which is addresses {extent(block)}"
+            allowed = f"allowed in {area} of {status['memory']}: {extent(there)}"
+            self.report.add((*path, "slot"), f"{found}, {allowed}")
+            return
+        self._claims.append(Claim(path, status["memory"], area, block))
+
+    def _there(self, path: KeyPath, name: object, area: Any) -> range | None:
+        """The addresses of a memory's area, if they can be told."""
+        memory = self.memories.get(name) if isinstance(name, str) else None
+        if not isinstance(memory, dict):
+            return None
+        if area not in memory:
+            areas = [each for each in AREAS if each in memory]
+            allowed = f"allowed: {listing(areas)}" if areas else "which needs one"
+            message = f"found {show(area)}, an area that {name} does not have, {allowed}"
+            self.report.add((*path, "area"), message)
+            return None
+        return addresses(memory[area])
+
+    def _overlaps(self) -> None:
+        """No address is written by two reads or blocks: the later one in the file is reported."""
+        order = {claim.path: number for number, claim in enumerate(self._claims)}
+        widest: dict[tuple[str, str], Claim] = {}
+        for claim in sorted(self._claims, key=lambda claim: claim.addresses.start):
+            key = (claim.memory, claim.area)
+            before = widest.setdefault(key, claim)
+            if before is not claim and claim.addresses.start < before.addresses.stop:
+                first, second = sorted((before, claim), key=lambda each: order[each.path])
+                overlapped = f"{extent(first.addresses)} of {self._named(first.path)}"
+                message = f"found {second}, which overlaps {overlapped}"
+                self.report.add(second.path, f"{message}, allowed: addresses of its own")
+            if claim.addresses.stop > before.addresses.stop:
+                widest[key] = claim
+
+    def _named(self, path: KeyPath) -> str:
+        return f"{self.report.document.spell(path)} in line {self.report.line(path)}"
+
+
+def _target(url: object) -> Target:
+    return parse(parse_url(url))
+
+
+def _serial_listeners(data: dict[Any, Any]) -> dict[str, KeyPath]:
+    """The serial ports that are served, each with its listener."""
+    ports: dict[str, KeyPath] = {}
+    for name, listener in mapping(data.get("listeners")).items():
+        if mapping(listener).get("type") in SERIAL_TYPES:
+            device = mapping(mapping(listener).get("serial")).get("device")
+            if isinstance(device, str) and device and "\0" not in device:
+                ports.setdefault(os.path.realpath(device), ("listeners", name))
+    return ports
+
+
+def _meet(one: range, other: range) -> bool:
+    return one.start < other.stop and other.start < one.stop
+
+
+def _last(path: KeyPath) -> str:
+    return f"{path[-2]}[{path[-1]}]"
