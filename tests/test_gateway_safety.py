@@ -443,7 +443,7 @@ def test_a_body_that_does_not_come_is_not_waited_for() -> None:
         with wire.Connection(running.address) as connection:
             connection.send(head + b"{")
             [answer] = web.answers(connection.rest())
-        assert (answer.status, answer.headers["holdfast-reason"]) == (408, "too_late")
+        assert (answer.status, answer.headers["holdfast-reason"]) == (408, "timeout")
 
 
 def test_too_many_requests_are_told_to_come_again(server: holdfast.Server) -> None:

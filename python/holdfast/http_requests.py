@@ -100,7 +100,7 @@ class Request:
             if size > most:
                 raise _too_large(most)
             if more and self.late:
-                raise Unfit("too_late", f"{size} bytes came in time, more were announced")
+                raise Unfit("timeout", f"{size} bytes came in time, more were announced")
         return b"".join(pieces)
 
     async def gone(self) -> None:

@@ -51,7 +51,7 @@ STATUSES = {
     "foreign_page": 403,
     "not_found": 404,
     "method_not_allowed": 405,
-    "too_late": 408,
+    "timeout": 408,
     "too_large": 413,
     "not_json": 415,
     "busy": 503,

@@ -6,13 +6,6 @@ refused before it came to the door.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import functools
-import hashlib
-import hmac
-import ipaddress
-import json
 import re
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qsl
@@ -22,6 +15,7 @@ import msgspec
 from holdfast import __version__
 from holdfast.adapters.rest import openapi, page
 from holdfast.http import SAFE, address_of, headers_of, respond
+from holdfast.http_requests import Gone, Request, Unfit, respond_to_its_end, shown
 from holdfast.ingest import Grant, Refused
 from holdfast.types import AREAS
 
@@ -31,11 +25,11 @@ if TYPE_CHECKING:
 
     from holdfast.config import RestConfig
     from holdfast.diagnostics import Diagnostics
-    from holdfast.http import Headers, Receive, Scope, Send
+    from holdfast.http import Receive, Scope, Send
     from holdfast.ingest import Door
 
     Answer: TypeAlias = tuple[bytes, bytes]
-    Handler: TypeAlias = Callable[["_Request"], Answer | Awaitable[Answer]]
+    Handler: TypeAlias = Callable[[Request], Answer | Awaitable[Answer]]
 
 STATUSES = {
     reason: int(status) for status, reasons in openapi.REASONS.items() for reason in reasons
@@ -45,25 +39,15 @@ STATUSES = {
 JSON = b"application/json"
 INGEST = "/api/v1/ingest"
 PARAMETERS = ("memory", "area", "address", "count")
-NOBODY = "-"
-"""Who asks, as long as that is not known."""
-
 ANYONE = "anyone"
 """Who asks, where there are no tokens."""
 
 LINGER = 2.0
 """Seconds that a client has to end a body that is too large, so that it gets the answer."""
 
-_CONTENT_TYPE = re.compile(rb'application/json[ \t]*(;[ \t]*charset="?utf-?8"?[ \t]*)?', re.I)
-_LONGEST_SHOWN = 40
-
 
 class Declined(Refused):
     """Refused before it came to the door, which does not know of it yet."""
-
-
-class Gone(Exception):
-    """The client went away in the middle of its request."""
 
 
 class App:
@@ -76,18 +60,16 @@ class App:
         self._diagnostics = diagnostics
         self._max_body = settings.max_body
         tokens = () if settings.tokens == "none" else settings.tokens
-        self._tokens = [
-            (
-                bytes.fromhex(token.sha256),
-                Grant(
-                    token.name,
-                    frozenset(token.memories),
-                    frozenset(token.areas),
-                    token.access == "read-write",
-                ),
+        self._tokens = [(token.name, bytes.fromhex(token.sha256)) for token in tokens]
+        self._grants = {
+            token.name: Grant(
+                token.name,
+                frozenset(token.memories),
+                frozenset(token.areas),
+                token.access == "read-write",
             )
             for token in tokens
-        ]
+        }
         self._anyone = (
             Grant(ANYONE, frozenset(door.memories), frozenset(AREAS))
             if settings.tokens == "none"
@@ -110,9 +92,11 @@ class App:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answers one request."""
-        request = _Request(scope, receive)
+        request = Request(scope, receive)
         try:
             kind, body = await self._answer(request)
+        except Unfit as unfit:
+            await self._refuse(request, Declined(unfit.reason, unfit.detail), send)
         except Refused as refused:
             await self._refuse(request, refused, send)
         except Gone:
@@ -121,11 +105,11 @@ class App:
             headers = headers_of(kind, body) if body else list(SAFE)
             await respond(send, 200 if body else 204, headers + request.more_headers, body)
 
-    async def _answer(self, request: _Request) -> Answer:
+    async def _answer(self, request: Request) -> Answer:
         path, method = request.scope["path"], request.scope["method"]
         route = self.routes.get(path)
         if route is None:
-            raise Declined("not_found", f"there is nothing at {_shown(path)}")
+            raise Declined("not_found", f"there is nothing at {shown(path)}")
         allowed, handler = route
         if method == allowed or (method == "HEAD" and allowed == "GET"):
             answer = handler(request)
@@ -136,7 +120,7 @@ class App:
             return JSON, b""
         raise Declined("method_not_allowed", f"allowed are {methods}")
 
-    async def _refuse(self, request: _Request, refused: Refused, send: Send) -> None:
+    async def _refuse(self, request: Request, refused: Refused, send: Send) -> None:
         """Counts what the door does not know of, and answers."""
         if isinstance(refused, Declined):
             write = request.scope["path"] == INGEST and request.scope["method"] == "POST"
@@ -147,59 +131,18 @@ class App:
         headers = headers_of(JSON, body) + request.more_headers
         if status == 401:
             headers.append((b"www-authenticate", b"Bearer"))
-        expects = request.header(b"expect") is not None
-        if expects or status in (408, 413):
-            headers.append((b"connection", b"close"))
-        if status != 413 or expects or request.arrived:
+        if status in (408, 413) or request.header(b"expect") is not None:
+            await respond_to_its_end(request, send, status, headers, body)
+        else:
             await respond(send, status, headers, body)
-            return
-        # A connection that is closed while the client sends is reset, and the answer lost with it.
-        await send({"type": "http.response.start", "status": status, "headers": headers})
-        await send({"type": "http.response.body", "body": body, "more_body": True})
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(LINGER):
-                while (await request.receive()).get("more_body", False) and not request.late:
-                    pass
-        await send({"type": "http.response.body", "body": b""})
 
-    async def _ingest(self, request: _Request) -> Answer:
+    async def _ingest(self, request: Request) -> Answer:
         grant = self._authorize(request)
-        kind = request.header(b"content-type")
-        if kind is None or not _CONTENT_TYPE.fullmatch(kind):
-            raise Declined(
-                "not_json", f"Content-Type is {_found(kind)}, allowed is {JSON.decode()}"
-            )
-        coding = request.header(b"content-encoding")
-        if coding is not None and coding.lower() != b"identity":
-            raise Declined("not_json", f"Content-Encoding is {_found(coding)}, allowed is none")
-        body = await self._body(request)
+        request.check_json()
+        body = await request.body(self._max_body)
         return JSON, msgspec.json.encode(self._door.ingest(body, grant, request.peer).answer())
 
-    async def _body(self, request: _Request) -> bytes:
-        """All of the body, which arrives in one piece or in many."""
-        told = request.header(b"content-length")
-        if told is not None and int(told) > self._max_body:
-            raise self._too_large()
-        pieces: list[bytes] = []
-        size, more = 0, True
-        while more:
-            message = await request.receive()
-            if message["type"] == "http.disconnect":
-                raise Gone
-            piece, more = message["body"], message["more_body"]
-            request.arrived = not more
-            pieces.append(piece)
-            size += len(piece)
-            if size > self._max_body:
-                raise self._too_large()
-            if more and request.late:
-                raise Declined("timeout", f"{size} bytes came in time, more were announced")
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
-
-    def _too_large(self) -> Declined:
-        return Declined("too_large", f"the body has more than {self._max_body} bytes")
-
-    def _read(self, request: _Request) -> Answer:
+    def _read(self, request: Request) -> Answer:
         grant = self._authorize(request)
         memory, area, address, count = _parameters(request.scope["query_string"])
         start = _number("address", address, 0, 65535)
@@ -207,20 +150,20 @@ class App:
         values = self._door.read(memory, area, start, amount, grant, request.peer)
         return JSON, msgspec.json.encode({"values": values})
 
-    def _health(self, _: _Request) -> Answer:
+    def _health(self, _: Request) -> Answer:
         return JSON, b'{"status":"ok"}'
 
-    def _memories(self, request: _Request) -> Answer:
+    def _memories(self, request: Request) -> Answer:
         grant = self._authorize(request)
         memories = self._diagnostics.memories()
         shown = {name: entry for name, entry in memories.items() if name in grant.memories}
         return JSON, msgspec.json.encode({"memories": shown})
 
-    def _stats(self, request: _Request) -> Answer:
+    def _stats(self, request: Request) -> Answer:
         self._authorize(request)
         return JSON, _encoded(self._diagnostics.stats())
 
-    def _mqtt(self, request: _Request) -> Answer:
+    def _mqtt(self, request: Request) -> Answer:
         self._authorize(request)
         status = self._diagnostics.adapter("mqtt")
         if status is None:
@@ -228,66 +171,26 @@ class App:
         least: dict[str, object] = {"connected": False, "broker": None, "topics": []}
         return JSON, _encoded(least | status)
 
-    def _openapi(self, _: _Request) -> Answer:
+    def _openapi(self, _: Request) -> Answer:
         return JSON, self._document
 
-    def _docs(self, request: _Request) -> Answer:
+    def _docs(self, request: Request) -> Answer:
         request.more_headers.append((b"content-security-policy", page.POLICY))
         return page.KIND, self._page
 
-    def _authorize(self, request: _Request) -> Grant:
+    def _authorize(self, request: Request) -> Grant:
         """Whose request it is. Raises `Declined`."""
         if self._anyone is not None:
-            host = request.header(b"host")
-            if host is not None and not _is_direct(host):
+            if not request.is_direct:
                 # A page of the web can make its own name lead to this machine, but not change it.
-                detail = f"Host is {_found(host)}, without tokens allowed are IP addresses"
-                raise Declined("not_granted", f"{detail} and localhost")
+                host = shown((request.header(b"host") or b"").decode("latin-1"))
+                detail = f"Host is {host}, without tokens allowed are IP addresses and localhost"
+                raise Declined("not_granted", detail)
             request.who = ANYONE
             return self._anyone
-        given = [value for name, value in request.scope["headers"] if name == b"authorization"]
-        if len(given) != 1:
-            detail = "there is more than one Authorization" if given else "no Authorization"
-            raise Declined("unauthorized", f"{detail}, needed is Authorization: Bearer TOKEN")
-        scheme, _, secret = given[0].partition(b" ")
-        if scheme.lower() != b"bearer":
-            raise Declined("unauthorized", "Authorization is not of the form Bearer TOKEN")
-        digest = hashlib.sha256(secret.strip()).digest()
-        grant = None
-        for known, its_grant in self._tokens:  # All of them: the time tells nothing.
-            if hmac.compare_digest(known, digest):
-                grant = its_grant
-        if grant is None:
-            raise Declined("unauthorized", "the token is not known")
+        grant = self._grants[request.owner(self._tokens)]
         request.who = grant.name
         return grant
-
-
-class _Request:
-    """What is known of a request."""
-
-    __slots__ = ("arrived", "more_headers", "peer", "receive", "scope", "who")
-
-    def __init__(self, scope: Scope, receive: Receive) -> None:
-        self.scope = scope
-        self.receive = receive
-        self.peer: str = scope["state"]["peer"]
-        self.who = NOBODY
-        self.arrived = False
-        self.more_headers: Headers = []
-
-    def header(self, wanted: bytes) -> bytes | None:
-        """The last header of this name, if there is one."""
-        found = None
-        for name, value in self.scope["headers"]:
-            if name == wanted:
-                found = value
-        return found
-
-    @property
-    def late(self) -> bool:
-        """Whether it did not arrive in time."""
-        return "late" in self.scope["state"]
 
 
 def _parameters(query: bytes) -> list[str]:
@@ -300,7 +203,7 @@ def _parameters(query: bytes) -> list[str]:
     given: dict[str, str] = {}
     for name, value in pairs:
         if name not in PARAMETERS:
-            raise _malformed(f"{_shown(name)} is not a parameter, allowed are {names}")
+            raise _malformed(f"{shown(name)} is not a parameter, allowed are {names}")
         if name in given:
             raise _malformed(f"{name} is given more than once, allowed is once")
         given[name] = value
@@ -314,35 +217,13 @@ def _number(name: str, text: str, least: int, most: int) -> int:
     """A parameter as a number. Raises `Declined`."""
     if re.fullmatch("[0-9]{1,10}", text) and least <= int(text) <= most:
         return int(text)
-    raise _malformed(f"{name} is {_shown(text)}, allowed is a number from {least} to {most}")
+    raise _malformed(f"{name} is {shown(text)}, allowed is a number from {least} to {most}")
 
 
 def _malformed(detail: str) -> Declined:
     return Declined("malformed", detail)
 
 
-@functools.lru_cache(maxsize=64)
-def _is_direct(host: bytes) -> bool:
-    """Whether a Host header names this machine without a name server's help."""
-    name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
-    if name in ("", "localhost"):
-        return True
-    try:
-        ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
-    except ValueError:
-        return False
-    return True
-
-
 def _encoded(document: Any) -> bytes:
     """JSON of what adapters say of themselves, whatever that is."""
     return msgspec.json.encode(document, enc_hook=str)
-
-
-def _found(value: bytes | None) -> str:
-    return "missing" if value is None else _shown(value.decode("latin-1"))
-
-
-def _shown(text: str) -> str:
-    """Text from outside, quoted and cut short."""
-    return json.dumps(text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…")
