@@ -38,6 +38,7 @@ bench: .venv/core.stamp .venv/dev.stamp
 # Writes what is made from the program: the schema of the configuration.
 docs: .venv/core.stamp
 	$(BIN)/holdfast schema > docs/config.schema.json
+	$(BIN)/holdfast scan --schema > docs/scanner.schema.json
 
 # Pins the newest versions that requirements/*.in allow.
 lock: .venv/dev.stamp

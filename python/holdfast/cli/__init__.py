@@ -25,6 +25,7 @@ COMMANDS = {
     "raw-send": "holdfast.cli.raw_send:raw_send",
     "read": "holdfast.cli.read:read",
     "run": "holdfast.cli.run:run",
+    "scan": "holdfast.cli.scan:scan",
     "schema": "holdfast.cli.schema:schema",
     "token": "holdfast.cli.token:token",
     "watch": "holdfast.cli.watch:watch",

@@ -1,0 +1,25 @@
+"""The scanner that is measured, at the NATS server of the command line."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import sys
+
+from holdfast.scanner import Scanner, Servers, Settings
+
+hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+async def main() -> None:
+    """Serves until it is killed."""
+    scanner = Scanner(Settings(Servers((f"nats://{sys.argv[1]}",))))
+    running = asyncio.create_task(scanner.run())
+    while not scanner.serves:
+        await asyncio.sleep(0.01)
+    print("listening -", flush=True)
+    await running
+
+
+asyncio.run(main())

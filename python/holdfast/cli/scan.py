@@ -1,0 +1,264 @@
+"""`holdfast scan`: the scanner, until a signal or a message ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import sys
+from contextlib import ExitStack, suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import click
+
+from holdfast import logs
+from holdfast.scanner import Limits, Scanner, Servers, Settings
+from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
+from holdfast.scanner.hosts import Allowed
+from holdfast.scanner.schema import json_schema
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+DEFAULT_URL = "nats://127.0.0.1:4222"
+PORT = 4222
+FAILED = 1
+
+WATCHED = 1.0
+"""Seconds between looks whether an embedded server still runs."""
+
+OTHER_FILES = 128
+"""Open files beside the connections of devices."""
+
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+def _servers(text: str) -> list[str]:
+    """The URLs of servers in a text with commas; without a scheme they are nats://."""
+    urls = []
+    for part in filter(None, map(str.strip, text.split(","))):
+        url = part if "://" in part else f"nats://{part}"
+        try:
+            parts = urlsplit(url)
+            parts.port  # noqa: B018
+        except ValueError as error:
+            raise click.BadParameter(f"{part!r}: {error}.") from None
+        if parts.scheme not in ("nats", "tls") or not parts.hostname or parts.path not in ("", "/"):
+            raise click.BadParameter(f"{part!r} is no server, as in {DEFAULT_URL}.")
+        urls.append(url)
+    return urls
+
+
+def _prefix(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})*", text):
+        raise click.BadParameter(f"{text!r} is no subject: letters, digits, _ and -, dots between.")
+    return text
+
+
+def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        click.echo(json.dumps(json_schema(), indent=2))
+        ctx.exit()
+
+
+@click.command(epilog="Example: holdfast scan --nats nats://10.0.0.5:4222 --allow 10.20.0.0/16")
+@click.option(
+    "--nats",
+    "nats",
+    multiple=True,
+    type=_servers,
+    metavar="URL",
+    help=f"NATS server; can be repeated. [env: NATS_SERVERS, with commas; default: {DEFAULT_URL}]",
+)
+@click.option(
+    "--embedded", is_flag=True, help="Start a NATS server too, on the loopback interface."
+)
+@click.option(
+    "--store",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="FOLDER",
+    help="With --embedded: where JetStream keeps its data; a temporary folder if not given.",
+)
+@click.option(
+    "--allow",
+    multiple=True,
+    metavar="NETWORK",
+    help="Devices that may be subscribed to: a network, an address or a serial device; can be "
+    "repeated. Without a network, private and loopback addresses.",
+)
+@click.option(
+    "--prefix",
+    type=_prefix,
+    default="modbus",
+    show_default=True,
+    metavar="SUBJECT",
+    help="First part of all subjects.",
+)
+@click.option("--user", metavar="NAME", help="User at the NATS server.")
+@click.option("--password-file", type=FILE, metavar="FILE", help="Holds the user's password.")
+@click.option("--token-file", type=FILE, metavar="FILE", help="Holds a token for the NATS server.")
+@click.option("--creds", type=FILE, metavar="FILE", help="Credentials with JWT and nkey.")
+@click.option("--tls-ca", type=FILE, metavar="FILE", help="Authorities that sign the server.")
+@click.option("--tls-cert", type=FILE, metavar="FILE", help="Our certificate.")
+@click.option("--tls-key", type=FILE, metavar="FILE", help="Its key.")
+@click.option(
+    "--max-devices",
+    type=click.IntRange(1),
+    default=Limits.devices,
+    show_default=True,
+    metavar="N",
+)
+@click.option(
+    "--max-tags",
+    type=click.IntRange(1),
+    default=Limits.tags,
+    show_default=True,
+    metavar="N",
+    help="Of all devices.",
+)
+@click.option(
+    "--log-level",
+    type=click.Choice(["debug", "info", "warning", "error"]),
+    default="info",
+    show_default=True,
+)
+@click.option(
+    "--log-format", type=click.Choice(["text", "json"]), default="text", show_default=True
+)
+@click.option(
+    "--schema",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_schema,
+    help="Print the JSON Schema of all messages and end.",
+)
+def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **options: Any) -> None:
+    """Poll Modbus devices for whoever subscribes over NATS.
+
+    Devices are connected to when somebody subscribes to their tags, and let go with the last
+    subscriber. Serves until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. Exit codes: 0 ended,
+    1 failed, 2 wrong usage.
+    """
+    urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
+    servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
+    try:
+        Allowed(options["allow"])
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.", param_hint="'--allow'") from None
+    if store is not None and not embedded:
+        raise click.UsageError("--store goes with --embedded.")
+    logs.configure(options["log_level"], options["log_format"])
+    limits = Limits(devices=options["max_devices"], tags=options["max_tags"])
+    _allow_open_files(limits)
+    with ExitStack() as stack:
+        check: Callable[[], None] | None = None
+        try:
+            if embedded:
+                server = stack.enter_context(Embedded(_embedded_port(servers), store))
+                servers, check = Servers((server.url,)), server.check
+            settings = Settings(servers, options["prefix"], options["allow"], limits)
+            click.echo(_greeting(settings))
+            asyncio.run(_serve(settings, check))
+        except (EmbeddedFailed, OSError) as error:
+            click.echo(f"holdfast: {error}", err=True)
+            sys.exit(FAILED)
+
+
+def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
+    """The servers, and who we are there; a usage error for what does not go together."""
+    together = (("password_file", "user"), ("tls_cert", "tls_key"), ("tls_key", "tls_cert"))
+    for key, other in together:
+        if options[key] is not None and options[other] is None:
+            given, missing = (f"--{name.replace('_', '-')}" for name in (key, other))
+            raise click.UsageError(f"{given} goes with {missing}.")
+    if options["creds"] is not None and find_spec("nkeys") is None:
+        raise click.UsageError("--creds needs the package nkeys, which is not installed.")
+    ways = [key for key in ("user", "token_file", "creds") if options[key] is not None]
+    if len(ways) > 1:
+        given = " and ".join(f"--{key.replace('_', '-')}" for key in ways)
+        raise click.UsageError(f"{given} exclude each other.")
+    return Servers(
+        urls,
+        options["user"],
+        options["password_file"],
+        options["token_file"],
+        options["creds"],
+        options["tls_ca"],
+        options["tls_cert"],
+        options["tls_key"],
+    )
+
+
+def _embedded_port(servers: Servers) -> int:
+    """The port that an embedded server is to have."""
+    parts = urlsplit(servers.urls[0])
+    plain = servers == Servers(servers.urls) and parts.username is None and parts.scheme == "nats"
+    if len(servers.urls) > 1 or parts.hostname not in (HOST, "localhost") or not plain:
+        allowed = f"--embedded serves at {HOST} only, to whoever is on this machine"
+        raise click.UsageError(f"{allowed}: --nats may name a port there, as in {DEFAULT_URL}.")
+    return PORT if parts.port is None else parts.port
+
+
+async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
+    scanner = Scanner(settings)
+    loop = asyncio.get_running_loop()
+
+    def end(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # A second one ends the process at once.
+        loop.call_soon_threadsafe(scanner.end)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    running = asyncio.create_task(scanner.run())
+    while not running.done():
+        await asyncio.wait([running], timeout=WATCHED)
+        if check is not None and not running.done():
+            try:
+                check()
+            except EmbeddedFailed:
+                scanner.end()
+                await running
+                raise
+    await running
+
+
+def _allow_open_files(limits: Limits) -> None:
+    """Lets this process hold the connections of all devices: one to scan, one to write."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit.
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = 2 * limits.devices + OTHER_FILES
+    if soft != resource.RLIM_INFINITY and soft < needed:
+        allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+        with suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+
+
+def _greeting(settings: Settings) -> str:
+    prefix = settings.prefix
+    lines = [
+        f"Scanning for whoever subscribes at {', '.join(_without_secrets(settings.servers))}.",
+        "",
+        f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse",
+        f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",
+        f"  published  {prefix}.data.DEVICE, {prefix}.status.DEVICE",
+        f"  devices    {', '.join(settings.allow) or 'at private and loopback addresses'}",
+        "",
+        "Ctrl-C stops it.",
+    ]
+    return "\n".join(lines)
+
+
+def _without_secrets(servers: Servers) -> Iterator[str]:
+    for url in servers.urls:
+        parts = urlsplit(url)
+        host = f"[{parts.hostname}]" if parts.hostname and ":" in parts.hostname else parts.hostname
+        yield f"{parts.scheme}://{host}:{parts.port or PORT}"

@@ -1,0 +1,222 @@
+"""The connection to NATS: made, made again for ever, and told of in the log.
+
+nats-py reconnects by itself and repeats the subscriptions. It gives a connection up for good when
+the server sends an error that it does not know better; then a new client is made here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import ssl
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from nats.aio.client import Client
+from nats.errors import Error
+
+from holdfast import logs
+
+if TYPE_CHECKING:
+    from nats.aio.msg import Msg
+
+Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
+
+FIRST_PAUSE = 0.25
+LONGEST_PAUSE = 10.0
+"""Seconds between attempts to connect: doubled with each failure, up to the longest."""
+
+SILENCE = 600.0
+"""Seconds for which a failure to connect is not logged again when its reason is the same."""
+
+PING = 10
+"""Seconds between questions whether the server is still there; two may stay without an answer."""
+
+PENDING = 64 * 1024 * 1024
+"""Bytes that nats-py may hold; the outbox sees to it that there are never so many."""
+
+CLOSING = 1.5
+"""Seconds that the last messages have to reach the server."""
+
+
+@dataclass(frozen=True)
+class Servers:
+    """Where NATS is, and who we are there. Files are read at each new client."""
+
+    urls: tuple[str, ...] = ("nats://127.0.0.1:4222",)
+    user: str | None = None
+    password_file: Path | None = None
+    token_file: Path | None = None
+    credentials: Path | None = None
+    """A file with a JWT and an nkey; needs the package `nkeys`."""
+    ca_file: Path | None = None
+    cert_file: Path | None = None
+    key_file: Path | None = None
+
+    @property
+    def secure(self) -> bool:
+        """Whether nothing may be sent without TLS."""
+        files = self.ca_file or self.cert_file
+        return files is not None or any(url.startswith("tls://") for url in self.urls)
+
+    def options(self) -> dict[str, Any]:
+        """As `Client.connect` has them. Raises `OSError` for a file that can't be used."""
+        options: dict[str, Any] = {"servers": list(self.urls)}
+        if self.user is not None:
+            options["user"] = self.user
+            options["password"] = _secret(self.password_file) if self.password_file else ""
+        if self.token_file is not None:
+            options["token"] = _secret(self.token_file)
+        if self.credentials is not None:
+            self.credentials.read_bytes()
+            options["user_credentials"] = str(self.credentials)
+        if self.secure:
+            context = ssl.create_default_context(cafile=self.ca_file)
+            context.minimum_version = ssl.TLSVersion.TLSv1_2
+            if self.cert_file is not None:
+                context.load_cert_chain(self.cert_file, self.key_file, password="")
+            options["tls"] = context
+        return options
+
+
+def _secret(file: Path) -> str:
+    try:
+        return file.read_text().removesuffix("\n").removesuffix("\r")
+    except UnicodeDecodeError:
+        raise OSError(f"{file} is no text") from None
+
+
+class Broker:
+    """Stays connected. `handlers` get the messages of their subjects."""
+
+    def __init__(
+        self,
+        servers: Servers,
+        handlers: Mapping[str, Handler],
+        connected: Callable[[Client | None], None],
+    ) -> None:
+        self._servers = servers
+        self._handlers = handlers
+        self._connected = connected
+        self._failures = 0
+        self._told = ("", 0.0)
+        self._worked = False
+        self.client: Client | None = None
+        """The client while there is a connection."""
+        self._subscribed = False
+
+    @property
+    def serves(self) -> bool:
+        """Whether messages reach the handlers just now."""
+        return self.client is not None and self._subscribed
+
+    async def run(self) -> None:
+        """Connects, and connects again, until it is cancelled. Raises `OSError` for files."""
+        while True:
+            client = _TlsClient() if self._servers.secure else Client()
+            ended = asyncio.Event()
+            try:
+                await self._connect(client, ended)
+                await ended.wait()
+            except OSError as error:
+                if not self._worked:
+                    raise
+                self._note(client, error)
+            finally:
+                self._subscribed = False
+                self._lost("stopped")
+                await _closed(client)
+            await asyncio.sleep(FIRST_PAUSE)
+
+    async def _connect(self, client: Client, ended: asyncio.Event) -> None:
+        """Connects, and listens to all subjects; `ended` is set when nats-py gives up."""
+
+        async def lost() -> None:
+            self._lost("the connection was lost")
+
+        async def again() -> None:
+            self._made(client)
+
+        async def closed() -> None:
+            ended.set()
+
+        async def failed(error: Exception) -> None:
+            self._note(client, error)
+
+        try:
+            await client.connect(
+                **self._servers.options(),
+                name="holdfast scan",
+                error_cb=failed,
+                disconnected_cb=lost,
+                reconnected_cb=again,
+                closed_cb=closed,
+                max_reconnect_attempts=-1,
+                reconnect_time_wait=FIRST_PAUSE,  # type: ignore[arg-type]
+                ping_interval=PING,
+                pending_size=PENDING,
+            )
+            self._made(client)
+            for subject, handler in self._handlers.items():
+                await client.subscribe(subject, cb=handler)
+            await client.flush()
+            self._subscribed = True
+        except Error as error:
+            self._note(client, error)
+            ended.set()
+
+    def _made(self, client: Client) -> None:
+        url = client.connected_url
+        logs.write(
+            logging.INFO,
+            "nats_connected",
+            server="" if url is None else f"{url.hostname}:{url.port}",
+            attempts=self._failures + 1,
+        )
+        self._failures, self._told, self._worked = 0, ("", 0.0), True
+        client.options["reconnect_time_wait"] = FIRST_PAUSE
+        self.client = client
+        self._connected(client)
+
+    def _lost(self, reason: str) -> None:
+        if self.client is None:
+            return
+        self.client = None
+        self._connected(None)
+        level = logging.INFO if reason == "stopped" else logging.WARNING
+        logs.write(level, "nats_disconnected", reason=reason)
+
+    def _note(self, client: Client, error: Exception) -> None:
+        """Notes an error; while there is no connection it is that of an attempt to make one."""
+        reason = str(error) or type(error).__name__
+        if self.client is not None:
+            logs.refused("nats_error", kind="nats", reason=reason)
+            return
+        self._failures += 1
+        pause = min(FIRST_PAUSE * 2 ** min(self._failures, 10), LONGEST_PAUSE)
+        client.options["reconnect_time_wait"] = pause
+        now = time.monotonic()
+        if reason == self._told[0] and now - self._told[1] < SILENCE:
+            return
+        self._told = (reason, now)
+        logs.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=self._failures)
+
+
+class _TlsClient(Client):
+    """Says nothing to a server that does not use TLS; the client by itself would go on without."""
+
+    async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
+        if initial_connection and not info.get("tls_required"):
+            raise Error("the server does not use TLS")
+        await super()._process_info(info, initial_connection)
+
+
+async def _closed(client: Client) -> None:
+    """Closes a client, whatever the server does."""
+    with contextlib.suppress(Exception):
+        async with asyncio.timeout(CLOSING):
+            await client.close()

@@ -1,0 +1,69 @@
+"""From the bytes of blocks to values: compiled once for the blocks that a device answers. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from holdfast.values import ConversionError, Layout, decode
+from holdfast.values.types import parsed
+
+if TYPE_CHECKING:
+    from holdfast.scanner.tags import Tag
+
+Decoder: TypeAlias = Callable[[bytes], Sequence[Any]]
+
+_BITS = [tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256)]
+
+
+class Undecoded:
+    """In place of a value that its registers can't be."""
+
+    def __init__(self, error: str) -> None:
+        self.error = error
+
+
+def decoder(tags: Sequence[Tag], address: int, count: int) -> Decoder:
+    """What makes the values of tags of one area from the bytes of a block that has them all."""
+    if tags[0].of_bits:
+        return _bits(tags, address)
+    fields = [(tag.id, tag.type, tag.address - address, tag.order) for tag in tags]
+    layout = Layout(fields, size=count)
+
+    def decoded(data: bytes) -> Sequence[Any]:
+        try:
+            return layout.decode_tuple(data)
+        except ConversionError:
+            return [_alone(tag, data, address) for tag in tags]
+
+    return decoded
+
+
+def _alone(tag: Tag, data: bytes, address: int) -> Any:
+    """The value of one tag, whatever becomes of the others."""
+    start = 2 * (tag.address - address)
+    try:
+        return decode(data[start : start + 2 * tag.count], tag.type, tag.order)
+    except ConversionError as error:
+        return Undecoded(str(error))
+
+
+def _bits(tags: Sequence[Tag], address: int) -> Decoder:
+    places = [tag.address - address for tag in tags]
+    if any(parsed(tag.type).count is not None for tag in tags):
+        spans = [
+            slice(place, place + tag.count) if parsed(tag.type).count is not None else place
+            for place, tag in zip(places, tags, strict=True)
+        ]
+        return lambda data: [_unpacked(data)[span] for span in spans]
+
+    def decoded(data: bytes) -> Sequence[Any]:
+        bits = _unpacked(data)
+        return [bits[place] for place in places]
+
+    return decoded
+
+
+def _unpacked(data: bytes) -> list[bool]:
+    return list(chain.from_iterable(map(_BITS.__getitem__, data)))

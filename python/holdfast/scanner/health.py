@@ -1,0 +1,72 @@
+"""How a device does, as its polls tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.scanner.messages import State
+    from holdfast.scanner.polling import Block
+
+TRANSPORT = 0x8000
+"""From here on faults are none of the device's: the request or its reply got lost."""
+
+UNREACHED = (0x0A, 0x0B)
+"""What a gateway answers that does not reach the device."""
+
+FAULTS = {
+    0x01: "exception 01 (Illegal Function)",
+    0x02: "exception 02 (Illegal Data Address)",
+    0x03: "exception 03 (Illegal Data Value)",
+    0x04: "exception 04 (Server Device Failure)",
+    0x05: "exception 05 (Acknowledge)",
+    0x06: "exception 06 (Server Device Busy)",
+    0x08: "exception 08 (Memory Parity Error)",
+    0x0A: "exception 0A (Gateway Path Unavailable)",
+    0x0B: "exception 0B (Gateway Target Device Failed to Respond)",
+    0x8001: "no reply in time",
+    0x8002: "no connection",
+    0x8003: "the connection was lost",
+    0x8004: "an invalid reply",
+}
+
+
+def described(fault: int) -> str:
+    """A fault in words."""
+    return FAULTS.get(fault, f"exception {fault:02X}")
+
+
+@dataclass
+class Health:
+    """State, failures since the last answer, and why."""
+
+    state: State = "connecting"
+    failures: int = 0
+    error: str | None = None
+    last_answer: float | None = None
+    """Seconds since 1970."""
+    scans: int = 0
+    blocks: list[Block] = field(default_factory=list)
+    """Those of the last scan."""
+
+    def judge(self, time: float, blocks: list[Block]) -> bool:
+        """Takes note of a poll; whether that is worth telling.
+
+        It is when the state changes, and when a device that answers refuses something new.
+        """
+        before = (self.state, self.error if self.state == "online" else None)
+        self.scans += 1
+        faults = [fault for *_, fault in blocks if fault]
+        if len(faults) < len(blocks) or any(_answered(fault) for fault in faults):
+            self.state, self.failures, self.last_answer = "online", 0, time
+        else:
+            self.state = "offline"
+            self.failures += 1
+        self.error = described(faults[0]) if faults else None
+        self.blocks = blocks
+        return before != (self.state, self.error if self.state == "online" else None)
+
+
+def _answered(fault: int) -> bool:
+    return fault < TRANSPORT and fault not in UNREACHED

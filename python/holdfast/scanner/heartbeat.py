@@ -1,0 +1,88 @@
+"""A sign of life in a JetStream bucket, which others look at to know what runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from typing import TYPE_CHECKING
+
+import msgspec
+from nats.js.errors import NotFoundError
+
+from holdfast import logs
+from holdfast.scanner.messages import Heartbeat
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.js.kv import KeyValue
+
+BUCKET = "service_heartbeats"
+EVERY = 10.0
+"""Seconds from one sign to the next."""
+
+KEPT = 60.0
+"""Seconds after which a sign that is not renewed is gone."""
+
+PATIENCE = 2.0
+"""Seconds that JetStream has to answer."""
+
+
+class Heart:
+    """Beats in one key, as long as somebody runs it."""
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+        self.started = _now()
+        """Milliseconds since 1970."""
+        self._works: bool | None = None
+
+    async def beat(self, client: Client | None) -> None:
+        """Renews the sign. Where there is no JetStream, says so once."""
+        if client is None:
+            return
+        sign = Heartbeat(
+            service_type="modbus",
+            module_id=self._key,
+            last_seen=_now(),
+            started_at=self.started,
+            metadata={},
+        )
+        try:
+            bucket = await _bucket(client)
+            await bucket.put(self._key, msgspec.json.encode(sign))
+        except Exception as error:  # A heartbeat is a courtesy, whatever keeps it from being given.
+            self._told(False, str(error) or type(error).__name__)
+        else:
+            self._told(True, "")
+
+    async def stop(self, client: Client | None) -> None:
+        """Takes the sign away."""
+        if client is None or not self._works:
+            return
+        with contextlib.suppress(Exception):
+            async with asyncio.timeout(PATIENCE):
+                await (await _bucket(client)).delete(self._key)
+
+    def _told(self, works: bool, reason: str) -> None:
+        if works is self._works:
+            return
+        if works:
+            logs.write(logging.INFO, "heartbeat", bucket=BUCKET, key=self._key)
+        else:
+            logs.write(logging.WARNING, "no_heartbeat", bucket=BUCKET, key=self._key, reason=reason)
+        self._works = works
+
+
+async def _bucket(client: Client) -> KeyValue:
+    """The bucket; it is made if it is not there."""
+    jetstream = client.jetstream(timeout=PATIENCE)
+    try:
+        return await jetstream.key_value(BUCKET)
+    except NotFoundError:
+        return await jetstream.create_key_value(bucket=BUCKET, history=1, ttl=KEPT)
+
+
+def _now() -> int:
+    return int(time.time() * 1000)

@@ -1,0 +1,155 @@
+"""The native poller, and the thread that takes what it read.
+
+The thread hands over all polls that wait at once, and takes no more before they are dealt with:
+what the event loop can't keep up with stays in the poller, which drops the oldest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from holdfast import _core
+from holdfast.client import endpoint
+
+if TYPE_CHECKING:
+    from holdfast.scanner.devices import Device
+    from holdfast.types import Area
+
+Block: TypeAlias = "tuple[Area, int, int, bytes | None, int]"
+"""Area, address, count, the bytes if there are any, and the fault."""
+
+Poll: TypeAlias = tuple[str, float, list[Block]]
+"""What the device is polled as, seconds since 1970, and its blocks."""
+
+PATIENCE = 0.05
+"""Seconds that the thread waits for polls before it looks around."""
+
+GATHERED = 0.005
+"""Seconds from one hand-over to the next, at least: so that a batch is worth its price."""
+
+FIRST_WITHIN = 1.0
+"""Seconds in which the first polls of new devices are spread."""
+
+RENEWED = 0.1
+"""Seconds from one change of what a device is polled for to the next, at least: a poll begins with
+each, and a caller may ask for a thousand tags one by one."""
+
+
+class Polling:
+    """Devices that are polled. `take` gets each poll, in the event loop: the device, the seconds
+    since 1970, and the blocks.
+    """
+
+    def __init__(self, take: Callable[[Device, float, list[Block]], None]) -> None:
+        self._take = take
+        self._devices: dict[str, Device] = {}
+        """By what they are polled as."""
+        self._renewed: dict[Device, float] = {}
+        self._waiting: dict[Device, asyncio.TimerHandle] = {}
+        self._loop = asyncio.get_running_loop()
+        self._poller = _core.Poller([])
+        self._names = map(str, itertools.count())
+        self._stopping = threading.Event()
+        self._taken = threading.Semaphore(1)
+        self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
+        self._thread.start()
+
+    def renew(self, device: Device) -> None:
+        """Polls a device as it is now wanted: at once, or soon if that has just changed."""
+        if device in self._waiting:
+            return
+        left = self._renewed.get(device, 0.0) + RENEWED - self._loop.time()
+        if device in self._renewed and left > 0:
+            self._waiting[device] = self._loop.call_later(left, self._renew, device)
+        else:
+            self._renew(device)
+
+    def _renew(self, device: Device) -> None:
+        """The new one is there before the old one goes, so that the connection, and what is known
+        of it, stays. It has another name: what the old one still reads is not taken for its.
+        """
+        self._waiting.pop(device, None)
+        old, name = device.polled_as, next(self._names)
+        self._poller.add(_made(device, name))
+        if old:
+            self._poller.remove(old)
+            del self._devices[old]
+        device.polled_as = name
+        self._devices[name] = device
+        self._renewed[device] = self._loop.time()
+
+    def drop(self, device: Device) -> None:
+        """Polls a device no more; its connection is closed."""
+        waiting = self._waiting.pop(device, None)
+        if waiting is not None:
+            waiting.cancel()
+        self._poller.remove(device.polled_as)
+        del self._devices[device.polled_as]
+        del self._renewed[device]
+
+    def counters(self) -> dict[str, dict[str, Any]]:
+        """How the poller sees its devices, by what they are polled as."""
+        return self._poller.counters()
+
+    @property
+    def dropped(self) -> int:
+        """Polls that were lost because the event loop did not keep up."""
+        return self._poller.dropped
+
+    async def stop(self) -> None:
+        """Polls nothing any more."""
+        self._stopping.set()
+        self._taken.release()
+        for waiting in self._waiting.values():
+            waiting.cancel()
+        await asyncio.to_thread(self._end)
+
+    def _end(self) -> None:
+        self._poller.stop()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            polls = self._poller.results(PATIENCE)
+            if not polls:
+                continue
+            self._taken.acquire()
+            if self._stopping.is_set():
+                return
+            self._loop.call_soon_threadsafe(self._hand_over, polls)
+            self._stopping.wait(GATHERED)
+
+    def _hand_over(self, polls: Sequence[Poll]) -> None:
+        try:
+            for name, moment, blocks in polls:
+                device = self._devices.get(name)
+                if device is not None:
+                    self._take(device, moment, blocks)
+        finally:
+            self._taken.release()
+
+
+def _made(device: Device, name: str) -> _core.Device:
+    source, plan = device.source, device.source.plan
+    interval = device.rate / 1000
+    reads = dict.fromkeys((tag.area, tag.address, tag.count, None) for tag in device.tags.values())
+    return _core.Device(
+        name,
+        endpoint(device.address),
+        unit=source.unit,
+        interval=interval,
+        timeout=source.timeout / 1000,
+        reads=list(reads),
+        max_gap=plan.max_gap,
+        max_registers=plan.max_registers,
+        max_bits=plan.max_bits,
+        readable=plan.readable,
+        forbidden=plan.forbidden,
+        start_within=0 if device.polled_as else min(interval, FIRST_WITHIN),
+        report=True,
+        release=source.release,
+    )

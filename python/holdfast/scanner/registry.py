@@ -1,0 +1,244 @@
+"""All devices that somebody wants tags of. A request changes all that it asks for, or nothing.
+
+Everything is judged before anything is changed, and both happen in one go. What a request says by
+itself is checked by `understood`, which needs no registry; what it says beside what others have
+said is checked by the registry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from holdfast import target as targets
+from holdfast.scanner.devices import Device, Plan, Source, Subscriber, Wanted
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.health import Health
+from holdfast.scanner.tags import tag
+from holdfast.target import NetworkTarget, SerialTarget
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast.scanner.limits import Limits
+    from holdfast.scanner.messages import SubscribeRequest, UnsubscribeRequest
+    from holdfast.scanner.tags import Tag
+    from holdfast.target import Target
+
+SCAN_RATE = 1000
+TIMEOUT = 1000
+
+
+@dataclass(frozen=True)
+class Subscription:
+    """A subscribe request that is right as far as it goes."""
+
+    device: str
+    subscriber: str
+    source: Source
+    said: frozenset[str]
+    """What of the source the request says; the rest is as the device is known, or a default."""
+    tags: Mapping[str, Tag]
+    wanted: Mapping[str, Wanted]
+    rate: int
+    publish: str
+    deadband: float
+
+
+def understood(request: SubscribeRequest, limits: Limits) -> Subscription:
+    """What a request asks for. Raises `Refused`."""
+    _check_id(request.device_id)
+    if request.deadband and request.publish != "change":
+        raise Refused('deadband goes with "publish": "change"')
+    source = Source(
+        _target(request),
+        1 if request.unit_id is None else request.unit_id,
+        _within(
+            "timeout", request.timeout, TIMEOUT, limits.shortest_timeout, limits.longest_timeout
+        ),
+        bool(request.release),
+        Plan.of(request.plan),
+    )
+    if isinstance(source.target, SerialTarget) and source.unit == 0:
+        raise Refused("unitId is 0, which is the broadcast of a serial line")
+    tags: dict[str, Tag] = {}
+    for index, entry in enumerate(request.tags):
+        where = f"tags[{index}]"
+        made = tag(entry, request.byte_order or "ABCD", where)
+        if made.id in tags:
+            raise Refused(f"{where}: the id {made.id!r} is there twice")
+        tags[made.id] = made
+    source.plan.check(list(tags.values()))
+    said = {key for key in ("timeout", "release", "plan") if getattr(request, key) is not None}
+    return Subscription(
+        request.device_id,
+        request.subscriber_id,
+        source,
+        frozenset(said),
+        tags,
+        {entry.id: Wanted(bool(entry.writable), entry.description) for entry in request.tags},
+        _within(
+            "scanRate", request.scan_rate, SCAN_RATE, limits.shortest_scan, limits.longest_scan
+        ),
+        request.publish or "scan",
+        request.deadband or 0.0,
+    )
+
+
+def _check_id(id: str) -> None:
+    """A device id is a part of subjects."""
+    flaw = not id.isprintable() or " " in id or "*" in id or ">" in id
+    if flaw or "" in id.split("."):
+        raise Refused(
+            f"deviceId is {id!r}, allowed is what a subject can end in: no blanks, * or >, and no "
+            "dots at its ends or beside each other"
+        )
+
+
+def _target(request: SubscribeRequest) -> Target:
+    beside = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
+    if request.url is not None:
+        if beside:
+            raise Refused(f"{beside[0]} stands beside url, allowed is one of both")
+        try:
+            return targets.parse(request.url)
+        except ValueError as error:
+            raise Refused(f"url: {error}") from None
+    if request.host is None:
+        raise Refused("host is missing; a url in its place would do")
+    transport = request.transport or "tcp"
+    if transport == "tls":
+        raise Refused("transport tls is not available in this version")
+    port = targets.PORT if request.port is None else request.port
+    return NetworkTarget(transport, request.host, port)
+
+
+def _within(key: str, value: int | None, default: int, least: int, most: int) -> int:
+    if value is None:
+        return default
+    if not least <= value <= most:
+        raise Refused(f"{key} is {value}, allowed are {least} to {most} ms")
+    return value
+
+
+class Registry:
+    """Devices by id, and who wants what of them."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.devices: dict[str, Device] = {}
+        self._limits = limits
+        self._tags = 0
+        self._holders: dict[str, set[str]] = {}
+        """The devices that have a tag of an id."""
+
+    def subscribe(self, asked: Subscription, address: Target) -> tuple[Device, bool]:
+        """Adds a subscription; the device, and whether what it is to be polled for changed.
+
+        Raises `Refused`.
+        """
+        device = self.devices.get(asked.device)
+        new = [id for id in asked.tags if device is None or id not in device.tags]
+        self._check_limits(device, asked, len(new))
+        if device is None:
+            device = Device(asked.device, asked.source, address, Health())
+            self.devices[device.id] = device
+        else:
+            _check_known(device, asked)
+            device.source.plan.check([asked.tags[id] for id in new])
+        before = device.rate if device.subscribers else None
+        subscriber = device.subscribers.setdefault(
+            asked.subscriber, Subscriber(asked.rate, "scan", 0.0)
+        )
+        subscriber.rate = asked.rate
+        subscriber.publish = "change" if asked.publish == "change" else "scan"
+        subscriber.deadband = asked.deadband
+        subscriber.tags |= asked.wanted
+        device.tags |= {id: asked.tags[id] for id in new}
+        for id in new:
+            self._holders.setdefault(id, set()).add(device.id)
+        self._tags += len(new)
+        return device, bool(new) or device.rate != before
+
+    def unsubscribe(self, request: UnsubscribeRequest) -> tuple[Device | None, bool]:
+        """Takes tags from a subscriber; the device, and whether what it is polled for changed.
+
+        The device is gone with its last subscriber. What is not known is not wanted: all is well.
+        """
+        device = self.devices.get(request.device_id)
+        subscriber = None if device is None else device.subscribers.get(request.subscriber_id)
+        if device is None or subscriber is None:
+            return device, False
+        before = device.rate
+        for id in request.tag_ids:
+            subscriber.tags.pop(id, None)
+        if not subscriber.tags:
+            del device.subscribers[request.subscriber_id]
+        unwanted = device.forget(request.tag_ids)
+        for id in unwanted:
+            self._holders[id].discard(device.id)
+            if not self._holders[id]:
+                del self._holders[id]
+        self._tags -= len(unwanted)
+        if not device.subscribers:
+            del self.devices[device.id]
+            return device, True
+        return device, bool(unwanted) or device.rate != before
+
+    def commanded(self, name: str) -> tuple[Device, Tag]:
+        """The tag that a command names: by its id, or by device and id. Raises `Refused`."""
+        found = {(device, name) for device in self._holders.get(name, ())}
+        parts = name.split(".")
+        for at in range(1, len(parts)):
+            device, id = ".".join(parts[:at]), ".".join(parts[at:])
+            if device in self._holders.get(id, ()):
+                found.add((device, id))
+        if not found:
+            raise Refused(f"there is no tag {name!r}")
+        if len(found) > 1:
+            known = ", ".join(f"{device}.{id}" for device, id in sorted(found))
+            raise Refused(f"{name!r} is ambiguous: {known}")
+        [(of, id)] = found
+        return self.devices[of], self.devices[of].tags[id]
+
+    def _check_limits(self, device: Device | None, asked: Subscription, new: int) -> None:
+        limits = self._limits
+        if device is None and len(self.devices) >= limits.devices:
+            raise Refused(f"there are {limits.devices} devices, more are not allowed")
+        subscribers = {} if device is None else device.subscribers
+        if asked.subscriber not in subscribers and len(subscribers) >= limits.subscribers:
+            raise Refused(
+                f"{asked.device} has {limits.subscribers} subscribers, no more are allowed"
+            )
+        tags = new + (0 if device is None else len(device.tags))
+        if tags > limits.device_tags:
+            raise Refused(
+                f"{asked.device} would have {tags} tags, allowed are {limits.device_tags}"
+            )
+        if self._tags + new > limits.tags:
+            raise Refused(f"there would be {self._tags + new} tags, allowed are {limits.tags}")
+
+
+def _check_known(device: Device, asked: Subscription) -> None:
+    """That a request does not say otherwise of a device than those before it."""
+    check_address(device, asked)
+    for key in ("timeout", "release", "plan"):
+        known, said = getattr(device.source, key), getattr(asked.source, key)
+        if key in asked.said and said != known:
+            raise Refused(
+                f"{key} of {device.id} is another one already; unsubscribe all of it first"
+            )
+    for id, wanted in asked.tags.items():
+        if id in device.tags and device.tags[id] != wanted:
+            raise Refused(
+                f"tag {id!r} of {device.id} has another definition already; unsubscribe it first"
+            )
+
+
+def check_address(device: Device, asked: Subscription) -> None:
+    """That a device is where a request says it is. Raises `Refused`."""
+    known, said = device.source, asked.source
+    if (known.target, known.unit) != (said.target, said.unit):
+        raise Refused(
+            f"{device.id} is known as {known.target} unit {known.unit}, not as {said.target} "
+            f"unit {said.unit}; unsubscribe all of it first"
+        )

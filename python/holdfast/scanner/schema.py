@@ -1,0 +1,39 @@
+"""The JSON Schema of every message, made from the types that messages are checked by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from holdfast.scanner.messages import (
+    Answer,
+    BrowseAnswer,
+    BrowseRequest,
+    Data,
+    Heartbeat,
+    Status,
+    SubscribeRequest,
+    UnsubscribeRequest,
+)
+
+MESSAGES = (
+    SubscribeRequest,
+    UnsubscribeRequest,
+    BrowseRequest,
+    Answer,
+    BrowseAnswer,
+    Data,
+    Status,
+    Heartbeat,
+)
+
+
+def json_schema() -> dict[str, Any]:
+    """One document with a definition for each message, by name."""
+    _, components = msgspec.json.schema_components(MESSAGES, ref_template="#/$defs/{name}")
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Messages of the scanner",
+        "$defs": dict(sorted(components.items())),
+    }

@@ -1,0 +1,332 @@
+"""The service: requests in, values out, from start to end.
+
+It wires the parts together. What it knows of devices is in the registry; whatever changes there, is
+at once polled and published in that way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+from weakref import WeakValueDictionary
+
+from holdfast import logs
+from holdfast.scanner import wire
+from holdfast.scanner.broker import Broker, Servers
+from holdfast.scanner.browsing import browsed
+from holdfast.scanner.commands import Writers
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.groups import grouped
+from holdfast.scanner.heartbeat import EVERY, Heart
+from holdfast.scanner.hosts import Allowed
+from holdfast.scanner.limits import Limits
+from holdfast.scanner.messages import (
+    Answer,
+    BrowseRequest,
+    ServiceReport,
+    Status,
+    SubscribeRequest,
+    UnsubscribeRequest,
+    decode,
+)
+from holdfast.scanner.outbox import Outbox
+from holdfast.scanner.polling import Polling
+from holdfast.scanner.publishing import Publisher
+from holdfast.scanner.registry import Registry, check_address, understood
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+
+    from holdfast.scanner.devices import Device
+    from holdfast.scanner.messages import BrowseAnswer
+    from holdfast.scanner.polling import Block
+    from holdfast.scanner.registry import Subscription
+    from holdfast.target import Target
+
+Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer]]"
+
+ENDING = 2.0
+"""Seconds that each step of a stop may take."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a scanner is told when it starts."""
+
+    servers: Servers = field(default_factory=Servers)
+    prefix: str = "modbus"
+    """The first part of all subjects, and the id of the module in messages."""
+    allow: tuple[str, ...] = ()
+    """Networks and serial devices, see `Allowed`."""
+    limits: Limits = field(default_factory=Limits)
+
+
+class Scanner:
+    """One service, from `run` to its end."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._allowed = Allowed(settings.allow)
+        self._ended = asyncio.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._registry = Registry(settings.limits)
+        self._publishers: dict[str, Publisher] = {}
+        self._writers = Writers()
+        self._heart = Heart(settings.prefix)
+        self.outbox = Outbox()
+        self._broker = Broker(settings.servers, self._handlers(), self._connected)
+        self._due = asyncio.Event()
+        """Set when a heartbeat is due before its time."""
+
+    async def run(self) -> None:
+        """Serves until `end` is called or asked for. Raises `OSError` for files of the settings."""
+        self._polling = Polling(self._take)
+        running: list[asyncio.Task[object]] = [
+            asyncio.create_task(work)
+            for work in (self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait())
+        ]
+        try:
+            done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            await self._stop(running)
+
+    @property
+    def serves(self) -> bool:
+        """Whether requests reach it just now."""
+        return self._broker.serves
+
+    def end(self) -> None:
+        """Ends the service."""
+        self._ended.set()
+
+    def _connected(self, client: Client | None) -> None:
+        self.outbox.connected(client)
+        self._due.set()
+
+    def _handlers(self) -> dict[str, Callable[[Msg], Awaitable[None]]]:
+        prefix = self._settings.prefix
+
+        async def shutdown(_: Msg) -> None:
+            logs.write(logging.INFO, "shutdown_asked")
+            self.end()
+
+        return {
+            f"{prefix}.subscribe": self._answering("subscribe", self._subscribe),
+            f"{prefix}.unsubscribe": self._answering("unsubscribe", self._unsubscribe),
+            f"{prefix}.command.>": self._answering("command", self._command),
+            f"{prefix}.browse": self._answering("browse", self._browse),
+            f"{prefix}.shutdown": shutdown,
+        }
+
+    def _answering(self, kind: str, handle: Handle) -> Callable[[Msg], Awaitable[None]]:
+        """What carries out messages of a kind beside each other, and answers those who ask."""
+
+        async def carry_out(message: Msg) -> None:
+            answer: Answer | BrowseAnswer
+            most = self._settings.limits.pending
+            try:
+                if len(self._tasks) > most:
+                    raise Refused(f"{most} requests are being carried out, no more are taken")
+                answer = await handle(message)
+            except Refused as refused:
+                logs.refused(
+                    "request_refused", kind=kind, subject=message.subject, reason=str(refused)
+                )
+                answer = Answer(success=False, error=str(refused))
+            except Exception as error:  # Nothing that a caller sends may end the service.
+                logs.problem("request_failed", subject=message.subject)
+                answer = Answer(success=False, error=f"internal error: {type(error).__name__}")
+            if message.reply:
+                await self.outbox.answer(message.reply, wire.message(message.reply, answer))
+
+        async def begin(message: Msg) -> None:
+            self._begin(carry_out(message))
+
+        return begin
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _subscribe(self, message: Msg) -> Answer:
+        limits = self._settings.limits
+        asked = understood(decode(message.data, SubscribeRequest, limits.request), limits)
+        async with self._turn(asked.device):
+            address = await self._address(asked)
+            newcomers = set(asked.tags)
+            device, changed = self._registry.subscribe(asked, address)
+            publisher = self._publishers.get(device.id)
+            if publisher is None:
+                publisher = Publisher(self._settings.prefix, device.id)
+                self._publishers[device.id] = publisher
+                self._tell(device)
+            publisher.regroup(grouped(device), device.rate, newcomers)
+            if changed:
+                self._polling.renew(device)
+        logs.write(
+            logging.INFO,
+            "subscribed",
+            device=asked.device,
+            subscriber=asked.subscriber,
+            tags=len(asked.tags),
+            scan_rate=asked.rate,
+        )
+        return Answer(success=True, count=len(asked.tags))
+
+    async def _address(self, asked: Subscription) -> Target:
+        """Where a device is: where it is known to be, or what its name says."""
+        device = self._registry.devices.get(asked.device)
+        if device is None:
+            return await self._allowed.address(asked.source.target)
+        check_address(device, asked)
+        return device.address
+
+    async def _unsubscribe(self, message: Msg) -> Answer:
+        request = decode(message.data, UnsubscribeRequest, self._settings.limits.request)
+        async with self._turn(request.device_id):
+            device, changed = self._registry.unsubscribe(request)
+            if device is not None:
+                if device.subscribers:
+                    self._publishers[device.id].regroup(grouped(device), device.rate, set())
+                    if changed:
+                        self._polling.renew(device)
+                elif changed:
+                    await self._drop(device)
+        logs.write(
+            logging.INFO,
+            "unsubscribed",
+            device=request.device_id,
+            subscriber=request.subscriber_id,
+            tags=len(request.tag_ids),
+        )
+        return Answer(success=True)
+
+    async def _drop(self, device: Device) -> None:
+        """Forgets a device that nobody wants."""
+        del self._publishers[device.id]
+        self._polling.drop(device)
+        await self._writers.drop(device.id)
+
+    def _turn(self, device: str) -> asyncio.Lock:
+        """Requests for one device are carried out one after the other."""
+        return self._turns.setdefault(device, asyncio.Lock())
+
+    async def _command(self, message: Msg) -> Answer:
+        name = message.subject.removeprefix(f"{self._settings.prefix}.command.")
+        most = self._settings.limits.command
+        if len(message.data) > most:
+            raise Refused(f"the value has {len(message.data)} bytes, allowed are {most}")
+        try:
+            text = message.data.decode()
+        except UnicodeDecodeError:
+            raise Refused("the value is no text") from None
+        device, tag = self._registry.commanded(name)
+        await self._writers.write(device, tag, text)
+        return Answer(success=True)
+
+    async def _browse(self, message: Msg) -> BrowseAnswer:
+        request = BrowseRequest()
+        if message.data:
+            request = decode(message.data, BrowseRequest, self._settings.limits.request)
+        devices = {
+            id: (device, self._publishers[id].undecoded)
+            for id, device in self._registry.devices.items()
+        }
+        client = self._broker.client
+        most = 2**20 if client is None else client.max_payload
+        service = ServiceReport(
+            started_at=self._heart.started,
+            published=self.outbox.sent,
+            replaced=self.outbox.replaced,
+            dropped=self.outbox.dropped,
+            lost_scans=self._polling.dropped,
+        )
+        return browsed(request, devices, self._polling.counters(), service, most)
+
+    def _take(self, device: Device, moment: float, blocks: list[Block]) -> None:
+        """Publishes what was read."""
+        try:
+            self._publish(device, moment, blocks)
+        except Exception:  # What is wrong with one device must not cost the others.
+            logs.problem("scan_failed", device=device.id)
+
+    def _publish(self, device: Device, moment: float, blocks: list[Block]) -> None:
+        if device.health.judge(moment, blocks):
+            self._tell(device)
+        if device.may_have_moved():
+            self._begin(self._look_up(device))
+        id = device.id
+        messages = self._publishers[id].messages(moment, blocks)
+        self.outbox.put([((id, tag), text) for tag, text in messages])
+
+    async def _look_up(self, device: Device) -> None:
+        """Looks where a device is that does not answer: its name may mean another address now."""
+        async with self._turn(device.id):
+            if self._registry.devices.get(device.id) is not device:
+                return
+            try:
+                address = await self._allowed.address(device.source.target, after=device.address)
+            except Refused as refused:
+                logs.refused("not_found", kind="name", device=device.id, reason=str(refused))
+                return
+            if address != device.address:
+                device.address = address
+                self._polling.renew(device)
+                logs.write(logging.INFO, "moved", device=device.id, address=str(address))
+
+    def _tell(self, device: Device) -> None:
+        """Publishes and logs how a device does."""
+        health = device.health
+        status = Status(
+            device_id=device.id,
+            state=health.state,
+            failures=health.failures,
+            error=health.error,
+            timestamp=int(time.time() * 1000),
+        )
+        subject = f"{self._settings.prefix}.status.{device.id}"
+        self.outbox.put([((device.id,), wire.message(subject, status))])
+        if health.state != "connecting":
+            level = logging.WARNING if health.error else logging.INFO
+            told = {} if health.error is None else {"error": health.error}
+            logs.write(level, f"device_{health.state}", device=device.id, **told)
+
+    async def _beat(self) -> None:
+        while True:
+            self._due.clear()
+            await self._heart.beat(self._broker.client)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(EVERY):
+                    await self._due.wait()
+
+    async def _stop(self, running: Sequence[asyncio.Task[object]]) -> None:
+        """Ends all parts; none of them may keep the others waiting."""
+        await _within(self._polling.stop())
+        for request in list(self._tasks):
+            request.cancel()
+        await _within(asyncio.gather(self._writers.close(), self._farewell()))
+        for task in running:
+            task.cancel()
+        await _within(asyncio.wait(running))
+        logs.write(logging.INFO, "stopped")
+
+    async def _farewell(self) -> None:
+        """Takes the heartbeat away, and sees that what was published is sent."""
+        await self._heart.stop(self._broker.client)
+        await self.outbox.flush()
+
+
+async def _within(step: Awaitable[object]) -> None:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(ENDING):
+            await step

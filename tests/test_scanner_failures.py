@@ -1,0 +1,416 @@
+"""What the scanner does when devices, NATS or JetStream fail, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import socket
+import time
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import wire
+from fake_device import HANG_UP, FakeDevice, exception, registers
+from holdfast import logs
+from holdfast.scanner import commands, devices
+from nats_bus import Caller, NatsServer, leaving, subscription, tag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    import holdfast
+    from conftest import Process, Serve
+    from nats_bus import Run
+
+
+@pytest.fixture(autouse=True)
+def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
+@pytest.fixture
+def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
+    with Caller(own_nats.url) as caller:
+        yield caller
+
+
+def events(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.name == "holdfast"]
+
+
+# NATS
+
+
+def test_nats_comes_back_and_everything_goes_on_with_the_newest_values(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    scanner = run_scanner(own_nats)
+    data = own_caller.listen("modbus.data.plc1")
+    tags = [tag("a", 0), tag("b", 1)]
+    own_caller.request("modbus.subscribe", subscription(server, *tags))
+    data.next()
+
+    own_nats.kill()
+    wire.until(lambda: "nats_disconnected" in events(caplog), "the scanner noticed")
+    data.take()
+    outbox = scanner.scanner.outbox
+    memory.write("holding_registers", 0, [1, 1])
+    replaced = outbox.replaced
+    wire.until(lambda: outbox.replaced > replaced + 8, "scans go on")
+    memory.write("holding_registers", 0, [2, 3])
+    replaced = outbox.replaced
+    wire.until(lambda: outbox.replaced > replaced + 8, "scans go on")
+    assert outbox.dropped == 0
+
+    own_nats.start()
+    found: dict[str, list[int]] = {"a": [], "b": []}
+    while not (found["a"] and found["b"]):
+        message = data.next()
+        found[message["variableId"]].append(message["value"])
+    assert {id: set(values) for id, values in found.items()} == {"a": {2}, "b": {3}}
+    wire.until(lambda: events(caplog).count("nats_connected") == 2, "it is told")
+    assert "nats_connect_failed" in events(caplog)
+    assert own_caller.request("modbus.unsubscribe", leaving("a", "b"))["success"]
+
+
+def test_a_client_that_nats_throws_out_is_replaced(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    scanner = run_scanner(own_nats)
+    data = own_caller.listen("modbus.data.plc1")
+    own_caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+    data.next()
+    # A text that is no command: the server says so and closes, and nats-py gives up for good.
+    scanner.do(_nonsense(scanner.scanner))
+    wire.until(lambda: events(caplog).count("nats_connected") == 2, "there is another client")
+    data.take()
+    assert data.next()["value"] == 0
+    wire.until(lambda: scanner.serves, "requests reach it")
+    assert own_caller.request("modbus.browse", b"")["count"] == 1
+
+
+async def _nonsense(scanner: Any) -> None:
+    client = scanner._broker.client
+    await client._send_command(b"NONSENSE\r\n")
+    await client._flush_pending()
+
+
+def test_a_scanner_waits_for_nats(
+    run_scanner: Run, tmp_path: Path, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    own_nats = NatsServer(tmp_path)
+    own_nats.kill()
+    scanner = run_scanner(own_nats, wait=False)
+    wire.until(lambda: "nats_connect_failed" in events(caplog), "it is told")
+    own_nats.start()
+    try:
+        wire.until(lambda: scanner.serves, "it is connected")
+        with Caller(own_nats.url) as caller:
+            data = caller.listen("modbus.data.plc1")
+            caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+            data.next()
+    finally:
+        scanner.stop()
+        own_nats.kill()
+
+
+def test_nats_that_hangs_holds_up_nothing(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+) -> None:
+    scanner = run_scanner(own_nats)
+    data = own_caller.listen("modbus.data.plc1")
+    tags = [tag(f"t{address}", address) for address in range(900)]
+    own_caller.request("modbus.subscribe", subscription(server, *tags))
+    data.next()
+    own_nats.signal(signal.SIGSTOP)
+    try:
+        outbox = scanner.scanner.outbox
+        wire.until(lambda: outbox.replaced > 1000, "the newest values are kept", 30)
+        memory.write("holding_registers", 0, [7] * 900)
+        replaced = outbox.replaced
+        wire.until(lambda: outbox.replaced > replaced + 800, "scans go on")
+    finally:
+        own_nats.signal(signal.SIGCONT)
+    data.until(lambda message: message["value"] == 7, "the newest values")
+
+
+# Devices
+
+
+def test_a_device_that_dies_and_comes_back_is_told_of(
+    run_scanner: Run, caller: Caller, serve: Serve, memory: holdfast.Memory
+) -> None:
+    run_scanner()
+    memory.write("holding_registers", 0, [1])
+    server = serve({1: memory})
+    host, port = server.address
+    status = caller.listen("modbus.status.plc1")
+    data = caller.listen("modbus.data.plc1")
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+    assert data.next()["value"] == 1
+    first, second = status.next(), status.next()
+    assert first.pop("timestamp") <= second.pop("timestamp")
+    assert first == {"deviceId": "plc1", "state": "connecting", "failures": 0}
+    assert second == {"deviceId": "plc1", "state": "online", "failures": 0}
+
+    server.stop()
+    lost = status.next()
+    assert lost.pop("timestamp")
+    assert lost.pop("error") in ("the connection was lost", "no connection")
+    assert lost == {"deviceId": "plc1", "state": "offline", "failures": 1}
+    data.take()
+    memory.write("holding_registers", 0, [2])
+    serve({1: memory}, bind=f"{host}:{port}")
+    assert status.next()["state"] == "online"
+    assert data.next()["value"] == 2
+    assert status.take() == []
+
+
+def test_a_device_that_is_not_there_costs_the_others_nothing(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    status = caller.listen("modbus.status.dead")
+    dead = subscription(server, tag("a", 0), deviceId="dead", port=port)
+    data = caller.listen("modbus.data.plc1")
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+    caller.request("modbus.subscribe", dead)
+    assert [status.next()["state"] for _ in range(2)] == ["connecting", "offline"]
+    times = [data.next()["timestamp"] for _ in range(25)]
+    assert max(later - earlier for earlier, later in pairwise(times)) < 500
+    assert status.take() == []
+    caller.request("modbus.unsubscribe", leaving("a", deviceId="dead"))
+
+
+def test_a_device_that_is_silent_is_offline_until_it_answers(
+    run_scanner: Run, caller: Caller, server_process: Process
+) -> None:
+    run_scanner()
+    plc = server_process()
+    host, port = plc.address
+    status, data = caller.listen("modbus.status.plc1"), caller.listen("modbus.data.plc1")
+    request = {
+        "deviceId": "plc1",
+        "subscriberId": "x",
+        "host": host,
+        "port": port,
+        "timeout": 100,
+        "scanRate": 100,
+        "tags": [tag("a", 0)],
+    }
+    caller.request("modbus.subscribe", request)
+    data.next()
+    os.kill(plc.pid, signal.SIGSTOP)
+    status.until(lambda message: message["state"] == "offline", "it is offline")
+    data.take()
+    os.kill(plc.pid, signal.SIGCONT)
+    status.until(lambda message: message["state"] == "online", "it is online again")
+    data.next()
+    caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
+
+
+def test_a_bad_address_in_the_middle_of_a_block_costs_its_own_tag_only(
+    run_scanner: Run, caller: Caller
+) -> None:
+    run_scanner()
+
+    def answer(pdu: bytes) -> bytes:
+        start, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if start <= 17 < start + count:
+            return exception(pdu, 2)
+        return registers(pdu, start)
+
+    with FakeDevice(answer) as plc:
+        tags = [tag(f"t{address}", address) for address in range(40)]
+        request = {"deviceId": "plc1", "subscriberId": "x", "url": plc.url, "scanRate": 50}
+        data, status = caller.listen("modbus.data.plc1"), caller.listen("modbus.status.plc1")
+        caller.request("modbus.subscribe", request | {"tags": tags})
+        found: set[str] = set()
+        while len(found) < 39:
+            found.add(data.next()["variableId"])
+        assert found == {f"t{address}" for address in range(40)} - {"t17"}
+        online = status.until(lambda message: message["state"] == "online", "it is online")
+        assert online["error"] == "exception 02 (Illegal Data Address)"
+        data.take()
+        # The plan that works is kept: a scan is a few requests, not a search.
+        data.until(lambda message: message["variableId"] == "t39", "the end of a scan")
+        [device] = caller.request("modbus.browse", b"")["devices"]
+        assert len(device["blocks"]) <= 12
+        errors = {each["id"]: each["error"] for each in device["tags"] if "error" in each}
+        assert errors == {"t17": "exception 02 (Illegal Data Address)"}
+        caller.request(
+            "modbus.unsubscribe", leaving(*(each["id"] for each in tags), subscriberId="x")
+        )
+
+
+@pytest.mark.parametrize("after", [0, 1])
+def test_a_device_that_hangs_up_is_asked_again(
+    run_scanner: Run, caller: Caller, after: int
+) -> None:
+    run_scanner()
+    asked = 0
+
+    def answer(pdu: bytes) -> bytes:
+        nonlocal asked
+        asked += 1
+        return HANG_UP if asked % 4 == after else registers(pdu, 9)
+
+    with FakeDevice(answer) as plc:
+        request = {"deviceId": "plc1", "subscriberId": "x", "url": plc.url, "scanRate": 50}
+        data = caller.listen("modbus.data.plc1")
+        caller.request("modbus.subscribe", request | {"tags": [tag("a", 0)]})
+        assert [data.next()["value"] for _ in range(10)] == [9] * 10
+        caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
+
+
+def test_a_name_is_looked_up_again_when_the_device_does_not_answer(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices, "LOOK_UP", 0.0)
+    port = server.address[1]
+    known = [(socket.AF_INET, 1, 6, "", (host, port)) for host in ("127.0.0.2", "127.0.0.1")]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: known)
+    run_scanner()
+    data = caller.listen("modbus.data.plc1")
+    request = subscription(server, tag("a", 0), host="plc.test")
+    assert caller.request("modbus.subscribe", request)["success"]
+    data.next()
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    assert device["address"] == f"tcp://127.0.0.1:{port}"
+
+
+def test_the_connection_of_commands_is_closed_when_there_are_none(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "IDLE", 0.05)
+    run_scanner()
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0, writable=True)))
+    assert caller.request("modbus.command.a", "1")["success"]
+    wire.until(lambda: _open(server) == 1, "only the scans have a connection")
+    assert caller.request("modbus.command.a", "2")["success"]
+
+
+# Heartbeat
+
+
+def test_the_heartbeat_is_in_its_bucket_and_gone_after_the_end(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller
+) -> None:
+    scanner = run_scanner(own_nats)
+
+    async def entry() -> Any:
+        bucket = await own_caller.client.jetstream().key_value("service_heartbeats")
+        status = await bucket.status()
+        assert (status.ttl, status.history) == (60.0, 1)
+        try:
+            return json.loads((await bucket.get("modbus")).value or b"null")
+        except Exception as error:  # There is no such key, or no longer.
+            return type(error).__name__
+
+    def beats() -> bool:
+        try:
+            return isinstance(own_caller.do(entry()), dict)
+        except Exception:  # The bucket is not there yet.
+            return False
+
+    wire.until(beats, "there is a heartbeat")
+    found = own_caller.do(entry())
+    assert found.pop("startedAt") <= found.pop("lastSeen") <= time.time() * 1000
+    assert found == {"serviceType": "modbus", "moduleId": "modbus", "metadata": {}}
+    scanner.stop()
+    assert own_caller.do(entry()) == "KeyNotFoundError"
+
+
+def test_without_jetstream_it_says_so_once_and_goes_on(
+    run_scanner: Run, tmp_path: Path, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    bare = NatsServer(tmp_path, jetstream=False)
+    try:
+        scanner = run_scanner(bare)
+        wire.until(lambda: "no_heartbeat" in events(caplog), "it is told")
+        with Caller(bare.url) as caller:
+            data = caller.listen("modbus.data.plc1")
+            caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+            data.next()
+            for _ in range(3):
+                scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
+        assert events(caplog).count("no_heartbeat") == 1
+        scanner.stop()
+    finally:
+        bare.kill()
+
+
+# The end
+
+
+def test_a_message_ends_it(run_scanner: Run, caller: Caller, server: holdfast.Server) -> None:
+    scanner = run_scanner()
+    data = caller.listen("modbus.data.plc1")
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+    data.next()
+    caller.publish("modbus.shutdown")
+    scanner.ended.result(wire.DEADLINE)
+    counters = server.counters()
+    assert "connections" in counters
+    wire.until(lambda: _open(server) == 0, "all connections are closed")
+
+
+def _open(server: holdfast.Server) -> int:
+    counters = server.counters()
+    assert "connections" in counters
+    return counters["connections"]["open"]
+
+
+def test_it_ends_while_everything_hangs(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, server_process: Process
+) -> None:
+    scanner = run_scanner(own_nats)
+    plc = server_process()
+    host, port = plc.address
+    data = own_caller.listen("modbus.data.tcp")
+    for id, transport in (("tcp", "tcp"), ("rtu", "rtu+tcp")):
+        request = {
+            "deviceId": id,
+            "subscriberId": "x",
+            "host": host,
+            "port": port,
+            "transport": transport,
+            "timeout": 3000,
+            "scanRate": 50,
+            "tags": [tag(f"{id}-{address}", address, writable=True) for address in range(900)],
+        }
+        own_caller.request("modbus.subscribe", request)
+    data.next()
+    os.kill(plc.pid, signal.SIGSTOP)
+    own_caller.publish("modbus.command.tcp-1", "1")
+    own_caller.publish("modbus.command.rtu-1", "1")
+    own_nats.signal(signal.SIGSTOP)
+    try:
+        began = time.monotonic()
+        scanner.stop()
+        assert time.monotonic() - began < 15
+    finally:
+        own_nats.signal(signal.SIGCONT)
+        os.kill(plc.pid, signal.SIGCONT)
