@@ -779,6 +779,23 @@ def test_the_reply_to_a_cancelled_call_is_dropped_and_counted() -> None:
     run(main)
 
 
+def test_a_call_may_be_cancelled_while_its_reply_is_read() -> None:
+    async def main() -> None:
+        with Stream("tcp", silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                task = asyncio.create_task(plc.read_holding_registers(1, 1))
+                await asyncio.to_thread(device.await_requests, 1)
+                # Both happen in one turn of the loop, first this, then that.
+                asyncio.get_running_loop().call_soon(task.cancel)
+                device.asked[0].answer()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+                assert await plc.read_holding_registers(2, 1) == [2]
+                assert device.connections == 1
+
+    run(main)
+
+
 @pytest.mark.parametrize("kind", ["udp", "rtu+tcp"])
 def test_a_call_in_a_thread_may_be_cancelled(kind: str) -> None:
     async def main() -> None:

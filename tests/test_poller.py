@@ -6,7 +6,7 @@ import itertools
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -973,3 +973,42 @@ def test_an_appliance_can_be_started_again(run: Run) -> None:
             appliance.diagnostics.stats()
         appliance.start()
         wire.until(lambda: len(fake.requests) > asked, "it is polled again")
+
+
+def test_with_measured_costs_the_answers_decide_which_holes_are_read(
+    run: Run, serve: Serve, memory: holdfast.Memory
+) -> None:
+    host, port = serve({1: memory}).address
+    appliance = run(
+        f"""
+        memories: {{mirror: {{holding_registers: 200}}}}
+        devices:
+          meter:
+            url: tcp://{host}:{port}
+            unit: 1
+            interval: 0.01
+            cost: {{per_request: 0, per_register: 1, measured: true}}
+            reads:
+              - {{area: holding_registers, address: 0, count: 1,
+                  into: {{memory: mirror, area: holding_registers, address: 0}}}}
+              - {{area: holding_registers, address: 10, count: 100,
+                  into: {{memory: mirror, area: holding_registers, address: 10}}}}
+        """
+    )
+
+    def meter() -> dict[str, Any]:
+        found: dict[str, Any] = appliance.diagnostics.stats()["devices"]["meter"]
+        return found
+
+    assert meter()["requests_per_poll"] == 2
+    wire.until(lambda: meter()["requests_per_poll"] == 1, "requests cost more than registers")
+    memory.write("holding_registers", 0, [7])
+    memory.write("holding_registers", 109, [9])
+    mirror = appliance.memories["mirror"]
+    wire.until(
+        lambda: (
+            mirror.read("holding_registers", 0, 1) + mirror.read("holding_registers", 109, 1)
+            == [7, 9]
+        ),
+        "both reads are mirrored",
+    )

@@ -144,6 +144,7 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.D
         ],
         status=None if status is None else (memories[status.memory], status.area, status.slot),
         start_within=min(settings.interval, SPREAD),
+        measured=settings.cost is not None and settings.cost.measured,
         **planning.rules(settings),
     )
 

@@ -41,7 +41,7 @@ pub struct Device {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Device {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, report=false, release=false))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, report=false, release=false, measured=false))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -60,6 +60,7 @@ impl Device {
         start_within: Option<f64>,
         report: bool,
         release: bool,
+        measured: bool,
     ) -> PyResult<Device> {
         let reads = reads.into_iter().map(|(area, address, count, into)| {
             Ok(ReadSettings {
@@ -88,6 +89,7 @@ impl Device {
             start_within: seconds("start_within", start_within.unwrap_or(interval))?,
             report,
             release,
+            measured,
         };
         Ok(Device { core })
     }

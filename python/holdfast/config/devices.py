@@ -81,6 +81,8 @@ class CostConfig(Model):
     """Milliseconds that a request takes, whatever it reads."""
     per_register: Milliseconds
     """Milliseconds that each register takes, or each 16 bits."""
+    measured: bool = False
+    """Whether the device's own answers take the place of both, after a hundred of them."""
 
 
 def _crc(data: dict[str, Any]) -> Literal["required"] | None:

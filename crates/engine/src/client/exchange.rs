@@ -22,7 +22,7 @@ use super::{Broken, ClientError};
 use crate::serial::{Line as SerialLine, LineMode};
 
 /// Bytes taken from a socket at once.
-const CHUNK: usize = 4096;
+const CHUNK: usize = 512;
 
 /// After this time without use a connection is looked at before it is trusted.
 const IDLE: Duration = Duration::from_millis(50);

@@ -21,6 +21,7 @@ use super::backoff;
 use super::forward::{Forward, ForwardSettings};
 use super::link::Link;
 use super::plan::{self, Block, Field, Limits, Strategy};
+use super::price::Samples;
 use super::results::{BlockResult, Poll, Results};
 use super::sink::Destination;
 use super::status::{Fault, Health, Status, StatusSettings};
@@ -55,6 +56,9 @@ pub struct DeviceSettings {
     pub reads: Vec<ReadSettings>,
     pub limits: Limits,
     pub strategy: Strategy,
+    /// Whether the prices of [`Strategy::Cost`] are only what it begins with: those that the device's
+    /// own answers show take their place.
+    pub measured: bool,
     pub forward: Vec<ForwardSettings>,
     pub status: Option<StatusSettings>,
     /// The first poll comes within this time, at a moment that differs from device to device.
@@ -216,6 +220,8 @@ pub(super) struct Device {
     plan: RefCell<Rc<Vec<Block>>>,
     /// The block that a poll begins with.
     first: Cell<usize>,
+    strategy: Cell<Strategy>,
+    samples: Cell<Samples>,
     /// When the first plan is tried again.
     revise: Cell<Option<Instant>>,
     silent: Cell<u32>,
@@ -255,6 +261,8 @@ impl Device {
             limits: RefCell::new(settings.limits.clone()),
             plan: RefCell::default(),
             first: Cell::new(0),
+            strategy: Cell::new(settings.strategy),
+            samples: Cell::default(),
             revise: Cell::new(None),
             silent: Cell::new(0),
             settings,
@@ -311,9 +319,25 @@ impl Device {
 
     fn draw_plan(&self) {
         // That every field can be read was checked when the poller was made.
-        let plan = plan::plan(&self.fields, &self.limits.borrow(), self.settings.strategy);
+        let plan = plan::plan(&self.fields, &self.limits.borrow(), self.strategy.get());
         *self.plan.borrow_mut() = Rc::new(plan.unwrap_or_default());
         self.note_plan();
+    }
+
+    /// Draws the plan anew when enough answers have shown what a request costs.
+    fn learn(&self) {
+        let Strategy::Cost { item, .. } = self.strategy.get() else { return };
+        if !self.settings.measured {
+            return;
+        }
+        if let Some((request, item)) = self.samples.get().price(item) {
+            self.strategy.set(Strategy::Cost { request, item });
+            self.samples.take();
+            // A plan that was made smaller for what the device refuses stays until its time comes.
+            if self.revise.get().is_none() {
+                self.draw_plan();
+            }
+        }
     }
 
     fn note_plan(&self) {
@@ -328,6 +352,7 @@ impl Device {
             self.limits.replace(self.settings.limits.clone());
             self.draw_plan();
         }
+        self.learn();
         self.state.counters.polls.add();
         let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
         let (mut fault, mut answered) = (None, false);
@@ -420,7 +445,14 @@ impl Device {
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let answer = self.link.read(*unit_id, &buffer[..len], *timeout, doubtful).await;
         match &answer {
-            Ok(_) => self.state.answered(began.elapsed()),
+            Ok(_) => {
+                let took = began.elapsed();
+                self.state.answered(took);
+                let mut samples = self.samples.get();
+                let bits = if block.area.is_bits() { 16.0 } else { 1.0 };
+                samples.add(f64::from(block.count) / bits, took.as_secs_f64() * 1e3);
+                self.samples.set(samples);
+            }
             Err(Fault::Exception(_)) => counters.exceptions.add(),
             Err(Fault::Timeout) => counters.timeouts.add(),
             Err(_) => counters.transport_errors.add(),

@@ -12,6 +12,7 @@ mod device;
 mod forward;
 mod link;
 pub mod plan;
+mod price;
 mod results;
 mod sink;
 mod status;
