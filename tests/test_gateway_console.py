@@ -1,175 +1,43 @@
-"""The gateway's console as people use it, in a real browser, on a desk and on a phone.
-
-With HOLDFAST_SCREENSHOTS set, the pictures of docs/gateway.md are taken anew.
-"""
+"""The gateway's console as people use it, in a real browser, on a desk and on a phone."""
 
 from __future__ import annotations
 
 import hashlib
-import math
-import os
-import struct
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
-import gateways
-import holdfast
-import wire
-from conftest import tool
-from fake_device import FakeDevice, exception, registers
-from holdfast.identity import Identity
+import gateway_pages
+from fake_device import FakeDevice
+from gateway_pages import DESK, PHONE, Opened, browsing, floats, opening
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from playwright.sync_api import Browser, Locator, Page, Request
+    from playwright.sync_api import Browser
 
-IMAGES = Path(__file__).parent.parent / "docs" / "images"
+    import holdfast
+
 HARMFUL = "<img src=x onerror=alert(1)>"
 SECRET = "correct-horse-battery-staple"
-
-PHONE: Any = {"viewport": {"width": 360, "height": 740}, "has_touch": True}
-DESK: Any = {"viewport": {"width": 1100, "height": 820}}
-
-
-@dataclass
-class View:
-    """A page of the console, and all that it must not do."""
-
-    page: Page
-    gateway: gateways.Running
-    port: int
-    memory: holdfast.Memory
-    requests: list[str] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.page.on("request", self._requested)
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda message: self._said(message.type, message.text))
-
-    def _requested(self, request: Request) -> None:
-        self.requests.append(request.url)
-
-    def _said(self, kind: str, text: str) -> None:
-        # The browser tells every refusal of the gateway as such an error.
-        if kind in ("error", "warning") and not text.startswith("Failed to load resource"):
-            self.errors.append(text)
-
-    def check(self) -> None:
-        """Nothing went wrong, nothing went elsewhere, nothing sticks out at the side."""
-        assert self.errors == []
-        assert [url for url in self.requests if not url.startswith(f"{self.gateway.url}/")] == []
-        width = self.page.evaluate("document.documentElement.scrollWidth")
-        assert width <= self.page.viewport_size["width"]  # type: ignore[index]
-
-    def open(self, fragment: str = "") -> View:
-        self.page.goto(f"{self.gateway.url}/{fragment}")
-        return self
-
-    def button(self, name: str) -> Locator:
-        return self.page.get_by_role("button", name=name, exact=True)
-
-    def says(self, text: str) -> None:
-        expect(self.page.get_by_text(text)).to_be_visible()
-
-    def connect(self, host: str = "127.0.0.1", port: int | None = None) -> None:
-        self.page.get_by_role("textbox", name="Device").fill(host)
-        self.page.get_by_role("spinbutton", name="Port").fill(str(port or self.port))
-        self.button("Connect").click()
-
-    def choose(self, **fields: str) -> None:
-        """Fills in what is to be read."""
-        for name, value in fields.items():
-            place = self.page.locator(f"#{name}")
-            if name in ("area", "type", "order"):
-                place.select_option(value)
-            else:
-                place.fill(value)
-
-    def row(self, address: int) -> Locator:
-        """The row of a register."""
-        return self.page.locator(f"tr[data-address='{address}']")
-
-    def shot(self, name: str) -> None:
-        IMAGES.mkdir(exist_ok=True)
-        self.page.screenshot(path=IMAGES / f"gateway-{name}.png", full_page=name != "write")
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        launched = playwright.chromium.launch(
-            executable_path=tool("chromium"), args=["--no-sandbox"]
-        )
+    with browsing() as launched:
         yield launched
-        launched.close()
-
-
-def floats(*values: float) -> list[int]:
-    data = struct.pack(f">{len(values)}f", *values)
-    return list(struct.unpack(f">{2 * len(values)}H", data))
 
 
 @pytest.fixture
 def plant() -> holdfast.Memory:
-    memory = holdfast.Memory(
-        coils=48,
-        discrete_inputs=(100, 20),
-        holding_registers=(0, 300),
-        input_registers=(1000, 64),
-    )
-    memory.write("holding_registers", 0, [*floats(21.5, 1.013), 1234, 0, 65535, 42])
-    memory.write("coils", 0, [1, 0, 1])
-    return memory
-
-
-@dataclass
-class Opened:
-    """Opens the console of a gateway with some settings."""
-
-    browser: Browser
-    plant: holdfast.Memory
-    port: int
-    views: list[tuple[View, Any, Any]] = field(default_factory=list)
-
-    def __call__(
-        self, size: Any = DESK, scheme: Literal["light", "dark"] = "light", **settings: Any
-    ) -> View:
-        running = gateways.running(**{"limits": {"interval": 0.05}, **settings})
-        gateway = running.__enter__()
-        context = self.browser.new_context(**size, color_scheme=scheme)
-        context.set_default_timeout(1000 * wire.DEADLINE)
-        view = View(context.new_page(), gateway, self.port, self.plant)
-        self.views.append((view, context, running))
-        return view.open()
-
-    def close(self) -> None:
-        for view, context, running in self.views:
-            try:
-                view.check()
-            finally:
-                context.close()
-                running.__exit__(None, None, None)
+    return gateway_pages.plant()
 
 
 @pytest.fixture
 def opened(browser: Browser, plant: holdfast.Memory) -> Iterator[Opened]:
-    expect.set_options(timeout=1000 * wire.DEADLINE)
-    model = "Feeder 7" if "HOLDFAST_SCREENSHOTS" in os.environ else HARMFUL
-    identity = Identity(vendor_name="Acme", product_code="F7", revision="2.1", model_name=model)
-    with holdfast.Server(
-        {1: plant}, bind="127.0.0.1:0", access="read-write", identity=identity
-    ) as server:
-        pages = Opened(browser, plant, server.address[1])
-        try:
-            yield pages
-        finally:
-            pages.close()
+    with opening(browser, plant, model=HARMFUL) as pages:
+        yield pages
 
 
 both = pytest.mark.parametrize(
@@ -490,69 +358,3 @@ def test_the_theme_follows_the_system(opened: Opened) -> None:
     light = view.page.evaluate(paper)
     view.page.emulate_media(color_scheme="dark")
     assert view.page.evaluate(paper) != light
-
-
-pictures = pytest.mark.skipif(
-    "HOLDFAST_SCREENSHOTS" not in os.environ, reason="takes the pictures of the docs"
-)
-
-RANGES = {
-    1: [range(64), range(512, 640)],
-    2: [range(64), range(1024, 1500), range(4096, 4200)],
-    3: [range(125), range(1000, 3200), range(4096, 4160), range(9000, 9512), range(40000, 40064)],
-    4: [range(300), range(30000, 31000)],
-}
-
-
-def like_a_drive(pdu: bytes) -> bytes:
-    """The reply of a device with many ranges; some addresses fail otherwise."""
-    first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
-    asked = range(first, first + count)
-    if pdu[0] == 3 and first < 20100 and asked[-1] >= 20000:
-        return exception(pdu, 4)
-    if not any(first in each and asked[-1] in each for each in RANGES.get(pdu[0], [])):
-        return exception(pdu, 2)
-    return (
-        registers(pdu)
-        if pdu[0] > 2
-        else bytes([pdu[0], (count + 7) // 8, *[0] * ((count + 7) // 8)])
-    )
-
-
-@pictures
-def test_the_picture_of_a_watch(opened: Opened, plant: holdfast.Memory) -> None:
-    view = opened()
-    view.connect()
-    view.choose(quantity="10", interval="250")
-    view.button("Watch").click()
-    view.says("Watching holding registers")
-    for step in range(70):
-        plant.write("holding_registers", 0, floats(21.5 + 1.4 * math.sin(step / 6)))
-        plant.write("holding_registers", 2, floats(1.013 + 0.02 * math.cos(step / 4)))
-        plant.write("holding_registers", 8, [16512 + step // 9, step])
-        expect(view.row(9).get_by_role("cell").first).to_have_text(str(step))
-    view.shot("watch")
-
-
-@pictures
-def test_the_picture_of_a_write(opened: Opened) -> None:
-    view = opened(PHONE, "dark")
-    view.connect()
-    view.choose(type="uint16", address="4", quantity="4")
-    view.button("Read").click()
-    view.button("Write 4").click()
-    view.page.get_by_role("textbox", name="New value").fill("1237")
-    view.button("Review").click()
-    view.page.get_by_role("row", name="New 1237").wait_for()
-    view.shot("write")
-
-
-@pictures
-def test_the_picture_of_a_map(opened: Opened) -> None:
-    with FakeDevice(like_a_drive) as drive:
-        view = opened()
-        view.connect(port=drive.port)
-        view.page.get_by_role("tab", name="Map").click()
-        view.button("Map device").click()
-        view.says("Done in")
-        view.shot("map")
