@@ -368,9 +368,9 @@ class Device:
     `forward` are hosts, ports, formats (`v1`, `crc`), crc (`required`, `none`), unit or memory ids,
     and timeouts. `status` is the memory, area and slot of the status block. `start_within` is when
     the first poll comes at the latest, an interval when left out; `report` hands polls to
-    `Poller.results`; `release` closes the connection after each;
-    with `measured` the device's own answers say what `cost` is after a while. Times are in seconds; interval 0
-    polls without a pause.
+    `Poller.results`; `release` closes the connection after each; with `measured` the device's own
+    answers say what `cost` is after a while. Times are in seconds; interval 0 polls
+    without a pause.
     """
 
     def __new__(

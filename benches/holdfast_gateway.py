@@ -1,0 +1,14 @@
+"""The gateway that is measured: it may connect to the device that is given, and nowhere else."""
+
+from __future__ import annotations
+
+import sys
+
+from holdfast.adapters import Stop
+from holdfast.gateway import Gateway, Settings, egress
+from holdfast.http import listen
+
+with listen("127.0.0.1", 0) as listener:
+    gateway = Gateway(Settings((egress.parse(sys.argv[1]),)), listener)
+    print(f"listening {gateway.address}", flush=True)
+    gateway.run(Stop())
