@@ -23,6 +23,7 @@ import pytest
 
 import holdfast
 import wire
+from holdfast import logs
 from holdfast.appliance import Appliance
 from holdfast.config import load
 
@@ -214,6 +215,16 @@ def server_process() -> Iterator[Process]:
             return process
 
         yield start
+
+
+@pytest.fixture(autouse=True)
+def logging_as_it_was() -> Iterator[None]:
+    """Commands that run in a test's own process set up the log: the next finds it as it was."""
+    logger = logs.LOGGER
+    before = (list(logger.handlers), logger.level, logger.propagate)
+    yield
+    logger.handlers[:], logger.propagate = before[0], before[2]
+    logger.setLevel(before[1])
 
 
 class Run(Protocol):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 MOST_BYTES = 120 * 1024
 SCHEMES: tuple[Scheme, ...] = ("light", "dark")
-LOW: Any = {"viewport": {"width": 1100, "height": 600}}
+LOW: Any = {"viewport": {"width": 1100, "height": 360}}
 
 RANGES = {
     1: [range(64), range(512, 640)],
@@ -48,7 +48,7 @@ def like_a_drive(pdu: bytes) -> bytes:
 
 def connect(opened: Opened, scheme: Scheme) -> View:
     """A device that answers."""
-    view = opened(LOW, scheme)
+    view = opened(DESK, scheme)
     view.connect()
     view.says("The device answers")
     return view
@@ -87,8 +87,8 @@ def watch(opened: Opened, scheme: Scheme) -> View:
     for step in range(40):
         opened.plant.write("holding_registers", 0, floats(21.5 + 1.4 * math.sin(step / 6)))
         opened.plant.write("holding_registers", 2, floats(1.013 + 0.02 * math.cos(step / 4)))
-        opened.plant.write("holding_registers", 4, [step])
-        expect(view.row(4).get_by_role("cell").first).to_have_text(str(step))
+        opened.plant.write("holding_registers", 4, floats(40 + step / 8))
+        expect(view.row(4).get_by_role("cell").nth(3)).to_have_text(f"{40 + step / 8:g}")
     return view
 
 
