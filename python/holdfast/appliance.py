@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from holdfast import _core, assembly, logs
+from holdfast.adapters import foreign
 from holdfast.adapters.supervisor import Supervisor
 from holdfast.audit import Audit
 from holdfast.config import ModbusAsciiListener, ModbusRtuListener
@@ -125,6 +126,9 @@ class _Running:
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         self._health = dict.fromkeys(config.devices, "unknown")
         self._looked = time.monotonic()
+        # An adapter that is not installed is told before any socket is opened.
+        for name, settings in config.adapters.items():
+            foreign.entry_point(name, settings)
         disabled = self._tell_disabled()
         with ExitStack() as undo:
             self._audit = self._opened_audit(undo)
@@ -168,12 +172,10 @@ class _Running:
         event = self._engine.next_event(timeout)
         if event is not None:
             self._log_event(*event)
-        lost, self._lost_events = (
-            self._engine.lost_events - self._lost_events,
-            self._engine.lost_events,
-        )
-        if lost:
-            logs.write(logging.WARNING, "events_lost", count=lost)
+        lost = self._engine.lost_events
+        if lost > self._lost_events:
+            logs.write(logging.WARNING, "events_lost", count=lost - self._lost_events)
+            self._lost_events = lost
         for name, memory in self._memories.items():
             before, now = self._seals[name], memory.seal_changes
             if now != before:
@@ -295,8 +297,6 @@ class _Running:
             metrics, metrics_at = config.metrics, sockets["metrics"]
             self._add("metrics", None, lambda: Metrics(metrics, self.diagnostics, metrics_at))
         for name, settings in config.adapters.items():
-            from holdfast.adapters import foreign
-
             own_door = self._door(name)
             self._add(name, own_door, foreign.factory(name, settings, own_door))
 
