@@ -30,6 +30,7 @@ pub mod poller;
 mod raw_ingest;
 mod serial;
 pub mod station;
+pub mod tls;
 mod udp;
 
 pub use engine::{
