@@ -224,7 +224,6 @@ def test_a_write_is_answered_when_the_device_has_confirmed_it(caller: Caller) ->
             "url": plc.url,
             "timeout": 10_000,
             "scanRate": 60_000,
-            "release": True,
             "tags": [tag("a", 0, writable=True)],
         }
         data = caller.listen("modbus.data.plc1")
@@ -244,7 +243,7 @@ def test_a_write_is_answered_when_the_device_has_confirmed_it(caller: Caller) ->
 
 def test_what_the_device_refuses_is_told(caller: Caller) -> None:
     def answer(pdu: bytes) -> bytes:
-        return exception(pdu, 4) if pdu[0] == 6 else registers(pdu)
+        return exception(pdu, pdu[4]) if pdu[0] == 6 else registers(pdu)
 
     with FakeDevice(answer) as plc:
         request = {
@@ -252,14 +251,17 @@ def test_what_the_device_refuses_is_told(caller: Caller) -> None:
             "subscriberId": "x",
             "url": plc.url,
             "scanRate": 60_000,
-            "release": True,
             "tags": [tag("a", 0, writable=True)],
         }
         data = caller.listen("modbus.data.plc1")
         caller.request("modbus.subscribe", request)
         data.next()
-        refused = caller.request("modbus.command.a", "1")
-        assert refused["error"] == "not written: exception 04 (Server Device Failure)"
+        for code, told in (
+            ("2", "not written: exception 02 (Illegal Data Address)"),
+            ("4", "not confirmed: exception 04 (Server Device Failure)"),
+            ("99", "not confirmed: exception 63"),
+        ):
+            assert caller.request("modbus.command.a", code) == {"success": False, "error": told}
         caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
 
 

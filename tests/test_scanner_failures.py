@@ -16,7 +16,7 @@ import pytest
 import wire
 from fake_device import HANG_UP, FakeDevice, exception, registers
 from holdfast import logs
-from holdfast.scanner import commands, devices
+from holdfast.scanner import devices
 from nats_bus import Caller, NatsServer, leaving, subscription, tag
 
 if TYPE_CHECKING:
@@ -299,17 +299,6 @@ def test_a_name_is_looked_up_again_when_the_device_does_not_answer(
     data.next()
     [device] = caller.request("modbus.browse", b"")["devices"]
     assert device["address"] == f"tcp://127.0.0.1:{port}"
-
-
-def test_the_connection_of_commands_is_closed_when_there_are_none(
-    run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(commands, "IDLE", 0.05)
-    run_scanner()
-    caller.request("modbus.subscribe", subscription(server, tag("a", 0, writable=True)))
-    assert caller.request("modbus.command.a", "1")["success"]
-    wire.until(lambda: _open(server) == 1, "only the scans have a connection")
-    assert caller.request("modbus.command.a", "2")["success"]
 
 
 # Heartbeat

@@ -407,16 +407,38 @@ class Poller:
     def add(self, device: Device) -> None:
         """Polls one more device. Raises `ValueError`, also for a name that is taken."""
 
+    def replace(self, name: str, device: Device) -> None:
+        """Polls a device in the place of the one called `name`; it may have the same name.
+
+        The poll under way is completed. The new device reads at once, then keeps to the schedule;
+        counters and connection stay. Raises `ValueError`; then nothing has changed.
+        """
+
+    def write(self, name: str, request: Request) -> int:
+        """Sends a write to a device over its own connection, between two reads.
+
+        Returns the number under which `results` tells what became of it. Raises `ValueError` for a
+        device that is not there, and a request that is no write.
+        """
+
     def remove(self, name: str) -> bool:
         """Stops polling a device; whether there was one of that name."""
 
     def results(
         self, timeout: float
-    ) -> list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int]]]]:
-        """All polls of devices with `report` since the last call, waiting for the first.
+    ) -> (
+        tuple[
+            list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int]]]],
+            list[tuple[int, int]],
+        ]
+        | None
+    ):
+        """All polls of devices with `report`, and all writes, since the last call.
 
-        Each is a device, the seconds since 1970, and its blocks as they were asked: area, address,
-        count, the bytes (`None` when there are none), and the fault as a status block tells it.
+        Waits up to `timeout` seconds for the first. A poll is a device, the seconds since 1970, and
+        its blocks as they were asked: area, address, count, the bytes (`None` when there are none),
+        and the fault as a status block tells it. A write is its number and the fault, 0 when the
+        device has confirmed it. `None` when the poller has stopped and nothing is left.
         """
 
     @property

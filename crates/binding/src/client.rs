@@ -28,7 +28,7 @@ const ADDRESSES: i128 = 65_536;
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Request {
-    pdu: Vec<u8>,
+    pub(crate) pdu: Vec<u8>,
 }
 
 #[pymethods]

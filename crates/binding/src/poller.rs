@@ -5,8 +5,8 @@ use std::time::SystemTime;
 
 use holdfast_engine::poller::plan::{self, Field, Limits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    Destination, DeviceSettings, DeviceState, ForwardSettings, Poll, Poller as Core, PollerError,
-    ReadSettings, StatusSettings,
+    Batch, Destination, DeviceSettings, DeviceState, Fault, ForwardSettings, Poll, Poller as Core,
+    PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
 use pyo3::exceptions::{PyOSError, PyValueError};
@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, seconds, within, word};
-use crate::client::Endpoint;
+use crate::client::{Endpoint, Request};
 use crate::memory::{Memory, named};
 
 /// An area, its first address, and the one behind its last.
@@ -117,14 +117,32 @@ impl Poller {
         self.core.add(device.core.clone()).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
+    fn replace(&self, name: &str, device: PyRef<'_, Device>) -> PyResult<()> {
+        self.core
+            .replace(name, device.core.clone())
+            .map_err(|error| PyValueError::new_err(error.to_string()))
+    }
+
+    fn write(&self, name: &str, request: PyRef<'_, Request>) -> PyResult<u64> {
+        self.core
+            .write(name, request.pdu.clone())
+            .map_err(|error| PyValueError::new_err(error.to_string()))
+    }
+
     fn remove(&self, name: &str) -> bool {
         self.core.remove(name)
     }
 
-    fn results<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Vec<PollResult<'py>>> {
+    fn results<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Taken<'py>>> {
         let timeout = seconds("timeout", timeout)?;
-        let polls = py.detach(|| self.core.results().take(timeout));
-        polls.iter().map(|poll| reported(py, poll)).collect()
+        let Batch { polls, writes, ended } = py.detach(|| self.core.results().take(timeout));
+        if ended && polls.is_empty() && writes.is_empty() {
+            return Ok(None);
+        }
+        let polls = polls.iter().map(|poll| reported(py, poll)).collect::<PyResult<_>>()?;
+        let writes = writes.iter();
+        let writes = writes.map(|done| (done.ticket, done.outcome.err().map_or(0, Fault::code)));
+        Ok(Some((polls, writes.collect())))
     }
 
     #[getter]
@@ -229,6 +247,9 @@ fn limits(
         forbidden: stretches(forbidden)?,
     })
 }
+
+/// Polls, and writes as ticket and fault.
+type Taken<'py> = (Vec<PollResult<'py>>, Vec<(u64, u16)>);
 
 /// Device, seconds since 1970, and blocks: area, address, count, bytes or fault.
 type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);

@@ -15,6 +15,8 @@ TRANSPORT = 0x8000
 UNREACHED = (0x0A, 0x0B)
 """What a gateway answers that does not reach the device."""
 
+NO_CONNECTION = 0x8002
+
 FAULTS = {
     0x01: "exception 01 (Illegal Function)",
     0x02: "exception 02 (Illegal Data Address)",
@@ -26,15 +28,23 @@ FAULTS = {
     0x0A: "exception 0A (Gateway Path Unavailable)",
     0x0B: "exception 0B (Gateway Target Device Failed to Respond)",
     0x8001: "no reply in time",
-    0x8002: "no connection",
+    NO_CONNECTION: "no connection",
     0x8003: "the connection was lost",
     0x8004: "an invalid reply",
 }
+
+UNWRITTEN = (0x01, 0x02, 0x03, 0x06, 0x0A, NO_CONNECTION)
+"""Faults of a write that never came to be carried out."""
 
 
 def described(fault: int) -> str:
     """A fault in words."""
     return FAULTS.get(fault, f"exception {fault:02X}")
+
+
+def is_unwritten(fault: int) -> bool:
+    """Whether a write that failed has certainly changed nothing."""
+    return fault in UNWRITTEN
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""The native poller, and the thread that takes what it read.
+"""The native poller, and the thread that takes what it read and wrote.
 
 The thread hands over all polls that wait at once, and takes no more before they are dealt with:
 what the event loop can't keep up with stays in the poller, which drops the oldest.
@@ -25,8 +25,8 @@ Block: TypeAlias = "tuple[Area, int, int, bytes | None, int]"
 Poll: TypeAlias = tuple[str, float, list[Block]]
 """What the device is polled as, seconds since 1970, and its blocks."""
 
-PATIENCE = 0.05
-"""Seconds that the thread waits for polls before it looks around."""
+PATIENCE = 60.0
+"""Seconds that the thread waits for polls at once; it ends with the poller."""
 
 GATHERED = 0.005
 """Seconds from one hand-over to the next, at least: so that a batch is worth its price."""
@@ -50,6 +50,8 @@ class Polling:
         """By what they are polled as."""
         self._renewed: dict[Device, float] = {}
         self._waiting: dict[Device, asyncio.TimerHandle] = {}
+        self._writes: dict[int, asyncio.Future[int]] = {}
+        """By the number that the poller gave them: what will have the fault."""
         self._loop = asyncio.get_running_loop()
         self._poller = _core.Poller([])
         self._names = map(str, itertools.count())
@@ -69,15 +71,16 @@ class Polling:
             self._renew(device)
 
     def _renew(self, device: Device) -> None:
-        """The new one is there before the old one goes, so that the connection, and what is known
-        of it, stays. It has another name: what the old one still reads is not taken for its.
+        """The name is another one with every change: what was still read for the old one is not
+        taken for the new one's.
         """
         self._waiting.pop(device, None)
         old, name = device.polled_as, next(self._names)
-        self._poller.add(_made(device, name))
         if old:
-            self._poller.remove(old)
+            self._poller.replace(old, _made(device, name))
             del self._devices[old]
+        else:
+            self._poller.add(_made(device, name))
         device.polled_as = name
         self._devices[name] = device
         self._renewed[device] = self._loop.time()
@@ -90,6 +93,15 @@ class Polling:
         self._poller.remove(device.polled_as)
         del self._devices[device.polled_as]
         del self._renewed[device]
+
+    async def write(self, device: Device, request: _core.Request) -> int:
+        """Sends a write to a device between two reads; the fault, 0 when it was confirmed."""
+        number = self._poller.write(device.polled_as, request)
+        done = self._writes[number] = self._loop.create_future()
+        try:
+            return await done
+        finally:
+            del self._writes[number]
 
     def counters(self) -> dict[str, dict[str, Any]]:
         """How the poller sees its devices, by what they are polled as."""
@@ -113,18 +125,19 @@ class Polling:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._stopping.is_set():
-            polls = self._poller.results(PATIENCE)
-            if not polls:
-                continue
+        while (taken := self._poller.results(PATIENCE)) is not None:
             self._taken.acquire()
             if self._stopping.is_set():
                 return
-            self._loop.call_soon_threadsafe(self._hand_over, polls)
+            self._loop.call_soon_threadsafe(self._hand_over, *taken)
             self._stopping.wait(GATHERED)
 
-    def _hand_over(self, polls: Sequence[Poll]) -> None:
+    def _hand_over(self, polls: Sequence[Poll], writes: Sequence[tuple[int, int]]) -> None:
         try:
+            for number, fault in writes:
+                done = self._writes.get(number)
+                if done is not None and not done.done():
+                    done.set_result(fault)
             for name, moment, blocks in polls:
                 device = self._devices.get(name)
                 if device is not None:
@@ -149,7 +162,7 @@ def _made(device: Device, name: str) -> _core.Device:
         max_bits=plan.max_bits,
         readable=plan.readable,
         forbidden=plan.forbidden,
-        start_within=0 if device.polled_as else min(interval, FIRST_WITHIN),
+        start_within=min(interval, FIRST_WITHIN),
         report=True,
         release=source.release,
     )

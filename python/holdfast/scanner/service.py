@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import WeakValueDictionary
 
 from holdfast import logs
-from holdfast.scanner import wire
+from holdfast.scanner import commands, wire
 from holdfast.scanner.broker import Broker, Servers
 from holdfast.scanner.browsing import browsed
-from holdfast.scanner.commands import Writers
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
@@ -78,7 +77,6 @@ class Scanner:
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._registry = Registry(settings.limits)
         self._publishers: dict[str, Publisher] = {}
-        self._writers = Writers()
         self._heart = Heart(settings.prefix)
         self.outbox = Outbox()
         self._broker = Broker(settings.servers, self._handlers(), self._connected)
@@ -201,7 +199,7 @@ class Scanner:
                     if changed:
                         self._polling.renew(device)
                 elif changed:
-                    await self._drop(device)
+                    self._drop(device)
         logs.write(
             logging.INFO,
             "unsubscribed",
@@ -211,11 +209,10 @@ class Scanner:
         )
         return Answer(success=True)
 
-    async def _drop(self, device: Device) -> None:
+    def _drop(self, device: Device) -> None:
         """Forgets a device that nobody wants."""
         del self._publishers[device.id]
         self._polling.drop(device)
-        await self._writers.drop(device.id)
 
     def _turn(self, device: str) -> asyncio.Lock:
         """Requests for one device are carried out one after the other."""
@@ -231,7 +228,7 @@ class Scanner:
         except UnicodeDecodeError:
             raise Refused("the value is no text") from None
         device, tag = self._registry.commanded(name)
-        await self._writers.write(device, tag, text)
+        await commands.write(self._polling, device, tag, text)
         return Answer(success=True)
 
     async def _browse(self, message: Msg) -> BrowseAnswer:
@@ -314,7 +311,7 @@ class Scanner:
         await _within(self._polling.stop())
         for request in list(self._tasks):
             request.cancel()
-        await _within(asyncio.gather(self._writers.close(), self._farewell()))
+        await _within(self._farewell())
         for task in running:
             task.cancel()
         await _within(asyncio.wait(running))

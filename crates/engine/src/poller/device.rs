@@ -5,9 +5,14 @@
 //! often, with one request, until it answers; behind an address that can't be reached nothing is
 //! asked before the next attempt. A poll begins behind the block that the one before it failed at,
 //! so that a block which is never answered does not keep the others waiting.
+//!
+//! A device whose settings change is succeeded by another one between two polls. The successor reads
+//! at once, and keeps to the schedule and the silence of the one before.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
+use std::convert::Infallible;
+use std::future::pending;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -15,11 +20,12 @@ use std::time::{Duration, SystemTime};
 
 use holdfast_memory::Area;
 use holdfast_protocol::pdu::{self, Range, Request};
+use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::backoff;
 use super::forward::{Forward, ForwardSettings};
-use super::link::Link;
+use super::link::{Link, Weight};
 use super::plan::{self, Block, Field, Limits, Strategy};
 use super::price::Samples;
 use super::results::{BlockResult, Poll, Results};
@@ -82,8 +88,8 @@ pub struct ReadSettings {
 #[derive(Debug, Default)]
 pub struct DeviceState {
     pub counters: DeviceCounters,
-    /// The age at which the last answer is out of date.
-    stale_after: Duration,
+    /// Milliseconds: the age at which the last answer is out of date.
+    stale_after: AtomicU64,
     health: AtomicU16,
     last_error: AtomicU16,
     failures: AtomicU32,
@@ -118,14 +124,14 @@ pub struct DeviceCounters {
 
 impl DeviceState {
     /// An answer is out of date after three intervals and the time that a reply may take.
-    pub(super) fn new(interval: Duration, timeout: Duration) -> DeviceState {
-        let stale_after = interval.saturating_mul(3).saturating_add(timeout);
-        DeviceState { stale_after, ..DeviceState::default() }
+    pub(super) fn expect(&self, interval: Duration, timeout: Duration) {
+        let after = interval.saturating_mul(3).saturating_add(timeout).as_millis();
+        self.stale_after.store(u64::try_from(after).unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 
     pub fn health(&self) -> Health {
         match self.health.load(Ordering::Relaxed) {
-            1 if self.age().is_some_and(|age| age > self.stale_after) => Health::Stale,
+            1 if self.age().is_some_and(|age| age > self.stale_after()) => Health::Stale,
             1 => Health::Ok,
             2 => Health::Error,
             _ => Health::Unknown,
@@ -156,6 +162,10 @@ impl DeviceState {
 
     pub fn in_error(&self) -> Duration {
         self.times().error_since.map_or(Duration::ZERO, |time| time.elapsed())
+    }
+
+    fn stale_after(&self) -> Duration {
+        Duration::from_millis(self.stale_after.load(Ordering::Relaxed))
     }
 
     fn times(&self) -> std::sync::MutexGuard<'_, Times> {
@@ -209,6 +219,7 @@ pub(super) struct Device {
     settings: DeviceSettings,
     state: Arc<DeviceState>,
     link: Rc<Link>,
+    turn: Rc<Turn>,
     forwards: Vec<Rc<Forward>>,
     /// The parts of reads that one request can carry.
     fields: Vec<Field>,
@@ -225,6 +236,36 @@ pub(super) struct Device {
     /// When the first plan is tried again.
     revise: Cell<Option<Instant>>,
     silent: Cell<u32>,
+    /// When the next poll is to begin.
+    due: Cell<Instant>,
+    /// Whether that is so late because nothing would answer before.
+    resting: Cell<bool>,
+}
+
+/// Held while a request is under way: a device gets one at a time, whoever sends it.
+pub(super) type Turn = tokio::sync::Mutex<()>;
+
+/// Where the successor of a device waits for it to end a poll.
+#[derive(Default)]
+pub(super) struct Succession {
+    next: RefCell<Option<Device>>,
+    named: Notify,
+}
+
+impl Succession {
+    pub(super) fn name(&self, successor: Device) {
+        *self.next.borrow_mut() = Some(successor);
+        self.named.notify_one();
+    }
+
+    async fn successor(&self) -> Device {
+        loop {
+            self.named.notified().await;
+            if let Some(successor) = self.next.take() {
+                return successor;
+            }
+        }
+    }
 }
 
 /// The fields of reads, each no longer than a request.
@@ -248,7 +289,7 @@ impl Device {
     pub(super) fn new(
         settings: DeviceSettings,
         state: Arc<DeviceState>,
-        link: Rc<Link>,
+        (link, turn): (Rc<Link>, Rc<Turn>),
         forwards: Vec<Rc<Forward>>,
         report: Option<Arc<Results>>,
     ) -> Device {
@@ -265,9 +306,12 @@ impl Device {
             samples: Cell::default(),
             revise: Cell::new(None),
             silent: Cell::new(0),
+            due: Cell::new(Instant::now()),
+            resting: Cell::new(false),
             settings,
             state,
             link,
+            turn,
             forwards,
         };
         device.draw_plan();
@@ -275,34 +319,70 @@ impl Device {
     }
 
     /// Polls for ever, first after `phase`, and keeps the status block true meanwhile.
-    pub(super) async fn run(self, phase: Duration) {
-        self.tell();
-        tokio::join!(self.poll_for_ever(phase), self.tell_for_ever());
+    pub(super) async fn run(mut self, phase: Duration, succession: Rc<Succession>) {
+        self.due.set(Instant::now() + phase);
+        let mut at_once = false;
+        loop {
+            self.tell();
+            let successor = tokio::select! {
+                successor = self.poll_until_replaced(at_once, &succession) => successor,
+                never = self.tell_for_ever() => match never {},
+            };
+            at_once = successor.follow(&self);
+            self = successor;
+        }
     }
 
-    async fn poll_for_ever(&self, phase: Duration) {
+    async fn poll_until_replaced(&self, mut at_once: bool, succession: &Succession) -> Device {
         let interval = self.settings.interval;
-        let mut due = Instant::now() + phase;
         loop {
-            sleep_until(due).await;
+            let mut due = self.due.get();
+            if !at_once {
+                tokio::select! {
+                    biased;
+                    successor = succession.successor() => return successor,
+                    () = sleep_until(due) => {}
+                }
+                due += interval;
+            }
+            at_once = false;
             self.poll().await;
             self.tell();
-            let missed;
-            (due, missed) = first_from(Instant::now(), due + interval, interval);
+            let (mut due, missed) = first_from(Instant::now(), due, interval);
             self.state.counters.missed.add_many(missed);
-            if let Some(until) = self.rest() {
-                sleep_until(until).await;
+            let rest = self.rest();
+            if let Some(until) = rest {
                 // What is left out on purpose is not missed.
-                (due, _) = first_from(Instant::now(), due, interval);
+                (due, _) = first_from(until, due, interval);
             }
+            self.resting.set(rest.is_some());
+            self.due.set(due);
             if interval.is_zero() {
                 tokio::task::yield_now().await;
             }
         }
     }
 
-    async fn tell_for_ever(&self) {
-        while self.settings.status.is_some() {
+    /// Goes on where the device before it ended; whether it reads at once, beside the schedule.
+    fn follow(&self, before: &Device) -> bool {
+        let soon = Instant::now() + self.settings.interval;
+        let (old, new) = (&before.settings, &self.settings);
+        if !Rc::ptr_eq(&before.link, &self.link) || old.unit_id != new.unit_id {
+            self.due.set(soon);
+            return true;
+        }
+        let resting = before.resting.get();
+        self.silent.set(before.silent.get());
+        self.resting.set(resting);
+        self.due.set(if resting { before.due.get() } else { before.due.get().min(soon) });
+        !resting
+    }
+
+    async fn tell_for_ever(&self) -> Infallible {
+        if self.settings.status.is_none() {
+            pending::<()>().await;
+        }
+        loop {
             sleep(TELLING).await;
             self.tell();
         }
@@ -438,12 +518,13 @@ impl Device {
         };
         let mut buffer = [0; pdu::MAX_LEN];
         let len = request.encode(&mut buffer).ok_or(Fault::Invalid)?;
+        let _turn = self.turn.lock().await;
         let counters = &self.state.counters;
         counters.requests.add();
         let began = Instant::now();
-        let doubtful = self.silent.get() > 0;
+        let weight = if self.silent.get() > 0 { Weight::Doubtful } else { Weight::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
-        let answer = self.link.read(*unit_id, &buffer[..len], *timeout, doubtful).await;
+        let answer = self.link.call(*unit_id, &buffer[..len], *timeout, weight).await;
         match &answer {
             Ok(_) => {
                 let took = began.elapsed();

@@ -26,7 +26,7 @@ use crate::client::{BlockingClient, ClientError, Endpoint, Session};
 /// Requests in flight on one connection.
 const IN_FLIGHT: usize = 8;
 
-/// Of these, requests to units that were silent the last time: they leave room for the others.
+/// Of these, doubtful ones.
 const DOUBTFUL: usize = 4;
 
 /// Timeouts one after the other, without a byte between them, after which a connection is given up.
@@ -35,8 +35,19 @@ const SILENT: u32 = 3;
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 16 * 1024;
 
-/// The bytes of a read, or why there are none.
+/// The bytes of a read, none of a write, or why it was not answered.
 pub(super) type Answer = Result<Vec<u8>, Fault>;
+
+/// How much a request matters beside others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Weight {
+    Usual,
+    /// To a unit that was silent the last time: it leaves room for the others.
+    Doubtful,
+    /// Somebody waits for it: it goes first where requests go one at a time, and tries an address
+    /// whose pause is not over.
+    Urgent,
+}
 
 pub(super) enum Link {
     Tcp(TcpLink),
@@ -52,23 +63,23 @@ impl Link {
         })
     }
 
-    /// Sends a read and waits for its bytes. `doubtful` is said of a unit that was silent.
-    pub(super) async fn read(
+    /// Sends a read or a write, and waits for the answer.
+    pub(super) async fn call(
         &self,
         unit_id: u8,
         pdu: &[u8],
         timeout: Duration,
-        doubtful: bool,
+        weight: Weight,
     ) -> Answer {
         match self {
-            Link::Tcp(link) => link.read(unit_id, pdu, timeout, doubtful).await,
-            Link::Blocking(link) => link.read(unit_id, pdu, timeout).await,
+            Link::Tcp(link) => link.call(unit_id, pdu, timeout, weight).await,
+            Link::Blocking(link) => link.call(unit_id, pdu, timeout, weight).await,
         }
     }
 }
 
 impl Link {
-    /// When an address that could not be reached is tried again; until then reads fail at once.
+    /// When an address that could not be reached is tried again; until then polls fail at once.
     pub(super) fn retry_at(&self) -> Option<Instant> {
         let failed = match self {
             Link::Tcp(link) => link.failed.get().map(|(until, _)| until),
@@ -77,7 +88,7 @@ impl Link {
         failed.filter(|until| Instant::now() < *until)
     }
 
-    /// Ends the connection if nobody waits for a reply; the next read makes a new one.
+    /// Ends the connection if nobody waits for a reply; the next request makes a new one.
     pub(super) fn release(&self) {
         match self {
             Link::Tcp(link) => {
@@ -132,12 +143,13 @@ impl TcpLink {
         }
     }
 
-    async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration, doubtful: bool) -> Answer {
+    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, weight: Weight) -> Answer {
+        let doubtful = weight == Weight::Doubtful;
         let _doubtful = if doubtful { self.doubtful.acquire().await.ok() } else { None };
         let Ok(_place) = self.places.acquire().await else { return Err(Fault::Reset) };
         let deadline = Instant::now() + timeout;
         if self.open.borrow().is_none() {
-            self.connect(deadline).await?;
+            self.connect(deadline, weight).await?;
         }
         let (id, answer) = self.send(unit_id, pdu)?;
         let sent = Instant::now();
@@ -155,13 +167,14 @@ impl TcpLink {
     }
 
     /// Makes the connection, once for all who wait for it.
-    async fn connect(&self, deadline: Instant) -> Result<(), Fault> {
+    async fn connect(&self, deadline: Instant, weight: Weight) -> Result<(), Fault> {
         let _alone = timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
         if self.open.borrow().is_some() {
             return Ok(());
         }
         if let Some((until, fault)) = self.failed.get()
             && Instant::now() < until
+            && weight != Weight::Urgent
         {
             return Err(fault);
         }
@@ -308,11 +321,11 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
     }
 }
 
-/// The bytes that a response to a read carries.
+/// The bytes that a response carries; the echo of a write was checked, and says no more.
 fn bytes(response: Result<Response<'_>, ResponseError>) -> Answer {
     match response {
         Ok(Response::Bits(bytes) | Response::Registers(bytes)) => Ok(bytes.to_vec()),
-        Ok(_) => Err(Fault::Invalid),
+        Ok(_) => Ok(Vec::new()),
         Err(ResponseError::Exception(code)) => Err(Fault::Exception(code.code())),
         Err(ResponseError::UnknownException(code)) => Err(Fault::Exception(code)),
         Err(_) => Err(Fault::Invalid),
@@ -322,18 +335,23 @@ fn bytes(response: Result<Response<'_>, ResponseError>) -> Answer {
 /// One request at a time, by blocking calls in a thread that ends with the link.
 pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
+    /// Calls that go before all jobs.
+    urgent: mpsc::Sender<Call>,
     retry_at: Cell<Option<Instant>>,
 }
 
 enum Job {
-    Read(Read),
+    Call(Call),
+    /// There is an urgent call.
+    Look,
     Release,
 }
 
-struct Read {
+struct Call {
     unit_id: u8,
     pdu: Vec<u8>,
     timeout: Duration,
+    urgent: bool,
     /// And when an endpoint that could not be opened is tried again.
     answer: oneshot::Sender<(Answer, Option<Instant>)>,
 }
@@ -341,47 +359,59 @@ struct Read {
 impl BlockingLink {
     fn new(endpoint: Endpoint) -> BlockingLink {
         let (jobs, queue) = mpsc::channel::<Job>();
+        let (urgent, first) = mpsc::channel::<Call>();
         let client = BlockingClient::new(endpoint);
         let work = move || {
             let (mut failures, mut retry_at) = (0, None);
+            let mut carry_out = |call: Call| {
+                // Nobody waits any more for a read whose device was stopped.
+                if !call.answer.is_closed() {
+                    let answer = carried_out(&client, &call, &mut failures, &mut retry_at);
+                    let _ = call.answer.send((answer, retry_at));
+                }
+            };
             for job in queue {
+                first.try_iter().for_each(&mut carry_out);
                 match job {
+                    Job::Call(call) => carry_out(call),
+                    Job::Look => {}
                     Job::Release => client.close(),
-                    // Nobody waits any more for a read whose device was stopped.
-                    Job::Read(read) if read.answer.is_closed() => {}
-                    Job::Read(read) => {
-                        let answer = call(&client, &read, &mut failures, &mut retry_at);
-                        let _ = read.answer.send((answer, retry_at));
-                    }
                 }
             }
         };
         // Without a thread every job fails, which its device tells.
         let _ = std::thread::Builder::new().name("holdfast-line".into()).spawn(work);
-        BlockingLink { jobs, retry_at: Cell::new(None) }
+        BlockingLink { jobs, urgent, retry_at: Cell::new(None) }
     }
 
-    async fn read(&self, unit_id: u8, pdu: &[u8], timeout: Duration) -> Answer {
+    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, weight: Weight) -> Answer {
         let (answer, answered) = oneshot::channel();
-        let read = Read { unit_id, pdu: pdu.to_vec(), timeout, answer };
-        self.jobs.send(Job::Read(read)).or(Err(Fault::Reset))?;
+        let urgent = weight == Weight::Urgent;
+        let call = Call { unit_id, pdu: pdu.to_vec(), timeout, urgent, answer };
+        let job = if urgent {
+            self.urgent.send(call).or(Err(Fault::Reset))?;
+            Job::Look
+        } else {
+            Job::Call(call)
+        };
+        self.jobs.send(job).or(Err(Fault::Reset))?;
         let (answer, retry_at) = answered.await.unwrap_or((Err(Fault::Reset), None));
         self.retry_at.set(retry_at);
         answer
     }
 }
 
-fn call(
+fn carried_out(
     client: &BlockingClient,
-    job: &Read,
+    call: &Call,
     failures: &mut u32,
     retry_at: &mut Option<Instant>,
 ) -> Answer {
-    if retry_at.is_some_and(|time| Instant::now() < time) {
+    if !call.urgent && retry_at.is_some_and(|time| Instant::now() < time) {
         return Err(Fault::Refused);
     }
-    let request = Request::parse(&job.pdu).or(Err(Fault::Invalid))?;
-    let answer = client.call(job.unit_id, &request, job.timeout, |response| bytes(Ok(response)));
+    let request = Request::parse(&call.pdu).or(Err(Fault::Invalid))?;
+    let answer = client.call(call.unit_id, &request, call.timeout, |response| bytes(Ok(response)));
     match answer {
         Err(ClientError::Connect { .. }) => {
             *failures = failures.saturating_add(1);

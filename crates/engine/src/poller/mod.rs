@@ -20,7 +20,7 @@ mod thread;
 
 pub use device::{DeviceCounters, DeviceSettings, DeviceState, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
-pub use results::{BlockResult, Poll, Results};
+pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use status::{Fault, Health, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

@@ -1,6 +1,8 @@
-//! What was read, for whoever takes it in another thread: woken once a batch, not once a block.
+//! What was read and written, for whoever takes it in another thread: woken once a batch, not once a
+//! block.
 //!
-//! The queue is bounded. When nobody takes what it holds, the oldest polls are dropped and counted.
+//! The queue is bounded. When nobody takes what it holds, the oldest polls are dropped and counted;
+//! what became of a write never is.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -32,37 +34,75 @@ pub struct BlockResult {
     pub outcome: Result<Vec<u8>, Fault>,
 }
 
+/// What became of a write.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Written {
+    /// The number that it was given.
+    pub ticket: u64,
+    pub outcome: Result<(), Fault>,
+}
+
+/// What is taken at once.
+#[derive(Debug, Default)]
+pub struct Batch {
+    pub polls: VecDeque<Poll>,
+    pub writes: Vec<Written>,
+    /// Nothing will come any more.
+    pub ended: bool,
+}
+
+impl Batch {
+    fn is_empty(&self) -> bool {
+        self.polls.is_empty() && self.writes.is_empty() && !self.ended
+    }
+}
+
 /// The queue between the poller's thread and the taker's.
 #[derive(Debug, Default)]
 pub struct Results {
-    queue: Mutex<VecDeque<Poll>>,
+    queue: Mutex<Batch>,
     ready: Condvar,
     dropped: AtomicU64,
 }
 
 impl Results {
     pub(super) fn push(&self, poll: Poll) {
-        let mut queue = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
-        if queue.len() == CAPACITY {
-            queue.pop_front();
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-        }
-        let first = queue.is_empty();
-        queue.push_back(poll);
-        drop(queue);
+        self.put(|batch| {
+            if batch.polls.len() == CAPACITY {
+                batch.polls.pop_front();
+                self.dropped.fetch_add(1, Ordering::Relaxed);
+            }
+            batch.polls.push_back(poll);
+        });
+    }
+
+    pub(super) fn push_write(&self, written: Written) {
+        self.put(|batch| batch.writes.push(written));
+    }
+
+    pub(super) fn end(&self) {
+        self.put(|batch| batch.ended = true);
+    }
+
+    fn put(&self, put: impl FnOnce(&mut Batch)) {
+        let mut batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        let first = batch.is_empty();
+        put(&mut batch);
+        drop(batch);
         if first {
             self.ready.notify_one();
         }
     }
 
-    /// All polls that wait; when there are none, waits up to `timeout` for the first.
-    pub fn take(&self, timeout: Duration) -> Vec<Poll> {
-        let queue = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
-        let (mut queue, _) = self
+    /// All that waits; when nothing does, waits up to `timeout` for the first.
+    pub fn take(&self, timeout: Duration) -> Batch {
+        let batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        let (mut batch, _) = self
             .ready
-            .wait_timeout_while(queue, timeout, |queue| queue.is_empty())
+            .wait_timeout_while(batch, timeout, |batch| batch.is_empty())
             .unwrap_or_else(PoisonError::into_inner);
-        queue.drain(..).collect()
+        let ended = batch.ended;
+        std::mem::replace(&mut *batch, Batch { ended, ..Batch::default() })
     }
 
     /// Polls that nobody took in time.

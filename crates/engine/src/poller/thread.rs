@@ -3,21 +3,23 @@
 use std::collections::HashMap;
 use std::io;
 use std::rc::{Rc, Weak};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use holdfast_protocol::pdu::Function;
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::device::{Device, DeviceSettings, DeviceState, fields};
+use super::device::{Device, DeviceSettings, DeviceState, Succession, Turn, fields};
 use super::forward::{Forward, ForwardCounters};
-use super::link::Link;
+use super::link::{Link, Weight};
 use super::plan::{self, PlanError};
-use super::results::Results;
-use super::status::BLOCK;
+use super::results::{Results, Written};
+use super::status::{BLOCK, Fault};
 use crate::client::Endpoint;
 
 #[derive(Debug, Error)]
@@ -32,6 +34,10 @@ pub enum PollerError {
     Beyond { device: String, read: usize },
     #[error("device {device}: there is one of that name")]
     Taken { device: String },
+    #[error("device {device}: there is none of that name")]
+    Unknown { device: String },
+    #[error("device {device}: function {function} does not write")]
+    NoWrite { device: String, function: u8 },
     #[error("can't start the poller's thread: {0}")]
     Thread(io::Error),
 }
@@ -44,18 +50,34 @@ pub struct Polled {
     pub forwards: Vec<Arc<ForwardCounters>>,
 }
 
+impl Polled {
+    fn new(device: &DeviceSettings, state: Arc<DeviceState>) -> Polled {
+        state.expect(device.interval, device.timeout);
+        let forwards = device.forward.iter().map(|_| Arc::default()).collect();
+        Polled { name: device.name.clone(), state, forwards }
+    }
+}
+
 /// Devices that are polled, until it is stopped or dropped. They may come and go.
 pub struct Poller {
     polled: Mutex<Vec<Polled>>,
     orders: mpsc::UnboundedSender<Order>,
     results: Arc<Results>,
+    tickets: AtomicU64,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
 /// What the poller's thread is told; it ends when nobody can tell it anything any more.
 enum Order {
     Add(Box<DeviceSettings>, Polled),
+    /// The device of that name gives way to another one.
+    Replace(String, Box<DeviceSettings>, Polled),
     Remove(String),
+    Write {
+        device: String,
+        ticket: u64,
+        pdu: Vec<u8>,
+    },
     Stop,
 }
 
@@ -77,7 +99,8 @@ impl Poller {
             .map_err(PollerError::Thread)?;
         let to = Arc::clone(&results);
         let work = move || {
-            LocalSet::new().block_on(&runtime, obey(told, to));
+            LocalSet::new().block_on(&runtime, obey(told, Arc::clone(&to)));
+            to.end();
             // A name that is being looked up is not waited for.
             runtime.shutdown_background();
         };
@@ -85,8 +108,13 @@ impl Poller {
             .name("holdfast-poller".into())
             .spawn(work)
             .map_err(PollerError::Thread)?;
-        let poller =
-            Poller { polled: Mutex::default(), orders, results, thread: Mutex::new(Some(thread)) };
+        let poller = Poller {
+            polled: Mutex::default(),
+            orders,
+            results,
+            tickets: AtomicU64::default(),
+            thread: Mutex::new(Some(thread)),
+        };
         for device in devices {
             poller.add(device)?;
         }
@@ -99,24 +127,59 @@ impl Poller {
     /// [`PollerError`] for one that can't be polled, or whose name is taken.
     pub fn add(&self, device: DeviceSettings) -> Result<(), PollerError> {
         check(&device)?;
-        let polled = Polled {
-            name: device.name.clone(),
-            state: Arc::new(DeviceState::new(device.interval, device.timeout)),
-            forwards: device.forward.iter().map(|_| Arc::default()).collect(),
-        };
-        let mut all = self.polled.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = self.polled();
         if all.iter().any(|other| other.name == device.name) {
             return Err(PollerError::Taken { device: device.name });
         }
+        let polled = Polled::new(&device, Arc::default());
         all.push(polled.clone());
         let _ = self.orders.send(Order::Add(Box::new(device), polled));
         Ok(())
     }
 
+    /// Polls a device in the place of the one called `name`, whose poll under way is completed. It
+    /// may have the same name. It reads at once, keeps the counters and the connection, and goes on
+    /// with the schedule.
+    ///
+    /// # Errors
+    /// [`PollerError`]; then nothing has changed.
+    pub fn replace(&self, name: &str, device: DeviceSettings) -> Result<(), PollerError> {
+        check(&device)?;
+        let mut all = self.polled();
+        if device.name != name && all.iter().any(|other| other.name == device.name) {
+            return Err(PollerError::Taken { device: device.name });
+        }
+        let Some(before) = all.iter_mut().find(|other| other.name == name) else {
+            return Err(PollerError::Unknown { device: name.to_owned() });
+        };
+        *before = Polled::new(&device, Arc::clone(&before.state));
+        let polled = before.clone();
+        let _ = self.orders.send(Order::Replace(name.to_owned(), Box::new(device), polled));
+        Ok(())
+    }
+
+    /// Sends a write, given as a PDU, to a device by its own connection. What becomes of it comes by
+    /// [`Poller::results`] under the number that is returned.
+    ///
+    /// # Errors
+    /// [`PollerError`] for a device that is not there, or a PDU that is no write.
+    pub fn write(&self, name: &str, pdu: Vec<u8>) -> Result<u64, PollerError> {
+        let function = pdu.first().copied().unwrap_or_default();
+        if !Function::from_code(function).is_some_and(Function::is_write) {
+            return Err(PollerError::NoWrite { device: name.to_owned(), function });
+        }
+        if !self.polled().iter().any(|device| device.name == name) {
+            return Err(PollerError::Unknown { device: name.to_owned() });
+        }
+        let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
+        let _ = self.orders.send(Order::Write { device: name.to_owned(), ticket, pdu });
+        Ok(ticket)
+    }
+
     /// Stops polling a device; its connection is closed when no other device uses it. Whether there
     /// was one of that name.
     pub fn remove(&self, name: &str) -> bool {
-        let mut all = self.polled.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = self.polled();
         let before = all.len();
         all.retain(|device| device.name != name);
         let _ = self.orders.send(Order::Remove(name.to_owned()));
@@ -125,10 +188,14 @@ impl Poller {
 
     /// The devices as they are now.
     pub fn devices(&self) -> Vec<Polled> {
-        self.polled.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.polled().clone()
     }
 
-    /// What devices with `report` answered.
+    fn polled(&self) -> MutexGuard<'_, Vec<Polled>> {
+        self.polled.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What devices with `report` answered, and what became of writes.
     pub fn results(&self) -> &Results {
         &self.results
     }
@@ -148,18 +215,35 @@ impl Drop for Poller {
     }
 }
 
+/// What the poller's thread knows of a device that is polled.
+struct Running {
+    link: Rc<Link>,
+    turn: Rc<Turn>,
+    unit_id: u8,
+    timeout: Duration,
+    release: bool,
+    succession: Rc<Succession>,
+    device: AbortHandle,
+    forwards: Vec<AbortHandle>,
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.device.abort();
+        self.stop_forwards();
+    }
+}
+
 /// Starts and ends the tasks of devices, until it is told to stop.
 async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
     let mut links: HashMap<String, Weak<Link>> = HashMap::new();
-    let mut tasks: HashMap<String, Vec<AbortHandle>> = HashMap::new();
+    let mut running: HashMap<String, Running> = HashMap::new();
     let mut started = 0;
     while let Some(order) = orders.recv().await {
         match order {
             Order::Stop => return,
             Order::Remove(name) => {
-                for task in tasks.remove(&name).unwrap_or_default() {
-                    task.abort();
-                }
+                running.remove(&name);
                 links.retain(|_, link| link.strong_count() > 0);
             }
             Order::Add(settings, polled) => {
@@ -167,10 +251,100 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                 started += 1;
                 let name = settings.name.clone();
                 let link = link_to(&settings.endpoint, &mut links);
-                tasks.insert(name, start(*settings, polled, link, phase, &results));
+                running.insert(name, Running::start(*settings, polled, link, phase, &results));
             }
+            Order::Replace(before, settings, polled) => {
+                let name = settings.name.clone();
+                let link = link_to(&settings.endpoint, &mut links);
+                // It is there as long as nobody removes it.
+                if let Some(mut device) = running.remove(&before) {
+                    device.replace(*settings, polled, link, &results);
+                    running.insert(name, device);
+                }
+                links.retain(|_, link| link.strong_count() > 0);
+            }
+            Order::Write { device, ticket, pdu } => match running.get(&device) {
+                Some(device) => device.write(ticket, pdu, &results),
+                None => results.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
+            },
         }
     }
+}
+
+impl Running {
+    /// Starts the tasks of a device.
+    fn start(
+        settings: DeviceSettings,
+        polled: Polled,
+        link: Rc<Link>,
+        phase: Duration,
+        results: &Arc<Results>,
+    ) -> Running {
+        let succession = Rc::new(Succession::default());
+        let DeviceSettings { unit_id, timeout, release, .. } = settings;
+        let turn = Rc::new(Turn::default());
+        let to = (Rc::clone(&link), Rc::clone(&turn));
+        let (device, forwards) = made(settings, polled, to, results);
+        let device = spawn_local(device.run(phase, Rc::clone(&succession))).abort_handle();
+        Running { link, turn, unit_id, timeout, release, succession, device, forwards }
+    }
+
+    fn replace(
+        &mut self,
+        settings: DeviceSettings,
+        polled: Polled,
+        link: Rc<Link>,
+        results: &Arc<Results>,
+    ) {
+        self.stop_forwards();
+        (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
+        (self.release, self.link) = (settings.release, Rc::clone(&link));
+        let (device, forwards) = made(settings, polled, (link, Rc::clone(&self.turn)), results);
+        self.forwards = forwards;
+        self.succession.name(device);
+    }
+
+    /// Writes between two reads, as soon as it can; the end of the device does not break it off.
+    fn write(&self, ticket: u64, pdu: Vec<u8>, results: &Arc<Results>) {
+        let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
+        let results = Arc::clone(results);
+        let Running { unit_id, timeout, release, .. } = *self;
+        spawn_local(async move {
+            let turn = turn.lock().await;
+            let answer = link.call(unit_id, &pdu, timeout, Weight::Urgent).await;
+            drop(turn);
+            if release {
+                link.release();
+            }
+            results.push_write(Written { ticket, outcome: answer.map(drop) });
+        });
+    }
+
+    fn stop_forwards(&mut self) {
+        for task in self.forwards.drain(..) {
+            task.abort();
+        }
+    }
+}
+
+/// A device, and the tasks that forward what it reads.
+fn made(
+    settings: DeviceSettings,
+    polled: Polled,
+    to: (Rc<Link>, Rc<Turn>),
+    results: &Arc<Results>,
+) -> (Device, Vec<AbortHandle>) {
+    let forwards: Vec<_> = settings
+        .forward
+        .iter()
+        .cloned()
+        .zip(polled.forwards)
+        .map(|(settings, counters)| Forward::new(settings, counters))
+        .collect();
+    let tasks = forwards.iter().map(|forward| spawn_local(Rc::clone(forward).run()).abort_handle());
+    let tasks = tasks.collect();
+    let report = settings.report.then(|| Arc::clone(results));
+    (Device::new(settings, polled.state, to, forwards, report), tasks)
 }
 
 /// The link to an endpoint, shared with all other devices there.
@@ -181,31 +355,6 @@ fn link_to(endpoint: &Endpoint, links: &mut HashMap<String, Weak<Link>>) -> Rc<L
         *known = Rc::downgrade(&link);
         link
     })
-}
-
-/// The tasks of one device.
-fn start(
-    settings: DeviceSettings,
-    polled: Polled,
-    link: Rc<Link>,
-    phase: Duration,
-    results: &Arc<Results>,
-) -> Vec<AbortHandle> {
-    let forwards: Vec<_> = settings
-        .forward
-        .iter()
-        .cloned()
-        .zip(polled.forwards)
-        .map(|(settings, counters)| Forward::new(settings, counters))
-        .collect();
-    let mut tasks: Vec<AbortHandle> = forwards
-        .iter()
-        .map(|forward| spawn_local(Rc::clone(forward).run()).abort_handle())
-        .collect();
-    let report = settings.report.then(|| Arc::clone(results));
-    let device = Device::new(settings, polled.state, link, forwards, report);
-    tasks.push(spawn_local(device.run(phase)).abort_handle());
-    tasks
 }
 
 /// When the device that was started as number `number` begins: by the golden ratio, which spreads
