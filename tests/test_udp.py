@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import socket
 import struct
+import sys
 import threading
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 
 READ = bytes.fromhex("0300000001")
 ZERO = bytes.fromhex("03020000")
+UDP_SEGMENT = 103
+"""The length of the datagrams that one call of Linux sends (linux/udp.h)."""
 WRITE = bytes.fromhex("0600001234")
 
 
@@ -275,6 +279,25 @@ def test_a_listener_on_every_address_knows_an_ipv4_peer_by_its_ipv4_address(run:
     with Datagrams(("127.0.0.1", port)) as client:
         assert client.ask(READ) == ZERO
     assert is_stranger("udp", appliance, ("::1", port), None)
+
+
+@needs_127_0_0_2
+@pytest.mark.parametrize("bind", ["0.0.0.0:0", "[::]:0"])
+def test_a_reply_comes_from_the_address_that_was_asked(run: Run, bind: str) -> None:
+    """A connected socket takes datagrams of no other address."""
+    _, port = address(run(configuration("udp", bind=bind)))
+    with Datagrams(("127.0.0.2", port), source="127.0.0.1") as client:
+        assert client.ask(READ) == ZERO
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux takes several datagrams at once")
+def test_datagrams_that_the_system_hands_over_at_once_are_answered_each(
+    client: Datagrams,
+) -> None:
+    requests = [wire.frame(READ, transaction=number) for number in range(1, 30)]
+    client.socket.setsockopt(socket.SOL_UDP, UDP_SEGMENT, len(requests[0]))
+    client.send(b"".join(requests) + b"cut")
+    assert [client.receive().transaction for _ in requests] == list(range(1, 30))
 
 
 def test_tcp_and_udp_may_have_the_same_port(run: Run) -> None:

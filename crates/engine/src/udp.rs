@@ -1,10 +1,13 @@
-//! Modbus over UDP: one request a datagram, one reply.
+//! Modbus over UDP: one request a datagram, one reply, from the address that was asked.
 
+use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
+use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
+use tokio::io::Interest;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
 
@@ -13,8 +16,11 @@ use crate::listener::Front;
 use crate::policy::{Grant, Policy, Rule};
 use crate::station::Station;
 
-/// How many datagrams are answered that wait when all are to stop.
-const LAST_DATAGRAMS: usize = 1024;
+/// Bytes taken from a socket at once: the system may hand over several datagrams of one peer.
+const INPUT: usize = 64 * 1024;
+
+/// How often the rest of the input is taken before all stops.
+const LAST_READS: usize = 1024;
 
 /// A listener for Modbus datagrams.
 #[derive(Debug, Clone)]
@@ -41,32 +47,47 @@ impl ModbusUdp {
         socket: std::net::UdpSocket,
         mut stop: watch::Receiver<bool>,
     ) {
-        let Ok(socket) = UdpSocket::from_std(socket) else {
-            return;
-        };
-        // One byte more than the longest request: a longer datagram shows.
-        let (mut input, mut output) = ([0; mbap::MAX_LEN + 1], [0; mbap::MAX_LEN]);
+        let Ok(state) = UdpSocketState::new((&socket).into()) else { return };
+        let Ok(socket) = UdpSocket::from_std(socket) else { return };
+        let socket = Datagrams { socket, state };
+        let mut input = vec![0; INPUT].into_boxed_slice();
         loop {
-            let received = tokio::select! {
+            let ready = tokio::select! {
                 biased;
                 _ = stop.wait_for(|stop| *stop) => break,
-                received = socket.recv_from(&mut input) => received,
+                ready = socket.socket.readable() => ready,
             };
             // An error tells of an earlier reply that could not be delivered.
-            let Ok((len, peer)) = received else { continue };
-            let len = self.answer(&front, peer, &input[..len], &mut output);
-            if len > 0 {
-                // A reply that the system has no room for is lost, as any datagram can be.
-                let _ = socket.try_send_to(&output[..len], peer);
+            let received = ready.and_then(|()| {
+                socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
+            });
+            if let Ok(meta) = received {
+                self.take(&front, &socket, &meta, &input);
             }
         }
-        let Ok(socket) = socket.into_std() else { return };
-        for _ in 0..LAST_DATAGRAMS {
-            let Ok((len, peer)) = socket.recv_from(&mut input) else { break };
-            let len = self.answer(&front, peer, &input[..len], &mut output);
-            if len > 0 {
-                let _ = socket.send_to(&output[..len], peer);
+        for _ in 0..LAST_READS {
+            match socket.receive(&mut input) {
+                Ok(meta) => self.take(&front, &socket, &meta, &input),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(_) => {}
             }
+        }
+    }
+
+    /// Answers all datagrams that came at once, which have one length but for the last.
+    fn take(&self, front: &Front, socket: &Datagrams, meta: &RecvMeta, input: &[u8]) {
+        let mut output = [0; mbap::MAX_LEN];
+        let mut rest = &input[..meta.len];
+        loop {
+            let (datagram, more) = rest.split_at(meta.stride.min(rest.len()));
+            let len = self.answer(front, meta.addr, datagram, &mut output);
+            if len > 0 {
+                socket.send(&output[..len], meta);
+            }
+            if more.is_empty() || datagram.is_empty() {
+                return;
+            }
+            rest = more;
         }
     }
 
@@ -105,5 +126,37 @@ impl ModbusUdp {
             auditor.note(&front.name, Some(peer), unit_id, request, reply);
         }
         len.map_or(0, |len| Mbap::complete(output, tag, unit_id, len))
+    }
+}
+
+/// A socket that tells which of its addresses was asked.
+struct Datagrams {
+    socket: UdpSocket,
+    state: UdpSocketState,
+}
+
+impl Datagrams {
+    fn receive(&self, input: &mut [u8]) -> io::Result<RecvMeta> {
+        let mut meta = [RecvMeta::default()];
+        self.state.recv((&self.socket).into(), &mut [IoSliceMut::new(input)], &mut meta)?;
+        Ok(meta[0])
+    }
+
+    /// A reply that the system has no room for is lost, as any datagram can be.
+    fn send(&self, reply: &[u8], to: &RecvMeta) {
+        let transmit = Transmit {
+            destination: to.addr,
+            ecn: None,
+            contents: reply,
+            segment_size: None,
+            src_ip: to.dst_ip,
+        };
+        let sent = self
+            .socket
+            .try_io(Interest::WRITABLE, || self.state.try_send((&self.socket).into(), &transmit));
+        if sent.is_err() {
+            // What was asked need not be an address of this machine: a broadcast is none.
+            let _ = self.socket.try_send_to(reply, to.addr);
+        }
     }
 }
