@@ -148,9 +148,9 @@ class Inbox:
 
 
 class Caller:
-    """A client of NATS beside the scanner."""
+    """A client of NATS beside the scanner; `options` are those of `Client.connect`."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, **options: Any) -> None:
         self._loop = _Loop()
         self.client = Client()
         self._loop.do(
@@ -159,6 +159,7 @@ class Caller:
                 max_reconnect_attempts=-1,
                 reconnect_time_wait=0.05,  # type: ignore[arg-type]
                 error_cb=_ignored,
+                **options,
             )
         )
 
@@ -220,7 +221,11 @@ class Running:
     def __init__(self, settings: Settings) -> None:
         loop = _Loop()
         self._loop: _Loop | None = loop
-        self.scanner = loop.do(self._made(settings))
+        try:
+            self.scanner = loop.do(self._made(settings))
+        except BaseException:
+            loop.close()
+            raise
         self.ended = asyncio.run_coroutine_threadsafe(self.scanner.run(), loop.loop)
 
     @staticmethod

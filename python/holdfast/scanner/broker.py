@@ -20,6 +20,7 @@ from nats.aio.client import Client
 from nats.errors import Error
 
 from holdfast import logs
+from holdfast.scanner.credentials import Credentials
 
 if TYPE_CHECKING:
     from nats.aio.msg import Msg
@@ -39,6 +40,9 @@ PING = 10
 PENDING = 64 * 1024 * 1024
 """Bytes that nats-py may hold; the outbox sees to it that there are never so many."""
 
+LOOK = 1.0
+"""Seconds between looks whether nats-py has given a connection up without telling."""
+
 CLOSING = 1.5
 """Seconds that the last messages have to reach the server."""
 
@@ -52,7 +56,7 @@ class Servers:
     password_file: Path | None = None
     token_file: Path | None = None
     credentials: Path | None = None
-    """A file with a JWT and an nkey; needs the package `nkeys`."""
+    """A file with a JWT and a seed, see `Credentials`."""
     ca_file: Path | None = None
     cert_file: Path | None = None
     key_file: Path | None = None
@@ -72,8 +76,9 @@ class Servers:
         if self.token_file is not None:
             options["token"] = _secret(self.token_file)
         if self.credentials is not None:
-            self.credentials.read_bytes()
-            options["user_credentials"] = str(self.credentials)
+            credentials = Credentials(self.credentials)
+            options["signature_cb"] = credentials.sign
+            options["user_jwt_cb"] = credentials.jwt
         if self.secure:
             context = ssl.create_default_context(cafile=self.ca_file)
             context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -121,7 +126,6 @@ class Broker:
             ended = asyncio.Event()
             try:
                 await self._connect(client, ended)
-                await ended.wait()
             except OSError as error:
                 if not self._worked:
                     raise
@@ -133,13 +137,15 @@ class Broker:
             await asyncio.sleep(FIRST_PAUSE)
 
     async def _connect(self, client: Client, ended: asyncio.Event) -> None:
-        """Connects, and listens to all subjects; `ended` is set when nats-py gives up."""
+        """Connects, and listens to all subjects, until nats-py gives up; then `ended` is set."""
 
         async def lost() -> None:
-            self._lost("the connection was lost")
+            if self.client is client:
+                self._lost("the connection was lost")
 
         async def again() -> None:
-            self._made(client)
+            if not ended.is_set():
+                self._made(client)
 
         async def closed() -> None:
             ended.set()
@@ -160,12 +166,25 @@ class Broker:
                 ping_interval=PING,
                 pending_size=PENDING,
             )
-            self._made(client)
+        except Error as error:
+            self._note(client, error)
+            return
+        self._made(client)
+        listening = asyncio.create_task(self._listen(client, ended))
+        try:
+            await _given_up(client, ended)
+        finally:
+            listening.cancel()
+        self._lost("the connection was lost")
+
+    async def _listen(self, client: Client, ended: asyncio.Event) -> None:
+        """Subscribes to all subjects; `ended` is set if that fails."""
+        try:
             for subject, handler in self._handlers.items():
                 await client.subscribe(subject, cb=handler)
             await client.flush()
             self._subscribed = True
-        except Error as error:
+        except (Error, OSError) as error:
             self._note(client, error)
             ended.set()
 
@@ -213,6 +232,15 @@ class _TlsClient(Client):
         if initial_connection and not info.get("tls_required"):
             raise Error("the server does not use TLS")
         await super()._process_info(info, initial_connection)
+
+
+async def _given_up(client: Client, ended: asyncio.Event) -> None:
+    """Returns when nats-py has given a client up, which it does not say when that fails."""
+    while not (ended.is_set() or client.is_closed):
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LOOK):
+                await ended.wait()
+    ended.set()
 
 
 async def _closed(client: Client) -> None:

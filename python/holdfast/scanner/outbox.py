@@ -9,8 +9,11 @@ is true now.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import OrderedDict
 from typing import TYPE_CHECKING
+
+from nats.errors import Error
 
 from holdfast.scanner import wire
 
@@ -85,11 +88,12 @@ class Outbox:
                 await self._send(self._client)
 
     async def flush(self) -> None:
-        """Waits until the server has what was put in."""
+        """Waits until the server has what was put in, or is gone."""
         while (self._flowing or self._kept) and self._client is not None:
             await asyncio.sleep(LOOK)
         if self._client is not None:
-            await self._client.flush()
+            with contextlib.suppress(Error):
+                await self._client.flush()
 
     async def _send(self, client: Client) -> None:
         texts = self._flowing

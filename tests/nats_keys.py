@@ -1,0 +1,116 @@
+"""Operators, accounts and users of NATS in tests, with their keys and JWTs, as `nsc` makes them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from nacl.signing import SigningKey
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SEED, OPERATOR, ACCOUNT, USER = 18 << 3, 14 << 3, 0, 20 << 3
+
+CREDENTIALS = """-----BEGIN NATS USER JWT-----
+{jwt}
+------END NATS USER JWT------
+
+************************* IMPORTANT *************************
+NKEY Seed printed below can be used to sign and prove identity.
+
+-----BEGIN USER NKEY SEED-----
+{seed}
+------END USER NKEY SEED------
+"""
+
+
+class Key:
+    """The key of an operator, an account or a user."""
+
+    def __init__(self, kind: int) -> None:
+        self._key = SigningKey.generate()
+        self.name = _text(bytes([kind]) + bytes(self._key.verify_key))
+        self.seed = _text(bytes([SEED | kind >> 5, (kind & 31) << 3]) + bytes(self._key))
+
+    def sign(self, text: str) -> bytes:
+        return self._key.sign(text.encode()).signature
+
+    def jwt(self, subject: Key, type: str, claims: dict[str, Any], **more: Any) -> str:
+        """What this key says of another one."""
+        nats = {"type": type, "version": 2, **claims}
+        now = int(time.time())
+        body = {"iss": self.name, "sub": subject.name, "iat": now, "nats": nats, **more}
+        head = {"typ": "JWT", "alg": "ed25519-nkey"}
+        text = f"{_base64(json.dumps(head).encode())}.{_base64(json.dumps(body).encode())}"
+        return f"{text}.{_base64(self.sign(text))}"
+
+
+class User:
+    """A user of an account. `more` are claims beside those of NATS, such as `exp`."""
+
+    def __init__(
+        self, account: Key, permissions: dict[str, Any] | None = None, **more: Any
+    ) -> None:
+        self.key = Key(USER)
+        claims = {"subs": -1, "data": -1, "payload": -1, **(permissions or {})}
+        self.jwt = account.jwt(self.key, "user", claims, **more)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """As `Client.connect` has them."""
+        return {
+            "signature_cb": lambda nonce: base64.b64encode(self.key.sign(nonce)),
+            "user_jwt_cb": self.jwt.encode,
+        }
+
+    def write(self, file: Path) -> Path:
+        """The file, with the credentials in it."""
+        return written(file, self.jwt, self.key.seed)
+
+
+class Operator:
+    """An operator with its accounts, and the configuration of a server that trusts it."""
+
+    def __init__(self) -> None:
+        self._key = Key(OPERATOR)
+        self._accounts: dict[str, str] = {}
+        self._system = self.account()
+        self.plant = self.account()
+        """An account without JetStream."""
+
+    def account(self, **limits: int) -> Key:
+        """An account of which servers know that are configured from now on."""
+        account = Key(ACCOUNT)
+        unlimited = dict.fromkeys(("subs", "conn", "data", "payload", "imports", "exports"), -1)
+        claims = {"limits": {**unlimited, "wildcards": True, **limits}}
+        self._accounts[account.name] = self._key.jwt(account, "account", claims)
+        return account
+
+    def configure(self, file: Path) -> Path:
+        """The file, with the configuration in it."""
+        accounts = "\n".join(f"  {name}: {jwt}" for name, jwt in self._accounts.items())
+        file.write_text(
+            f"operator: {self._key.jwt(self._key, 'operator', {})}\n"
+            f"system_account: {self._system.name}\n"
+            f"resolver: MEMORY\nresolver_preload: {{\n{accounts}\n}}\n"
+        )
+        return file
+
+
+def written(file: Path, jwt: str, seed: str) -> Path:
+    """The file, with credentials in it."""
+    file.write_text(CREDENTIALS.format(jwt=jwt, seed=seed))
+    return file
+
+
+def _text(data: bytes) -> str:
+    checksum = binascii.crc_hqx(data, 0).to_bytes(2, "little")
+    return base64.b32encode(data + checksum).rstrip(b"=").decode()
+
+
+def _base64(data: bytes) -> str:
+    return base64.urlsafe_b64encode(data).rstrip(b"=").decode()
