@@ -5,10 +5,11 @@ from __future__ import annotations
 import sys
 
 from holdfast.adapters import Stop
-from holdfast.gateway import Gateway, Settings, egress
+from holdfast.config.egress import parse_allowed
+from holdfast.gateway import Gateway, Settings
 from holdfast.http import listen
 
 with listen("127.0.0.1", 0) as listener:
-    gateway = Gateway(Settings((egress.parse(sys.argv[1]),)), listener)
+    gateway = Gateway(Settings((parse_allowed(sys.argv[1]),)), listener)
     print(f"listening {gateway.address}", flush=True)
     gateway.run(Stop())

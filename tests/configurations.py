@@ -6,6 +6,8 @@ from typing import Any, cast
 
 from hypothesis import strategies as st
 
+from holdfast.config.values import RESERVED
+
 NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
 TEXTS = st.text(st.characters(exclude_categories=("Cc", "Cs")), min_size=1, max_size=60)
 SPANS = st.integers(0, 65535).flatmap(
@@ -123,18 +125,19 @@ def grants(memories: list[str]) -> dict[str, st.SearchStrategy[Any]]:
     return {"memories": names, "areas": AREAS}
 
 
-def rest(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
-    token = st.fixed_dictionaries(
-        {"name": NAMES, "sha256": HASHES, **grants(memories), "access": ACCESS}
-    )
-    tokens = st.lists(
-        token,
+def tokens(**more: st.SearchStrategy[Any]) -> st.SearchStrategy[list[dict[str, Any]]]:
+    return st.lists(
+        st.fixed_dictionaries({"name": NAMES, "sha256": HASHES, **more}),
         min_size=1,
         max_size=3,
         unique_by=(lambda t: t["name"], lambda t: t["sha256"].lower()),
     )
+
+
+def rest(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
+    listed = tokens(**grants(memories), access=ACCESS)
     return st.fixed_dictionaries(
-        {"bind": st.just("127.0.0.1:80"), "sources": SOURCES, "tokens": tokens | st.just("none")},
+        {"bind": st.just("127.0.0.1:80"), "sources": SOURCES, "tokens": listed | st.just("none")},
         optional={"max_body": st.integers(1024, 2**30), "request_timeout": SECONDS},
     )
 
@@ -154,12 +157,49 @@ def mqtt(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
     )
 
 
+POLLABLE = NETWORKS | st.sampled_from(["/dev/ttyUSB9", "COM3", "172.16.0.0/12"])
+NATS = st.fixed_dictionaries(
+    {
+        "servers": st.lists(
+            st.sampled_from(["nats://127.0.0.1", "tls://nats.example:4443", "nats://[fd00::1]"]),
+            min_size=1,
+            max_size=3,
+        ),
+        "devices": st.lists(POLLABLE, min_size=1, max_size=3),
+    },
+    optional={
+        "username": TEXTS,
+        "prefix": st.from_regex(r"[A-Za-z0-9_-]{1,9}(\.[A-Za-z0-9_-]{1,9}){0,2}", fullmatch=True),
+        "limits": st.fixed_dictionaries(
+            {}, optional={"devices": st.integers(1, 2**40), "tags": st.integers(1, 2**40)}
+        ),
+    },
+)
+EGRESS = st.sampled_from(
+    ["10.0.0.0/8", "10.0.0.5:5020", "0.0.0.0/0:*", "10.0.0.0/24:502-510", "[fd00::]/8:1-9"]
+)
+
+
+@st.composite
+def gateway(draw: st.DrawFn) -> dict[str, Any]:
+    return {
+        "bind": "127.0.0.1:82",
+        "allow": draw(st.lists(EGRESS, min_size=1, max_size=3)),
+        "access": draw(ACCESS),
+        **draw(
+            st.fixed_dictionaries({"sources": SOURCES, "tokens": tokens()})
+            | st.just({"sources": ["127.0.0.0/8", "::1"], "tokens": "none"})
+        ),
+        **draw(st.fixed_dictionaries({}, optional={"in_flight": st.integers(1, 64)})),
+    }
+
+
 def adapters(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
     adapter = st.fixed_dictionaries(
         {"type": NAMES, **grants(memories), "access": ACCESS},
         optional={"options": st.dictionaries(TEXTS, OPTIONS, max_size=3)},
     )
-    names = NAMES.filter(lambda name: name not in ("rest", "mqtt", "metrics"))
+    names = NAMES.filter(lambda name: name not in RESERVED)
     return st.dictionaries(names, adapter, max_size=2)
 
 
@@ -260,7 +300,14 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
         name: draw(draw(st.sampled_from(kinds))(names, 5000 + index))
         for index, name in enumerate(draw(st.lists(NAMES, max_size=3, unique=True)))
     }
-    optional = {"rest": rest(names), "mqtt": mqtt(names), "metrics": METRICS, "audit": AUDITS}
+    optional = {
+        "rest": rest(names),
+        "mqtt": mqtt(names),
+        "nats": NATS,
+        "gateway": gateway(),
+        "metrics": METRICS,
+        "audit": AUDITS,
+    }
     sections = draw(
         st.fixed_dictionaries(
             {
@@ -272,6 +319,6 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
             optional=optional,
         )
     )
-    if not listeners and not sections.keys() & {"rest", "mqtt"}:
+    if not listeners and not sections.keys() & {"rest", "mqtt", "nats", "gateway"}:
         sections["rest"] = draw(rest(names))
     return {"memories": memories, "listeners": listeners, **sections}

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import web
 import wire
 from holdfast.adapters import Stop
+from holdfast.config.egress import parse_allowed
 from holdfast.gateway import Gateway, Limits, Settings, egress
 from holdfast.gateway.pool import dial
 from holdfast.http import listen
@@ -144,7 +145,7 @@ def running(
     listener = listen(bind, 0)
     host, port, *_ = listener.getsockname()
     chosen = Settings(
-        tuple(map(egress.parse, allow)),
+        tuple(map(parse_allowed, allow)),
         limits=replace(Limits(), **(limits or {})),
         **{"writes": True, **settings},
     )

@@ -225,6 +225,25 @@ def test_an_adapter_that_ends_by_itself_has_failed(supervised: list[Supervisor])
     assert supervised[0].status()["restarts"] == 2
 
 
+@pytest.mark.usefixtures("quick")
+def test_an_adapter_that_may_end_is_made_anew_after_failures_only(
+    supervised: list[Supervisor], caplog: pytest.LogCaptureFixture
+) -> None:
+    class Ending(Scripted):
+        def run(self, stop: Stop) -> None:
+            if self.made <= self.failures:
+                super().run(stop)
+
+    ending = Ending(failures=3)
+    caplog.set_level("INFO")
+    supervised.append(Supervisor("ending", ending, may_end=True))
+    supervised[0].start()
+    wire.until(lambda: ending.made == 4, "it is made anew")
+    wire.until(lambda: supervised[0].status()["state"] == "stopped", "it has ended")
+    assert (ending.made, supervised[0].status()["restarts"]) == (4, 3)
+    assert [each.message for each in caplog.records].count("adapter_stopped") == 1
+
+
 def test_a_status_that_raises_is_left_out(supervised: list[Supervisor]) -> None:
     steady = Scripted(failures=0)
     supervised.append(Supervisor("steady", steady))

@@ -21,6 +21,7 @@ import wire
 from cli import done, invoke, usage_error
 from holdfast.scanner.schema import json_schema
 from nats_bus import Caller, NatsServer, subscription, tag
+from nats_keys import Operator, User
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -137,6 +138,23 @@ def test_secrets_are_used_and_not_shown(
         own.kill()
 
 
+def test_credentials_are_used_and_not_shown(start: Start, tmp_path: Path) -> None:
+    operator = Operator()
+    own = NatsServer(tmp_path, "-c", str(operator.configure(tmp_path / "nats.conf")))
+    try:
+        user = User(operator.plant)
+        process = start("--nats", own.url, "--creds", str(user.write(tmp_path / "scan.creds")))
+        said = greeting(process)
+        connected(process)
+        process.terminate()
+        _, log = process.communicate(timeout=wire.DEADLINE)
+        assert process.returncode == 0
+        for secret in (user.key.seed, user.jwt):
+            assert secret not in said + log
+    finally:
+        own.kill()
+
+
 def _subscribe(caller: Caller, server: holdfast.Server) -> None:
     """Subscribes as soon as the scanner serves."""
 
@@ -224,15 +242,18 @@ def test_a_server_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (["--nats", "http://localhost"], "'http://localhost' is no server, as in nats://"),
-        (["--nats", "nats://host:port"], "'nats://host:port'"),
-        (["--allow", "10.0.0.1/8"], "10.0.0.1/8 has host bits set"),
-        (["--allow", "example"], "'example' does not appear to be an IPv4 or IPv6 network"),
-        (["--prefix", "a b"], "'a b' is no subject"),
-        (["--prefix", "a.>"], "'a.>' is no subject"),
+        (["--nats", "http://localhost"], "found neither nats:// nor tls://, allowed: nats://host"),
+        (["--nats", "nats://host:port"], "found a host or port that can't be"),
+        (["--nats", "nats://me:secret@"], "found no host"),
+        (["--allow", "10.0.0.1/8"], "found '10.0.0.1/8', which has host bits set: the network is"),
+        (["--allow", "example"], "found 'example', allowed: a network or an address"),
+        (["--prefix", "a b"], "found 'a b', allowed: the first part of subjects"),
+        (["--prefix", "a.>"], "found 'a.>', allowed: the first part of subjects"),
         (["--password-file", __file__], "--password-file goes with --user."),
         (["--tls-cert", __file__], "--tls-cert goes with --tls-key."),
         (["--user", "a", "--token-file", __file__], "--user and --token-file exclude each other."),
+        (["--user", "a", "--creds", __file__], "--user and --creds exclude each other."),
+        (["--creds", "missing"], "'missing' does not exist."),
         (["--store", "x"], "--store goes with --embedded."),
         (["--embedded", "--nats", "nats://10.0.0.1"], "--embedded serves at 127.0.0.1 only"),
         (["--embedded", "--user", "a"], "--embedded serves at 127.0.0.1 only"),
@@ -245,15 +266,23 @@ def test_wrong_usage_is_told(options: list[str], error: str) -> None:
 
 def test_a_wrong_server_in_the_environment_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NATS_SERVERS", "localhost:4222,ftp://x")
-    assert "'ftp://x' is no server" in usage_error("scan")
+    assert "found neither nats:// nor tls://" in usage_error("scan")
+
+
+def test_a_serial_device_is_allowed_beside_private_addresses(
+    start: Start, nats: NatsServer
+) -> None:
+    said = greeting(start("--nats", f"{nats.url}/", "--allow", "/dev/ttyUSB7"))
+    assert "devices    /dev/ttyUSB7, 127.0.0.0/8, 10.0.0.0/8, " in said
 
 
 def test_the_schema_is_printed() -> None:
     assert json.loads("\n".join(done("scan", "--schema"))) == json_schema()
 
 
-def test_a_file_that_can_not_be_used_is_told(start: Start, nats: NatsServer) -> None:
-    process = start("--nats", nats.url, "--tls-ca", __file__)
+@pytest.mark.parametrize("option", ["--creds", "--tls-ca"])
+def test_a_file_that_can_not_be_used_is_told(start: Start, nats: NatsServer, option: str) -> None:
+    process = start("--nats", nats.url, option, __file__)
     _, log = process.communicate(timeout=wire.DEADLINE)
     assert process.returncode == 1
     assert "holdfast: " in log

@@ -121,3 +121,26 @@ def test_the_entry_fits_into_a_configuration(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(REST + text)
     assert load(path).rest is not None
+
+
+def test_the_entry_of_the_gateway_fits_into_a_configuration(tmp_path: Path) -> None:
+    head = (
+        "gateway:\n  bind: 127.0.0.1:8090\n  sources: [10.0.0.0/8]\n  allow: [10.0.0.0/8]\n"
+        "  access: read-only\n  tokens:\n"
+    )
+    told, _, text = run("--gateway", "--name", "panel", "--stdin", stdin=SECRET).stdout.partition(
+        ":\n\n"
+    )
+    path = tmp_path / "plant.yaml"
+    path.write_text(head + text)
+    gateway = load(path).gateway
+    assert told == "Under gateway.tokens in the configuration"
+    assert gateway is not None
+    assert gateway.model_dump()["tokens"] == ({"name": "panel", "sha256": digest(SECRET)},)
+
+
+@pytest.mark.parametrize("options", [("--gateway", "--line"), ("--line", "--json")])
+def test_there_is_one_form_at_a_time(options: tuple[str, ...]) -> None:
+    result = run(*options)
+    assert result.exit_code == 2
+    assert "don't go together" in result.stderr

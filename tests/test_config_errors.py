@@ -49,7 +49,10 @@ AREA = "an integer from 1 to 65536 or a mapping with the keys start, size"
 SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
 CODES = "1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"
-TOP = "memories, identity, listeners, devices, rest, mqtt, adapters, metrics, audit, log, workers"
+TOP = (
+    "memories, identity, listeners, devices, rest, mqtt, nats, gateway, adapters, metrics, audit, "
+    "log, workers"
+)
 TYPES = "modbus-tcp, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii"
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
 RULE = "listeners.scada.rules[0]"
@@ -377,13 +380,6 @@ def test_the_rest_is_checked(folder: Folder, extra: str, problem: str) -> None:
     assert folder.problems(GOOD + extra + "\n") == [f"p.yaml:11: {problem}"]
 
 
-@pytest.mark.parametrize("section", ["nats", "gateway"])
-def test_sections_to_come_are_refused_by_name(folder: Folder, section: str) -> None:
-    assert folder.problems(f"{GOOD}{section}: {{bind: x}}\n") == [
-        f"p.yaml:11: {section}: this section is not available in this version"
-    ]
-
-
 def test_listener_types_to_come_are_refused_by_name(folder: Folder) -> None:
     assert folder.problems(f"{GOOD}  later: {{type: modbus-tls, certificate: x}}\n") == [
         "p.yaml:11: listeners.later.type: 'modbus-tls' is not available in this version, "
@@ -550,7 +546,8 @@ listeners:
   four: {type: modbus-rtu, serial: {}, rules: [{sources: [], units: {0: c}}]}
 mqtt: {url: tcp://broker, password: x, subscriptions: [{topic: '', memories: [c], areas: [coil]}]}
 rest: {bind: 0.0.0.0:502, sources: [], tokens: none}
-nats: {}
+nats: {servers: [nats], user: x}
+gateway: {bind: '127.0.0.1:502', sources: [x], allow: [], access: all, tokens: all}
 """
 
 
@@ -590,7 +587,16 @@ def test_all_problems_of_all_kinds_are_told_at_once_in_the_order_of_lines(folder
         "p.yaml:21: rest.bind",
         "p.yaml:21: rest.sources",
         "p.yaml:21: rest.tokens",
-        "p.yaml:22: nats: this section is not available in this version",
+        "p.yaml:22: nats.devices: missing, allowed: a list with at least one entry",
+        "p.yaml:22: nats.servers[0]",
+        "p.yaml:22: nats.user",
+        "p.yaml:23: gateway.bind",
+        "p.yaml:23: gateway.bind",
+        "p.yaml:23: gateway.bind",
+        "p.yaml:23: gateway.sources[0]",
+        "p.yaml:23: gateway.allow",
+        "p.yaml:23: gateway.access",
+        "p.yaml:23: gateway.tokens",
         "v.csv:1",
     ]
 
@@ -608,7 +614,7 @@ def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 def test_any_shape_anywhere_is_answered_with_problems_or_served(
     folder: Folder, wrong: object
 ) -> None:
-    for name in ("boiler.csv", "mqtt-password.txt"):
+    for name in ("boiler.csv", "mqtt-password.txt", "nats-password.txt"):
         shutil.copy(EXAMPLES / name, folder.path)
     whole = YAML(typ="safe").load(EXAMPLES / "full.yaml")
     for path in places(whole):

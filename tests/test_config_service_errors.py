@@ -42,6 +42,7 @@ metrics: {bind: 127.0.0.1:9464}
 audit: {file: audit.log}
 """
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
+OTHER = "a name other than rest, mqtt, nats, gateway or metrics"
 SOME = "a list with at least one entry"
 DIGEST = "the SHA-256 of the token, 64 hexadecimal digits"
 URL = "mqtt://host:port or mqtts://host:port"
@@ -66,7 +67,7 @@ def test_an_appliance_serves_something(folder: Folder, text: str, found: str) ->
     (problem,) = folder.problems(MEMORIES + text)
     assert problem.partition(": ")[2] == (
         f"listeners: {found}, allowed: a mapping with at least one entry, "
-        "or none beside rest, mqtt or devices"
+        "or none beside rest, mqtt, nats, gateway or devices"
     )
 
 
@@ -318,9 +319,10 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
     ("old", "new", "problem"),
     [
         ("weather:", "rest:",
-         "5: adapters.rest: found 'rest', allowed: a name other than rest, mqtt or metrics"),
+         f"5: adapters.rest: found 'rest', allowed: {OTHER}"),
         ("weather:", "mqtt:",
-         "5: adapters.mqtt: found 'mqtt', allowed: a name other than rest, mqtt or metrics"),
+         f"5: adapters.mqtt: found 'mqtt', allowed: {OTHER}"),
+        ("weather:", "gateway:", f"5: adapters.gateway: found 'gateway', allowed: {OTHER}"),
         ("weather:", "7:", f"5: adapters.7: found 7, allowed: {NAME}; write '7' to make it text"),
         ("type: weather, ", "", "5: adapters.weather.type: missing, allowed: text"),
         ("type: weather", "type: a b", f"5: adapters.weather.type: found 'a b', allowed: {NAME}"),

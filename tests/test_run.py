@@ -45,12 +45,16 @@ class Run:
         )
         self.greeting = ""
 
-    def wait_until_it_serves(self) -> tuple[str, int]:
+    def wait_for_greeting(self) -> str:
         assert self.process.stdout is not None
         while "Ctrl-C stops it." not in self.greeting:
             line = self.process.stdout.readline()
             assert line, self.process.communicate()
             self.greeting += line
+        return self.greeting
+
+    def wait_until_it_serves(self) -> tuple[str, int]:
+        self.wait_for_greeting()
         match = re.search(r"scada +modbus-tcp +([0-9.]+):([0-9]+)", self.greeting)
         assert match, self.greeting
         return match[1], int(match[2])

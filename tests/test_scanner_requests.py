@@ -219,7 +219,9 @@ def test_a_serial_device_is_refused_that_is_not_named(scanner: Running, caller: 
         "tags": [tag("a", 0)],
     }
     answer = caller.request("modbus.subscribe", request)
-    assert answer["error"] == "/dev/ttyUSB7 is not allowed; --allow /dev/ttyUSB7 does that"
+    assert answer["error"] == (
+        "/dev/ttyUSB7 is not allowed; name it with --allow, or in nats.devices of the configuration"
+    )
 
 
 def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
@@ -244,12 +246,23 @@ def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
 
 
 def test_serial_devices_beside_networks(caller: Caller) -> None:
-    allowed = Allowed(["/dev/ttyUSB0"])
+    allowed = Allowed(["/dev/ttyUSB0", "10.0.0.0/8"])
     line = SerialTarget("rtu", "/dev/ttyUSB0")
     assert caller.do(allowed.address(line)) == line
     with pytest.raises(Refused):
         caller.do(allowed.address(SerialTarget("rtu", "/etc/passwd")))
-    assert caller.do(allowed.address(NetworkTarget("tcp", "10.1.2.3", 502)))
+    device = NetworkTarget("tcp", "10.1.2.3", 502)
+    assert caller.do(allowed.address(device)) == device
+    with pytest.raises(
+        Refused, match=r"10\.1\.2\.3 is not allowed, allowed are serial devices only"
+    ):
+        caller.do(Allowed(["/dev/ttyUSB0"]).address(device))
+
+
+@pytest.mark.parametrize("entry", ["10.0.0.1/8", "plc", "::ffff:10.0.0.1", "COMPANY"])
+def test_what_is_no_device_can_not_be_allowed(entry: str) -> None:
+    with pytest.raises(ValueError, match="found"):
+        Allowed([entry])
 
 
 def test_the_schema_of_the_docs_is_that_of_the_program() -> None:

@@ -27,7 +27,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast.adapters import Adapter
-    from holdfast.config import Config, Listener, MetricsConfig, RestConfig
+    from holdfast.config import (
+        Bind,
+        Config,
+        GatewayConfig,
+        Listener,
+        MetricsConfig,
+        RestConfig,
+    )
 
 # Everything else that a listener reports is a refusal or a fault.
 LEVELS = {
@@ -56,7 +63,7 @@ class Endpoint:
     host: str
     port: int | None
     """`None` on a serial line, whose device is `host`."""
-    settings: Listener | RestConfig | MetricsConfig
+    settings: Listener | RestConfig | GatewayConfig | MetricsConfig
 
 
 class Appliance:
@@ -223,12 +230,11 @@ class _Running:
     def _bound_sockets(self, undo: ExitStack) -> dict[str, socket.socket]:
         """The sockets of what is served over HTTP."""
         sockets: dict[str, socket.socket] = {}
-        services = {"rest": self._config.rest, "metrics": self._config.metrics}
+        config = self._config
+        services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
         for name, settings in services.items():
             if settings is not None:
-                from holdfast import http
-
-                sockets[name] = http.listen(settings.bind.host, settings.bind.port)
+                sockets[name] = _listening(name, settings.bind)
                 undo.callback(sockets[name].close)
         return sockets
 
@@ -291,6 +297,16 @@ class _Running:
 
             mqtt, to_mqtt = config.mqtt, self._door("mqtt")
             self._add("mqtt", to_mqtt, lambda: Mqtt(mqtt, to_mqtt))
+        if config.nats is not None:
+            from holdfast.scanner.adapter import ScannerAdapter
+
+            scanner = assembly.scanner(config.nats)
+            self._add("nats", None, lambda: ScannerAdapter(scanner), may_end=True)
+        if config.gateway is not None:
+            from holdfast.gateway import Gateway
+
+            gateway, gateway_at = assembly.gateway(config.gateway), sockets["gateway"]
+            self._add("gateway", None, lambda: Gateway(gateway, gateway_at))
         if config.metrics is not None:
             from holdfast.adapters.metrics import Metrics
 
@@ -303,8 +319,15 @@ class _Running:
     def _door(self, name: str) -> Door:
         return Door(name, self._memories, self._audit)
 
-    def _add(self, name: str, door: Door | None, factory: Callable[[], Adapter]) -> None:
-        supervisor = Supervisor(name, factory)
+    def _add(
+        self,
+        name: str,
+        door: Door | None,
+        factory: Callable[[], Adapter],
+        *,
+        may_end: bool = False,
+    ) -> None:
+        supervisor = Supervisor(name, factory, may_end=may_end)
         self._supervisors.append(supervisor)
         self.diagnostics.adapters[name] = (supervisor, door)
 
@@ -324,6 +347,17 @@ class _Running:
                 lost = missed
             if ended and not writes:
                 return
+
+
+def _listening(name: str, bind: Bind) -> socket.socket:
+    """The socket of a service. Raises `OSError`, which names both."""
+    from holdfast import http
+
+    try:
+        return http.listen(bind.host, bind.port)
+    except OSError as error:
+        message = f"{name}: can't listen on {bind}: {error.strerror or error}"
+        raise OSError(error.errno, message) from error
 
 
 def _joined(endpoint: Endpoint) -> str:

@@ -1,6 +1,7 @@
-"""From a configuration to the native parts: memories, rules, listeners, devices, identity.
+"""From a configuration to the native parts: memories, rules, listeners, devices, identity; and to
+what gateway and scanner are told.
 
-It converts, and starts nothing.
+It converts, and starts nothing. Gateway and scanner are imported only where they are wanted.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, assert_never
 from holdfast import _core, planning
 from holdfast.client import endpoint
 from holdfast.config import (
+    BrokerTlsConfig,
     ModbusAsciiListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
@@ -27,13 +29,17 @@ if TYPE_CHECKING:
     from holdfast.config import (
         Config,
         DestinationConfig,
+        GatewayConfig,
         IdentityConfig,
         Listener,
         MemoryConfig,
+        NatsConfig,
         RawRuleConfig,
         RuleConfig,
         SerialRuleConfig,
     )
+    from holdfast.gateway import Settings as GatewaySettings
+    from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area
 
 SPREAD = 10.0
@@ -154,6 +160,40 @@ def disabled_status(name: str) -> list[int]:
     text = name.encode("ascii", "replace")[:STATUS_NAME].ljust(STATUS_NAME, b"\0")
     told = [DISABLED, 0, 0, *struct.unpack(f">{STATUS_NAME // 2}H", text)]
     return told + [0] * (STATUS_BLOCK - len(told))
+
+
+def gateway(settings: GatewayConfig) -> GatewaySettings:
+    """What the gateway is told."""
+    from holdfast.gateway import Limits, Settings
+
+    tokens = () if settings.tokens == "none" else settings.tokens
+    return Settings(
+        settings.allow,
+        writes=settings.access == "read-write",
+        tokens=tuple((token.name, bytes.fromhex(token.sha256)) for token in tokens),
+        sources=settings.sources,
+        limits=Limits(in_flight=settings.in_flight),
+    )
+
+
+def scanner(settings: NatsConfig) -> ScannerSettings:
+    """What the scanner is told."""
+    from holdfast.scanner import Limits, Servers, Settings
+
+    tls = settings.tls or BrokerTlsConfig()
+    servers = Servers(
+        settings.servers,
+        settings.username,
+        settings.password_file,
+        settings.token_file,
+        settings.credentials_file,
+        tls.ca_file,
+        tls.cert_file,
+        tls.key_file,
+    )
+    devices = tuple(str(entry) for entry in settings.devices)
+    limits = Limits(devices=settings.limits.devices, tags=settings.limits.tags)
+    return Settings(servers, settings.prefix, devices, limits)
 
 
 def _place(

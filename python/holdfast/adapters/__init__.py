@@ -4,8 +4,8 @@ An adapter is made by a factory, `factory(context) -> Adapter`, and lives in a t
 `run` works until it is stopped. When it raises, or ends by itself, it is logged and made anew after
 a pause; the others don't notice. Adapters must never reach past their door to memory.
 
-`rest`, `mqtt` and `metrics` are built in. Others are found by the entry point group
-`holdfast.adapters`, see docs/adapters.md.
+`rest`, `mqtt`, `nats`, `gateway` and `metrics` are built in. Others are found by the entry point
+group `holdfast.adapters`, see docs/adapters.md.
 """
 
 from __future__ import annotations

@@ -47,11 +47,12 @@ def give_way() -> None:
 
 
 class Supervisor:
-    """One adapter, from `start` to `stop`."""
+    """One adapter, from `start` to `stop`. With `may_end` it may end by itself, for good."""
 
-    def __init__(self, name: str, factory: Callable[[], Adapter]) -> None:
+    def __init__(self, name: str, factory: Callable[[], Adapter], *, may_end: bool = False) -> None:
         self.name = name
         self._factory = factory
+        self._may_end = may_end
         self._stop = Stop()
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
         self._adapter: Adapter | None = None
@@ -95,9 +96,15 @@ class Supervisor:
         pause = FIRST_PAUSE
         while not self._stop.is_set():
             began = time.monotonic()
-            self._once()
+            ended = self._once()
             if self._stop.is_set():
                 break
+            if ended and self._may_end:
+                logs.write(logging.WARNING, "adapter_stopped", adapter=self.name)
+                break
+            if ended:
+                self._last_error = "ended by itself"
+                logs.write(logging.ERROR, "adapter_ended", adapter=self.name)
             if time.monotonic() - began >= PROVEN:
                 pause = FIRST_PAUSE
             self._state = "failed"
@@ -106,20 +113,19 @@ class Supervisor:
             pause = min(2 * pause, LONGEST_PAUSE)
         self._state = "stopped"
 
-    def _once(self) -> None:
-        """Makes the adapter and runs it to its end."""
+    def _once(self) -> bool:
+        """Makes the adapter and runs it to its end; whether it came there without an error."""
         try:
             self._adapter = self._factory()
             self._state = "running"
             self._adapter.run(self._stop)
-            if not self._stop.is_set():
-                self._last_error = "ended by itself"
-                logs.write(logging.ERROR, "adapter_ended", adapter=self.name)
         except (Exception, SystemExit) as error:
             self._last_error = f"{type(error).__name__}: {error}"
             logs.LOGGER.error(
                 "adapter_failed", extra={"fields": {"adapter": self.name}}, exc_info=True
             )
+            return False
+        return True
 
 
 def _step_back() -> None:

@@ -16,7 +16,8 @@ from holdfast import logs
 from holdfast.adapters import Stop
 from holdfast.cli.run import PATIENCE, Signals
 from holdfast.config.addresses import parse_bind, parse_source
-from holdfast.gateway import Gateway, Limits, Settings, egress, tokens
+from holdfast.config.egress import parse_allowed
+from holdfast.gateway import Gateway, Limits, Settings, tokens
 from holdfast.gateway.settings import LOOPBACK
 from holdfast.http import listen
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from holdfast.config.addresses import Bind, Network
+    from holdfast.config.egress import Allowed
 
 FAILED = 1
 
@@ -55,7 +57,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
 )
 @click.option(
     "--allow",
-    type=_by(egress.parse),
+    type=_by(parse_allowed),
     multiple=True,
     required=True,
     metavar="NETWORK[:PORTS]",
@@ -88,7 +90,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
 @click.option("--json-log", is_flag=True, help="Log JSON, an object a line.")
 def gateway(
     bind: Bind,
-    allow: tuple[egress.Allowed, ...],
+    allow: tuple[Allowed, ...],
     writes: bool,
     token_file: Path | None,
     sources: tuple[Network, ...],

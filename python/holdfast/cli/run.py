@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import shlex
 import shutil
@@ -14,24 +13,29 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast import logs
+from holdfast import assembly, logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.adapters.supervisor import give_way
 from holdfast.appliance import Appliance
 from holdfast.cli.configuration import WRONG, load_or_exit
-from holdfast.config import ModbusTcpListener
+from holdfast.cli.open_files import allow_open_files
+from holdfast.config import GatewayConfig, ModbusTcpListener
 
 if TYPE_CHECKING:
     from types import FrameType
 
     from holdfast.appliance import Endpoint
-    from holdfast.config import Config, DeviceConfig, RawRuleConfig, RuleConfig, SerialRuleConfig
+    from holdfast.config import (
+        Config,
+        DeviceConfig,
+        NatsConfig,
+        RawRuleConfig,
+        RuleConfig,
+        SerialRuleConfig,
+    )
 
 # How long a signal may wait until it is noticed, in seconds.
 PATIENCE = 0.2
-
-# Open files beside the connections: listeners, readers of metrics, the interpreter's own.
-OTHER_FILES = 128
 
 # Devices that the greeting names.
 MOST_DEVICES = 10
@@ -56,7 +60,7 @@ def run(file: Path) -> None:
     config = load_or_exit(file)
     logs.configure(config.log.level, config.log.format)
     give_way()
-    _allow_open_files(config)
+    allow_open_files(_connections(config))
     signals = Signals()
     appliance = Appliance(config)
     try:
@@ -75,22 +79,16 @@ def run(file: Path) -> None:
         appliance.stop()
 
 
-def _allow_open_files(config: Config) -> None:
-    """Lets this process hold all the connections that its listeners may have."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit.
-        return
+def _connections(config: Config) -> int:
+    """The most connections that it may have at once."""
     served = [*config.listeners.values(), config.rest]
-    needed = sum(getattr(each, "max_connections", 0) for each in served) + OTHER_FILES
-    needed += sum(1 + len(device.forward) for device in config.devices.values())
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= needed:
-        return
-    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-    if allowed < needed:
-        logs.write(logging.WARNING, "too_few_open_files", needed=needed, allowed=allowed)
+    most = sum(getattr(each, "max_connections", 0) for each in served)
+    most += sum(1 + len(device.forward) for device in config.devices.values())
+    if config.nats is not None:
+        most += assembly.scanner(config.nats).limits.connections
+    if config.gateway is not None:
+        most += assembly.gateway(config.gateway).limits.open_connections
+    return most
 
 
 class Signals:
@@ -115,15 +113,21 @@ def _explained(error: OSError) -> str:
 
 def _greeting(appliance: Appliance, file: Path) -> str:
     endpoints = appliance.endpoints()
-    devices = list(appliance.config.devices.items())
+    devices, nats = list(appliance.config.devices.items()), appliance.config.nats
     shown = devices[:MOST_DEVICES]
     names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
+    names += [] if nats is None else ["nats"]
     width = max(map(len, names), default=0)
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
         lines.append(f"  {endpoint.name:{width}}  {_address(endpoint)}")
         rules = getattr(endpoint.settings, "rules", ())
         lines += [f"  {'':{width}}    {_granted(rule)}" for rule in rules]
+        if isinstance(endpoint.settings, GatewayConfig):
+            lines.append(f"  {'':{width}}    {_reached(endpoint.settings)}")
+    if nats is not None:
+        lines.append(f"  {'nats':{width}}  {', '.join(nats.servers)}")
+        lines.append(f"  {'':{width}}    {_scanned(nats)}")
     lines += [f"  {name:{width}}  {_polled(device)}" for name, device in shown]
     if len(devices) > len(shown):
         lines.append(f"  and {len(devices) - len(shown)} more devices")
@@ -144,6 +148,20 @@ def _polled(device: DeviceConfig) -> str:
     if not device.enabled:
         return f"{device.url} unit {device.unit}, not polled"
     return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
+
+
+def _reached(gateway: GatewayConfig) -> str:
+    """What the gateway lets whom do, in a line."""
+    can = "reads and writes" if gateway.access == "read-write" else "reads"
+    sources = ", ".join(map(str, gateway.sources))
+    tokens = "no tokens" if gateway.tokens == "none" else "a token each"
+    return f"console and API; {can} {', '.join(map(str, gateway.allow))} for {sources}; {tokens}"
+
+
+def _scanned(nats: NatsConfig) -> str:
+    """What the scanner does for whom, in a line."""
+    devices = ", ".join(map(str, nats.devices))
+    return f"polls and writes {devices} for subscribers at {nats.prefix}.subscribe"
 
 
 def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
-import re
 import signal
 import sys
-from contextlib import ExitStack, suppress
-from importlib.util import find_spec
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -17,23 +16,23 @@ from urllib.parse import urlsplit
 import click
 
 from holdfast import logs
+from holdfast.cli.open_files import allow_open_files
+from holdfast.config.scanning import PREFIX, SERVER_PORT, parse_prefix, parse_server
 from holdfast.scanner import Limits, Scanner, Servers, Settings
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
-from holdfast.scanner.hosts import Allowed
+from holdfast.scanner.hosts import PRIVATE, Allowed
 from holdfast.scanner.schema import json_schema
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-DEFAULT_URL = "nats://127.0.0.1:4222"
-PORT = 4222
+    from holdfast.config.remote import Remote
+
+DEFAULT_URL = f"nats://127.0.0.1:{SERVER_PORT}"
 FAILED = 1
 
 WATCHED = 1.0
 """Seconds between looks whether an embedded server still runs."""
-
-OTHER_FILES = 128
-"""Open files beside the connections of devices."""
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -44,20 +43,24 @@ def _servers(text: str) -> list[str]:
     for part in filter(None, map(str.strip, text.split(","))):
         url = part if "://" in part else f"nats://{part}"
         try:
-            parts = urlsplit(url)
-            parts.port  # noqa: B018
+            _server(url)
         except ValueError as error:
-            raise click.BadParameter(f"{part!r}: {error}.") from None
-        if parts.scheme not in ("nats", "tls") or not parts.hostname or parts.path not in ("", "/"):
-            raise click.BadParameter(f"{part!r} is no server, as in {DEFAULT_URL}.")
+            raise click.BadParameter(f"{error}, as in {DEFAULT_URL}.") from None
         urls.append(url)
     return urls
 
 
+def _server(url: str) -> Remote:
+    """Where a server is. A user and a password may stand before the host, and port 0 is any."""
+    scheme, mark, rest = url.removesuffix("/").partition("://")
+    return parse_server(f"{scheme}{mark}{rest.rpartition('@')[2]}", least_port=0)
+
+
 def _prefix(text: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})*", text):
-        raise click.BadParameter(f"{text!r} is no subject: letters, digits, _ and -, dots between.")
-    return text
+    try:
+        return parse_prefix(text)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.") from None
 
 
 def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -94,7 +97,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option(
     "--prefix",
     type=_prefix,
-    default="modbus",
+    default=PREFIX,
     show_default=True,
     metavar="SUBJECT",
     help="First part of all subjects.",
@@ -102,7 +105,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option("--user", metavar="NAME", help="User at the NATS server.")
 @click.option("--password-file", type=FILE, metavar="FILE", help="Holds the user's password.")
 @click.option("--token-file", type=FILE, metavar="FILE", help="Holds a token for the NATS server.")
-@click.option("--creds", type=FILE, metavar="FILE", help="Credentials with JWT and nkey.")
+@click.option("--creds", type=FILE, metavar="FILE", help="Holds a user's JWT and seed.")
 @click.option("--tls-ca", type=FILE, metavar="FILE", help="Authorities that sign the server.")
 @click.option("--tls-cert", type=FILE, metavar="FILE", help="Our certificate.")
 @click.option("--tls-key", type=FILE, metavar="FILE", help="Its key.")
@@ -147,27 +150,33 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     """
     urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
-    try:
-        Allowed(options["allow"])
-    except ValueError as error:
-        raise click.BadParameter(f"{error}.", param_hint="'--allow'") from None
+    allow = _allowed(options["allow"])
     if store is not None and not embedded:
         raise click.UsageError("--store goes with --embedded.")
     logs.configure(options["log_level"], options["log_format"])
     limits = Limits(devices=options["max_devices"], tags=options["max_tags"])
-    _allow_open_files(limits)
+    allow_open_files(limits.connections)
     with ExitStack() as stack:
         check: Callable[[], None] | None = None
         try:
             if embedded:
                 server = stack.enter_context(Embedded(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
-            settings = Settings(servers, options["prefix"], options["allow"], limits)
+            settings = Settings(servers, options["prefix"], allow, limits)
             click.echo(_greeting(settings))
             asyncio.run(_serve(settings, check))
         except (EmbeddedFailed, OSError) as error:
             click.echo(f"holdfast: {error}", err=True)
             sys.exit(FAILED)
+
+
+def _allowed(entries: tuple[str, ...]) -> tuple[str, ...]:
+    """Whom subscribers may have polled: without a network, private and loopback addresses too."""
+    try:
+        listed = Allowed(entries)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.", param_hint="'--allow'") from None
+    return entries if listed.networks else (*entries, *map(str, PRIVATE))
 
 
 def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
@@ -177,8 +186,6 @@ def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
         if options[key] is not None and options[other] is None:
             given, missing = (f"--{name.replace('_', '-')}" for name in (key, other))
             raise click.UsageError(f"{given} goes with {missing}.")
-    if options["creds"] is not None and find_spec("nkeys") is None:
-        raise click.UsageError("--creds needs the package nkeys, which is not installed.")
     ways = [key for key in ("user", "token_file", "creds") if options[key] is not None]
     if len(ways) > 1:
         given = " and ".join(f"--{key.replace('_', '-')}" for key in ways)
@@ -202,7 +209,7 @@ def _embedded_port(servers: Servers) -> int:
     if len(servers.urls) > 1 or parts.hostname not in (HOST, "localhost") or not plain:
         allowed = f"--embedded serves at {HOST} only, to whoever is on this machine"
         raise click.UsageError(f"{allowed}: --nats may name a port there, as in {DEFAULT_URL}.")
-    return PORT if parts.port is None else parts.port
+    return SERVER_PORT if parts.port is None else parts.port
 
 
 async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
@@ -226,20 +233,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
                 await running
                 raise
     await running
-
-
-def _allow_open_files(limits: Limits) -> None:
-    """Lets this process hold the connections of all devices: one to scan, one to write."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit.
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = 2 * limits.devices + OTHER_FILES
-    if soft != resource.RLIM_INFINITY and soft < needed:
-        allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-        with suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    logs.write(logging.INFO, "stopped")
 
 
 def _greeting(settings: Settings) -> str:
@@ -258,7 +252,4 @@ def _greeting(settings: Settings) -> str:
 
 
 def _without_secrets(servers: Servers) -> Iterator[str]:
-    for url in servers.urls:
-        parts = urlsplit(url)
-        host = f"[{parts.hostname}]" if parts.hostname and ":" in parts.hostname else parts.hostname
-        yield f"{parts.scheme}://{host}:{parts.port or PORT}"
+    return (str(_server(url)) for url in servers.urls)

@@ -1,4 +1,4 @@
-"""`holdfast token`: a secret for a client of REST, and the entry that lets it in."""
+"""`holdfast token`: a secret for a client of REST or the gateway, and the entry that lets it in."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ SHORT = 16
 _ENTRY = """\
     - name: {name}
       sha256: "{digest}"
+"""
+_RIGHTS = """\
       memories: []          # names of memories
       areas: []             # coils, discrete_inputs, holding_registers, input_registers
       access:               # read-only or read-write
@@ -33,17 +35,19 @@ _ENTRY = """\
 @click.command(epilog="Example: holdfast token --name edge-gateway")
 @click.option("--name", default="edge-gateway", show_default=True, help="The name of the client.")
 @click.option("--stdin", is_flag=True, help="Take the secret from standard input.")
+@click.option("--gateway", is_flag=True, help="An entry for the gateway of a configuration.")
 @click.option("--line", is_flag=True, help="A line for a gateway's token file.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
-def token(name: str, stdin: bool, line: bool, as_json: bool) -> None:
+def token(name: str, stdin: bool, gateway: bool, line: bool, as_json: bool) -> None:
     """Make a secret for a client of REST, and the entry of the configuration that lets it in.
 
     The secret is shown once and kept nowhere: the configuration holds only its SHA-256. With
-    --stdin the secret is the one line of standard input, and is not shown again. With --line there
-    is a line of a token file, for `holdfast gateway`, and the secret goes to standard error.
+    --stdin the secret is the one line of standard input, and is not shown again. With --gateway the
+    entry is one for the section `gateway`. With --line there is a line of a token file, for
+    `holdfast gateway`, and the secret goes to standard error.
     """
-    if line and as_json:
-        raise click.UsageError("--line and --json don't go together.")
+    if gateway + line + as_json > 1:
+        raise click.UsageError("--gateway, --line and --json don't go together.")
     if not is_name(name):
         raise click.BadParameter(f"found {name!r}, allowed: {NAME_FORM}", param_hint="'--name'")
     secret = _read() if stdin else secrets.token_urlsafe(BYTES)
@@ -59,8 +63,9 @@ def token(name: str, stdin: bool, line: bool, as_json: bool) -> None:
         return
     if not stdin:
         click.echo(f"The secret, shown this once: {secret}\n")
-    click.echo("Under rest.tokens in the configuration:\n")
-    click.echo(_ENTRY.format(name=_quoted(name), digest=digest), nl=False)
+    click.echo(f"Under {'gateway' if gateway else 'rest'}.tokens in the configuration:\n")
+    entry = _ENTRY.format(name=_quoted(name), digest=digest)
+    click.echo(entry if gateway else entry + _RIGHTS, nl=False)
 
 
 def _read() -> str:

@@ -1,24 +1,17 @@
-"""MQTT's own forms: the URL of a broker, and topic filters.
-
-No message repeats a URL: someone may have written a password into it.
-"""
+"""MQTT's own forms: the URL of a broker, and topic filters."""
 
 from __future__ import annotations
 
 import re
-from ipaddress import IPv6Address
 from typing import NamedTuple
 
-from holdfast.config.words import shape, show
+from holdfast.config.remote import parse_remote
+from holdfast.config.words import show
 
 URL_FORM = "mqtt://host:port or mqtts://host:port"
 LONGEST_TEXT = 65535
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
-_HOST = re.compile(
-    r"(?:\[(?P<six>[^\]]*)\]|(?P<name>[A-Za-z0-9][A-Za-z0-9_.-]{0,252}))(?::(?P<port>[0-9]{1,5}))?",
-    re.ASCII,
-)
 
 
 class Broker(NamedTuple):
@@ -31,30 +24,8 @@ class Broker(NamedTuple):
 
 def parse_broker(text: object) -> Broker:
     """Raises `ValueError` for anything but a scheme, a host and perhaps a port."""
-    if not isinstance(text, str):
-        raise ValueError(f"found {shape(text)}, allowed: {URL_FORM}")
-    scheme, _, rest = text.partition("://")
-    if scheme not in _PORTS or not rest:
-        found = "no host" if scheme in _PORTS else "neither mqtt:// nor mqtts://"
-        raise ValueError(f"found {found}, allowed: {URL_FORM}")
-    if "@" in rest:
-        where = "the user is username, the password is in the file that password_file names"
-        raise ValueError(f"found a user in it, allowed: {URL_FORM}; {where}")
-    if re.search("[/?#]", rest):
-        raise ValueError(f"found more than host and port, allowed: {URL_FORM}")
-    match = _HOST.fullmatch(rest)
-    port = int(match["port"] or _PORTS[scheme]) if match else 0
-    if match is None or not _is_host(match) or not 1 <= port <= 65535:
-        allowed = "a host name or an address, IPv6 in brackets, and a port from 1 to 65535"
-        raise ValueError(f"found a host or port that can't be, allowed: {allowed}")
-    return Broker(match["name"] or match["six"], port, scheme == "mqtts")
-
-
-def _is_host(match: re.Match[str]) -> bool:
-    try:
-        return match["six"] is None or bool(IPv6Address(match["six"]))
-    except ValueError:
-        return False
+    remote = parse_remote(text, _PORTS, URL_FORM)
+    return Broker(remote.host, remote.port, remote.scheme == "mqtts")
 
 
 def parse_topic_filter(text: object) -> str:

@@ -1,4 +1,6 @@
-"""What the keys of devices must keep together: destinations, ranges, forwards and serial lines."""
+"""What the keys of devices must keep together: destinations, ranges, forwards and serial lines;
+and that a line polled for subscribers is nobody else's.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
 from holdfast.config.initial import extent
 from holdfast.config.listeners import SERIAL_TYPES
 from holdfast.config.memory_checks import addresses
+from holdfast.config.scanning import parse_pollable
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.values import (
     AREAS,
@@ -68,6 +71,7 @@ class DeviceChecks:
         for name, device in mapping(data.get("devices")).items():
             if isinstance(device, dict):
                 self._device(("devices", name), device, taken)
+        self._subscribed(entries(mapping(data.get("nats")).get("devices")), taken)
         self._overlaps()
 
     def _device(self, path: KeyPath, device: dict[Any, Any], taken: dict[str, KeyPath]) -> None:
@@ -101,13 +105,24 @@ class DeviceChecks:
             self.report.add((*path, "unit"), f"found {number}, {allowed}")
         port = os.path.realpath(target.device)
         if port in taken:
-            of = self._named(taken[port])
-            message = f"found {show(target.device)}, which is the device of {of}, allowed: another"
-            self.report.add((*path, "url"), message)
+            self._taken((*path, "url"), target.device, taken[port])
         first, other = self._lines.setdefault(port, (path, target))
         if replace(target, device=other.device) != other:
             message = f"found other settings of the line than {self._named(first)} has"
             self.report.add((*path, "url"), f"{message}, allowed: the same")
+
+    def _subscribed(self, devices: list[Any], taken: dict[str, KeyPath]) -> None:
+        """The serial lines among those that subscribers may have polled."""
+        lines = {port: path for port, (path, _) in self._lines.items()} | taken
+        for index, device in enumerate(devices):
+            pollable = parsed(parse_pollable, device)
+            if isinstance(pollable, str) and os.path.realpath(pollable) in lines:
+                self._taken(("nats", "devices", index), pollable, lines[os.path.realpath(pollable)])
+
+    def _taken(self, path: KeyPath, device: str, owner: KeyPath) -> None:
+        of = self._named(owner)
+        message = f"found {show(device)}, which is the device of {of}, allowed: another"
+        self.report.add(path, message)
 
     def _ranges(self, path: KeyPath, ranges: object) -> list[tuple[KeyPath, object, range]]:
         """The ranges that can be told, each with its place and its area."""

@@ -20,8 +20,10 @@ from holdfast.config.memories import MemoryConfig
 from holdfast.config.services import (
     AdapterConfig,
     AuditConfig,
+    GatewayConfig,
     MetricsConfig,
     MqttConfig,
+    NatsConfig,
     RestConfig,
 )
 from holdfast.config.values import (
@@ -86,20 +88,24 @@ class LogConfig(Model):
 class Config(Model):
     """The configuration of a Holdfast appliance."""
 
-    memories: dict[Name, MemoryConfig] = Field(min_length=1, json_schema_extra=NAME_KEYS)
-    """The memories, by name."""
+    memories: dict[Name, MemoryConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
+    """The memories, by name; at least one, unless nothing but nats and gateway is served."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
     """What the appliance says of itself."""
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(
         default={}, json_schema_extra=NAME_KEYS
     )
-    """The servers, by name; at least one, unless there is rest, mqtt or a device."""
+    """The servers, by name; at least one, unless there is rest, mqtt, nats, gateway or a device."""
     devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
     """Devices that are polled, by name."""
     rest: Annotated[RestConfig | None, NotNull()] = None
     """The REST interface."""
     mqtt: Annotated[MqttConfig | None, NotNull()] = None
     """The MQTT client."""
+    nats: Annotated[NatsConfig | None, NotNull()] = None
+    """The scanner, which polls devices for subscribers over NATS."""
+    gateway: Annotated[GatewayConfig | None, NotNull()] = None
+    """The gateway, which serves devices over HTTP, with a console."""
     adapters: dict[AdapterName, AdapterConfig] = Field(default={}, json_schema_extra=ADAPTER_KEYS)
     """Third-party adapters, by name."""
     metrics: Annotated[MetricsConfig | None, NotNull()] = None

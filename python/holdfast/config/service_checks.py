@@ -1,4 +1,4 @@
-"""What the keys of REST, MQTT, adapters and the audit file must keep together."""
+"""What the keys of the sections beside listeners and devices must keep together."""
 
 from __future__ import annotations
 
@@ -9,17 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.addresses import parse_bind
+from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.broker import parse_broker, parse_topic_filter
+from holdfast.config.scanning import parse_server
 from holdfast.config.tolerance import entries, mapping, parsed
 from holdfast.config.unique import Owners
 from holdfast.config.values import parse_sha256
-from holdfast.config.words import show
+from holdfast.config.words import choice, show
 
 if TYPE_CHECKING:
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
+
+_USERS_OF_MEMORIES = ("listeners", "devices", "rest", "mqtt", "adapters")
+_USERS_OF_NONE = {"nats", "gateway"}
+_INSTEAD_OF_LISTENERS = ("rest", "mqtt", "nats", "gateway", "devices")
+_IDENTITIES = ("username", "token_file", "credentials_file")
+"""Keys that say who the scanner is at the NATS server."""
 
 
 @dataclass
@@ -35,29 +42,49 @@ class ServiceChecks:
         self._served(data)
         self._rest(mapping(data.get("rest")))
         self._mqtt(mapping(data.get("mqtt")))
+        self._nats(mapping(data.get("nats")))
+        self._gateway(mapping(data.get("gateway")))
         for name, adapter in mapping(data.get("adapters")).items():
             self.grants.grant(("adapters", name), mapping(adapter))
         self._audit(mapping(data.get("audit")).get("file"))
 
     def _served(self, data: dict[Any, Any]) -> None:
-        if data.get("listeners", {}) != {} or data.keys() & {"rest", "mqtt", "devices"}:
-            return
-        found = "found an empty mapping" if "listeners" in data else "missing"
-        message = (
-            f"{found}, allowed: a mapping with at least one entry, or none beside rest, mqtt "
-            "or devices"
-        )
-        self.report.add(("listeners",), message, of_key=True)
+        """That there is something to serve, and memories where that needs them."""
+        used = any(data.get(key, {}) != {} for key in _USERS_OF_MEMORIES)
+        if data.get("memories", {}) == {} and (used or not data.keys() & _USERS_OF_NONE):
+            self._empty("memories", data, "beside nothing but nats and gateway")
+        if data.get("listeners", {}) == {} and not data.keys() & {*_INSTEAD_OF_LISTENERS}:
+            self._empty("listeners", data, f"beside {choice(_INSTEAD_OF_LISTENERS)}")
+
+    def _empty(self, key: str, data: dict[Any, Any], unless: str) -> None:
+        found = "found an empty mapping" if key in data else "missing"
+        message = f"{found}, allowed: a mapping with at least one entry, or none {unless}"
+        self.report.add((key,), message, of_key=True)
 
     def _rest(self, rest: dict[Any, Any]) -> None:
-        bind = parsed(parse_bind, rest.get("bind"))
-        if rest.get("tokens") == "none" and bind is not None and not bind.address.is_loopback:
-            message = f"found 'none' beside bind {bind}, allowed: none on a loopback address only"
-            self.report.add(("rest", "tokens"), message)
-        names, hashes = Owners(self.report, "name"), Owners(self.report, "sha256")
+        self._tokens("rest", rest)
         for index, token in enumerate(entries(rest.get("tokens"))):
-            path: KeyPath = ("rest", "tokens", index)
-            self.grants.grant(path, mapping(token))
+            self.grants.grant(("rest", "tokens", index), mapping(token))
+
+    def _gateway(self, gateway: dict[Any, Any]) -> None:
+        self._tokens("gateway", gateway)
+        if gateway.get("tokens") != "none":
+            return
+        for index, source in enumerate(entries(gateway.get("sources"))):
+            network = parsed(parse_source, source)
+            if network is not None and not network.is_loopback:
+                allowed = "allowed beside tokens none: loopback addresses, as in 127.0.0.0/8"
+                self.report.add(("gateway", "sources", index), f"found {show(source)}, {allowed}")
+
+    def _tokens(self, section: str, settings: dict[Any, Any]) -> None:
+        """Tokens that are told apart; none on a loopback address only."""
+        bind, tokens = parsed(parse_bind, settings.get("bind")), settings.get("tokens")
+        if tokens == "none" and bind is not None and not bind.address.is_loopback:
+            message = f"found 'none' beside bind {bind}, allowed: none on a loopback address only"
+            self.report.add((section, "tokens"), message)
+        names, hashes = Owners(self.report, "name"), Owners(self.report, "sha256")
+        for index, token in enumerate(entries(tokens)):
+            path: KeyPath = (section, "tokens", index)
             name = mapping(token).get("name")
             if isinstance(name, str):
                 names.claim((*path, "name"), name, show(name), path)
@@ -66,15 +93,12 @@ class ServiceChecks:
                 hashes.claim((*path, "sha256"), digest, "a hash", path)
 
     def _mqtt(self, mqtt: dict[Any, Any]) -> None:
-        if "password_file" in mqtt and "username" not in mqtt:
-            message = "found without username, allowed: both or none"
-            self.report.add(("mqtt", "password_file"), message, of_key=True)
-        self._readable(("mqtt", "password_file"), mqtt.get("password_file"))
+        self._password("mqtt", mqtt)
         broker = parsed(parse_broker, mqtt.get("url"))
         if "tls" in mqtt and broker is not None and not broker.secure:
             message = "found beside a url that begins with mqtt://, allowed: beside mqtts:// only"
             self.report.add(("mqtt", "tls"), message, of_key=True)
-        self._certificates(mapping(mqtt.get("tls")))
+        self._certificates("mqtt", mapping(mqtt.get("tls")))
         topics = Owners(self.report, "topic")
         for index, subscription in enumerate(entries(mqtt.get("subscriptions"))):
             path: KeyPath = ("mqtt", "subscriptions", index)
@@ -83,13 +107,33 @@ class ServiceChecks:
             if topic is not None:
                 topics.claim((*path, "topic"), topic, show(topic), path)
 
-    def _certificates(self, tls: dict[Any, Any]) -> None:
+    def _nats(self, nats: dict[Any, Any]) -> None:
+        self._password("nats", nats)
+        for key in ("token_file", "credentials_file"):
+            self._readable(("nats", key), nats.get(key))
+        first, *others = [key for key in _IDENTITIES if key in nats] or [""]
+        for key in others:
+            message = f"found beside {first}, allowed: one of {choice(_IDENTITIES)}"
+            self.report.add(("nats", key), message, of_key=True)
+        servers = [parsed(parse_server, url) for url in entries(nats.get("servers"))]
+        if "tls" in nats and servers and all(each and each.scheme == "nats" for each in servers):
+            message = "found beside servers that begin with nats://, allowed: beside tls:// only"
+            self.report.add(("nats", "tls"), message, of_key=True)
+        self._certificates("nats", mapping(nats.get("tls")))
+
+    def _password(self, section: str, settings: dict[Any, Any]) -> None:
+        if "password_file" in settings and "username" not in settings:
+            message = "found without username, allowed: both or none"
+            self.report.add((section, "password_file"), message, of_key=True)
+        self._readable((section, "password_file"), settings.get("password_file"))
+
+    def _certificates(self, section: str, tls: dict[Any, Any]) -> None:
         for key, other in (("cert_file", "key_file"), ("key_file", "cert_file")):
             if key in tls and other not in tls:
                 message = f"found without {other}, allowed: both or none"
-                self.report.add(("mqtt", "tls", key), message, of_key=True)
+                self.report.add((section, "tls", key), message, of_key=True)
         for key in ("ca_file", "cert_file", "key_file"):
-            self._readable(("mqtt", "tls", key), tls.get(key))
+            self._readable((section, "tls", key), tls.get(key))
 
     def _readable(self, path: KeyPath, file: object) -> None:
         if isinstance(file, str) and file and "\0" not in file:

@@ -1,14 +1,17 @@
-"""What an appliance offers or uses beside its listeners: REST, MQTT, adapters, metrics, audit."""
+"""What an appliance offers or uses beside its listeners: REST, MQTT, the scanner, the gateway,
+adapters, metrics, audit.
+"""
 
 from __future__ import annotations
 
 from ipaddress import IPv4Network, IPv6Network
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.config.base import Model
 from holdfast.config.broker import Broker, parse_broker
+from holdfast.config.scanning import MOST_DEVICES, MOST_TAGS, PREFIX
 from holdfast.config.values import (
     Access,
     Areas,
@@ -16,27 +19,36 @@ from holdfast.config.values import (
     BrokerUrl,
     Connections,
     Duration,
+    EgressEntry,
     FilePath,
     MemoryNames,
     MqttText,
     MqttVersion,
     Name,
+    NatsUrl,
     NotNull,
     OptionName,
+    PollableEntry,
     QualityOfService,
     Sha256,
     Sources,
+    SubjectPrefix,
     TopicFilter,
 )
 
 
-class TokenConfig(Model):
-    """One who may use REST, by a secret token, and what for."""
+class GatewayTokenConfig(Model):
+    """One who may use the gateway, by a secret token."""
 
     name: Name
     """What the logs call it; no two tokens share one."""
     sha256: Sha256
     """The SHA-256 of the token, 64 hexadecimal digits; the token itself is not in the file."""
+
+
+class TokenConfig(GatewayTokenConfig):
+    """One who may use REST, by a secret token, and what for."""
+
     memories: MemoryNames
     """The memories it reaches."""
     areas: Areas
@@ -49,8 +61,9 @@ def _form(tokens: object) -> str:
     return "word" if isinstance(tokens, str) else "list"
 
 
+Token = TypeVar("Token", bound=GatewayTokenConfig)
 Tokens: TypeAlias = Annotated[
-    Annotated[tuple[TokenConfig, ...], Strict(False), Field(min_length=1), Tag("list")]
+    Annotated[tuple[Token, ...], Strict(False), Field(min_length=1), Tag("list")]
     | Annotated[Literal["none"], Tag("word")],
     Discriminator(_form),
 ]
@@ -63,7 +76,7 @@ class RestConfig(Model):
     """Where to listen: an IP address and a port."""
     sources: Sources
     """Networks and addresses of the clients, IPv4 or IPv6."""
-    tokens: Tokens
+    tokens: Tokens[TokenConfig]
     """Who may do what; `none` lets everyone do everything, on a loopback address only."""
     max_body: Annotated[int, Field(ge=1024, le=2**30)] = 8 * 2**20
     """The most bytes of the body of a request."""
@@ -73,8 +86,8 @@ class RestConfig(Model):
     """Seconds from the first byte of a request to its last."""
 
 
-class MqttTlsConfig(Model):
-    """Certificates for MQTT over TLS; without them, the broker is judged by the system's own."""
+class BrokerTlsConfig(Model):
+    """Certificates for TLS with a broker, which without them is judged by the system's own."""
 
     ca_file: Annotated[FilePath | None, NotNull()] = None
     """The authorities that may vouch for the broker, in PEM."""
@@ -112,7 +125,7 @@ class MqttConfig(Model):
     """The version of MQTT."""
     keep_alive: Annotated[int, Field(ge=1, le=65535)] = 60
     """Seconds without a message after which the connection is tested."""
-    tls: Annotated[MqttTlsConfig | None, NotNull()] = None
+    tls: Annotated[BrokerTlsConfig | None, NotNull()] = None
     """Certificates; beside mqtts:// only."""
     subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
     """The topics to listen to."""
@@ -136,6 +149,55 @@ class MqttConfig(Model):
     def secure(self) -> bool:
         """Whether TLS is spoken."""
         return self.broker.secure
+
+
+class NatsLimitsConfig(Model):
+    """What subscribers of the scanner may ask for at most."""
+
+    devices: Annotated[int, Field(ge=1)] = MOST_DEVICES
+    """Devices that are polled at once."""
+    tags: Annotated[int, Field(ge=1)] = MOST_TAGS
+    """Tags of all devices."""
+
+
+class NatsConfig(Model):
+    """The scanner: polls devices for whoever subscribes over NATS."""
+
+    servers: Annotated[tuple[NatsUrl, ...], Strict(False), Field(min_length=1)]
+    """The NATS servers: nats://host:port, or tls://host:port; the port is 4222 if left out."""
+    devices: Annotated[tuple[PollableEntry, ...], Strict(False), Field(min_length=1)]
+    """Whom subscribers may have polled and written to: networks, addresses, serial devices."""
+    username: Annotated[MqttText | None, NotNull()] = None
+    """The user name that is told to the server."""
+    password_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that holds the password; beside username only."""
+    token_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that holds a token, in the place of a user."""
+    credentials_file: Annotated[FilePath | None, NotNull()] = None
+    """A file with a JWT and the seed of its key, in the place of a user."""
+    tls: Annotated[BrokerTlsConfig | None, NotNull()] = None
+    """Certificates; beside tls:// only."""
+    prefix: SubjectPrefix = PREFIX
+    """The first part of all subjects."""
+    limits: NatsLimitsConfig = Field(default_factory=NatsLimitsConfig)
+    """What subscribers may ask for at most."""
+
+
+class GatewayConfig(Model):
+    """The gateway: Modbus devices over HTTP, and a console for a browser."""
+
+    bind: BindAddress
+    """Where to listen: an IP address and a port."""
+    sources: Sources
+    """Networks and addresses of the clients, IPv4 or IPv6."""
+    allow: Annotated[tuple[EgressEntry, ...], Strict(False), Field(min_length=1)]
+    """Whom it may connect to: networks and addresses, with ports; without, it is port 502."""
+    access: Access
+    """Whether it may write to devices."""
+    tokens: Tokens[GatewayTokenConfig]
+    """Who may use it; `none` lets everyone, from this machine only."""
+    in_flight: Annotated[int, Field(ge=1, le=64)] = 1
+    """Requests on their way to one device at once."""
 
 
 class AdapterConfig(Model):

@@ -19,10 +19,13 @@ if TYPE_CHECKING:
 
     _Server: TypeAlias = tuple[KeyPath, dict[Any, Any]]
 
+SERVICES = ("rest", "gateway", "metrics")
+"""Sections that are served over HTTP."""
+
 
 def check_sockets(data: object, report: Report) -> None:
     """Reports what overlaps: TCP with TCP, UDP with UDP, a serial port with itself."""
-    services = [((name,), mapping(mapping(data).get(name))) for name in ("rest", "metrics")]
+    services = [((name,), mapping(mapping(data).get(name))) for name in SERVICES]
     _overlaps([*_listeners(data, CONNECTION_TYPES), *services], report)
     _overlaps(_listeners(data, DATAGRAM_TYPES), report)
     devices = Owners(report, "device")

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _KEY = "[key]"
 _NO_KIND = ("union_tag_invalid", "union_tag_not_found")
+_TOKENS = (("rest", "tokens"), ("gateway", "tokens"))
+_SERVERS = ("nats", "servers")
 _TOLD = ("default_factory_not_called",)
 """Errors that only follow from others."""
 
@@ -43,7 +45,7 @@ def build(data: object, context: Mapping[str, Any], report: Report) -> Config | 
 def _untagged(path: KeyPath) -> KeyPath:
     """The path without the name of a kind, which pydantic puts in where there are several."""
     of_listener = path[:1] == ("listeners",) and path[2:] != (_KEY,)
-    return path[:2] + path[3:] if of_listener or path[:2] == ("rest", "tokens") else path
+    return path[:2] + path[3:] if of_listener or path[:2] in _TOKENS else path
 
 
 def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
@@ -76,9 +78,9 @@ def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
 
 
 def _shown(path: KeyPath, value: object) -> str:
-    """The value in words; in the place of a token only its shape, as it could be the secret."""
-    of_token = path[:2] == ("rest", "tokens") and len(path) <= 3
-    return shape(value) if of_token else show(value)
+    """The value in words; where it could be a secret, or have one in it, only its shape."""
+    of_token = path[:2] in _TOKENS and len(path) <= 3
+    return shape(value) if of_token or path == _SERVERS else show(value)
 
 
 def _unknown(path: KeyPath, data: object) -> str:

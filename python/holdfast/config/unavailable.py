@@ -14,16 +14,11 @@ from holdfast.config.words import choice
 if TYPE_CHECKING:
     from holdfast.config.problems import Report
 
-SECTIONS = ("nats", "gateway")
 TYPES = ("modbus-tls",)
 
 
 def refuse_unavailable(data: object, report: Report) -> None:
     """Reports what is not available, for nobody else to look at it."""
-    for name in SECTIONS:
-        if name in mapping(data):
-            message = "this section is not available in this version"
-            report.settle((name,), message, of_key=True)
     for name, listener in mapping(mapping(data).get("listeners")).items():
         kind = mapping(listener).get("type")
         if isinstance(kind, str) and kind in TYPES:

@@ -30,7 +30,9 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from holdfast.config.addresses import Bind, Network, parse_bind, parse_source
 from holdfast.config.broker import LONGEST_TEXT, parse_broker, parse_topic_filter
+from holdfast.config.egress import Allowed, parse_allowed
 from holdfast.config.receiver import parse_receiver
+from holdfast.config.scanning import PREFIX, Pollable, parse_pollable, parse_prefix, parse_server
 from holdfast.config.words import choice, shape, show
 from holdfast.target import FORMS, parse
 
@@ -57,7 +59,7 @@ BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 FUNCTIONS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43)
 WRITES = (5, 6, 15, 16, 22, 23)
-RESERVED = ("rest", "mqtt", "metrics")
+RESERVED = ("rest", "mqtt", "nats", "gateway", "metrics")
 """Names that adapters can't have, because the appliance's own parts have them."""
 
 
@@ -107,6 +109,11 @@ def parse_sha256(value: object) -> str:
 
 def _broker_url(value: object) -> str:
     parse_broker(value)
+    return str(value)
+
+
+def _nats_url(value: object) -> str:
+    parse_server(value)
     return str(value)
 
 
@@ -260,6 +267,28 @@ BrokerUrl = Annotated[
     WithJsonSchema(
         {"type": "string", "examples": ["mqtt://127.0.0.1:1883", "mqtts://broker.example"]}
     ),
+]
+NatsUrl = Annotated[
+    str,
+    PlainValidator(_nats_url),
+    WithJsonSchema({"type": "string", "examples": ["nats://127.0.0.1:4222", "tls://nats.example"]}),
+]
+SubjectPrefix = Annotated[
+    str,
+    PlainValidator(parse_prefix),
+    WithJsonSchema({"type": "string", "examples": [PREFIX, "plant.modbus"]}),
+]
+PollableEntry = Annotated[
+    Pollable,
+    PlainValidator(parse_pollable),
+    PlainSerializer(str, return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7", "/dev/ttyUSB0"]}),
+]
+EgressEntry = Annotated[
+    Allowed,
+    PlainValidator(parse_allowed),
+    PlainSerializer(str, return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7:5020", "[fd00::]/64"]}),
 ]
 DeviceUrl = Annotated[
     str,

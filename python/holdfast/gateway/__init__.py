@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from holdfast.config.egress import Allowed
 from holdfast.gateway.app import App
-from holdfast.gateway.egress import Allowed
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import Limits, Settings
 from holdfast.http import Host, address_of
@@ -56,3 +56,7 @@ class Gateway:
     def counts(self) -> dict[str, int]:
         """What became of connections, from any thread."""
         return self._host.counts()
+
+    def status(self) -> dict[str, object]:
+        """Where it listens, and what became of connections and requests, from any thread."""
+        return {"address": self.address, "connections": self.counts(), **self._app.counts()}

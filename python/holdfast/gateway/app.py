@@ -59,6 +59,9 @@ STATUSES = {
 """The status of a refusal by its reason; everything else is 500."""
 
 
+WRITES_ON = "--writes, or access: read-write in the configuration, lets this gateway write"
+
+
 class App:
     """The ASGI application."""
 
@@ -81,6 +84,8 @@ class App:
             dial=dial,
         )
         self._running = {"requests": 0, "streams": 0}
+        self._requests = self._failed = self._writes = 0
+        self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         document = openapi.document(__version__, ENDPOINTS, settings)
@@ -96,6 +101,20 @@ class App:
             **dict.fromkeys(assets.FILES, ("GET", self._asset)),
         }
 
+    def counts(self) -> dict[str, object]:
+        """How many requests came, and what became of them, from any thread.
+
+        `refused` has them by their reason, `failed` are those whose device did not answer, `writes`
+        those that may have changed one, `devices` the connections that are kept.
+        """
+        return {
+            "requests": self._requests,
+            "refused": dict(self._refused),
+            "failed": self._failed,
+            "writes": self._writes,
+            "devices": len(self._pool),
+        }
+
     def end(self) -> None:
         """Ends all streams. From any thread."""
         if self._loop is not None:
@@ -106,11 +125,13 @@ class App:
         """Answers one request."""
         self._loop = asyncio.get_running_loop()
         request = Request(scope, receive)
+        self._requests += 1
         try:
             await self._answer(request, send)
         except Unfit as unfit:
             await self._refuse(request, send, unfit)
         except Failed as failed:
+            self._failed += 1
             body = _error(failed.detail)
             await self._reply(request, send, body, status=500, reason=failed.reason)
         except Gone:
@@ -140,6 +161,7 @@ class App:
 
     async def _refuse(self, request: Request, send: Send, unfit: Unfit) -> None:
         status = STATUSES[unfit.reason]
+        self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
         logs.refused(
             "gateway_refused",
             kind=unfit.reason,
@@ -231,7 +253,7 @@ class App:
                 given = from_json(await request.body(self._limits.body), fields)
                 changes = endpoint.writes(given)
                 if changes and not self._settings.writes:
-                    raise Unfit("writes_off", "writes are off: this gateway runs without --writes")
+                    raise Unfit("writes_off", f"writes are off: {WRITES_ON}")
                 device = Device(self._egress, self._pool, given)
                 work = self._carry_out(request, send, endpoint, given, device, changes)
                 await self._while_there(request, work)
@@ -260,7 +282,8 @@ class App:
         await self._reply(request, send, msgspec.json.encode(answer))
 
     def _note_write(self, request: Request, given: dict[str, Any], outcome: str) -> None:
-        """Who wrote where, without the values."""
+        """Counts a write, and tells who wrote where, without the values."""
+        self._writes += 1
         logs.write(
             logging.INFO,
             "gateway_write",

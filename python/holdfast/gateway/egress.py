@@ -8,39 +8,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import socket
 import threading
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv6Address, ip_address
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, TypeAlias
-
-from holdfast.config.addresses import parse_source
-from holdfast.target import PORT
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from holdfast.config.addresses import Network
+    from holdfast.config.addresses import Address
+    from holdfast.config.egress import Allowed
     from holdfast.target import Transport
 
-    Address: TypeAlias = IPv4Address | IPv6Address
     Resolve: TypeAlias = Callable[[str], Awaitable[list[str]]]
-
-FORM = (
-    "NETWORK[:PORTS] as 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
-    "[fd00::]/8:502; without ports it is 502"
-)
-LAST_PORT = 65535
 
 MOST_LOOKUPS = 32
 """Names that are looked up at once; more wait."""
-
-_ENTRY = re.compile(
-    r"(?:\[(?P<six>[0-9a-fA-F:.]*)\](?P<prefix>/[0-9]{1,3})?|(?P<four>[0-9./]+))"
-    r"(?::(?P<ports>\*|[0-9]{1,5}(?:-[0-9]{1,5})?))?",
-    re.ASCII,
-)
 
 
 class Refused(Exception):
@@ -49,53 +33,6 @@ class Refused(Exception):
 
 class NoSuchName(Exception):
     """A name that means no address."""
-
-
-@dataclass(frozen=True)
-class Allowed:
-    """A network and the ports in it."""
-
-    network: Network
-    first: int
-    last: int
-
-    def holds(self, address: Address, port: int) -> bool:
-        """Whether a connection to this port of this address is one of them."""
-        return self.first <= port <= self.last and address in self.network
-
-    def __str__(self) -> str:
-        network = self.network
-        whole = network.prefixlen == network.max_prefixlen
-        prefix = "" if whole else f"/{network.prefixlen}"
-        host = str(network.network_address)
-        ports = str(self.first) if self.first == self.last else f"{self.first}-{self.last}"
-        if (self.first, self.last) == (1, LAST_PORT):
-            ports = "*"
-        return f"[{host}]{prefix}:{ports}" if network.version == 6 else f"{host}{prefix}:{ports}"
-
-
-def parse(text: str) -> Allowed:
-    """An entry of the list. Raises `ValueError`, which says what is allowed."""
-    match = _ENTRY.fullmatch(text)
-    if match is None:
-        raise ValueError(f"found {text!r}, allowed: {FORM}")
-    host = match["four"] or f"{match['six']}{match['prefix'] or ''}"
-    network = parse_source(host)
-    if match["six"] is not None and network.version != 6:
-        raise ValueError(f"found {text!r}, brackets are for IPv6")
-    first, last = _ports(match["ports"])
-    if not 1 <= first <= last <= LAST_PORT:
-        raise ValueError(f"found {text!r}, allowed are ports 1 to 65535, lower ones first")
-    return Allowed(network, first, last)
-
-
-def _ports(text: str | None) -> tuple[int, int]:
-    if text is None:
-        return PORT, PORT
-    if text == "*":
-        return 1, LAST_PORT
-    first, _, last = text.partition("-")
-    return int(first), int(last or first)
 
 
 @dataclass(frozen=True)

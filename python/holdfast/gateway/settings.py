@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from holdfast.config.addresses import Network
-    from holdfast.gateway.egress import Allowed
+    from holdfast.config.egress import Allowed
     from holdfast.gateway.tokens import Token
 
 LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"))
@@ -42,6 +42,11 @@ class Limits:
     """Connections of HTTP clients."""
     request_timeout: float = 10.0
     """For a request to arrive, and for an answer to be taken."""
+
+    @property
+    def open_connections(self) -> int:
+        """The most connections, to clients and to devices."""
+        return self.connections + self.devices
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ import contextlib
 import socket
 import threading
 from dataclasses import replace
-from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from ipaddress import IPv6Address, ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
+from holdfast.config.scanning import parse_pollable
 from holdfast.scanner.errors import Refused
 from holdfast.target import NetworkTarget, SerialTarget
 
@@ -43,23 +44,19 @@ PRIVATE = tuple(
 )
 """What is allowed where nothing is said."""
 
+WHERE = "name it with --allow, or in nats.devices of the configuration"
+
 
 class Allowed:
-    """Networks, and serial devices by their paths.
+    """Networks, and serial devices by their paths; without any, `PRIVATE`.
 
-    What is no address or network is a serial device. Without any network, private and loopback
-    addresses are allowed; serial devices are allowed only by name.
+    Raises `ValueError` for an entry that is neither.
     """
 
     def __init__(self, entries: Iterable[str] = ()) -> None:
-        networks: list[IPv4Network | IPv6Network] = []
-        self._devices: set[str] = set()
-        for entry in entries:
-            if entry.startswith(("/dev/", "COM", "\\\\.\\")):
-                self._devices.add(entry)
-            else:
-                networks.append(ip_network(entry))
-        self._networks = tuple(networks) or PRIVATE
+        allowed = [parse_pollable(entry) for entry in entries] or PRIVATE
+        self._devices = {entry for entry in allowed if isinstance(entry, str)}
+        self.networks = tuple(entry for entry in allowed if not isinstance(entry, str))
         self._looking = 0
 
     async def address(self, target: Target, *, after: Target | None = None) -> Target:
@@ -69,14 +66,14 @@ class Allowed:
         """
         if isinstance(target, SerialTarget):
             if target.device not in self._devices:
-                raise Refused(f"{target.device} is not allowed; --allow {target.device} does that")
+                raise Refused(f"{target.device} is not allowed; {WHERE}")
             return target
         found = await self._found(target)
         allowed = [address for address in found if self._contains(address)]
         if not allowed:
             known = ", ".join(found)
             told = "" if known == target.host else f" ({known})"
-            networks = ", ".join(map(str, self._networks))
+            networks = ", ".join(map(str, self.networks)) or "serial devices only"
             raise Refused(f"{target.host}{told} is not allowed, allowed are {networks}")
         last = after.host if isinstance(after, NetworkTarget) else ""
         at = (allowed.index(last) + 1) % len(allowed) if last in allowed else 0
@@ -108,7 +105,7 @@ class Allowed:
 
     def _contains(self, text: str) -> bool:
         address = _plain(ip_address(text))
-        return any(address in network for network in self._networks)
+        return any(address in network for network in self.networks)
 
 
 def _plain(address: IPv4Address | IPv6Address) -> IPv4Address | IPv6Address:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from holdfast.config.scanning import MOST_DEVICES, MOST_TAGS
+
 
 @dataclass(frozen=True)
 class Limits:
     """The limits of one scanner; times are in milliseconds."""
 
-    devices: int = 5000
-    tags: int = 500_000
+    devices: int = MOST_DEVICES
+    tags: int = MOST_TAGS
     """Of all devices."""
     device_tags: int = 10_000
     """Of one device."""
@@ -26,3 +28,8 @@ class Limits:
     """Bytes of the value of a command."""
     pending: int = 10_000
     """Requests that are carried out at once."""
+
+    @property
+    def connections(self) -> int:
+        """The most connections to devices: one to each, and one beside it that is being closed."""
+        return self.devices

@@ -97,7 +97,8 @@ class Polling:
     async def write(self, device: Device, request: _core.Request) -> int:
         """Sends a write to a device between two reads; the fault, 0 when it was confirmed."""
         number = self._poller.write(device.polled_as, request)
-        done = self._writes[number] = self._loop.create_future()
+        done: asyncio.Future[int] = self._loop.create_future()
+        self._writes[number] = done
         try:
             return await done
         finally:

@@ -102,6 +102,11 @@ class Scanner:
         """Whether requests reach it just now."""
         return self._broker.serves
 
+    @property
+    def devices(self) -> int:
+        """How many devices it polls."""
+        return 0 if self._ended.is_set() else len(self._registry.devices)
+
     def end(self) -> None:
         """Ends the service."""
         self._ended.set()
@@ -315,7 +320,6 @@ class Scanner:
         for task in running:
             task.cancel()
         await _within(asyncio.wait(running))
-        logs.write(logging.INFO, "stopped")
 
     async def _farewell(self) -> None:
         """Takes the heartbeat away, and sees that what was published is sent."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from holdfast.adapters.mqtt.waiting import Waiter
-    from holdfast.config import MqttTlsConfig
+    from holdfast.config import BrokerTlsConfig
 
 PATIENCE = 10.0
 """Seconds that one address of the broker has to accept the connection, and TLS to be agreed on."""
@@ -20,7 +20,7 @@ PATIENCE = 10.0
 _UNDER_WAY = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
 
 
-def tls_context(files: MqttTlsConfig | None) -> ssl.SSLContext:
+def tls_context(files: BrokerTlsConfig | None) -> ssl.SSLContext:
     """Checks certificate and host name; the files are read now, so a renewed one is taken.
 
     Raises `OSError` for a file that can't be used.

@@ -1,0 +1,67 @@
+"""The URL of a server that others run: a scheme, a host and perhaps a port.
+
+No message repeats a URL: someone may have written a password into it.
+"""
+
+from __future__ import annotations
+
+import re
+from ipaddress import IPv6Address
+from typing import TYPE_CHECKING, NamedTuple
+
+from holdfast.config.words import shape
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_HOST = re.compile(
+    r"(?:\[(?P<six>[^\]]*)\]|(?P<name>[A-Za-z0-9][A-Za-z0-9_.-]{0,252}))(?::(?P<port>[0-9]{1,5}))?",
+    re.ASCII,
+)
+
+
+class Remote(NamedTuple):
+    """Where a server is; the host is a name or an address without brackets."""
+
+    scheme: str
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.scheme}://{host}:{self.port}"
+
+
+def parse_remote(
+    text: object, ports: Mapping[str, int], form: str, *, least_port: int = 1
+) -> Remote:
+    """The parts of a URL; `ports` has the schemes, each with the port that is left out.
+
+    Raises `ValueError` for anything but a scheme, a host and perhaps a port.
+    """
+    if not isinstance(text, str):
+        raise ValueError(f"found {shape(text)}, allowed: {form}")
+    scheme, _, rest = text.partition("://")
+    if scheme not in ports or not rest:
+        neither = f"neither {' nor '.join(f'{known}://' for known in ports)}"
+        found = "no host" if scheme in ports else neither
+        raise ValueError(f"found {found}, allowed: {form}")
+    if "@" in rest:
+        where = "the user is username, the password is in the file that password_file names"
+        raise ValueError(f"found a user in it, allowed: {form}; {where}")
+    if re.search("[/?#]", rest):
+        raise ValueError(f"found more than host and port, allowed: {form}")
+    match = _HOST.fullmatch(rest)
+    port = int(match["port"] or ports[scheme]) if match else 0
+    if match is None or not _is_host(match) or not least_port <= port <= 65535:
+        port_form = f"a port from {least_port} to 65535"
+        allowed = f"allowed: a host name or an address, IPv6 in brackets, and {port_form}"
+        raise ValueError(f"found a host or port that can't be, {allowed}")
+    return Remote(scheme, match["name"] or match["six"], port)
+
+
+def _is_host(match: re.Match[str]) -> bool:
+    try:
+        return match["six"] is None or bool(IPv6Address(match["six"]))
+    except ValueError:
+        return False

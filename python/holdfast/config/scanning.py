@@ -1,0 +1,54 @@
+"""What the scanner is told, as text: NATS servers, the prefix of its subjects, and devices."""
+
+from __future__ import annotations
+
+import re
+from ipaddress import IPv4Network, IPv6Network
+from typing import TYPE_CHECKING, TypeAlias
+
+from holdfast.config.addresses import SOURCE_FORM, Network, parse_source
+from holdfast.config.remote import parse_remote
+from holdfast.config.words import show
+
+if TYPE_CHECKING:
+    from holdfast.config.remote import Remote
+
+Pollable: TypeAlias = Network | str
+"""A network of devices, or the path of a serial device."""
+
+SERVER_FORM = "nats://host:port or tls://host:port"
+SERVER_PORT = 4222
+PREFIX = "modbus"
+PREFIX_FORM = "the first part of subjects: letters, digits, '_' and '-', with dots between"
+POLLABLE_FORM = f"{SOURCE_FORM}, or a serial device, as in /dev/ttyUSB0 or COM3"
+
+MOST_DEVICES = 5000
+MOST_TAGS = 500_000
+"""What subscribers may ask for where nothing else is said; tags are those of all devices."""
+
+_PORTS = {"nats": SERVER_PORT, "tls": SERVER_PORT}
+_PREFIX = re.compile(r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})*", re.ASCII)
+_NUMBER = re.compile(r"[0-9a-fA-F.:/]+", re.ASCII)
+_SERIAL = re.compile(r"/[^\0]+|COM[0-9]+|\\\\\.\\[^\0]+", re.ASCII)
+
+
+def parse_server(text: object, *, least_port: int = 1) -> Remote:
+    """The parts of a server's URL. Raises `ValueError`, which does not repeat it."""
+    return parse_remote(text, _PORTS, SERVER_FORM, least_port=least_port)
+
+
+def parse_prefix(text: object) -> str:
+    """Raises `ValueError` for what can't begin a subject."""
+    if isinstance(text, str) and _PREFIX.fullmatch(text):
+        return text
+    raise ValueError(f"found {show(text)}, allowed: {PREFIX_FORM}")
+
+
+def parse_pollable(text: object) -> Pollable:
+    """Raises `ValueError` for anything but a network, an address or a serial device."""
+    if isinstance(text, str) and _SERIAL.fullmatch(text):
+        return text
+    is_number = isinstance(text, str) and _NUMBER.fullmatch(text)
+    if is_number or isinstance(text, IPv4Network | IPv6Network):
+        return parse_source(text)
+    raise ValueError(f"found {show(text)}, allowed: {POLLABLE_FORM}")
