@@ -258,10 +258,10 @@ class SyncClient(_Common):
 class Client(_Common):
     """A client for asyncio: every method is awaited.
 
-    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS up to
-    `max_in_flight` requests are on their way at once, and replies may come in any order; what is
-    more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers only
-    one at a time. On other transports one request is on its way at once.
+    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS
+    up to `max_in_flight` requests are on their way at once, and replies may come in any order; what
+    is more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers
+    only one at a time. On other transports one request is on its way at once.
 
     Any number of tasks may share a client, in one event loop; in another one after `close`, or
     when the first is closed. A call that is cancelled leaves the connection usable.
