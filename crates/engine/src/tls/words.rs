@@ -52,7 +52,17 @@ fn certificate(flaw: &CertificateError) -> String {
         }
         CertificateError::BadEncoding => "the certificate can't be read".into(),
         CertificateError::BadSignature => "a signature of the certificate is wrong".into(),
-        CertificateError::Other(other) => format!("the certificate: {other}"),
+        CertificateError::Other(other) => match other.0.downcast_ref() {
+            Some(webpki::Error::CaUsedAsEndEntity) => {
+                "the certificate is that of an authority: as a device's own it has to be one of \
+                 those that are trusted"
+                    .into()
+            }
+            Some(webpki::Error::UnsupportedCertVersion) => {
+                "the certificate has an old form, allowed: X.509 version 3".into()
+            }
+            _ => format!("the certificate: {other}"),
+        },
         other => format!("the certificate: {other}"),
     }
 }
