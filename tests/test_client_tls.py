@@ -21,6 +21,7 @@ from pymodbus.server import ModbusTlsServer
 
 import holdfast
 import wire
+from cli import answer, done, failure, usage_error
 from faces import FACES, dialling, run
 from holdfast import _core
 from holdfast.client import endpoint
@@ -611,6 +612,22 @@ def test_pymodbus(dial: Dial, version: str, authority: Authority, plc: Owner) ->
         wire.until(lambda: not server.connections, "pymodbus has noticed")
     finally:
         server.stop()
+
+
+def test_commands(device: Address, authority: Authority, plc: Owner, tmp_path: Path) -> None:
+    with Relay(device, context(plc)) as relay:
+        url = relay.url(ca=authority.ca)
+        told = answer("read", url, "hr", "0", "3")
+        assert told["registers"] == [11, 22, 33]
+        told = answer("bench", url, "--count", "3", "--in-flight", "4", "--seconds", "0.05")
+        assert told["errors"] == {}
+
+        [told] = failure("read", relay.url(ca=authority.ca, name="plc7"), "hr", "0")
+        assert told.endswith("the certificate is for '127.0.0.1', not for 'plc7'")
+        none = f"tls://plc?ca={tmp_path}/none.pem"
+        for words in (("read", none, "hr", "0"), ("bench", none), ("watch", none, "hr", "0")):
+            assert "No such file or directory" in usage_error(*words)
+        assert "1 request" in done("plan", none, "--read", "hr:0:3")
 
 
 def test_an_appliance_polls_a_device_with_files_beside_its_configuration(
