@@ -194,6 +194,11 @@ class _LoopLink:
         return connection
 
     @property
+    def secure(self) -> bool:
+        """Whether it is by TLS."""
+        return self._context is not None
+
+    @property
     def _name(self) -> str:
         """What the certificate of the device is for."""
         return self._target.tls.name or self._target.host
@@ -224,6 +229,7 @@ class _Connection(asyncio.Protocol):
         self._here = here
         self._loop = here.loop
         self.closed: asyncio.Future[None] = self._loop.create_future()
+        self._heard = not here.secure
         self._futures: dict[int, asyncio.Future[Any]] = {}
         self._by_deadline: deque[tuple[float, int, asyncio.Future[Any], float]] = deque()
         """The earliest first: deadline, transaction id, future, and the timeout that it had."""
@@ -285,6 +291,7 @@ class _Connection(asyncio.Protocol):
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:
+        self._heard = True
         completed, broken = self.session.receive(data)
         for number, result in completed:
             future = self._futures.pop(number)
@@ -300,7 +307,7 @@ class _Connection(asyncio.Protocol):
             self.end(InvalidResponse(f"invalid response: {broken}"))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        why = "closed by the peer" if exc is None else tls.told(exc)
+        why = "closed by the peer" if exc is None else tls.told(exc, heard=self._heard)
         self.end(ConnectionLost(f"connection lost: {why}"))
         self.closed.set_result(None)
 

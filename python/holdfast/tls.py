@@ -14,6 +14,7 @@ CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
 UNKNOWN = "the issuer of the certificate is unknown: it is none of those that are trusted"
 ENDED = "the peer ended the connection instead of agreeing on TLS"
 NO_TLS = "the peer does not speak TLS"
+REFUSES = "the peer ended the connection before any reply; it may have refused the certificate"
 OTHER_TLS = "the peer has no version or cipher suite of TLS that is ours, 1.2 or 1.3"
 
 FLAWS = {
@@ -89,7 +90,9 @@ def not_agreed(error: Exception, name: str) -> str:
     return told(error)
 
 
-def told(error: Exception) -> str:
-    """What ended a connection."""
+def told(error: Exception, *, heard: bool = True) -> str:
+    """What ended a connection; `heard` says whether the peer had replied on it."""
+    if not heard and isinstance(error, ConnectionResetError | BrokenPipeError):
+        return f"{REFUSES}: {error}"  # A reset overtakes the alert that would say it.
     reason = error.reason if isinstance(error, ssl.SSLError) else ""
     return REASONS.get(reason, str(error))

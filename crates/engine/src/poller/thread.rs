@@ -19,7 +19,7 @@ use super::plan::{self, PlanError};
 use super::results::Results;
 use super::status::BLOCK;
 use crate::client::Endpoint;
-use crate::tls::client::ClientTls;
+use crate::tls::client::Identity;
 
 #[derive(Debug, Error)]
 pub enum PollerError {
@@ -216,11 +216,14 @@ fn spread(within: Duration, number: u32) -> Duration {
 }
 
 /// What devices share a link by: where it goes to, and whom it trusts there.
-type Address = (String, Option<Arc<ClientTls>>);
+type Address = (String, Option<Arc<Identity>>);
 
 fn address(endpoint: &Endpoint) -> Address {
     match endpoint {
-        Endpoint::Tcp { host, port, tls } => (format!("tcp://{host}:{port}"), tls.clone()),
+        Endpoint::Tcp { host, port, tls } => {
+            let identity = tls.as_ref().map(|tls| Arc::clone(tls.identity()));
+            (format!("tcp://{host}:{port}"), identity)
+        }
         Endpoint::RtuOverTcp { host, port } => (format!("rtu+tcp://{host}:{port}"), None),
         Endpoint::Udp { host, port } => (format!("udp://{host}:{port}"), None),
         Endpoint::Serial { line, .. } => (format!("serial:{}", line.device), None),

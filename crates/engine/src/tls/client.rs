@@ -4,10 +4,9 @@
 //! is valid now is asked when it is used, never when its file is read: the clock of a machine that
 //! has just been switched on may be wrong.
 
-use std::hash::{Hash, Hasher};
 use std::io;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::client::{Resumption, verify_server_cert_signed_by_trust_anchor, verify_server_name};
@@ -50,10 +49,18 @@ pub enum TlsError {
 #[derive(Debug)]
 pub struct ClientTls {
     config: Arc<ClientConfig>,
-    trusted: Arc<Trusted>,
+    identity: Arc<Identity>,
+}
+
+/// What makes the TLS of a client what it is.
+#[derive(Debug, PartialEq, Eq, Hash)]
+pub struct Identity {
+    trusted: Certificates,
     own: Vec<CertificateDer<'static>>,
     name: ServerName<'static>,
 }
+
+type Certificates = Arc<[CertificateDer<'static>]>;
 
 impl ClientTls {
     /// Reads the files.
@@ -67,12 +74,16 @@ impl ClientTls {
         })?;
         let provider = Arc::new(ring::default_provider());
         let trusted = Arc::new(Trusted {
-            certificates: settings.ca.map_or_else(of_system, |file| Ok(certificates(file)?))?,
+            certificates: settings
+                .ca
+                .map_or_else(of_system, |file| Ok(certificates(file)?.into()))?,
             of_system: settings.ca.is_none(),
             algorithms: provider.signature_verification_algorithms,
         });
         let (config, own) = config(&provider, &trusted, settings.own)?;
-        Ok(ClientTls { config: Arc::new(config), trusted, own, name })
+        let trusted = Arc::clone(&trusted.certificates);
+        let identity = Arc::new(Identity { trusted, own, name });
+        Ok(ClientTls { config: Arc::new(config), identity })
     }
 
     /// The TLS of a new connection.
@@ -80,39 +91,36 @@ impl ClientTls {
     /// # Errors
     /// The system has no random numbers.
     pub fn channel(&self) -> Result<Channel, Error> {
-        ClientConnection::new(Arc::clone(&self.config), self.name.clone()).map(Channel::new)
+        let name = self.identity.name.clone();
+        ClientConnection::new(Arc::clone(&self.config), name).map(Channel::new)
     }
 
-    fn identity(
-        &self,
-    ) -> (&[CertificateDer<'static>], &[CertificateDer<'static>], &ServerName<'_>) {
-        (&self.trusted.certificates, &self.own, &self.name)
+    pub fn identity(&self) -> &Arc<Identity> {
+        &self.identity
     }
 }
 
 impl PartialEq for ClientTls {
     fn eq(&self, other: &ClientTls) -> bool {
-        self.identity() == other.identity()
+        self.identity == other.identity
     }
 }
 
 impl Eq for ClientTls {}
 
-impl Hash for ClientTls {
-    fn hash<H: Hasher>(&self, state: &mut H) {
-        self.identity().hash(state);
+/// The certificates that the system trusts, the same for all.
+fn of_system() -> Result<Certificates, TlsError> {
+    static FOUND: OnceLock<Certificates> = OnceLock::new();
+    if let Some(found) = FOUND.get() {
+        return Ok(Arc::clone(found));
     }
-}
-
-/// The certificates that the system trusts.
-fn of_system() -> Result<Vec<CertificateDer<'static>>, TlsError> {
     let found = rustls_native_certs::load_native_certs();
     if found.certs.is_empty() {
         let why = found.errors.first().map(|error| format!(": {error}")).unwrap_or_default();
         let text = format!("the system has no authorities{why}; ca has to say who is trusted");
         return Err(TlsError::Other(text));
     }
-    Ok(found.certs)
+    Ok(Arc::clone(FOUND.get_or_init(|| found.certs.into())))
 }
 
 fn config(
@@ -148,7 +156,7 @@ fn config(
 /// Judges the certificate of a peer.
 #[derive(Debug)]
 struct Trusted {
-    certificates: Vec<CertificateDer<'static>>,
+    certificates: Certificates,
     of_system: bool,
     algorithms: WebPkiSupportedAlgorithms,
 }
@@ -183,7 +191,7 @@ impl Trusted {
     ) -> Result<(), Error> {
         let mut authorities = RootCertStore::empty();
         let mut lapsed = None;
-        for each in &self.certificates {
+        for each in self.certificates.iter() {
             match self.is_authority(each, now) {
                 Ok(true) => authorities.add(each.clone())?,
                 Ok(false) => {}
@@ -482,7 +490,7 @@ mod tests {
             (IsCa::ExplicitNoCa, None),
             (IsCa::NoCa, Some(&unknown)),
         ] {
-            let plc = Owner::new("plc", is_ca.clone(), by);
+            let plc = Owner::new("plc", is_ca, by);
             assert_eq!(told(&plc.pem(), "plc", &plc), "pong");
             assert!(told(&plc.pem(), "plc8", &plc).contains("for 'plc', not for 'plc8'"));
             let twin = Owner::new("plc", is_ca, by);
