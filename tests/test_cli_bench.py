@@ -109,7 +109,10 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
     [
         (("tcp://127.0.0.1", "--count", "126"), "count is 126, one read returns 1 to 125."),
         (("tcp://127.0.0.1", "--address", "65530"), "the last address is 65535."),
-        (("udp://127.0.0.1", "--in-flight", "2"), "only tcp has more than one request in flight."),
+        (
+            ("udp://127.0.0.1", "--in-flight", "2"),
+            "only tcp and tls have more than one request in flight.",
+        ),
         (("rtu:///dev/ttyX", "--connections", "2"), "a serial line has one connection."),
         (("tcp://127.0.0.1", "--area", "x"), "'x' is no area"),
         (("tcp://127.0.0.1", "--seconds", "inf"), "'inf' is no number of seconds"),

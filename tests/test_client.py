@@ -28,7 +28,7 @@ import wire
 from conftest import AREAS, endpoint
 from faces import FACES, Awaited, Dial, Face, dialling, run
 from holdfast.identity import Identity
-from holdfast.target import NetworkTarget, SerialTarget, parse
+from holdfast.target import NetworkTarget, SerialTarget, Tls, parse
 from hostile import Hostile, Stream, Udp, silent
 
 if TYPE_CHECKING:
@@ -519,6 +519,14 @@ def test_the_number_in_flight_has_its_limits(number: Any) -> None:
         ("tcp://10.0.0.1:1502/", NetworkTarget("tcp", "10.0.0.1", 1502)),
         ("udp://[fe80::1%25eth0]:502", NetworkTarget("udp", "fe80::1%eth0", 502)),
         ("rtu+tcp://gateway:4001", NetworkTarget("rtu+tcp", "gateway", 4001)),
+        ("tls://plc", NetworkTarget("tls", "plc", 802)),
+        ("tls://[fd00::1]:1802/?ca=ca.pem", NetworkTarget("tls", "fd00::1", 1802, Tls("ca.pem"))),
+        (
+            "tls://10.0.0.5?ca=/a%20b/c+d%26.pem&cert=c.pem&key=C:\\k.pem&name=plc7",
+            NetworkTarget(
+                "tls", "10.0.0.5", 802, Tls("/a b/c+d&.pem", "c.pem", "C:\\k.pem", "plc7")
+            ),
+        ),
         ("rtu:///dev/ttyUSB0", SerialTarget("rtu", "/dev/ttyUSB0", 19200, "even", 1, 8)),
         ("rtu:///dev/ttyS0?parity=none", SerialTarget("rtu", "/dev/ttyS0", 19200, "none", 2, 8)),
         (
@@ -545,7 +553,17 @@ def test_a_target_is_shown_as_a_url() -> None:
         ("", "is no URL of a device; allowed are tcp://host:502"),
         ("plc", "is no URL of a device"),
         ("http://plc", "is no URL of a device"),
-        ("tls://plc", "tls is not available"),
+        ("tls://", "is no address of a device"),
+        ("tls://plc/unit", "is no address of a device"),
+        ("tls://plc?baud=9600", "'baud' is not known, allowed are ca, cert, key, name"),
+        ("tls://plc?ca=a&ca=b", "ca is given twice"),
+        ("tls://plc?ca=", "ca is '', allowed are paths of files"),
+        ("tls://plc?ca=a%00b", r"ca is 'a\\x00b', allowed are paths of files"),
+        ("tls://plc?name=", "name is '', allowed are host names and IP addresses"),
+        ("tls://plc?cert=a", "cert is alone, allowed are cert and key, or none of both"),
+        ("tls://plc?key=a", "key is alone"),
+        ("tcp://plc?ca=a", "is no address of a device"),
+        ("rtu:///dev/x?ca=a", "'ca' is not known, allowed are baud, parity"),
         ("tcp://", "is no address of a device"),
         ("tcp://plc:0", "port 0"),
         ("tcp://plc:65536", "[Pp]ort out of range"),

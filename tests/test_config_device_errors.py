@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from config_folder import Folder
+from holdfast.target import NetworkTarget, Tls
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +37,7 @@ ANOTHER = """\
     reads: [{area: coils, address: 0, count: 8, into: {memory: plant, area: coils, address: 0}}]
 """
 URLS = (
-    "tcp://host:502, udp://host:502, rtu+tcp://host:502, "
+    "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
     "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
 RECEIVER = "raw://host:port, as in raw://10.0.2.9:9000 or raw://[fd00::9]:9000"
@@ -54,6 +55,20 @@ def folder(tmp_path: Path) -> Folder:
 def changed(old: str, new: str, text: str = METER) -> str:
     assert text.count(old) == 1, old
     return HEAD + text.replace(old, new)
+
+
+def test_files_of_a_url_are_relative_to_the_folder_of_the_configuration(folder: Folder) -> None:
+    (folder.path / "a b.pem").write_text("")
+    url = "tls://plc:1802?ca=a%20b.pem&name=plc7"
+
+    config = folder.config(changed("tcp://10.0.0.9", url))
+
+    path = f"{folder.path}/a%20b.pem"
+    assert config.devices["meter"].url == f"tls://plc:1802?ca={path}&name=plc7"
+    assert config.devices["meter"].target == NetworkTarget(
+        "tls", "plc", 1802, Tls(ca=f"{folder.path}/a b.pem", name="plc7")
+    )
+    assert folder.config(config.dump()) == config
 
 
 def told(folder: Folder, text: str) -> list[str]:
@@ -77,6 +92,13 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("tcp://10.0.0.9", "http://a", "5: url: 'http://a' is no URL of a device; allowed are "
          f"{URLS}"),
         ("tcp://10.0.0.9", "tcp://a:0", "5: url: 'tcp://a:0': port 0, allowed are 1 to 65535"),
+        ("tcp://10.0.0.9", "tls://plc?ca=none.pem",
+         "5: url: found ca='none.pem', which can't be read: No such file or directory"),
+        ("tcp://10.0.0.9", "tls://plc?cert=p.yaml&key=/",
+         "5: url: found key='/', which can't be read: Is a directory"),
+        ("tcp://10.0.0.9", "tls://plc?cert=p.yaml",
+         "5: url: 'tls://plc?cert=p.yaml': cert is alone, allowed are cert and key, or none of "
+         "both"),
         ("tcp://10.0.0.9", "rtu:///dev/a%00",
          "5: url: found 'rtu:///dev/a%00', allowed: a URL without NUL"),
         ("    unit: 1\n", "", "4: unit: missing, allowed: an integer from 0 to 255"),

@@ -37,6 +37,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"port": "502"}, "Expected `int | null`, got `str` - at `$.port`"),
     ({"url": "tcp://127.0.0.1"}, "host stands beside url, allowed is one of both"),
     ({"host": None, "port": None, "url": "http://127.0.0.1"}, "url: 'http://127.0.0.1' is no URL"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1"}, "url: tls is not available in this"),
     ({"host": None, "port": None, "unitId": 0, "url": "rtu:///dev/ttyS0"}, "unitId is 0, which is"),
     ({"plan": {"forbidden": [[0, 1]] * 33}}, "Expected `array` of length <= 32"),
     ({"unitId": 256}, "Expected `int` <= 255 - at `$.unitId`"),

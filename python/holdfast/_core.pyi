@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
 from typing import Any, Literal, final
 
 from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
@@ -294,6 +295,22 @@ class Endpoint:
     @staticmethod
     def network(transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int) -> Endpoint:
         """A device, or a gateway, behind an address."""
+
+    @staticmethod
+    def tls(
+        host: str,
+        port: int,
+        ca: str | PathLike[str] | None = None,
+        cert: str | PathLike[str] | None = None,
+        key: str | PathLike[str] | None = None,
+        name: str | None = None,
+    ) -> Endpoint:
+        """Modbus TCP over TLS; the files, in PEM, are read now.
+
+        `ca` has the certificates that are trusted, of authorities or of the device itself; without
+        it they are the system's. `name` is the one that the device's certificate has if it is not
+        `host`. Raises `OSError` and `ValueError` for files that can't be used.
+        """
 
     @staticmethod
     def serial(

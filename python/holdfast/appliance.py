@@ -133,16 +133,22 @@ class _Running:
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         self._health = dict.fromkeys(config.devices, "unknown")
         self._looked = time.monotonic()
-        # An adapter that is not installed is told before any socket is opened.
+        # An adapter that is not installed, and a file that a device's TLS can't use, are told
+        # before any socket is opened.
         for name, settings in config.adapters.items():
             foreign.entry_point(name, settings)
+        devices = [
+            assembly.device(name, config, memories)
+            for name, device in config.devices.items()
+            if device.enabled
+        ]
         disabled = self._tell_disabled()
         with ExitStack() as undo:
             self._audit = self._opened_audit(undo)
             self._sockets = sockets = self._bound_sockets(undo)
             self._engine = self._started_engine()
             undo.callback(self._engine.stop)
-            self._poller = self._started_poller()
+            self._poller = _core.Poller(devices) if devices else None
             if self._poller is not None:
                 undo.callback(self._poller.stop)
             self.endpoints = self._listed(sockets)
@@ -249,14 +255,6 @@ class _Running:
             events="all" if config.log.level == "debug" else "refusals",
             audit=self._audit is not None,
         )
-
-    def _started_poller(self) -> _core.Poller | None:
-        """Polls the devices that are enabled, if there are any."""
-        config = self._config
-        names = [name for name, settings in config.devices.items() if settings.enabled]
-        if not names:
-            return None
-        return _core.Poller([assembly.device(name, config, self._memories) for name in names])
 
     def _tell_disabled(self) -> list[str]:
         """Writes the status blocks of the devices that are not polled; their names."""

@@ -131,12 +131,16 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
 
 
 def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.Device:
-    """The native poller's device of that name."""
+    """The native poller's device of that name. Raises `OSError` for files it can't use."""
     settings = config.devices[name]
     status = settings.status
+    try:
+        made = endpoint(settings.target)
+    except (OSError, ValueError) as error:
+        raise OSError(f"devices.{name}.url: {error}") from error
     return _core.Device(
         name,
-        endpoint(settings.target),
+        made,
         unit=settings.unit,
         interval=settings.interval,
         timeout=settings.timeout,

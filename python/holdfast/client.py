@@ -13,14 +13,15 @@ import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Self
 
-from holdfast import operations
+from holdfast import operations, tls
 from holdfast._core import BlockingClient, Endpoint, Request
 from holdfast.errors import ConnectionLost, ModbusException
 from holdfast.link import CLOSED, Link
-from holdfast.target import NetworkTarget, SerialTarget, parse
+from holdfast.target import IN_FLIGHT, NetworkTarget, SerialTarget, parse
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
+    from ssl import SSLContext
 
     from holdfast.operations import Identification, Plan, Result, ServerId, Steps
     from holdfast.target import Target
@@ -55,9 +56,12 @@ class _Common:
 class SyncClient(_Common):
     """A client that waits: every method returns when the device has answered.
 
-    `url` names the device: `tcp://host:502`, `udp://host:502`, `rtu+tcp://host:502`,
-    `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`. `unit` is the unit id, 0
-    to 255, that a call can replace. `timeout` in seconds covers connecting, sending and receiving.
+    `url` names the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
+    `rtu+tcp://host:502`, `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`.
+    `unit` is the unit id, 0 to 255, that a call can replace. `timeout` in seconds covers
+    connecting, sending and receiving.
+
+    The files of a `tls` URL are read now: `OSError` and `ValueError` say what is wrong with them.
 
     Threads may share a client; their calls take turns, for which `timeout` does not count.
 
@@ -254,10 +258,10 @@ class SyncClient(_Common):
 class Client(_Common):
     """A client for asyncio: every method is awaited.
 
-    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP up to
-    `max_in_flight` requests are on their way at once, and replies may come in any order; what is
-    more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers only
-    one at a time. On other transports one request is on its way at once.
+    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS
+    up to `max_in_flight` requests are on their way at once, and replies may come in any order; what
+    is more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers
+    only one at a time. On other transports one request is on its way at once.
 
     Any number of tasks may share a client, in one event loop; in another one after `close`, or
     when the first is closed. A call that is cancelled leaves the connection usable.
@@ -276,8 +280,8 @@ class Client(_Common):
                 f"max_in_flight is {max_in_flight!r}, allowed are 1 to {MOST_IN_FLIGHT}"
             )
         self._transport: Link | _Thread
-        if isinstance(self.target, NetworkTarget) and self.target.transport == "tcp":
-            self._transport = Link(self.target, max_in_flight)
+        if isinstance(self.target, NetworkTarget) and self.target.transport in IN_FLIGHT:
+            self._transport = Link(self.target, max_in_flight, _context(self.target))
         else:
             self._transport = _Thread(self.target)
 
@@ -516,7 +520,18 @@ def endpoint(target: Target) -> Endpoint:
             silence=target.silence,
             echo=target.echo,
         )
+    if target.transport == "tls":
+        of = target.tls
+        return Endpoint.tls(target.host, target.port, of.ca, of.cert, of.key, of.name)
     return Endpoint.network(target.transport, target.host, target.port)
+
+
+def _context(target: NetworkTarget) -> SSLContext | None:
+    """What asyncio needs to know of TLS, if the target has it."""
+    if target.transport != "tls":
+        return None
+    endpoint(target)  # It says what is wrong with files and names, as in the other client.
+    return tls.context(target.tls)
 
 
 def _unit(unit: int) -> int:

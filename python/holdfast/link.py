@@ -1,4 +1,4 @@
-"""Modbus TCP in asyncio: many requests in flight on one connection, none of them in a thread.
+"""Modbus TCP in asyncio, with TLS or not: many requests in flight on one connection, in no thread.
 
 The native session frames requests and matches replies; here are the socket, the deadlines and the
 futures. Requests that are made in one turn of the event loop leave with one write, replies that
@@ -14,11 +14,13 @@ from math import inf
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
+from holdfast import tls
 from holdfast._core import Session
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, RequestTimeout
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
+    from ssl import SSLContext
 
     from holdfast._core import Request
     from holdfast.target import NetworkTarget
@@ -29,9 +31,12 @@ CLOSED = "connection lost: closed by this side"
 class Link:
     """The connection of a client, in one event loop at a time."""
 
-    def __init__(self, target: NetworkTarget, max_in_flight: int) -> None:
+    def __init__(
+        self, target: NetworkTarget, max_in_flight: int, context: SSLContext | None = None
+    ) -> None:
         self._target = target
         self._max_in_flight = max_in_flight
+        self._context = context
         self._late = 0
         self._here: _LoopLink | None = None
 
@@ -66,7 +71,7 @@ class Link:
             if old.in_use and not old.loop.is_closed():
                 raise RuntimeError("the client is in use in another event loop: close it there")
             self._late += old.late
-        self._here = here = _LoopLink(self._target, self._max_in_flight, loop)
+        self._here = here = _LoopLink(self._target, self._max_in_flight, self._context, loop)
         return here
 
 
@@ -74,10 +79,15 @@ class _LoopLink:
     """A connection in its loop, made when it is needed, and again after it was lost."""
 
     def __init__(
-        self, target: NetworkTarget, max_in_flight: int, loop: asyncio.AbstractEventLoop
+        self,
+        target: NetworkTarget,
+        max_in_flight: int,
+        context: SSLContext | None,
+        loop: asyncio.AbstractEventLoop,
     ) -> None:
         self.loop = loop
         self._target = target
+        self._context = context
         self._max_in_flight = self._free = max_in_flight
         self._queue: deque[asyncio.Future[None]] = deque()
         self._connection: _Connection | None = None
@@ -166,17 +176,32 @@ class _LoopLink:
         return connecting.result()
 
     async def _connect(self, timeout: float) -> _Connection:
-        target = self._target
+        target, context = self._target, self._context
         try:
             async with asyncio.timeout(timeout):
                 _, connection = await self.loop.create_connection(
-                    lambda: _Connection(self), target.host, target.port
+                    lambda: _Connection(self),
+                    target.host,
+                    target.port,
+                    ssl=context,
+                    server_hostname=self._name if context is not None else None,
                 )
         except TimeoutError:
             raise self._not_in_time(timeout) from None
         except (OSError, UnicodeError) as error:
-            raise ConnectionLost(f"can't connect to {target}: {error}") from error
+            told = str(error) if context is None else tls.not_agreed(error, self._name)
+            raise ConnectionLost(f"can't connect to {target}: {told}") from error
         return connection
+
+    @property
+    def secure(self) -> bool:
+        """Whether it is by TLS."""
+        return self._context is not None
+
+    @property
+    def _name(self) -> str:
+        """What the certificate of the device is for."""
+        return self._target.tls.name or self._target.host
 
     def _not_in_time(self, timeout: float) -> RequestTimeout:
         return RequestTimeout(f"no connection to {self._target} within {timeout:g} s")
@@ -204,6 +229,7 @@ class _Connection(asyncio.Protocol):
         self._here = here
         self._loop = here.loop
         self.closed: asyncio.Future[None] = self._loop.create_future()
+        self._heard = not here.secure
         self._futures: dict[int, asyncio.Future[Any]] = {}
         self._by_deadline: deque[tuple[float, int, asyncio.Future[Any], float]] = deque()
         """The earliest first: deadline, transaction id, future, and the timeout that it had."""
@@ -265,6 +291,7 @@ class _Connection(asyncio.Protocol):
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:
+        self._heard = True
         completed, broken = self.session.receive(data)
         for number, result in completed:
             future = self._futures.pop(number)
@@ -280,7 +307,7 @@ class _Connection(asyncio.Protocol):
             self.end(InvalidResponse(f"invalid response: {broken}"))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        why = "closed by the peer" if exc is None else str(exc)
+        why = "closed by the peer" if exc is None else tls.told(exc, heard=self._heard)
         self.end(ConnectionLost(f"connection lost: {why}"))
         self.closed.set_result(None)
 

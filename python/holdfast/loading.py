@@ -22,7 +22,7 @@ from holdfast.errors import (
     RequestTimeout,
 )
 from holdfast.operations import ADDRESSES, READ_LIMITS
-from holdfast.target import NetworkTarget, SerialTarget, parse
+from holdfast.target import IN_FLIGHT, NetworkTarget, SerialTarget, parse
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,8 +114,9 @@ class Load:
             raise ValueError(f"connections is {connections}, allowed are 1 to {MOST_CONNECTIONS}")
         if isinstance(target, SerialTarget) and connections > 1:
             raise ValueError("a serial line has one connection")
-        if in_flight > 1 and not (isinstance(target, NetworkTarget) and target.transport == "tcp"):
-            raise ValueError("only tcp has more than one request in flight")
+        many = isinstance(target, NetworkTarget) and target.transport in IN_FLIGHT
+        if in_flight > 1 and not many:
+            raise ValueError("only tcp and tls have more than one request in flight")
         self.seconds = seconds
         self.elapsed = 0.0
         """The seconds that it has taken so far."""

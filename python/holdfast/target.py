@@ -3,24 +3,50 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
-from urllib.parse import parse_qsl, unquote, urlsplit
+from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
 
-Transport: TypeAlias = Literal["tcp", "udp", "rtu+tcp"]
+Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp"]
 Mode: TypeAlias = Literal["rtu", "ascii"]
 Parity: TypeAlias = Literal["none", "even", "odd"]
 
 PORT = 502
 """The port of Modbus over TCP and UDP."""
 
+TLS_PORT = 802
+"""The port of Modbus over TLS."""
+
+IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
+"""The transports that carry many requests at once."""
+
 FORMS = (
-    "tcp://host:502, udp://host:502, rtu+tcp://host:502, "
+    "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
     "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Who is trusted, and what is shown; the files are in PEM."""
+
+    ca: str | None = None
+    """Certificates of authorities, or of the device itself; `None` for the system's."""
+    cert: str | None = None
+    key: str | None = None
+    name: str | None = None
+    """The name that the device's certificate has, if that is not its host."""
+
+    def files(self) -> Iterator[tuple[str, str]]:
+        """The files that are given, with their keys."""
+        for key in ("ca", "cert", "key"):
+            file: str | None = getattr(self, key)
+            if file is not None:
+                yield key, file
 
 
 @dataclass(frozen=True)
@@ -30,6 +56,8 @@ class NetworkTarget:
     transport: Transport
     host: str
     port: int
+    tls: Tls = Tls()
+    """Of transport `tls`."""
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -70,18 +98,33 @@ def parse(url: str) -> Target:
     scheme = parts.scheme
     if parts.fragment or parts.username is not None:
         raise ValueError(f"{url!r} has a user or a fragment; allowed are {FORMS}")
-    if scheme in ("tcp", "udp", "rtu+tcp"):
-        if not parts.hostname or parts.path not in ("", "/") or parts.query:
+    if scheme in ("tcp", "tls", "udp", "rtu+tcp"):
+        query = parts.query and scheme != "tls"
+        if not parts.hostname or parts.path not in ("", "/") or query:
             raise ValueError(f"{url!r} is no address of a device; allowed are {FORMS}")
         if port == 0:
             raise ValueError(f"{url!r}: port 0, allowed are 1 to 65535")
         host = unquote(parts.hostname)
+        if scheme == "tls":
+            tls = _tls(url, parts.query)
+            return NetworkTarget("tls", host, TLS_PORT if port is None else port, tls)
         return NetworkTarget(cast("Transport", scheme), host, PORT if port is None else port)
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
-    if scheme == "tls":
-        raise ValueError(f"{url!r}: tls is not available in this version; allowed are {FORMS}")
     raise ValueError(f"{url!r} is no URL of a device; allowed are {FORMS}")
+
+
+def in_folder(url: str, folder: Path) -> str:
+    """The URL with files that are relative to this folder made absolute."""
+    target = parse(url)
+    if not isinstance(target, NetworkTarget) or target.transport != "tls":
+        return url
+    tls = replace(target.tls, **{key: str(folder / file) for key, file in target.tls.files()})
+    if tls == target.tls:
+        return url
+    given = {key: value for key, value in asdict(tls).items() if value is not None}
+    query = "&".join(f"{key}={quote(value)}" for key, value in given.items())
+    return f"{url.partition('?')[0]}?{query}"
 
 
 @dataclass(frozen=True)
@@ -90,7 +133,7 @@ class _Option:
 
     allowed: str
     read: Callable[[str], Any]
-    modes: tuple[Mode, ...] = field(default=("rtu", "ascii"))
+    schemes: tuple[str, ...] = field(default=("rtu", "ascii"))
 
 
 def _one_of(*words: str, read: Callable[[str], Any] = str) -> _Option:
@@ -114,6 +157,12 @@ def _seconds(text: str) -> float:
     return float(text)
 
 
+def _text(text: str) -> str:
+    if not text or "\0" in text:
+        raise ValueError(text)
+    return text
+
+
 OPTIONS: Mapping[str, _Option] = {
     "baud": _Option("50 to 4000000", _baud),
     "parity": _one_of("none", "even", "odd"),
@@ -121,7 +170,37 @@ OPTIONS: Mapping[str, _Option] = {
     "data_bits": _one_of("7", "8", read=int),
     "silence": _Option("seconds, up to 10", _seconds, ("rtu",)),
     "echo": _one_of("0", "1", read=lambda text: text == "1"),
+    "ca": _Option("paths of files", _text, ("tls",)),
+    "cert": _Option("paths of files", _text, ("tls",)),
+    "key": _Option("paths of files", _text, ("tls",)),
+    "name": _Option("host names and IP addresses", _text, ("tls",)),
 }
+
+
+def _chosen(url: str, scheme: str, query: str) -> dict[str, Any]:
+    """What a query says, of what it may say with this scheme."""
+    chosen: dict[str, Any] = {}
+    # A plus is itself in a URL; only forms of HTML mean a blank by it.
+    for key, text in parse_qsl(query.replace("+", "%2B"), keep_blank_values=True):
+        option = OPTIONS.get(key)
+        if option is None or scheme not in option.schemes:
+            known = ", ".join(name for name, each in OPTIONS.items() if scheme in each.schemes)
+            raise ValueError(f"{url!r}: {key!r} is not known, allowed are {known}")
+        if key in chosen:
+            raise ValueError(f"{url!r}: {key} is given twice")
+        try:
+            chosen[key] = option.read(text)
+        except ValueError:
+            raise ValueError(f"{url!r}: {key} is {text!r}, allowed are {option.allowed}") from None
+    return chosen
+
+
+def _tls(url: str, query: str) -> Tls:
+    tls = Tls(**_chosen(url, "tls", query))
+    if (tls.cert is None) != (tls.key is None):
+        alone = "cert" if tls.key is None else "key"
+        raise ValueError(f"{url!r}: {alone} is alone, allowed are cert and key, or none of both")
+    return tls
 
 
 def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
@@ -130,18 +209,7 @@ def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
         device = device[1:]  # Windows has no folder before its ports.
     if device in ("", "/"):
         raise ValueError(f"{url!r} names no device; allowed are {FORMS}")
-    chosen: dict[str, Any] = {}
-    for key, text in parse_qsl(query, keep_blank_values=True):
-        option = OPTIONS.get(key)
-        if option is None or mode not in option.modes:
-            known = ", ".join(name for name, each in OPTIONS.items() if mode in each.modes)
-            raise ValueError(f"{url!r}: {key!r} is not known, allowed are {known}")
-        if key in chosen:
-            raise ValueError(f"{url!r}: {key} is given twice")
-        try:
-            chosen[key] = option.read(text)
-        except ValueError:
-            raise ValueError(f"{url!r}: {key} is {text!r}, allowed are {option.allowed}") from None
+    chosen = _chosen(url, mode, query)
     if mode == "rtu" and chosen.get("data_bits", 8) != 8:
         raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu is 8")
     chosen.setdefault("data_bits", 8 if mode == "rtu" else 7)

@@ -1,17 +1,20 @@
 //! `Request`, `BlockingClient` and `Session`: requests in, values or exceptions out.
 
-use std::sync::Mutex;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
 
 use holdfast_engine::client::{
     BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Session as CoreSession,
     exception_name,
 };
+use holdfast_engine::tls::FileError;
+use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{Line, LineMode, LineParity};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Diagnostics, Range, Request as CoreRequest, Response, ResponseError, SubFunction, limit,
 };
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 
@@ -180,7 +183,7 @@ impl Endpoint {
     #[staticmethod]
     fn network(transport: &str, host: String, port: u16) -> PyResult<Endpoint> {
         let core = match transport {
-            "tcp" => CoreEndpoint::Tcp { host, port },
+            "tcp" => CoreEndpoint::Tcp { host, port, tls: None },
             "rtu+tcp" => CoreEndpoint::RtuOverTcp { host, port },
             "udp" => CoreEndpoint::Udp { host, port },
             _ => {
@@ -189,6 +192,27 @@ impl Endpoint {
             }
         };
         Ok(Endpoint { core })
+    }
+
+    #[staticmethod]
+    #[pyo3(signature = (host, port, ca=None, cert=None, key=None, name=None))]
+    fn tls(
+        host: String,
+        port: u16,
+        ca: Option<PathBuf>,
+        cert: Option<PathBuf>,
+        key: Option<PathBuf>,
+        name: Option<&str>,
+    ) -> PyResult<Endpoint> {
+        let own = match (cert.as_deref(), key.as_deref()) {
+            (Some(cert), Some(key)) => Some((cert, key)),
+            (None, None) => None,
+            _ => return Err(PyValueError::new_err("cert and key go together")),
+        };
+        let name = name.unwrap_or(&host);
+        let tls = ClientTls::new(ClientSettings { ca: ca.as_deref(), own, name });
+        let tls = Some(Arc::new(tls.map_err(unusable)?));
+        Ok(Endpoint { core: CoreEndpoint::Tcp { host, port, tls } })
     }
 
     #[staticmethod]
@@ -245,6 +269,23 @@ impl BlockingClient {
     fn late(&self) -> u64 {
         self.core.late()
     }
+}
+
+/// A file that can't be read is an `OSError` of the kind that Python raises itself.
+fn unusable(error: TlsError) -> PyErr {
+    match error {
+        TlsError::File(FileError::Unreadable { file, error }) => match error.raw_os_error() {
+            Some(code) => PyOSError::new_err((code, told(&error), file)),
+            None => PyOSError::new_err(format!("{file}: {error}")),
+        },
+        other => PyValueError::new_err(other.to_string()),
+    }
+}
+
+/// What the system calls an error, without its number, which Python adds.
+fn told(error: &std::io::Error) -> String {
+    let text = error.to_string();
+    text.split(" (os error").next().unwrap_or(&text).to_owned()
 }
 
 /// A serial line as arguments describe it.

@@ -104,7 +104,7 @@ def bench(
     Ctrl-C ends it earlier, with what was measured until then. Exit codes: 0 done, 1 no answer,
     2 wrong usage.
     """
-    try:
+    with device.usable():
         load = Load(
             url,
             area,
@@ -116,8 +116,6 @@ def bench(
             seconds=seconds,
             timeout=timeout,
         )
-    except ValueError as error:
-        raise click.UsageError(f"{error}.") from error
     told: dict[str, object] = {
         "url": url,
         "unit": unit,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
@@ -21,7 +22,7 @@ from holdfast.target import parse
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from holdfast.types import Area
 
@@ -89,9 +90,16 @@ def device_options(command: Command) -> Command:
 
 def connect(url: str, unit: int, timeout: float) -> SyncClient:
     """A client, which connects when it is used."""
-    try:
+    with usable():
         return SyncClient(url, unit=unit, timeout=timeout)
-    except ValueError as error:
+
+
+@contextlib.contextmanager
+def usable() -> Iterator[None]:
+    """Wrong usage is what a client refuses: a value, or a file of its URL."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
         raise click.UsageError(f"{error}.") from error
 
 

@@ -71,8 +71,8 @@ def read(
     --modicon it is 40001, 400001 or 4x0001, which counts from 1 and names the area (0, 1, 3, 4), so
     that AREA can be left out.
 
-    URL is tcp://host:502, udp://host:502, rtu+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200 or
-    ascii:///dev/ttyUSB0.
+    URL is tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502,
+    rtu:///dev/ttyUSB0?baud=19200 or ascii:///dev/ttyUSB0.
 
     Exit codes: 0 read, 1 not all could be read, 2 wrong usage.
     """

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
+from holdfast.config.files import unreadable
 from holdfast.config.initial import extent
 from holdfast.config.listeners import SERIAL_TYPES
 from holdfast.config.memory_checks import addresses
@@ -26,6 +27,8 @@ from holdfast.config.words import choice, listing, show
 from holdfast.target import SerialTarget, parse
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
@@ -54,8 +57,9 @@ class Claim:
 
 @dataclass
 class DeviceChecks:
-    """Checks the devices of one file."""
+    """Checks the devices of one file; files are relative to `folder`."""
 
+    folder: Path
     report: Report
     grants: GrantChecks
     memories: dict[Any, Any]
@@ -78,6 +82,12 @@ class DeviceChecks:
         target = parsed(_target, device.get("url"))
         if isinstance(target, SerialTarget):
             self._line(path, target, device.get("unit"), taken)
+        elif target is not None:
+            for key, file in target.tls.files():
+                reason = unreadable(self.folder / file)
+                if reason:
+                    message = f"found {key}={show(file)}, which can't be read: {reason}"
+                    self.report.add((*path, "url"), message)
         if "max_gap" in device and "cost" in device:
             message = "found beside max_gap, allowed: one of both"
             self.report.add((*path, "cost"), message, of_key=True)

@@ -56,5 +56,5 @@ def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     grants = GrantChecks(report, [str(name) for name in memories])
     ListenerChecks(report, grants, memories).check(data.get("listeners"))
     ServiceChecks(folder, report, grants).check(data)
-    DeviceChecks(report, grants, memories).check(data)
+    DeviceChecks(folder, report, grants, memories).check(data)
     check_sockets(data, report)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.broker import parse_broker, parse_topic_filter
+from holdfast.config.files import unreadable
 from holdfast.config.scanning import parse_server
 from holdfast.config.tolerance import entries, mapping, parsed
 from holdfast.config.unique import Owners
@@ -137,7 +135,7 @@ class ServiceChecks:
 
     def _readable(self, path: KeyPath, file: object) -> None:
         if isinstance(file, str) and file and "\0" not in file:
-            reason = _unreadable(self.folder / file)
+            reason = unreadable(self.folder / file)
             if reason:
                 self.report.add(path, f"found {show(file)}, which can't be read: {reason}")
 
@@ -151,14 +149,3 @@ class ServiceChecks:
         elif not path.parent.is_dir():
             message = f"found {show(file)}, allowed: a file in a folder that is there"
             self.report.add(("audit", "file"), message)
-
-
-def _unreadable(path: Path) -> str:
-    """Why a file can't be read, nothing when it can; it is not opened, as it may hold a secret."""
-    try:
-        mode = path.stat().st_mode
-    except OSError as error:
-        return error.strerror or str(error)
-    if stat.S_ISDIR(mode):
-        return os.strerror(errno.EISDIR)
-    return "" if os.access(path, os.R_OK) else os.strerror(errno.EACCES)

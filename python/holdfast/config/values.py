@@ -34,7 +34,7 @@ from holdfast.config.egress import Allowed, parse_allowed
 from holdfast.config.receiver import parse_receiver
 from holdfast.config.scanning import PREFIX, Pollable, parse_pollable, parse_prefix, parse_server
 from holdfast.config.words import choice, shape, show
-from holdfast.target import FORMS, parse
+from holdfast.target import FORMS, in_folder, parse
 
 MOST_BYTES = 244
 LONGEST_DEVICE = 4095
@@ -127,6 +127,10 @@ def parse_url(value: object) -> str:
     return value
 
 
+def _device_url(value: object, info: ValidationInfo) -> str:
+    return in_folder(parse_url(value), _folder(info))
+
+
 def _receiver_url(value: object) -> str:
     parse_receiver(value)
     return str(value)
@@ -143,12 +147,18 @@ def _version(value: object) -> object:
     return "5" if type(value) is int and value == 5 else value
 
 
+def _folder(info: ValidationInfo) -> Path:
+    """What the files of a configuration are relative to."""
+    folder: Path = (info.context or {}).get("folder", Path())
+    return folder
+
+
 def _in_folder(value: object, info: ValidationInfo) -> object:
     if not isinstance(value, str):
         return value
     if not value or "\0" in value:
         raise ValueError(f"found {show(value)}, allowed: the path of a file")
-    return (info.context or {}).get("folder", Path()) / value
+    return _folder(info) / value
 
 
 def _function(value: object) -> int:
@@ -292,7 +302,7 @@ EgressEntry = Annotated[
 ]
 DeviceUrl = Annotated[
     str,
-    PlainValidator(parse_url),
+    PlainValidator(_device_url),
     WithJsonSchema(
         {"type": "string", "examples": ["tcp://10.0.0.9:502", "rtu:///dev/ttyUSB0?baud=9600"]}
     ),

@@ -101,9 +101,12 @@ def _target(request: SubscribeRequest) -> Target:
         if beside:
             raise Refused(f"{beside[0]} stands beside url, allowed is one of both")
         try:
-            return targets.parse(request.url)
+            target = targets.parse(request.url)
         except ValueError as error:
             raise Refused(f"url: {error}") from None
+        if isinstance(target, NetworkTarget) and target.transport == "tls":
+            raise Refused("url: tls is not available in this version")
+        return target
     if request.host is None:
         raise Refused("host is missing; a url in its place would do")
     transport = request.transport or "tcp"

@@ -8,7 +8,7 @@
 use std::io::{self, ErrorKind};
 use std::net::UdpSocket;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -16,10 +16,12 @@ use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, Request, Response, ResponseError};
 
 use super::line::{self, Line, Stream};
+use super::secure::Secure;
 use super::session::Session;
 use super::turns::Turns;
 use super::{Broken, ClientError};
 use crate::serial::{Line as SerialLine, LineMode};
+use crate::tls::client::ClientTls;
 
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 512;
@@ -39,6 +41,7 @@ pub enum Endpoint {
     Tcp {
         host: String,
         port: u16,
+        tls: Option<Arc<ClientTls>>,
     },
     RtuOverTcp {
         host: String,
@@ -71,6 +74,10 @@ struct Connection {
 enum Kind {
     Tcp {
         stream: Stream,
+        session: Session,
+    },
+    Tls {
+        stream: Box<Secure>,
         session: Session,
     },
     Udp {
@@ -136,7 +143,7 @@ impl BlockingClient {
         let deadline = Instant::now() + timeout;
         let call = Call { unit_id, request, pdu: &buffer[..len], timeout, deadline };
         let mut held = self.connection.lock().unwrap_or_else(PoisonError::into_inner);
-        if held.as_ref().is_some_and(Connection::has_ended) {
+        if held.as_mut().is_some_and(Connection::has_ended) {
             *held = None;
         }
         let connection = match held.as_mut() {
@@ -181,9 +188,16 @@ impl BlockingClient {
         };
         let at = |host: &str, port: u16| failed(format!("{host}:{port}"));
         let kind = match &self.endpoint {
-            Endpoint::Tcp { host, port } => {
+            Endpoint::Tcp { host, port, tls } => {
                 let stream = Stream::connect(host, *port, deadline).map_err(at(host, *port))?;
-                Kind::Tcp { stream, session: Session::default() }
+                let session = Session::default();
+                match tls {
+                    None => Kind::Tcp { stream, session },
+                    Some(tls) => {
+                        let secure = Secure::agree(stream, tls, deadline);
+                        Kind::Tls { stream: secure.map_err(at(host, *port))?.into(), session }
+                    }
+                }
             }
             Endpoint::RtuOverTcp { host, port } => {
                 let stream = Stream::connect(host, *port, deadline).map_err(at(host, *port))?;
@@ -216,9 +230,12 @@ impl BlockingClient {
 impl Connection {
     /// Whether the connection can't be used any more: the peer ended it while nobody used it, or
     /// sent what nobody asked for. Where replies have no ids, that would be taken for a reply.
-    fn has_ended(&self) -> bool {
-        match &self.kind {
+    fn has_ended(&mut self) -> bool {
+        match &mut self.kind {
             Kind::Tcp { stream, session } => {
+                session.is_broken() || (self.used.elapsed() > IDLE && stream.has_ended())
+            }
+            Kind::Tls { stream, session } => {
                 session.is_broken() || (self.used.elapsed() > IDLE && stream.has_ended())
             }
             Kind::Udp { .. } => false,
@@ -234,6 +251,7 @@ impl Connection {
     ) -> Result<(), Failure> {
         match &mut self.kind {
             Kind::Tcp { stream, session } => over_tcp(stream, session, call, give, late),
+            Kind::Tls { stream, session } => over_tcp(&mut **stream, session, call, give, late),
             Kind::Udp { socket, next_id } => over_udp(socket, next_id, call, give, late),
             Kind::Rtu { line, silence, echo } => {
                 over_rtu(line.as_mut(), *silence, self.used, echo, call, give)
@@ -288,7 +306,7 @@ fn invalid(text: impl Into<String>) -> Failure {
 }
 
 fn over_tcp(
-    stream: &mut Stream,
+    stream: &mut impl Line,
     session: &mut Session,
     call: &Call<'_>,
     give: &mut dyn FnMut(Response<'_>),

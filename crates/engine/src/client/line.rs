@@ -69,6 +69,17 @@ impl Stream {
         }
     }
 
+    /// Does something with the socket that is not to wait.
+    pub(super) fn at_once<T>(
+        &mut self,
+        work: impl FnOnce(&mut TcpStream) -> io::Result<T>,
+    ) -> io::Result<T> {
+        self.socket.set_nonblocking(true)?;
+        let done = work(&mut self.socket);
+        self.socket.set_nonblocking(false)?;
+        done
+    }
+
     /// Looks whether there is something to read, without waiting for it.
     fn peek(&self) -> io::Result<usize> {
         self.socket.set_nonblocking(true)?;

@@ -7,6 +7,7 @@
 
 mod exchange;
 mod line;
+mod secure;
 pub mod session;
 mod turns;
 

@@ -7,9 +7,9 @@
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::rc::Rc;
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use holdfast_protocol::pdu::{Request, Response, ResponseError};
@@ -20,8 +20,11 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, timeout_at};
 
 use super::backoff;
+use super::handshake;
 use super::status::Fault;
 use crate::client::{BlockingClient, ClientError, Endpoint, Session};
+use crate::tls::Channel;
+use crate::tls::client::ClientTls;
 
 /// Requests in flight on one connection.
 const IN_FLIGHT: usize = 8;
@@ -58,7 +61,7 @@ impl Link {
     /// In the context of a `LocalSet`.
     pub(super) fn new(endpoint: Endpoint) -> Rc<Link> {
         Rc::new(match endpoint {
-            Endpoint::Tcp { host, port } => Link::Tcp(TcpLink::new(host, port)),
+            Endpoint::Tcp { host, port, tls } => Link::Tcp(TcpLink::new(host, port, tls)),
             other => Link::Blocking(BlockingLink::new(other)),
         })
     }
@@ -107,6 +110,7 @@ impl Link {
 pub(super) struct TcpLink {
     host: String,
     port: u16,
+    tls: Option<Arc<ClientTls>>,
     places: Semaphore,
     doubtful: Semaphore,
     connecting: Mutex<()>,
@@ -121,6 +125,7 @@ struct Open {
     session: Session,
     waiting: HashMap<u16, oneshot::Sender<Answer>>,
     writer: tokio::net::tcp::OwnedWriteHalf,
+    tls: Option<Channel>,
     /// What the socket did not take yet.
     unsent: Vec<u8>,
     /// Timeouts since something came, and when the last of them was.
@@ -130,10 +135,11 @@ struct Open {
 }
 
 impl TcpLink {
-    fn new(host: String, port: u16) -> TcpLink {
+    fn new(host: String, port: u16, tls: Option<Arc<ClientTls>>) -> TcpLink {
         TcpLink {
             host,
             port,
+            tls,
             places: Semaphore::new(IN_FLIGHT),
             doubtful: Semaphore::new(DOUBTFUL),
             connecting: Mutex::default(),
@@ -179,12 +185,19 @@ impl TcpLink {
             return Err(fault);
         }
         let address = (self.host.as_str(), self.port);
-        let connected = timeout_at(deadline, TcpStream::connect(address)).await;
-        let fault = match connected {
-            Ok(Ok(stream)) => {
+        let connected = timeout_at(deadline, async {
+            let mut stream = TcpStream::connect(address).await?;
+            let tls = match &self.tls {
+                None => None,
+                Some(tls) => Some(handshake::agree(&mut stream, tls).await?),
+            };
+            Ok::<_, io::Error>((stream, tls))
+        });
+        let fault = match connected.await {
+            Ok(Ok((stream, tls))) => {
                 self.failures.set(0);
                 self.failed.set(None);
-                self.take(stream);
+                self.take(stream, tls);
                 return Ok(());
             }
             Ok(Err(_)) => Fault::Refused,
@@ -196,13 +209,14 @@ impl TcpLink {
         Err(fault)
     }
 
-    fn take(&self, stream: TcpStream) {
+    fn take(&self, stream: TcpStream, tls: Option<Channel>) {
         let _ = stream.set_nodelay(true);
         let (reader, writer) = stream.into_split();
         let open = Open {
             session: Session::default(),
             waiting: HashMap::new(),
             writer,
+            tls,
             unsent: Vec::new(),
             timeouts: 0,
             timed_out: Instant::now(),
@@ -260,7 +274,10 @@ impl Open {
     /// Sends without waiting; what the socket does not take goes with the next. Whether the
     /// connection still works.
     fn write(&mut self, frame: &[u8]) -> bool {
-        self.unsent.extend_from_slice(frame);
+        match &mut self.tls {
+            None => self.unsent.extend_from_slice(frame),
+            Some(tls) => tls.send(frame, &mut self.unsent),
+        }
         match self.writer.try_write(&self.unsent) {
             Ok(len) => {
                 self.unsent.drain(..len);
@@ -274,6 +291,10 @@ impl Open {
 
 impl Drop for Open {
     fn drop(&mut self) {
+        if let Some(tls) = &mut self.tls {
+            tls.end(&mut self.unsent);
+            let _ = self.writer.try_write(&self.unsent);
+        }
         if let Some(reader) = &self.reader {
             reader.abort();
         }
@@ -283,6 +304,7 @@ impl Drop for Open {
 /// Reads replies until the connection ends.
 async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
     let mut chunk = vec![0; CHUNK].into_boxed_slice();
+    let mut plain = Vec::new();
     loop {
         let read = match reader.readable().await {
             Ok(()) => reader.try_read(&mut chunk),
@@ -296,17 +318,26 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
             Err(_) => Fault::Reset,
             Ok(len) => {
                 connection.timeouts = 0;
-                let Open { session, waiting, .. } = connection;
-                let received = session.receive(&chunk[..len], |id, response| {
+                let Open { session, waiting, tls, unsent, .. } = connection;
+                let (came, lasts) = match tls {
+                    None => (&chunk[..len], true),
+                    Some(tls) => {
+                        plain.clear();
+                        let intact = tls.receive(&chunk[..len], &mut plain, unsent).is_ok();
+                        (&plain[..], intact && !tls.has_ended())
+                    }
+                };
+                let received = session.receive(came, |id, response| {
                     if let Some(sender) = waiting.remove(&id) {
                         let _ = sender.send(bytes(response));
                     }
                 });
+                let valid = received.is_ok();
                 // What the socket did not take earlier, it may take now.
-                if received.is_ok() && (connection.unsent.is_empty() || connection.write(&[])) {
+                if valid && lasts && (connection.unsent.is_empty() || connection.write(&[])) {
                     continue;
                 }
-                Fault::Invalid
+                if valid && !lasts { Fault::Reset } else { Fault::Invalid }
             }
         };
         let lost = open.take();

@@ -10,6 +10,7 @@
 mod backoff;
 mod device;
 mod forward;
+mod handshake;
 mod link;
 pub mod plan;
 mod price;

@@ -21,6 +21,7 @@ use super::plan::{self, PlanError};
 use super::results::{Results, Written};
 use super::status::{BLOCK, Fault};
 use crate::client::Endpoint;
+use crate::tls::client::Identity;
 
 #[derive(Debug, Error)]
 pub enum PollerError {
@@ -236,7 +237,7 @@ impl Drop for Running {
 
 /// Starts and ends the tasks of devices, until it is told to stop.
 async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
-    let mut links: HashMap<String, Weak<Link>> = HashMap::new();
+    let mut links: HashMap<Address, Weak<Link>> = HashMap::new();
     let mut running: HashMap<String, Running> = HashMap::new();
     let mut started = 0;
     while let Some(order) = orders.recv().await {
@@ -348,7 +349,7 @@ fn made(
 }
 
 /// The link to an endpoint, shared with all other devices there.
-fn link_to(endpoint: &Endpoint, links: &mut HashMap<String, Weak<Link>>) -> Rc<Link> {
+fn link_to(endpoint: &Endpoint, links: &mut HashMap<Address, Weak<Link>>) -> Rc<Link> {
     let known = links.entry(address(endpoint)).or_default();
     known.upgrade().unwrap_or_else(|| {
         let link = Link::new(endpoint.clone());
@@ -363,13 +364,18 @@ fn spread(within: Duration, number: u32) -> Duration {
     within.mul_f64((f64::from(number) * 0.618_033_988_749_895).fract())
 }
 
-/// What devices share a link by.
-fn address(endpoint: &Endpoint) -> String {
+/// What devices share a link by: where it goes to, and whom it trusts there.
+type Address = (String, Option<Arc<Identity>>);
+
+fn address(endpoint: &Endpoint) -> Address {
     match endpoint {
-        Endpoint::Tcp { host, port } => format!("tcp://{host}:{port}"),
-        Endpoint::RtuOverTcp { host, port } => format!("rtu+tcp://{host}:{port}"),
-        Endpoint::Udp { host, port } => format!("udp://{host}:{port}"),
-        Endpoint::Serial { line, .. } => format!("serial:{}", line.device),
+        Endpoint::Tcp { host, port, tls } => {
+            let identity = tls.as_ref().map(|tls| Arc::clone(tls.identity()));
+            (format!("tcp://{host}:{port}"), identity)
+        }
+        Endpoint::RtuOverTcp { host, port } => (format!("rtu+tcp://{host}:{port}"), None),
+        Endpoint::Udp { host, port } => (format!("udp://{host}:{port}"), None),
+        Endpoint::Serial { line, .. } => (format!("serial:{}", line.device), None),
     }
 }
 

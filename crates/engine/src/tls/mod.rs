@@ -2,9 +2,16 @@
 //!
 //! A [`Channel`] does no I/O: whoever has the socket gives it what came, and sends what it says.
 
+pub mod client;
+mod files;
+mod words;
+
 use std::io::{Read, Write};
 
 use rustls::{Connection, Error};
+
+pub use files::FileError;
+pub use words::words;
 
 /// Bytes of plain text taken out at once.
 const CHUNK: usize = 4096;
@@ -57,6 +64,11 @@ impl Channel {
 
     pub fn is_handshaking(&self) -> bool {
         self.0.is_handshaking()
+    }
+
+    /// Whether the peer has said that nothing more will come.
+    pub fn has_ended(&mut self) -> bool {
+        matches!(self.0.reader().read(&mut [0]), Ok(0))
     }
 
     fn take(&mut self, plain: &mut Vec<u8>) {

@@ -1,0 +1,39 @@
+//! Agreeing on TLS over a connection that was just made.
+
+use std::io::{self, ErrorKind};
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use crate::tls::client::ClientTls;
+use crate::tls::{Channel, words};
+
+/// Bytes taken from a socket at once.
+const CHUNK: usize = 4096;
+
+/// # Errors
+/// The connection is to be closed; the peer was told why.
+pub(super) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result<Channel> {
+    let failed = |error| io::Error::other(words(&error));
+    let mut channel = tls.channel().map_err(failed)?;
+    let (mut plain, mut out) = (Vec::new(), Vec::new());
+    let mut chunk = vec![0; CHUNK];
+    channel.send(&[], &mut out);
+    loop {
+        stream.write_all(&out).await?;
+        out.clear();
+        if !channel.is_handshaking() {
+            break;
+        }
+        let len = stream.read(&mut chunk).await?;
+        if len == 0 {
+            return Err(ErrorKind::UnexpectedEof.into());
+        }
+        if let Err(error) = channel.receive(&chunk[..len], &mut plain, &mut out) {
+            let _ = stream.try_write(&out);
+            return Err(failed(error));
+        }
+    }
+    // Nobody has asked for anything yet.
+    if plain.is_empty() { Ok(channel) } else { Err(ErrorKind::InvalidData.into()) }
+}

@@ -1,0 +1,615 @@
+//! The client's side: whom it trusts, and what it shows of itself.
+//!
+//! Each connection checks the certificate of the peer anew; nothing is resumed. Whether a certificate
+//! is valid now is asked when it is used, never when its file is read: the clock of a machine that
+//! has just been switched on may be wrong.
+
+use std::io;
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::client::{Resumption, verify_server_cert_signed_by_trust_anchor, verify_server_name};
+use rustls::crypto::{
+    CryptoProvider, WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature,
+};
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::server::ParsedCertificate;
+use rustls::{
+    CertificateError, ClientConfig, ClientConnection, DigitallySignedStruct, Error, OtherError,
+    RootCertStore, SignatureScheme,
+};
+use thiserror::Error as ThisError;
+
+use super::files::{FileError, certificates, key};
+use super::{Channel, words};
+
+/// What a client's TLS is made from.
+#[derive(Debug, Clone, Copy)]
+pub struct ClientSettings<'s> {
+    /// The certificates that are trusted: of authorities, or of the device itself. The system's
+    /// authorities when it is left out.
+    pub ca: Option<&'s Path>,
+    /// The certificate that is shown to the peer, with those between it and the root; and its key.
+    pub own: Option<(&'s Path, &'s Path)>,
+    /// The name or address that the certificate of the peer has.
+    pub name: &'s str,
+}
+
+/// Settings that can't be used.
+#[derive(Debug, ThisError)]
+pub enum TlsError {
+    #[error(transparent)]
+    File(#[from] FileError),
+    #[error("{0}")]
+    Other(String),
+}
+
+/// TLS to one peer. Two are equal when they trust, show and ask for the same.
+#[derive(Debug)]
+pub struct ClientTls {
+    config: Arc<ClientConfig>,
+    identity: Arc<Identity>,
+}
+
+/// What makes the TLS of a client what it is.
+#[derive(Debug, PartialEq, Eq, Hash)]
+pub struct Identity {
+    trusted: Certificates,
+    own: Vec<CertificateDer<'static>>,
+    name: ServerName<'static>,
+}
+
+type Certificates = Arc<[CertificateDer<'static>]>;
+
+impl ClientTls {
+    /// Reads the files.
+    ///
+    /// # Errors
+    /// [`TlsError`] for files and names that can't be used.
+    pub fn new(settings: ClientSettings<'_>) -> Result<ClientTls, TlsError> {
+        let name = ServerName::try_from(settings.name.to_owned()).map_err(|_| {
+            let found = format!("found {:?} as the name of a certificate", settings.name);
+            TlsError::Other(format!("{found}, allowed: a host name or an IP address"))
+        })?;
+        let provider = Arc::new(ring::default_provider());
+        let trusted = Arc::new(Trusted {
+            certificates: settings
+                .ca
+                .map_or_else(of_system, |file| Ok(certificates(file)?.into()))?,
+            of_system: settings.ca.is_none(),
+            algorithms: provider.signature_verification_algorithms,
+        });
+        let (config, own) = config(&provider, &trusted, settings.own)?;
+        let trusted = Arc::clone(&trusted.certificates);
+        let identity = Arc::new(Identity { trusted, own, name });
+        Ok(ClientTls { config: Arc::new(config), identity })
+    }
+
+    /// The TLS of a new connection.
+    ///
+    /// # Errors
+    /// The system has no random numbers.
+    pub fn channel(&self) -> Result<Channel, Error> {
+        let name = self.identity.name.clone();
+        ClientConnection::new(Arc::clone(&self.config), name).map(Channel::new)
+    }
+
+    pub fn identity(&self) -> &Arc<Identity> {
+        &self.identity
+    }
+}
+
+impl PartialEq for ClientTls {
+    fn eq(&self, other: &ClientTls) -> bool {
+        self.identity == other.identity
+    }
+}
+
+impl Eq for ClientTls {}
+
+/// The certificates that the system trusts, the same for all.
+fn of_system() -> Result<Certificates, TlsError> {
+    static FOUND: OnceLock<Certificates> = OnceLock::new();
+    if let Some(found) = FOUND.get() {
+        return Ok(Arc::clone(found));
+    }
+    let found = rustls_native_certs::load_native_certs();
+    if found.certs.is_empty() {
+        let why = found.errors.first().map(|error| format!(": {error}")).unwrap_or_default();
+        let text = format!("the system has no authorities{why}; ca has to say who is trusted");
+        return Err(TlsError::Other(text));
+    }
+    Ok(Arc::clone(FOUND.get_or_init(|| found.certs.into())))
+}
+
+fn config(
+    provider: &Arc<CryptoProvider>,
+    trusted: &Arc<Trusted>,
+    own: Option<(&Path, &Path)>,
+) -> Result<(ClientConfig, Vec<CertificateDer<'static>>), TlsError> {
+    let builder = ClientConfig::builder_with_provider(Arc::clone(provider))
+        .with_safe_default_protocol_versions()
+        .map_err(|error| TlsError::Other(words(&error)))?
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::clone(trusted) as Arc<dyn ServerCertVerifier>);
+    let (mut config, own) = match own {
+        None => (builder.with_no_client_auth(), Vec::new()),
+        Some((file, key_file)) => {
+            let (chain, key) = (certificates(file)?, key(key_file)?);
+            let config = builder.with_client_auth_cert(chain.clone(), key).map_err(|error| {
+                let flaw = match error {
+                    Error::InconsistentKeys(_) => {
+                        format!("it is not the key of the certificate in {}", file.display())
+                    }
+                    _ => "found a key of another kind, allowed: RSA, P-256, P-384, Ed25519".into(),
+                };
+                FileError::content(key_file, flaw)
+            })?;
+            (config, chain)
+        }
+    };
+    config.resumption = Resumption::disabled();
+    Ok((config, own))
+}
+
+/// Judges the certificate of a peer.
+#[derive(Debug)]
+struct Trusted {
+    certificates: Certificates,
+    of_system: bool,
+    algorithms: WebPkiSupportedAlgorithms,
+}
+
+impl Trusted {
+    /// Whether a certificate, looked at by itself, is one of an authority.
+    ///
+    /// # Errors
+    /// It is not valid now, or not for servers.
+    fn is_authority(&self, of: &CertificateDer<'_>, now: UnixTime) -> Result<bool, Error> {
+        let parsed = ParsedCertificate::try_from(of)?;
+        let nobody = RootCertStore::empty();
+        let all = self.algorithms.all;
+        match verify_server_cert_signed_by_trust_anchor(&parsed, &nobody, &[], now, all) {
+            Err(Error::InvalidCertificate(CertificateError::UnknownIssuer)) => Ok(false),
+            Err(Error::InvalidCertificate(CertificateError::Other(OtherError(why))))
+                if why.downcast_ref() == Some(&webpki::Error::CaUsedAsEndEntity) =>
+            {
+                Ok(true)
+            }
+            other => other.map(|()| false),
+        }
+    }
+
+    /// Looks for an authority that vouches for a certificate. One that is trusted for itself is not
+    /// one, whatever its key has signed.
+    fn vouch(
+        &self,
+        parsed: &ParsedCertificate<'_>,
+        intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<(), Error> {
+        let mut authorities = RootCertStore::empty();
+        let mut lapsed = None;
+        for each in self.certificates.iter() {
+            match self.is_authority(each, now) {
+                Ok(true) => authorities.add(each.clone())?,
+                Ok(false) => {}
+                Err(error) => lapsed = lapsed.or(Some(error)),
+            }
+        }
+        let all = self.algorithms.all;
+        let found = verify_server_cert_signed_by_trust_anchor(
+            parsed,
+            &authorities,
+            intermediates,
+            now,
+            all,
+        );
+        match (found, lapsed) {
+            (Err(Error::InvalidCertificate(CertificateError::UnknownIssuer)), Some(lapsed))
+                if !self.of_system =>
+            {
+                let why = words(&lapsed);
+                let text = format!("its issuer is unknown; of those that are trusted, one: {why}");
+                let cause = OtherError(Arc::new(io::Error::other(text)));
+                Err(CertificateError::Other(cause).into())
+            }
+            (found, _) => found,
+        }
+    }
+}
+
+impl ServerCertVerifier for Trusted {
+    fn verify_server_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        server_name: &ServerName<'_>,
+        _ocsp_response: &[u8],
+        now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        let parsed = ParsedCertificate::try_from(end_entity)?;
+        if self.certificates.contains(end_entity) {
+            self.is_authority(end_entity, now)?;
+        } else {
+            self.vouch(&parsed, intermediates, now)?;
+        }
+        verify_server_name(&parsed, server_name)?;
+        Ok(ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls12_signature(message, certificate, signed, &self.algorithms)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signed, &self.algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.algorithms.supported_schemes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::PathBuf;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use rcgen::{
+        BasicConstraints, Certificate, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer,
+        KeyPair, date_time_ymd,
+    };
+    use rustls::pki_types::PrivateKeyDer;
+    use rustls::server::WebPkiClientVerifier;
+    use rustls::version::{TLS12, TLS13};
+    use rustls::{ServerConfig, ServerConnection, SupportedProtocolVersion};
+
+    use super::*;
+
+    const CA: IsCa = IsCa::Ca(BasicConstraints::Unconstrained);
+    const VERSIONS: [&SupportedProtocolVersion; 2] = [&TLS12, &TLS13];
+
+    /// A certificate and its key.
+    struct Owner {
+        certificate: Certificate,
+        params: CertificateParams,
+        key: KeyPair,
+    }
+
+    impl Owner {
+        fn new(name: &str, is_ca: IsCa, by: Option<&Owner>) -> Owner {
+            Owner::made(name, by, |params| params.is_ca = is_ca)
+        }
+
+        fn made(name: &str, by: Option<&Owner>, with: impl Fn(&mut CertificateParams)) -> Owner {
+            let mut params = CertificateParams::new([name.to_owned()]).unwrap();
+            params.distinguished_name.push(rcgen::DnType::CommonName, name);
+            with(&mut params);
+            let key = KeyPair::generate().unwrap();
+            let certificate = match by {
+                None => params.self_signed(&key),
+                Some(by) => params.signed_by(&key, &Issuer::from_params(&by.params, &by.key)),
+            };
+            Owner { certificate: certificate.unwrap(), params, key }
+        }
+
+        fn pem(&self) -> String {
+            self.certificate.pem()
+        }
+    }
+
+    /// A file that goes when it is dropped.
+    struct File(PathBuf);
+
+    impl File {
+        fn new(content: impl AsRef<[u8]>) -> File {
+            static NUMBER: AtomicU32 = AtomicU32::new(0);
+            let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+            let name = format!("holdfast-tls-{}-{number}.pem", std::process::id());
+            let path = std::env::temp_dir().join(name);
+            fs::write(&path, content).unwrap();
+            File(path)
+        }
+    }
+
+    impl Drop for File {
+        fn drop(&mut self) {
+            let _ = fs::remove_file(&self.0);
+        }
+    }
+
+    fn client(ca: &str, own: Option<&Owner>, name: &str) -> ClientTls {
+        let ca = File::new(ca);
+        let own = own.map(|own| (File::new(own.pem()), File::new(own.key.serialize_pem())));
+        let own = own.as_ref().map(|(file, key)| (file.0.as_path(), key.0.as_path()));
+        ClientTls::new(ClientSettings { ca: Some(&ca.0), own, name }).unwrap()
+    }
+
+    fn server(
+        of: &Owner,
+        version: &'static SupportedProtocolVersion,
+        asks: Option<&Owner>,
+    ) -> Channel {
+        let provider = Arc::new(ring::default_provider());
+        let builder = ServerConfig::builder_with_provider(Arc::clone(&provider))
+            .with_protocol_versions(&[version])
+            .unwrap();
+        let builder = match asks {
+            None => builder.with_no_client_auth(),
+            Some(authority) => {
+                let mut roots = RootCertStore::empty();
+                roots.add(authority.certificate.der().clone()).unwrap();
+                let roots = Arc::new(roots);
+                let verifier = WebPkiClientVerifier::builder_with_provider(roots, provider);
+                builder.with_client_cert_verifier(verifier.build().unwrap())
+            }
+        };
+        let key = PrivateKeyDer::try_from(of.key.serialize_der()).unwrap();
+        let chain = vec![of.certificate.der().clone()];
+        let config = builder.with_single_cert(chain, key).unwrap();
+        Channel::new(ServerConnection::new(Arc::new(config)).unwrap())
+    }
+
+    /// What each side has got of the other, or why the client or the server gave up.
+    fn talk(client: &ClientTls, server: &mut Channel, piece: usize) -> Result<Vec<u8>, String> {
+        let mut client = client.channel().unwrap();
+        let (mut to_server, mut to_client) = (Vec::new(), Vec::new());
+        let (mut asked, mut answered, mut greeted) = (Vec::new(), Vec::new(), false);
+        client.send(&[], &mut to_server);
+        for _ in 0..20 {
+            let mut refused = Ok(());
+            for bytes in std::mem::take(&mut to_server).chunks(piece) {
+                refused = refused.and(server.receive(bytes, &mut asked, &mut to_client));
+            }
+            if refused.is_ok() && asked == b"ping" {
+                server.send(b"pong", &mut to_client);
+                asked.clear();
+            }
+            for bytes in std::mem::take(&mut to_client).chunks(piece) {
+                let done = client.receive(bytes, &mut answered, &mut to_server);
+                done.map_err(|error| words(&error))?;
+            }
+            if !client.is_handshaking() && !greeted {
+                greeted = true;
+                client.send(b"ping", &mut to_server);
+            }
+            if !answered.is_empty() {
+                client.end(&mut to_server);
+                let (mut rest, mut out) = (Vec::new(), Vec::new());
+                server.receive(&to_server, &mut rest, &mut out).unwrap();
+                assert!(server.has_ended() && rest.is_empty());
+                return Ok(answered);
+            }
+        }
+        Err("no end".into())
+    }
+
+    fn told(ca: &str, name: &str, peer: &Owner) -> String {
+        let told = VERSIONS.map(|version| {
+            match talk(&client(ca, None, name), &mut server(peer, version, None), usize::MAX) {
+                Ok(_) => "pong".to_owned(),
+                Err(why) => why,
+            }
+        });
+        assert_eq!(told[0], told[1]);
+        let [told, _] = told;
+        told
+    }
+
+    #[test]
+    fn what_is_sent_arrives_in_whatever_pieces() {
+        let authority = Owner::new("authority", CA, None);
+        let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
+        for version in VERSIONS {
+            for piece in [1, 7, 1000, usize::MAX] {
+                let client = client(&authority.pem(), None, "plc");
+                let answered = talk(&client, &mut server(&plc, version, None), piece);
+                assert_eq!(answered.unwrap(), b"pong");
+            }
+        }
+    }
+
+    #[test]
+    fn the_issuer_and_the_name_decide() {
+        let authority = Owner::new("authority", CA, None);
+        let stranger = Owner::new("stranger", CA, None);
+        let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
+        let address = Owner::new("10.0.0.5", IsCa::NoCa, Some(&authority));
+        let both = authority.pem() + &stranger.pem();
+
+        assert_eq!(told(&both, "plc", &plc), "pong");
+        assert_eq!(told(&both, "10.0.0.5", &address), "pong");
+        assert_eq!(
+            told(&stranger.pem(), "plc", &plc),
+            "the issuer of the certificate is unknown: it is none of those that are trusted"
+        );
+        assert_eq!(
+            told(&both, "10.0.0.5", &plc),
+            "the certificate is for 'plc', not for '10.0.0.5'"
+        );
+        assert_eq!(
+            told(&both, "plc", &address),
+            "the certificate is for '10.0.0.5', not for 'plc'"
+        );
+    }
+
+    #[test]
+    fn what_has_expired_is_not_trusted() {
+        let expired = |params: &mut CertificateParams| {
+            params.not_before = date_time_ymd(2020, 1, 1);
+            params.not_after = date_time_ymd(2021, 1, 1);
+        };
+        let authority = Owner::new("authority", CA, None);
+        let late = Owner::made("plc", Some(&authority), expired);
+        let own = Owner::made("plc", None, expired);
+        for told in [told(&authority.pem(), "plc", &late), told(&own.pem(), "plc", &own)] {
+            assert!(told.starts_with("the certificate expired "), "{told}");
+        }
+
+        let early = Owner::made("plc", Some(&authority), |params| {
+            params.not_before = date_time_ymd(3000, 1, 1);
+        });
+        let told_early = told(&authority.pem(), "plc", &early);
+        assert!(
+            told_early.starts_with("the certificate is not valid for another "),
+            "{told_early}"
+        );
+
+        let former = Owner::made("former", None, |params| {
+            params.is_ca = CA;
+            expired(params);
+        });
+        let plc = Owner::new("plc", IsCa::NoCa, Some(&former));
+        let why = told(&former.pem(), "plc", &plc);
+        assert!(why.contains("its issuer is unknown"), "{why}");
+        assert!(why.contains("of those that are trusted, one: the certificate expired"), "{why}");
+        // One that has expired harms no other.
+        let third = Owner::new("plc", IsCa::NoCa, Some(&authority));
+        assert_eq!(told(&(former.pem() + &authority.pem()), "plc", &third), "pong");
+    }
+
+    #[test]
+    fn a_device_is_trusted_by_its_own_certificate() {
+        let unknown = Owner::new("unknown", CA, None);
+        for (is_ca, by) in [
+            (CA, None),
+            (IsCa::NoCa, None),
+            (IsCa::ExplicitNoCa, None),
+            (IsCa::NoCa, Some(&unknown)),
+        ] {
+            let plc = Owner::new("plc", is_ca, by);
+            assert_eq!(told(&plc.pem(), "plc", &plc), "pong");
+            assert!(told(&plc.pem(), "plc8", &plc).contains("for 'plc', not for 'plc8'"));
+            let twin = Owner::new("plc", is_ca, by);
+            assert!(told(&plc.pem(), "plc", &twin) != "pong");
+        }
+        let of_client = Owner::made("plc", None, |params| {
+            params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+        });
+        assert_eq!(
+            told(&of_client.pem(), "plc", &of_client),
+            "the certificate is not one for servers"
+        );
+    }
+
+    #[test]
+    fn the_key_of_a_device_vouches_for_no_other() {
+        for is_ca in [IsCa::NoCa, IsCa::ExplicitNoCa] {
+            let device = Owner::new("plc1", is_ca, None);
+            let forged = Owner::new("plc2", IsCa::NoCa, Some(&device));
+            let told = told(&device.pem(), "plc2", &forged);
+            assert!(told.starts_with("the issuer of the certificate is unknown"), "{told}");
+        }
+    }
+
+    #[test]
+    fn a_peer_that_asks_for_a_certificate() {
+        let authority = Owner::new("authority", CA, None);
+        let stranger = Owner::new("stranger", CA, None);
+        let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
+        let panel = Owner::new("panel", IsCa::NoCa, Some(&authority));
+        let foreign = Owner::new("foreign", IsCa::NoCa, Some(&stranger));
+        for version in VERSIONS {
+            let told = |own| {
+                let client = client(&authority.pem(), own, "plc");
+                talk(&client, &mut server(&plc, version, Some(&authority)), usize::MAX)
+            };
+            assert_eq!(told(Some(&panel)).unwrap(), b"pong");
+            assert_eq!(told(None).unwrap_err(), "the peer asks for a certificate");
+            assert_eq!(
+                told(Some(&foreign)).unwrap_err(),
+                "the peer refused the certificate: it does not know its issuer"
+            );
+        }
+    }
+
+    #[test]
+    fn what_is_no_tls_is_told() {
+        let authority = Owner::new("authority", CA, None);
+        let tls = client(&authority.pem(), None, "plc");
+        for bytes in [&b"HTTP/1.1 400 Bad Request\r\n\r\n"[..], b"\0\0\0\0\0\x03\x01\x83\x01"] {
+            let (mut plain, mut out) = (Vec::new(), Vec::new());
+            let error = tls.channel().unwrap().receive(bytes, &mut plain, &mut out).unwrap_err();
+            assert_eq!(words(&error), "the peer does not speak TLS");
+            assert!(plain.is_empty());
+        }
+    }
+
+    #[test]
+    fn files_that_can_not_be_used_say_why() {
+        let [plc, other] = ["plc", "other"].map(|name| Owner::new(name, IsCa::NoCa, None));
+        let (certificate, key) = (plc.pem(), plc.key.serialize_pem());
+        let told = |certificate: &str, key: &[u8]| {
+            let (ca, file, key) = (File::new(plc.pem()), File::new(certificate), File::new(key));
+            let own = Some((file.0.as_path(), key.0.as_path()));
+            let settings = ClientSettings { ca: Some(&ca.0), own, name: "plc" };
+            let error = ClientTls::new(settings).unwrap_err();
+            let (file, key) = (file.0.display().to_string(), key.0.display().to_string());
+            error.to_string().replace(&file, "CERT").replace(&key, "KEY")
+        };
+        assert_eq!(
+            told(&certificate, other.key.serialize_pem().as_bytes()),
+            "KEY: it is not the key of the certificate in CERT"
+        );
+        assert_eq!(
+            told(&key, key.as_bytes()),
+            "CERT: found no certificate, allowed: a certificate in PEM"
+        );
+        assert_eq!(
+            told(&certificate, certificate.as_bytes()),
+            "KEY: found no key, allowed: a key in PEM"
+        );
+        assert_eq!(
+            told(&certificate, &plc.key.serialize_der()),
+            "KEY: found DER, allowed: a key in PEM"
+        );
+        assert_eq!(told(&certificate, b""), "KEY: found no key, allowed: a key in PEM");
+        assert_eq!(
+            told(&certificate, b"-----BEGIN ENCRYPTED PRIVATE KEY-----\n"),
+            "KEY: the key is encrypted, allowed: one without a passphrase"
+        );
+        assert!(told(&certificate[..100], key.as_bytes()).starts_with("CERT: "));
+        assert_eq!(
+            told("-----BEGIN CERTIFICATE-----\nMAA=\n-----END CERTIFICATE-----\n", key.as_bytes()),
+            "CERT: certificate 1 can't be read, allowed: X.509 version 3"
+        );
+        let missing = Path::new("/nonexistent/ca.pem");
+        let settings = ClientSettings { ca: Some(missing), own: None, name: "plc" };
+        let error = ClientTls::new(settings).unwrap_err().to_string();
+        assert!(error.starts_with("/nonexistent/ca.pem: "), "{error}");
+        let ca = File::new(vec![b'\n'; 5 << 20]);
+        let settings = ClientSettings { ca: Some(&ca.0), own: None, name: "plc" };
+        assert!(
+            ClientTls::new(settings).unwrap_err().to_string().contains("more than 4194304 bytes")
+        );
+        let ca = File::new(&certificate);
+        let settings = ClientSettings { ca: Some(&ca.0), own: None, name: "a b" };
+        assert_eq!(
+            ClientTls::new(settings).unwrap_err().to_string(),
+            "found \"a b\" as the name of a certificate, allowed: a host name or an IP address"
+        );
+    }
+
+    #[test]
+    fn equal_is_what_trusts_shows_and_asks_for_the_same() {
+        let [one, two] = ["one", "two"].map(|name| Owner::new(name, IsCa::NoCa, None));
+        let made = || client(&one.pem(), Some(&two), "plc");
+        assert_eq!(made(), made());
+        assert_ne!(made(), client(&two.pem(), Some(&two), "plc"));
+        assert_ne!(made(), client(&one.pem(), None, "plc"));
+        assert_ne!(made(), client(&one.pem(), Some(&two), "plc2"));
+    }
+}
