@@ -445,17 +445,19 @@ class Poller:
         self, timeout: float
     ) -> (
         tuple[
-            list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int]]]],
+            list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int, float]]]],
             list[tuple[int, int]],
         ]
         | None
     ):
         """All polls of devices with `report`, and all writes, since the last call.
 
-        Waits up to `timeout` seconds for the first. A poll is a device, the seconds since 1970, and
-        its blocks as they were asked: area, address, count, the bytes (`None` when there are none),
-        and the fault as a status block tells it. A write is its number and the fault, 0 when the
-        device has confirmed it. `None` when the poller has stopped and nothing is left.
+        Waits up to `timeout` seconds for the first. A poll is a device, the seconds from the
+        poller's start to when the schedule wanted it (to when it began, if that was beside the
+        schedule), and its blocks as they were asked: area, address, count, the bytes (`None` when
+        there are none), the fault as a status block tells it, and the seconds since 1970 when that
+        was known. A write is its number and the fault, 0 when the device has confirmed it. `None`
+        when the poller has stopped and nothing is left.
         """
 
     @property

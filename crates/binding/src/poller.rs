@@ -251,20 +251,21 @@ fn limits(
 /// Polls, and writes as ticket and fault.
 type Taken<'py> = (Vec<PollResult<'py>>, Vec<(u64, u16)>);
 
-/// Device, seconds since 1970, and blocks: area, address, count, bytes or fault.
+/// Device, seconds of the schedule, and blocks: area, address, count, bytes or fault, and seconds
+/// since 1970.
 type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);
-type ReportedBlock<'py> = (&'static str, u16, u16, Option<Bound<'py, PyBytes>>, u16);
+type ReportedBlock<'py> = (&'static str, u16, u16, Option<Bound<'py, PyBytes>>, u16, f64);
 
 fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
-    let time = poll.time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let blocks = poll.blocks.iter().map(|block| {
         let (bytes, fault) = match &block.outcome {
             Ok(bytes) => (Some(PyBytes::new(py, bytes)), 0),
             Err(fault) => (None, fault.code()),
         };
-        (block.area.name(), block.address, block.count, bytes, fault)
+        let time = block.time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        (block.area.name(), block.address, block.count, bytes, fault, time.as_secs_f64())
     });
-    Ok((poll.device.to_string(), time.as_secs_f64(), blocks.collect()))
+    Ok((poll.device.to_string(), poll.due.as_secs_f64(), blocks.collect()))
 }
 
 fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDict>> {

@@ -105,7 +105,7 @@ def _blocks(device: Device) -> Iterator[BlockReport]:
             yield BlockReport(
                 area=area, address=address, count=count, tags=len(members), holes=holes
             )
-    for area, address, count, _, fault in device.health.blocks:
+    for area, address, count, _, fault, _ in device.health.blocks:
         inside = [
             tag
             for tag in tags
@@ -126,7 +126,7 @@ def _tags(device: Device, undecoded: Mapping[str, str]) -> Iterator[TagReport]:
     faults = [block for block in device.health.blocks if block[4]]
     for tag in device.tags.values():
         error = undecoded.get(tag.id)
-        for area, address, count, _, fault in faults:
+        for area, address, count, _, fault, _ in faults:
             if tag.area == area and tag.address >= address and tag.end <= address + count:
                 error = described(fault)
         descriptions = (

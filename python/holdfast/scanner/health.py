@@ -17,6 +17,9 @@ UNREACHED = (0x0A, 0x0B)
 
 NO_CONNECTION = 0x8002
 
+FORGIVEN = 1
+"""Scans in a row that a device may leave unanswered before it is offline."""
+
 FAULTS = {
     0x01: "exception 01 (Illegal Function)",
     0x02: "exception 02 (Illegal Data Address)",
@@ -60,19 +63,22 @@ class Health:
     blocks: list[Block] = field(default_factory=list)
     """Those of the last scan."""
 
-    def judge(self, time: float, blocks: list[Block]) -> bool:
+    def judge(self, blocks: list[Block]) -> bool:
         """Takes note of a poll; whether that is worth telling.
 
-        It is when the state changes, and when a device that answers refuses something new.
+        It is when the state changes, and when a device that answers refuses something new. One
+        reply that is missing does not make a device offline that was online.
         """
         before = (self.state, self.error if self.state == "online" else None)
         self.scans += 1
-        faults = [fault for *_, fault in blocks if fault]
-        if len(faults) < len(blocks) or any(_answered(fault) for fault in faults):
-            self.state, self.failures, self.last_answer = "online", 0, time
+        faults = [fault for *_, fault, _ in blocks if fault]
+        answers = [time for *_, fault, time in blocks if not fault or _answered(fault)]
+        if answers:
+            self.state, self.failures, self.last_answer = "online", 0, answers[-1]
         else:
-            self.state = "offline"
             self.failures += 1
+            if self.state != "online" or self.failures > FORGIVEN or NO_CONNECTION in faults:
+                self.state = "offline"
         self.error = described(faults[0]) if faults else None
         self.blocks = blocks
         return before != (self.state, self.error if self.state == "online" else None)

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from holdfast.scanner.devices import Device
     from holdfast.types import Area
 
-Block: TypeAlias = "tuple[Area, int, int, bytes | None, int]"
-"""Area, address, count, the bytes if there are any, and the fault."""
+Block: TypeAlias = "tuple[Area, int, int, bytes | None, int, float]"
+"""Area, address, count, the bytes if there are any, the fault, and the seconds since 1970 when that
+was known."""
 
 Poll: TypeAlias = tuple[str, float, list[Block]]
-"""What the device is polled as, seconds since 1970, and its blocks."""
+"""What the device is polled as, when the schedule wanted the poll, in seconds, and its blocks."""
 
 PATIENCE = 60.0
 """Seconds that the thread waits for polls at once; it ends with the poller."""
@@ -40,8 +41,8 @@ each, and a caller may ask for a thousand tags one by one."""
 
 
 class Polling:
-    """Devices that are polled. `take` gets each poll, in the event loop: the device, the seconds
-    since 1970, and the blocks.
+    """Devices that are polled. `take` gets each poll, in the event loop: the device, when the
+    schedule wanted it, in seconds, and the blocks.
     """
 
     def __init__(self, take: Callable[[Device, float, list[Block]], None]) -> None:
@@ -139,10 +140,10 @@ class Polling:
                 done = self._writes.get(number)
                 if done is not None and not done.done():
                     done.set_result(fault)
-            for name, moment, blocks in polls:
+            for name, due, blocks in polls:
                 device = self._devices.get(name)
                 if device is not None:
-                    self._take(device, moment, blocks)
+                    self._take(device, due, blocks)
         finally:
             self._taken.release()
 

@@ -30,8 +30,8 @@ Message: TypeAlias = tuple[str, bytes]
 SHAPES = 64
 """Sets of blocks that are remembered; a device that refuses some has more than one."""
 
-EARLY = 0.25
-"""By this part of a scan a message may come early: answers do not all take the same time."""
+SLACK = 0.0005
+"""Seconds that two times of a schedule may be off: they were reckoned in nanoseconds."""
 
 _UNKNOWN = object()
 _encode = msgspec.json.Encoder().encode
@@ -52,14 +52,14 @@ class Publisher:
         self.undecoded: dict[str, str] = {}
         """Why tags have no value though their registers were read."""
 
-    def regroup(self, groups: Sequence[Group], interval: int, newcomers: set[str]) -> None:
+    def regroup(self, groups: Sequence[Group], newcomers: set[str]) -> None:
         """Publishes these groups from now on; of newcomers the next value, changed or not."""
         before = {(due.group.change, due.group.rate): due for due in self._groups if not due.once}
         known = {tag.id for due in before.values() for tag in due.group.tags} - self._fresh
         self._fresh = {tag.id for group in groups for tag in group.tags} - known
         self._groups = [
-            *(_Due(group, interval, None, once=True) for group in self._firsts(groups, before)),
-            *(_Due(group, interval, before.get((group.change, group.rate))) for group in groups),
+            *(_Due(group, None, once=True) for group in self._firsts(groups, before)),
+            *(_Due(group, before.get((group.change, group.rate))) for group in groups),
         ]
         ids = {tag.id for group in groups for tag in group.tags if group.change}
         self._last = {id: value for id, value in self._last.items() if id in ids - newcomers}
@@ -68,25 +68,26 @@ class Publisher:
         self.undecoded.clear()
         self._shapes.clear()
 
-    def messages(self, time: float, blocks: Sequence[Block]) -> list[Message]:
-        """What is to be published after a poll, at a time in seconds since 1970."""
+    def messages(self, due: float, blocks: Sequence[Block]) -> list[Message]:
+        """What is to be published after a poll that the schedule wanted at this time in seconds."""
         shape = tuple(block[:3] for block in blocks if block[3] is not None)
         parts = self._shapes.get(shape)
         if parts is None:
             parts = self._compiled(shape)
-        data = [block[3] for block in blocks if block[3] is not None]
-        timestamp = b"%d" % (time * 1000)
+        answered = [
+            (block[3], b"%d" % (block[5] * 1000)) for block in blocks if block[3] is not None
+        ]
         made: list[Message] = []
         first: set[str] = set()
-        for due, compiled in parts:
-            if not compiled or not due.now(time):
+        for group, compiled in parts:
+            if not compiled or not group.now(due):
                 continue
             for part in compiled:
-                found = self._made(part, data[part.block], timestamp)
-                if first and not due.once:
+                found = self._made(part, *answered[part.block])
+                if first and not group.once:
                     found = (message for message in found if message[0] not in first)
                 made += found
-            if due.once:
+            if group.once:
                 first = {id for id, _ in made}
         if self._fresh and any(compiled for _, compiled in parts):
             self._forget_firsts()
@@ -216,23 +217,16 @@ class _Part(NamedTuple):
 class _Due:
     """A group, and when it is published next."""
 
-    def __init__(
-        self, group: Group, interval: int, before: _Due | None, *, once: bool = False
-    ) -> None:
+    def __init__(self, group: Group, before: _Due | None, *, once: bool = False) -> None:
         self.group = group
         self.once = once
-        self._pause = (group.rate - EARLY * interval) / 1000
-        self._every_scan = group.rate <= interval
         self._last: float = -math.inf if before is None else before._last
-        # When a device is scanned anew, the first scan may come too early.
-        self._not_before = self._last + self._pause
 
-    def now(self, time: float) -> bool:
-        """Whether it is published with the values of this time, which is noted then."""
-        if self._last <= time < self._not_before:
+    def now(self, due: float) -> bool:
+        """Whether it is published with the values of this scan, which is noted then."""
+        if due < self._last + self.group.rate / 1000 - SLACK:
             return False
-        self._last = time
-        self._not_before = -math.inf if self._every_scan else time + self._pause
+        self._last = due
         return True
 
 

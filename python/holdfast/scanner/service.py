@@ -173,7 +173,7 @@ class Scanner:
                 publisher = Publisher(self._settings.prefix, device.id)
                 self._publishers[device.id] = publisher
                 self._tell(device)
-            publisher.regroup(grouped(device), device.rate, newcomers)
+            publisher.regroup(grouped(device), newcomers)
             if changed:
                 self._polling.renew(device)
         logs.write(
@@ -200,7 +200,7 @@ class Scanner:
             device, changed = self._registry.unsubscribe(request)
             if device is not None:
                 if device.subscribers:
-                    self._publishers[device.id].regroup(grouped(device), device.rate, set())
+                    self._publishers[device.id].regroup(grouped(device), set())
                     if changed:
                         self._polling.renew(device)
                 elif changed:
@@ -255,20 +255,20 @@ class Scanner:
         )
         return browsed(request, devices, self._polling.counters(), service, most)
 
-    def _take(self, device: Device, moment: float, blocks: list[Block]) -> None:
+    def _take(self, device: Device, due: float, blocks: list[Block]) -> None:
         """Publishes what was read."""
         try:
-            self._publish(device, moment, blocks)
+            self._publish(device, due, blocks)
         except Exception:  # What is wrong with one device must not cost the others.
             logs.problem("scan_failed", device=device.id)
 
-    def _publish(self, device: Device, moment: float, blocks: list[Block]) -> None:
-        if device.health.judge(moment, blocks):
+    def _publish(self, device: Device, due: float, blocks: list[Block]) -> None:
+        if device.health.judge(blocks):
             self._tell(device)
         if device.may_have_moved():
             self._begin(self._look_up(device))
         id = device.id
-        messages = self._publishers[id].messages(moment, blocks)
+        messages = self._publishers[id].messages(due, blocks)
         self.outbox.put([((id, tag), text) for tag, text in messages])
 
     async def _look_up(self, device: Device) -> None:

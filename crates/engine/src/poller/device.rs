@@ -337,16 +337,18 @@ impl Device {
         let interval = self.settings.interval;
         loop {
             let mut due = self.due.get();
+            let mut began = Instant::now();
             if !at_once {
                 tokio::select! {
                     biased;
                     successor = succession.successor() => return successor,
                     () = sleep_until(due) => {}
                 }
+                began = due;
                 due += interval;
             }
             at_once = false;
-            self.poll().await;
+            self.poll(began).await;
             self.tell();
             let (mut due, missed) = first_from(Instant::now(), due, interval);
             self.state.counters.missed.add_many(missed);
@@ -426,7 +428,7 @@ impl Device {
     }
 
     /// Reads every block, and hands on every read that came whole.
-    async fn poll(&self) {
+    async fn poll(&self, due: Instant) {
         if self.revise.get().is_some_and(|time| Instant::now() >= time) {
             self.revise.set(None);
             self.limits.replace(self.settings.limits.clone());
@@ -455,7 +457,7 @@ impl Device {
         }
         if let Some(results) = &self.report {
             let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
-            results.push(Poll { device, time: SystemTime::now(), blocks });
+            results.push(Poll { device, due: results.counted(due.into_std()), blocks });
         }
         if self.settings.release {
             self.link.release();
@@ -638,7 +640,8 @@ impl Gathered {
     fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
         if self.report {
             let Block { area, address, count, .. } = *block;
-            self.blocks.push(BlockResult { area, address, count, outcome });
+            let time = SystemTime::now();
+            self.blocks.push(BlockResult { area, address, count, outcome, time });
         }
     }
 

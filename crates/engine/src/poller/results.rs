@@ -7,7 +7,7 @@
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use holdfast_memory::Area;
 
@@ -20,7 +20,9 @@ const CAPACITY: usize = 16_384;
 #[derive(Debug, Clone)]
 pub struct Poll {
     pub device: Arc<str>,
-    pub time: SystemTime,
+    /// When the schedule wanted it, counted from the poller's start; a poll beside the schedule has
+    /// the time when it began.
+    pub due: Duration,
     /// In the order in which they were asked; those behind one that was not answered are missing.
     pub blocks: Vec<BlockResult>,
 }
@@ -32,6 +34,8 @@ pub struct BlockResult {
     pub address: u16,
     pub count: u16,
     pub outcome: Result<Vec<u8>, Fault>,
+    /// When that was known.
+    pub time: SystemTime,
 }
 
 /// What became of a write.
@@ -58,14 +62,31 @@ impl Batch {
 }
 
 /// The queue between the poller's thread and the taker's.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Results {
+    began: Instant,
     queue: Mutex<Batch>,
     ready: Condvar,
     dropped: AtomicU64,
 }
 
+impl Default for Results {
+    fn default() -> Results {
+        Results {
+            began: Instant::now(),
+            queue: Mutex::default(),
+            ready: Condvar::default(),
+            dropped: AtomicU64::default(),
+        }
+    }
+}
+
 impl Results {
+    /// A time as polls tell it.
+    pub(super) fn counted(&self, time: Instant) -> Duration {
+        time.saturating_duration_since(self.began)
+    }
+
     pub(super) fn push(&self, poll: Poll) {
         self.put(|batch| {
             if batch.polls.len() == CAPACITY {
