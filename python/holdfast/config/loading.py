@@ -54,7 +54,7 @@ def load(path: Path | str) -> Config:
 def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     memories = mapping(data.get("memories"))
     grants = GrantChecks(report, [str(name) for name in memories])
-    ListenerChecks(report, grants, memories).check(data.get("listeners"))
+    ListenerChecks(folder, report, grants, memories).check(data.get("listeners"))
     ServiceChecks(folder, report, grants).check(data)
     DeviceChecks(report, grants, memories).check(data)
     check_sockets(data, report)

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.config.listeners import LISTENER_TYPES
 from holdfast.config.tolerance import mapping
-from holdfast.config.words import choice
 
 if TYPE_CHECKING:
     from holdfast.config.problems import Report
 
 SECTIONS = ("nats", "gateway")
-TYPES = ("modbus-tls",)
 
 
 def refuse_unavailable(data: object, report: Report) -> None:
@@ -24,9 +21,3 @@ def refuse_unavailable(data: object, report: Report) -> None:
         if name in mapping(data):
             message = "this section is not available in this version"
             report.settle((name,), message, of_key=True)
-    for name, listener in mapping(mapping(data).get("listeners")).items():
-        kind = mapping(listener).get("type")
-        if isinstance(kind, str) and kind in TYPES:
-            allowed = f"allowed: {choice(LISTENER_TYPES)}"
-            message = f"{kind!r} is not available in this version, {allowed}"
-            report.settle(("listeners", name), message, ("type",))

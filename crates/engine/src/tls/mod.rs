@@ -2,6 +2,10 @@
 //!
 //! A [`Channel`] does no I/O: whoever has the socket gives it what came, and sends what it says.
 
+mod certificate;
+mod pem;
+pub mod server;
+
 use std::io::{Read, Write};
 
 use rustls::{Connection, Error};
@@ -57,6 +61,12 @@ impl Channel {
 
     pub fn is_handshaking(&self) -> bool {
         self.0.is_handshaking()
+    }
+
+    /// Whether the peer has said that it sends no more.
+    pub fn is_ended(&mut self) -> bool {
+        // No plain text waits here, so that only an end has a length.
+        matches!(self.0.reader().read(&mut [0]), Ok(0))
     }
 
     fn take(&mut self, plain: &mut Vec<u8>) {
