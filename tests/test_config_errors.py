@@ -50,7 +50,10 @@ SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
 CODES = "1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"
 TOP = "memories, identity, listeners, devices, rest, mqtt, adapters, metrics, audit, log, workers"
-TYPES = "modbus-tcp, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii"
+TYPES = (
+    "modbus-tcp, modbus-tls, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or "
+    "modbus-ascii"
+)
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
 RULE = "listeners.scada.rules[0]"
 
@@ -384,13 +387,6 @@ def test_sections_to_come_are_refused_by_name(folder: Folder, section: str) -> N
     ]
 
 
-def test_listener_types_to_come_are_refused_by_name(folder: Folder) -> None:
-    assert folder.problems(f"{GOOD}  later: {{type: modbus-tls, certificate: x}}\n") == [
-        "p.yaml:11: listeners.later.type: 'modbus-tls' is not available in this version, "
-        f"allowed: {TYPES}"
-    ]
-
-
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
@@ -546,7 +542,7 @@ listeners:
       - {sources: [10.0.0.0/8], units: {1: b}, access: rw}
       - {sources: [10.1.0.0/16, 1], units: {1: a}, access: read-only, functions: [9]}
   two: {type: modbus-tcp, bind: 127.0.0.1:502, rules: []}
-  three: {type: modbus-tls, port: 5}
+  three: {type: modbus-tsl, port: 5}
   four: {type: modbus-rtu, serial: {}, rules: [{sources: [], units: {0: c}}]}
 mqtt: {url: tcp://broker, password: x, subscriptions: [{topic: '', memories: [c], areas: [coil]}]}
 rest: {bind: 0.0.0.0:502, sources: [], tokens: none}
@@ -571,8 +567,7 @@ def test_all_problems_of_all_kinds_are_told_at_once_in_the_order_of_lines(folder
         "p.yaml:16: listeners.one.rules[1].functions[0]",
         "p.yaml:17: listeners.two.bind",
         "p.yaml:17: listeners.two.rules",
-        "p.yaml:18: listeners.three.type: 'modbus-tls' is not available in this version, "
-        f"allowed: {TYPES}",
+        "p.yaml:18: listeners.three.type",
         "p.yaml:19: listeners.four.serial.device: missing, allowed: text, as in /dev/ttyUSB0 or "
         "COM3",
         "p.yaml:19: listeners.four.rules[0].access: missing, allowed: read-only or read-write",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import wire
-from brokers import Certificates
+from certificates import Certificates
 from holdfast import logs
 from holdfast.scanner import Servers
 from nats_bus import NatsServer

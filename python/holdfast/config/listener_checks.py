@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.addresses import Network, covers, parse_source
 from holdfast.config.allowed import allowed
-from holdfast.config.file_checks import check_readable
+from holdfast.config.files import unreadable
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.unique import refuse_repeats
@@ -94,7 +94,12 @@ class ListenerChecks:
 
     def _certificates(self, path: KeyPath, tls: dict[Any, Any]) -> None:
         for key in ("cert_file", "key_file", "ca_file", "crl_file"):
-            check_readable((*path, key), tls, self.folder, self.report)
+            file = tls.get(key)
+            if isinstance(file, str) and file and "\0" not in file:
+                reason = unreadable(self.folder / file)
+                if reason:
+                    message = f"found {show(file)}, which can't be read: {reason}"
+                    self.report.add((*path, key), message)
 
     def _line(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         for rule_path, rule in self._rules(path, listener):

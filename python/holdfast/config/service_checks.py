@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.addresses import parse_bind
 from holdfast.config.broker import parse_broker, parse_topic_filter
-from holdfast.config.file_checks import check_readable
+from holdfast.config.files import unreadable
 from holdfast.config.tolerance import entries, mapping, parsed
 from holdfast.config.unique import Owners
 from holdfast.config.values import parse_sha256
 from holdfast.config.words import show
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
@@ -68,7 +67,7 @@ class ServiceChecks:
         if "password_file" in mqtt and "username" not in mqtt:
             message = "found without username, allowed: both or none"
             self.report.add(("mqtt", "password_file"), message, of_key=True)
-        check_readable(("mqtt", "password_file"), mqtt, self.folder, self.report)
+        self._readable(("mqtt", "password_file"), mqtt.get("password_file"))
         broker = parsed(parse_broker, mqtt.get("url"))
         if "tls" in mqtt and broker is not None and not broker.secure:
             message = "found beside a url that begins with mqtt://, allowed: beside mqtts:// only"
@@ -88,7 +87,13 @@ class ServiceChecks:
                 message = f"found without {other}, allowed: both or none"
                 self.report.add(("mqtt", "tls", key), message, of_key=True)
         for key in ("ca_file", "cert_file", "key_file"):
-            check_readable(("mqtt", "tls", key), tls, self.folder, self.report)
+            self._readable(("mqtt", "tls", key), tls.get(key))
+
+    def _readable(self, path: KeyPath, file: object) -> None:
+        if isinstance(file, str) and file and "\0" not in file:
+            reason = unreadable(self.folder / file)
+            if reason:
+                self.report.add(path, f"found {show(file)}, which can't be read: {reason}")
 
     def _audit(self, file: object) -> None:
         if not isinstance(file, str) or not file or "\0" in file:

@@ -3,12 +3,14 @@
 //! A [`Channel`] does no I/O: whoever has the socket gives it what came, and sends what it says.
 
 mod certificate;
-mod pem;
+mod files;
 pub mod server;
 
 use std::io::{Read, Write};
 
 use rustls::{Connection, Error};
+
+pub use files::FileError;
 
 /// Bytes of plain text taken out at once.
 const CHUNK: usize = 4096;

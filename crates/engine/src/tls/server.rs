@@ -4,12 +4,13 @@
 //! certificate of a client, and its dates, are judged at every connection.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rustls::client::danger::HandshakeSignatureValid;
 use rustls::crypto::{CryptoProvider, ring, verify_tls12_signature, verify_tls13_signature};
-use rustls::pki_types::{CertificateDer, UnixTime};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::server::{NoServerSessionStorage, VerifierBuilderError, WebPkiClientVerifier};
 use rustls::{
@@ -19,7 +20,7 @@ use rustls::{
 
 use super::Channel;
 use super::certificate::Parsed;
-use super::pem::{File, FileError};
+use super::files::{FileError, certificates, key};
 
 /// The files of a server, in PEM.
 #[derive(Debug, Clone)]
@@ -39,29 +40,27 @@ pub struct ServerFiles {
 pub struct ServerTls(Arc<ServerConfig>);
 
 impl ServerTls {
+    /// Reads the files.
+    ///
     /// # Errors
-    /// [`FileError`] names the file that can't be used.
+    /// [`FileError`] for one that can't be used.
     pub fn load(files: &ServerFiles) -> Result<ServerTls, FileError> {
-        let cert_file = File { role: "cert_file", path: &files.cert_file };
-        let key_file = File { role: "key_file", path: &files.key_file };
         let provider = Arc::new(ring::default_provider());
-        let (chain, key) = (cert_file.certificates()?, key_file.key()?);
-        let signer = provider.key_provider.load_private_key(key.clone_key()).map_err(|_| {
-            let allowed = "allowed: RSA of 2048 bits or more, ECDSA P-256 or P-384, Ed25519";
-            key_file.error(format!("found a key of another kind, {allowed}"))
-        })?;
-        drop(signer);
+        let (chain, key) = (certificates(&files.cert_file)?, key(&files.key_file)?);
         let clients = Arc::new(Clients::load(files, &provider)?);
         let config = ServerConfig::builder_with_provider(provider)
             .with_safe_default_protocol_versions()
-            .map_err(|error| cert_file.error(error.to_string()))?;
+            .map_err(|error| FileError::content(&files.cert_file, error.to_string()))?;
         let config = config.with_client_cert_verifier(clients).with_single_cert(chain, key);
-        let mut config = config.map_err(|error| match error {
-            Error::InconsistentKeys(_) => {
-                let allowed = "allowed: the key of its first certificate";
-                key_file.error(format!("found a key that does not fit cert_file, {allowed}"))
-            }
-            error => cert_file.error(error.to_string()),
+        let mut config = config.map_err(|error| {
+            let flaw = match error {
+                Error::InconsistentKeys(_) => {
+                    let certificate = files.cert_file.display();
+                    format!("it is not the key of the certificate in {certificate}")
+                }
+                _ => "found a key of another kind, allowed: RSA, P-256, P-384, Ed25519".into(),
+            };
+            FileError::content(&files.key_file, flaw)
         })?;
         config.session_storage = Arc::new(NoServerSessionStorage {});
         config.send_tls13_tickets = 0;
@@ -90,8 +89,8 @@ pub(crate) fn role(channel: &Channel) -> Result<String, Error> {
 /// Why a connection failed, in a word.
 pub(crate) fn reason(error: &Error) -> &'static str {
     use CertificateError::{
-        BadEncoding, Expired, ExpiredContext, InvalidPurpose, InvalidPurposeContext, NotValidYet,
-        NotValidYetContext, Revoked, UnhandledCriticalExtension, UnknownIssuer,
+        BadEncoding, BadSignature, Expired, ExpiredContext, InvalidPurpose, InvalidPurposeContext,
+        NotValidYet, NotValidYetContext, Revoked, UnhandledCriticalExtension, UnknownIssuer,
         UnknownRevocationStatus,
     };
     match error {
@@ -105,6 +104,7 @@ pub(crate) fn reason(error: &Error) -> &'static str {
             InvalidPurpose | InvalidPurposeContext { .. } => "wrong_purpose",
             UnhandledCriticalExtension => "unknown_extension",
             BadEncoding => "bad_certificate",
+            BadSignature => "bad_signature",
             _ => "untrusted_certificate",
         },
         Error::AlertReceived(_) => "refused_by_peer",
@@ -128,57 +128,72 @@ struct Clients {
 
 impl Clients {
     fn load(files: &ServerFiles, provider: &Arc<CryptoProvider>) -> Result<Clients, FileError> {
-        let ca_file = File { role: "ca_file", path: &files.ca_file };
         let (mut roots, mut pinned) = (RootCertStore::empty(), Vec::new());
         let mut subjects = Vec::new();
-        for (index, certificate) in ca_file.certificates()?.into_iter().enumerate() {
-            let found = |what: String| ca_file.error(format!("certificate {}: {what}", index + 1));
-            let parsed =
-                Parsed::new(&certificate).map_err(|_| found("not an X.509 certificate".into()))?;
-            // One that is no authority must vouch for nobody but itself.
+        for (index, certificate) in certificates(&files.ca_file)?.into_iter().enumerate() {
+            let wrong = |what: String| {
+                FileError::content(&files.ca_file, format!("certificate {}: {what}", index + 1))
+            };
+            let parsed = Parsed::new(&certificate).map_err(|error| wrong(error.to_string()))?;
+            // One that is no authority vouches for nobody but itself.
             let (is_authority, is_self_signed) = (parsed.is_authority(), parsed.is_self_signed());
             if is_authority {
-                roots.add(certificate.clone()).map_err(|error| found(error.to_string()))?;
+                roots.add(certificate.clone()).map_err(|error| wrong(error.to_string()))?;
             } else if !is_self_signed {
                 let allowed = "allowed: authorities (CA:TRUE) and self-signed certificates";
-                return Err(found(format!("neither of both, {allowed}")));
+                return Err(wrong(format!("found neither of both, {allowed}")));
             }
             if is_self_signed {
                 pinned.push(certificate);
             }
             subjects.extend(parsed.subject());
         }
-        let signed = match (roots.is_empty(), &files.crl_file) {
-            (false, _) => Some(authorities(roots, files, provider)?),
-            (true, None) => None,
-            (true, Some(path)) => {
-                let reason = "found beside a ca_file without authorities, allowed: beside some";
-                return Err(File { role: "crl_file", path }.error(reason));
+        let crl_file = files.crl_file.as_deref();
+        let signed = match crl_file {
+            Some(file) if roots.is_empty() => {
+                let flaw = "found beside a ca_file without authorities, allowed: beside some";
+                return Err(FileError::content(file, flaw));
             }
+            None if roots.is_empty() => None,
+            _ => Some(authorities(roots, crl_file, provider)?),
         };
         Ok(Clients { signed, pinned, subjects, provider: Arc::clone(provider) })
     }
 }
 
-/// What judges certificates that are signed by authorities.
+/// What judges certificates that authorities have signed.
 fn authorities(
     roots: RootCertStore,
-    files: &ServerFiles,
+    crl_file: Option<&Path>,
     provider: &Arc<CryptoProvider>,
 ) -> Result<Arc<dyn ClientCertVerifier>, FileError> {
-    let (roots, provider) = (Arc::new(roots), Arc::clone(provider));
-    let mut builder = WebPkiClientVerifier::builder_with_provider(roots, provider);
-    let crl_file = files.crl_file.as_deref().map(|path| File { role: "crl_file", path });
-    if let Some(file) = &crl_file {
-        builder = builder.with_crls(file.revocations()?);
-    }
+    let builder =
+        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(provider));
+    let file = crl_file.unwrap_or(Path::new(""));
+    let builder = match crl_file {
+        Some(file) => builder.with_crls(revocations(file)?),
+        None => builder,
+    };
     builder.build().map_err(|error| {
-        let file = crl_file.unwrap_or(File { role: "ca_file", path: &files.ca_file });
-        file.error(match error {
-            VerifierBuilderError::InvalidCrl(error) => format!("can't be used: {error:?}"),
+        let flaw = match error {
+            VerifierBuilderError::InvalidCrl(error) => format!("{error:?}"),
             error => error.to_string(),
-        })
+        };
+        FileError::content(file, format!("a list can't be read: {flaw}"))
     })
+}
+
+/// All lists of revoked certificates of a file, at least one.
+fn revocations(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, FileError> {
+    let text = std::fs::read(file)
+        .map_err(|error| FileError::Unreadable { file: file.display().to_string(), error })?;
+    let found: Result<Vec<_>, _> = CertificateRevocationListDer::pem_slice_iter(&text).collect();
+    let found = found.map_err(|error| FileError::content(file, error.to_string()))?;
+    if found.is_empty() {
+        let flaw = "found no list of revoked certificates, allowed: X509 CRL in PEM";
+        return Err(FileError::content(file, flaw));
+    }
+    Ok(found)
 }
 
 impl ClientCertVerifier for Clients {
@@ -193,13 +208,13 @@ impl ClientCertVerifier for Clients {
         now: UnixTime,
     ) -> Result<ClientCertVerified, Error> {
         let parsed = Parsed::new(end_entity)?;
+        parsed.role()?;
         if self.pinned.contains(end_entity) {
             parsed.is_valid_at(now)?;
         } else {
             let signed = self.signed.as_ref().ok_or(CertificateError::UnknownIssuer)?;
             signed.verify_client_cert(end_entity, intermediates, now)?;
         }
-        parsed.role()?;
         Ok(ClientCertVerified::assertion())
     }
 

@@ -1,0 +1,87 @@
+//! Certificates and keys, out of PEM files.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::server::ParsedCertificate;
+use thiserror::Error;
+
+/// The most bytes of a file.
+const LONGEST: u64 = 4 << 20;
+
+/// The first byte of anything in DER.
+const SEQUENCE: u8 = 0x30;
+
+/// A file that can't be used.
+#[derive(Debug, Error)]
+pub enum FileError {
+    #[error("{file}: {error}")]
+    Unreadable { file: String, error: io::Error },
+    /// What is wrong with what is in it.
+    #[error("{file}: {flaw}")]
+    Content { file: String, flaw: String },
+}
+
+impl FileError {
+    pub(super) fn content(file: &Path, flaw: impl Into<String>) -> FileError {
+        FileError::Content { file: file.display().to_string(), flaw: flaw.into() }
+    }
+}
+
+/// All certificates of a file, in its order; at least one.
+///
+/// # Errors
+/// [`FileError`]
+pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, FileError> {
+    let text = read(file)?;
+    let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&text).collect();
+    let found = found.map_err(|error| FileError::content(file, error.to_string()))?;
+    if found.is_empty() {
+        return Err(FileError::content(file, missing(&text, "certificate")));
+    }
+    for (index, certificate) in found.iter().enumerate() {
+        if ParsedCertificate::try_from(certificate).is_err() {
+            let number = index + 1;
+            let flaw = format!("certificate {number} can't be read, allowed: X.509 version 3");
+            return Err(FileError::content(file, flaw));
+        }
+    }
+    Ok(found)
+}
+
+/// The first key of a file: PKCS#8, PKCS#1 or SEC1.
+///
+/// # Errors
+/// [`FileError`]
+pub(super) fn key(file: &Path) -> Result<PrivateKeyDer<'static>, FileError> {
+    let text = read(file)?;
+    if text.windows(9).any(|word| word == b"ENCRYPTED") {
+        let flaw = "the key is encrypted, allowed: one without a passphrase";
+        return Err(FileError::content(file, flaw));
+    }
+    match PrivateKeyDer::pem_slice_iter(&text).next() {
+        Some(found) => found.map_err(|error| FileError::content(file, error.to_string())),
+        None => Err(FileError::content(file, missing(&text, "key"))),
+    }
+}
+
+fn read(file: &Path) -> Result<Vec<u8>, FileError> {
+    let unreadable = |error| FileError::Unreadable { file: file.display().to_string(), error };
+    let mut text = Vec::new();
+    File::open(file)
+        .and_then(|opened| opened.take(LONGEST + 1).read_to_end(&mut text))
+        .map_err(unreadable)?;
+    if text.len() as u64 > LONGEST {
+        let flaw = format!("more than {LONGEST} bytes, allowed: certificates or a key in PEM");
+        return Err(FileError::content(file, flaw));
+    }
+    Ok(text)
+}
+
+fn missing(text: &[u8], what: &str) -> String {
+    let found = if text.first() == Some(&SEQUENCE) { "DER" } else { &format!("no {what}") };
+    format!("found {found}, allowed: a {what} in PEM")
+}
