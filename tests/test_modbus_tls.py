@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import select
 import ssl
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
+from pymodbus.client import ModbusTlsClient
 
 import wire
 from certificates import FUTURE, PAST, ROLE, Certificates, Issued, named, openssl, self_signed
+from conftest import tool
+from holdfast.appliance import Appliance
+from holdfast.cli.configuration import load_whole
+from holdfast.config import ConfigError, load
+from test_stream import resident
 from tls_peer import Peer, Refused, address, configuration, connections, context
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from conftest import Run
-    from holdfast.appliance import Appliance
 
 READ = bytes.fromhex("0300000001")
 ZERO = bytes.fromhex("03020000")
@@ -595,3 +605,171 @@ def test_stop_answers_what_was_received_and_says_so(
             assert len(client.receive_many(3)) == 3
             assert client.end() == "close_notify"
         assert shaking.rest() == b""
+
+
+# Clients of others
+
+
+@versions
+def test_pymodbus(secure: Appliance, party: Party, version: str) -> None:
+    host, port = address(secure)
+    trust = context(party.authority.ca, party.engineer, version)
+    trust.check_hostname = False  # It has no way to say which name it wants.
+    client = ModbusTlsClient(host, port=port, sslctx=trust, timeout=wire.DEADLINE)
+    try:
+        assert client.connect()
+        assert not client.write_registers(3, [1, 2, 3], device_id=1).isError()
+        assert client.read_holding_registers(3, count=3, device_id=1).registers == [1, 2, 3]
+    finally:
+        client.close()
+
+
+def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(
+    secure: Appliance, party: Party, caplog: pytest.LogCaptureFixture
+) -> None:
+    host, port = address(secure)
+    shown = ("-cert", str(party.operator.certificate), "-key", str(party.operator.key))
+    client = subprocess.Popen(
+        [tool("openssl"), "s_client", "-connect", f"{host}:{port}", "-tls1_3", *shown],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        bufsize=0,
+    )
+    assert client.stdin is not None
+    assert client.stdout is not None
+
+    def say(data: bytes, until: bytes) -> None:
+        """A line that begins with K asks for new keys, if it comes alone."""
+        assert client.stdin is not None
+        assert client.stdout is not None
+        client.stdin.write(data)
+        told = b""
+        while until not in told:
+            piece = client.stdout.read(4096)
+            if not piece:
+                raise BrokenPipeError
+            told += piece
+
+    try:
+        for number in range(1, 4):
+            say(b"K\n", b"KEYUPDATE\n")
+            say(wire.frame(READ, 1, number), wire.frame(ZERO, 1, number))
+        with contextlib.suppress(BrokenPipeError):
+            for _ in range(1000):
+                say(b"K\n", b"KEYUPDATE\n")
+    finally:
+        client.kill()
+        client.communicate()
+    assert reasons(secure, caplog) == ["protocol_error"]
+
+
+# Memory
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_idle_connections_cost_little_memory(party: Party, tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    limits = {"max_connections": 1000, "idle_timeout": 0}
+    file.write_text(configuration(party.files(), BY_ROLE, **limits))
+    trust = context(party.authority.ca, party.engineer)
+    with serving(file) as (pid, at), contextlib.ExitStack() as opened:
+        with Peer(at, trust) as first:
+            assert first.shake().ask(READ) == ZERO
+        before = resident(pid)
+        clients = [opened.enter_context(Peer(at, trust)).shake() for _ in range(200)]
+        assert all(client.ask(READ) == ZERO for client in clients)
+        assert resident(pid) - before < 200 * 64 * 1024
+
+
+@contextlib.contextmanager
+def serving(file: Path) -> Iterator[tuple[int, tuple[str, int]]]:
+    """A process that runs a configuration: its id, and where it listens."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "holdfast", "run", str(file)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        greeting = ""
+        while "Ctrl-C stops it." not in greeting:
+            line = process.stdout.readline()
+            assert line, greeting
+            greeting += line
+        match = re.search(r"modbus-tls +([0-9.]+):([0-9]+)", greeting)
+        assert match, greeting
+        assert "for 127.0.0.1/32 as engineer" in greeting
+        yield process.pid, (match[1], int(match[2]))
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# What is checked before anything starts
+
+
+def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_path: Path) -> None:
+    nothing = tmp_path / "nothing.pem"
+    nothing.write_text("nothing\n")
+    locked = party.authority.issue("locked", "DNS:locked", "-passout", "pass:secret")
+    odd = party.authority.issue("odd", "DNS:odd", curve="P-521")
+    ca, key, server = party.authority.ca, party.server.key, party.server.certificate
+    cases = [
+        ({"cert_file": key}, key, "found no certificate, allowed: a certificate in PEM"),
+        ({"key_file": server}, server, "found no key, allowed: a key in PEM"),
+        (
+            {"key_file": party.engineer.key},
+            party.engineer.key,
+            f"it is not the key of the certificate in {server}",
+        ),
+        (
+            {"key_file": locked.key},
+            locked.key,
+            "the key is encrypted, allowed: one without a passphrase",
+        ),
+        (
+            {"cert_file": odd.certificate, "key_file": odd.key},
+            odd.key,
+            "found a key of another kind, allowed: RSA, P-256, P-384, Ed25519",
+        ),
+        ({"ca_file": nothing}, nothing, "found no certificate, allowed: a certificate in PEM"),
+        (
+            {"ca_file": party.engineer.certificate},
+            party.engineer.certificate,
+            "certificate 1: found neither of both, allowed: authorities (CA:TRUE) and "
+            "self-signed certificates",
+        ),
+        (
+            {"crl_file": ca},
+            ca,
+            "found no list of revoked certificates, allowed: X509 CRL in PEM",
+        ),
+    ]
+    file = tmp_path / "plant.yaml"
+    for files, wrong, message in cases:
+        file.write_text(configuration({**party.files(), **files}, ANYONE))
+        with pytest.raises(ConfigError) as caught:
+            load_whole(file)
+        [problem] = caught.value.problems
+        assert str(problem) == f"{file}:1: listeners.secure.tls: {wrong}: {message}"
+        with pytest.raises(ValueError, match=re.escape(message)):
+            Appliance(load(file)).start()
+
+    outcome = subprocess.run(
+        [sys.executable, "-m", "holdfast", "run", str(file)],
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    assert outcome.returncode == 2
+    assert "found no list of revoked certificates" in outcome.stderr
+
+
+def test_lists_without_an_authority_are_told(party: Party, tmp_path: Path) -> None:
+    lonely = self_signed(tmp_path, "lonely")
+    files = party.files(ca_file=lonely.certificate, crl_file=party.authority.revoke())
+    (tmp_path / "plant.yaml").write_text(configuration(files, ANYONE))
+    with pytest.raises(ConfigError, match="found beside a ca_file without authorities"):
+        load_whole(tmp_path / "plant.yaml")
