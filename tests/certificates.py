@@ -121,8 +121,8 @@ def self_signed(
     )
     openssl(
         *("ca", "-batch", "-notext", "-selfsign", "-config", configuration),
-        *("-keyfile", issued.key, "-in", request, "-out", issued.certificate, "-extfile", file),
-        *_from_to(dates),
+        *("-keyfile", issued.key, "-in", request, "-extfile", file),
+        *("-out", issued.certificate, *_from_to(dates)),
     )
     return issued
 

@@ -174,8 +174,8 @@ def test_the_null_role_has_a_name_in_rules(run: Run, party: Party) -> None:
 def test_a_rule_without_roles_holds_any_and_the_first_that_holds_settles(
     run: Run, party: Party
 ) -> None:
-    source = {"sources": ["127.0.0.1"]}
-    rules = [
+    source: dict[str, Any] = {"sources": ["127.0.0.1"]}
+    rules: list[dict[str, Any]] = [
         {"sources": ["10.0.0.0/8"], "access": "read-write"},
         {**source, "roles": ["operator"], "access": "read-only"},
         {**source, "access": "read-write", "deny": [3]},
@@ -388,7 +388,7 @@ def test_old_versions_are_refused(secure: Appliance, caplog: pytest.LogCaptureFi
     old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     old.check_hostname, old.verify_mode = False, ssl.CERT_NONE
     with pytest.deprecated_call():
-        old.minimum_version = old.maximum_version = ssl.TLSVersion.TLSv1_1  # type: ignore[assignment]
+        old.minimum_version = old.maximum_version = ssl.TLSVersion.TLSv1_1
     old.set_ciphers("ALL:@SECLEVEL=0")
     assert "ALERT" in verdict(secure, old)
     assert reasons(secure, caplog) == ["incompatible"]
@@ -504,7 +504,7 @@ def test_a_record_that_was_changed_ends_the_connection(
         client.shake()
         changed = bytearray(client.seal(wire.frame(WRITE)))
         changed[-1] ^= 1
-        client.wire.send(changed)
+        client.wire.send(bytes(changed))
         assert client.end().endswith("ALERT_BAD_RECORD_MAC")
     assert reasons(secure, caplog) == ["decrypt_error"]
 
@@ -617,11 +617,11 @@ def test_pymodbus(secure: Appliance, party: Party, version: str) -> None:
     trust.check_hostname = False  # It has no way to say which name it wants.
     client = ModbusTlsClient(host, port=port, sslctx=trust, timeout=wire.DEADLINE)
     try:
-        assert client.connect()
+        assert client.connect()  # type: ignore[no-untyped-call]
         assert not client.write_registers(3, [1, 2, 3], device_id=1).isError()
         assert client.read_holding_registers(3, count=3, device_id=1).registers == [1, 2, 3]
     finally:
-        client.close()
+        client.close()  # type: ignore[no-untyped-call]
 
 
 def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(

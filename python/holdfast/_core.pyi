@@ -155,7 +155,8 @@ class Listener:
     """The settings of a listener; as constructed, one for Modbus over TCP connections.
 
     `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP; with `tls` it is spoken inside TLS.
-    Times are in seconds, `idle_timeout` 0 is for ever. Raises `ValueError` for an address, limit or time that can't be.
+    Times are in seconds, `idle_timeout` 0 is for ever. Raises `ValueError` for an address, limit or
+    time that can't be.
     """
 
     def __new__(

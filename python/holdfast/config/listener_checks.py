@@ -38,9 +38,9 @@ class _Holder:
 
     def overlaps(self, other: _Holder) -> bool:
         """Whether some source is of both."""
-        return any(
-            covers(self.networks, source) or any(covers([source], network) for network in self.networks)
-            for source in other.networks
+        mine, theirs = self.networks, other.networks
+        return any(covers(mine, network) for network in theirs) or any(
+            covers(theirs, network) for network in mine
         )
 
 

@@ -144,12 +144,12 @@ mod tests {
         let ca = IsCa::Ca(Constraints::Unconstrained);
         assert!(!parsed(|_| {}).is_authority());
         assert!(!parsed(|params| params.is_ca = IsCa::ExplicitNoCa).is_authority());
-        assert!(parsed(|params| params.is_ca = ca.clone()).is_authority());
+        assert!(parsed(|params| params.is_ca = ca).is_authority());
         for (usage, is_authority) in
             [(KeyUsagePurpose::KeyCertSign, true), (KeyUsagePurpose::DigitalSignature, false)]
         {
             let with_usage = |params: &mut CertificateParams| {
-                params.is_ca = ca.clone();
+                params.is_ca = ca;
                 params.key_usages = vec![usage];
             };
             assert_eq!(parsed(with_usage).is_authority(), is_authority);
