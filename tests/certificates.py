@@ -116,13 +116,13 @@ def self_signed(
     configuration.write_text(CONFIGURATION.format(folder=folder, name=name))
     file.write_text("\n".join(["basicConstraints=CA:FALSE", *extensions, ""]))
     openssl(
-        *("req", *_new_key("P-256"), "-nodes", "-keyout", issued.key, "-out", request),
-        *("-subj", f"/CN={name}"),
+        *("req", *_new_key("P-256"), "-nodes", "-subj", f"/CN={name}"),
+        *("-keyout", issued.key, "-out", request),
     )
     openssl(
         *("ca", "-batch", "-notext", "-selfsign", "-config", configuration),
-        *("-keyfile", issued.key, "-in", request, "-extfile", file),
-        *("-out", issued.certificate, *_from_to(dates)),
+        *("-keyfile", issued.key, "-in", request, "-extfile", file, "-out", issued.certificate),
+        *_from_to(dates),
     )
     return issued
 

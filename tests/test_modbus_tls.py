@@ -91,7 +91,7 @@ ANYONE: list[dict[str, Any]] = [{"sources": ["127.0.0.1"], "access": "read-write
 @pytest.fixture
 def secure(run: Run, party: Party) -> Appliance:
     """The engineer writes, the operator reads, nobody else comes in."""
-    return run(configuration(party.files(), BY_ROLE, **{"idle_timeout": 60}))
+    return run(configuration(party.files(), BY_ROLE))
 
 
 def peer(appliance: Appliance, trust: ssl.SSLContext, **options: Any) -> Peer:
