@@ -1,4 +1,4 @@
-"""MQTT in tests: Mosquitto, a client to talk to it, certificates, and adapters that run.
+"""MQTT in tests: Mosquitto, a client to talk to it, and adapters that run.
 
 Nothing here leaves the loopback interface, and a `Rig` stops all that it started.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import queue
 import signal
 import socket
@@ -304,47 +303,6 @@ def handled(door: Door) -> int:
     """How many messages were accepted or refused."""
     counts: Any = door.counts()
     return int(counts["accepted"] + sum(counts["refused"].values()))
-
-
-class Certificates:
-    """An authority, and certificates that it vouches for, made by openssl."""
-
-    def __init__(self, folder: Path, name: str = "authority") -> None:
-        self._folder = folder
-        self._name = name
-        self.ca = folder / f"{name}.pem"
-        self._key = folder / f"{name}.key"
-        self._openssl(
-            *("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
-            *("-keyout", self._key, "-out", self.ca, "-days", "2", "-subj", f"/CN={name}"),
-            *("-addext", "keyUsage=critical,keyCertSign,cRLSign"),
-        )
-
-    def issue(self, name: str, alternative: str, *options: str) -> tuple[Path, Path]:
-        """A certificate and its key; `alternative` is such as `IP:127.0.0.1`."""
-        certificate, key, request, extensions = (
-            self._folder / f"{self._name}-{name}.{end}" for end in ("pem", "key", "csr", "ext")
-        )
-        extensions.write_text(f"subjectAltName={alternative}\nauthorityKeyIdentifier=keyid\n")
-        self._openssl(
-            *("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
-            *(options or ("-nodes",)),
-            *("-keyout", key, "-out", request, "-subj", f"/CN={name}"),
-        )
-        self._openssl(
-            *("x509", "-req", "-in", request, "-CA", self.ca, "-CAkey", self._key),
-            *("-CAcreateserial", "-days", "2", "-extfile", extensions, "-out", certificate),
-        )
-        return certificate, key
-
-    @staticmethod
-    def _openssl(*arguments: str | Path) -> None:
-        subprocess.run(
-            [tool("openssl"), *map(str, arguments)],
-            check=True,
-            capture_output=True,
-            env=os.environ | {"RANDFILE": os.devnull},
-        )
 
 
 class Rig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, cast
 
 from hypothesis import strategies as st
@@ -24,6 +25,15 @@ AREAS = st.lists(
     min_size=1,
     unique=True,
 )
+ROLES = st.text(st.characters(exclude_categories=("Cc", "Cs")), max_size=60)
+CERTIFICATES = {
+    key: str(Path(__file__).parents[1] / "examples" / "certificates" / name)
+    for key, name in [
+        ("cert_file", "server.pem"),
+        ("key_file", "server.key"),
+        ("ca_file", "ca.pem"),
+    ]
+}
 ACCESS = st.sampled_from(["read-only", "read-write"])
 SECONDS = st.floats(0.001, 31_622_400)
 CONNECTIONS = st.integers(1, 65535)
@@ -75,6 +85,20 @@ def connections(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, An
         "when_full": draw(st.sampled_from(["refuse", "evict"])),
         "idle_timeout": draw(st.just(0) | SECONDS | st.integers(1, 1000)),
         "request_timeout": draw(SECONDS),
+    }
+
+
+@st.composite
+def secure(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
+    of_roles = st.fixed_dictionaries(
+        {}, optional={"roles": st.lists(ROLES, min_size=1, max_size=3, unique=True)}
+    )
+    rules = st.builds(lambda rule, roles: rule | roles, modbus_rules(memories), of_roles)
+    return {
+        **draw(connections(memories, port)),
+        "type": "modbus-tls",
+        "tls": CERTIFICATES,
+        "rules": draw(with_sources(rules)),
     }
 
 
@@ -295,7 +319,7 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
     for number, memory in enumerate(memories.values()):
         memory["id"] = number
     names = list(memories)
-    kinds = [connections, datagrams, lines, raw_ingest]
+    kinds = [connections, secure, datagrams, lines, raw_ingest]
     listeners = {
         name: draw(draw(st.sampled_from(kinds))(names, 5000 + index))
         for index, name in enumerate(draw(st.lists(NAMES, max_size=3, unique=True)))

@@ -10,7 +10,7 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 import wire
-from brokers import Certificates
+from certificates import PAST, Certificates, openssl
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,8 +22,6 @@ VERSIONS = {"TLS 1.2": ssl.TLSVersion.TLSv1_2, "TLS 1.3": ssl.TLSVersion.TLSv1_3
 Owner = tuple["Path", "Path"]
 """A certificate and its key."""
 
-LONG_AGO = ("20200101000000Z", "20210101000000Z")
-
 EC = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
@@ -32,29 +30,13 @@ class Authority(Certificates):
 
     def issue_expired(self, name: str, alternative: str) -> Owner:
         """A certificate that was valid long ago."""
-        certificate, key, request, settings, extensions = self._files(
-            name, "pem", "key", "csr", "cnf", "ext"
-        )
-        extensions.write_text(f"subjectAltName={alternative}\n")
-        (self._folder / "index.txt").write_text("")
-        settings.write_text(
-            f"[ca]\ndefault_ca=own\n[own]\ndatabase={self._folder}/index.txt\nrand_serial=yes\n"
-            f"new_certs_dir={self._folder}\ndefault_md=sha256\npolicy=any\n[any]\n"
-            "commonName=supplied\n"
-        )
-        self._openssl("req", *EC, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
-        self._openssl(
-            *("ca", "-batch", "-notext", "-config", settings, "-extfile", extensions),
-            *("-cert", self.ca, "-keyfile", self._key, "-in", request, "-out", certificate),
-            *("-startdate", LONG_AGO[0], "-enddate", LONG_AGO[1]),
-        )
-        return certificate, key
+        return self.issue(name, alternative, dates=PAST)
 
     def self_signed(self, name: str, alternative: str, *, ca: bool) -> Owner:
         """What a device makes for itself."""
         certificate, key = self._files(name, "pem", "key")
         told = str(ca).upper()
-        self._openssl(
+        openssl(
             *("req", "-x509", *EC, "-keyout", key, "-out", certificate, "-days", "2"),
             *("-subj", f"/CN={name}", "-addext", f"subjectAltName={alternative}"),
             *("-addext", f"basicConstraints=critical,CA:{told}"),
@@ -63,10 +45,14 @@ class Authority(Certificates):
 
     def issue_by(self, owner: Owner, name: str, alternative: str) -> Owner:
         """A certificate that somebody signed who is perhaps no authority."""
-        other = Authority.__new__(Authority)
-        other._folder, other._name = self._folder, f"{self._name}-{owner[0].stem}"
-        other.ca, other._key = owner
-        return other.issue(name, alternative)
+        certificate, key, request, extensions = self._files(name, "pem", "key", "csr", "ext")
+        extensions.write_text(f"subjectAltName={alternative}\n")
+        openssl("req", *EC, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
+        openssl(
+            *("x509", "-req", "-in", request, "-CA", owner[0], "-CAkey", owner[1]),
+            *("-CAcreateserial", "-days", "2", "-extfile", extensions, "-out", certificate),
+        )
+        return certificate, key
 
     def rsa(self, name: str) -> Owner:
         """A certificate with an RSA key in PKCS#1."""
@@ -74,12 +60,12 @@ class Authority(Certificates):
             name, "pem", "key", "pk8", "csr", "ext"
         )
         extensions.write_text("basicConstraints=CA:FALSE\n")
-        self._openssl(
+        openssl(
             *("req", "-newkey", "rsa:2048", "-nodes", "-keyout", modern),
             *("-out", request, "-subj", f"/CN={name}"),
         )
-        self._openssl("rsa", "-traditional", "-in", modern, "-out", key)
-        self._openssl(
+        openssl("rsa", "-traditional", "-in", modern, "-out", key)
+        openssl(
             *("x509", "-req", "-in", request, "-CA", self.ca, "-CAkey", self._key),
             *("-CAcreateserial", "-days", "2", "-extfile", extensions, "-out", certificate),
         )
@@ -88,7 +74,7 @@ class Authority(Certificates):
     def sec1(self, key: Path) -> Path:
         """An EC key in SEC1."""
         file = key.with_suffix(".sec1")
-        self._openssl("ec", "-in", key, "-out", file)
+        openssl("ec", "-in", key, "-out", file)
         return file
 
     def locked(self, key: Path, *, traditional: bool) -> Path:
@@ -96,7 +82,7 @@ class Authority(Certificates):
         file = key.with_suffix(".locked")
         form = ("-traditional",) if traditional else ()
         options = ("-aes128", "-passout", "pass:secret")
-        self._openssl("pkey", "-in", key, "-out", file, *options, *form)
+        openssl("pkey", "-in", key, "-out", file, *options, *form)
         return file
 
     def _files(self, name: str, *ends: str) -> list[Path]:

@@ -576,6 +576,7 @@ def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:
     assert sorted(nullable) == [
         "ModbusRtuOverTcpListener.max_connections_per_source",
         "ModbusTcpListener.max_connections_per_source",
+        "ModbusTlsListener.max_connections_per_source",
         "RawIngestListener.max_connections_per_source",
     ]
 
@@ -601,6 +602,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "ModbusRtuListener": ["type", "serial", "rules"],
         "ModbusRtuOverTcpListener": ["type", "bind", "rules"],
         "ModbusTcpListener": ["type", "bind", "rules"],
+        "ModbusTlsListener": ["type", "bind", "rules", "tls"],
         "ModbusUdpListener": ["type", "bind", "rules"],
         "MqttConfig": ["url", "client_id", "subscriptions"],
         "NatsConfig": ["servers", "devices"],
@@ -614,9 +616,11 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RuleConfig": ["sources", "units", "access"],
         "Seal": ["area", "address"],
         "SerialRuleConfig": ["units", "access"],
+        "ServerTlsConfig": ["cert_file", "key_file", "ca_file"],
         "Span": ["size"],
         "StatusConfig": ["memory", "area", "slot"],
         "SubscriptionConfig": ["topic", "memories", "areas"],
+        "TlsRuleConfig": ["sources", "units", "access"],
         "TokenConfig": ["name", "sha256", "memories", "areas", "access"],
     }
     assert "required" not in json_schema()

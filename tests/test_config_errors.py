@@ -53,7 +53,10 @@ TOP = (
     "memories, identity, listeners, devices, rest, mqtt, nats, gateway, adapters, metrics, audit, "
     "log, workers"
 )
-TYPES = "modbus-tcp, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii"
+TYPES = (
+    "modbus-tcp, modbus-tls, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or "
+    "modbus-ascii"
+)
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
 RULE = "listeners.scada.rules[0]"
 
@@ -380,13 +383,6 @@ def test_the_rest_is_checked(folder: Folder, extra: str, problem: str) -> None:
     assert folder.problems(GOOD + extra + "\n") == [f"p.yaml:11: {problem}"]
 
 
-def test_listener_types_to_come_are_refused_by_name(folder: Folder) -> None:
-    assert folder.problems(f"{GOOD}  later: {{type: modbus-tls, certificate: x}}\n") == [
-        "p.yaml:11: listeners.later.type: 'modbus-tls' is not available in this version, "
-        f"allowed: {TYPES}"
-    ]
-
-
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
@@ -542,7 +538,7 @@ listeners:
       - {sources: [10.0.0.0/8], units: {1: b}, access: rw}
       - {sources: [10.1.0.0/16, 1], units: {1: a}, access: read-only, functions: [9]}
   two: {type: modbus-tcp, bind: 127.0.0.1:502, rules: []}
-  three: {type: modbus-tls, port: 5}
+  three: {type: modbus-tsl, port: 5}
   four: {type: modbus-rtu, serial: {}, rules: [{sources: [], units: {0: c}}]}
 mqtt: {url: tcp://broker, password: x, subscriptions: [{topic: '', memories: [c], areas: [coil]}]}
 rest: {bind: 0.0.0.0:502, sources: [], tokens: none}
@@ -568,8 +564,7 @@ def test_all_problems_of_all_kinds_are_told_at_once_in_the_order_of_lines(folder
         "p.yaml:16: listeners.one.rules[1].functions[0]",
         "p.yaml:17: listeners.two.bind",
         "p.yaml:17: listeners.two.rules",
-        "p.yaml:18: listeners.three.type: 'modbus-tls' is not available in this version, "
-        f"allowed: {TYPES}",
+        "p.yaml:18: listeners.three.type",
         "p.yaml:19: listeners.four.serial.device: missing, allowed: text, as in /dev/ttyUSB0 or "
         "COM3",
         "p.yaml:19: listeners.four.rules[0].access: missing, allowed: read-only or read-write",

@@ -48,6 +48,15 @@ CRC = """\
       - {sources: [10.0.0.0/8], memories: [plant], areas: [coils]}
 """
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
+TLS = """\
+  tls:
+    type: modbus-tls
+    bind: 127.0.0.1:8020
+    tls: {cert_file: c.pem, key_file: k.pem, ca_file: a.pem}
+    rules:
+      - {sources: [10.0.0.0/8], roles: [engineer], units: {1: plant}, access: read-write}
+"""
+PEM = {"c_pem": "", "k_pem": "", "a_pem": ""}
 AREAS = "coils, discrete_inputs, holding_registers or input_registers"
 SERIAL_UNIT = "a unit id from 1 to 247; 0 is the broadcast, 248 to 255 are reserved"
 SOME = "a list with at least one entry"
@@ -65,10 +74,13 @@ def changed(text: str, old: str, new: str) -> str:
 
 def test_a_listener_says_what_it_is(folder: Folder) -> None:
     text = MEMORIES + "  a: {bind: 127.0.0.1:1, rules: []}\n  b: 5\n  c: []\n"
-    types = "modbus-ascii, modbus-rtu, modbus-rtu-over-tcp, modbus-tcp, modbus-udp or raw-ingest"
+    types = (
+        "modbus-ascii, modbus-rtu, modbus-rtu-over-tcp, modbus-tcp, modbus-tls, modbus-udp or "
+        "raw-ingest"
+    )
     assert folder.problems(text) == [
-        "p.yaml:5: listeners.a.type: missing, allowed: modbus-tcp, modbus-rtu-over-tcp, "
-        "raw-ingest, modbus-udp, modbus-rtu or modbus-ascii",
+        "p.yaml:5: listeners.a.type: missing, allowed: modbus-tcp, modbus-tls, "
+        "modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii",
         f"p.yaml:6: listeners.b: found 5, allowed: a mapping with the type {types}",
         f"p.yaml:7: listeners.c: found an empty list, allowed: a mapping with the type {types}",
     ]
@@ -77,8 +89,8 @@ def test_a_listener_says_what_it_is(folder: Folder) -> None:
 def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) -> None:
     text = changed(UDP, "modbus-udp", "udp").replace("{1: plant}", "{1: plan}")
     assert folder.problems(text) == [
-        "p.yaml:6: listeners.udp.type: found 'udp', allowed: modbus-tcp, modbus-rtu-over-tcp, "
-        "raw-ingest, modbus-udp, modbus-rtu or modbus-ascii",
+        "p.yaml:6: listeners.udp.type: found 'udp', allowed: modbus-tcp, modbus-tls, "
+        "modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii",
         "p.yaml:9: listeners.udp.rules[0].units.1: found 'plan', allowed: plant, other; "
         "did you mean 'plant'?",
     ]  # fmt: skip
@@ -327,3 +339,74 @@ def test_sockets_of_one_protocol_do_not_overlap(folder: Folder, one: str, other:
 def test_tcp_and_udp_share_a_port_number(folder: Folder) -> None:
     tcp = UDP.replace("modbus-udp", "modbus-tcp").replace("udp:", "tcp:")
     assert list(folder.config(MEMORIES + UDP + tcp).listeners) == ["udp", "tcp"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("tls: {", "tlsx: {", "5: tls: missing, allowed: a mapping with the keys cert_file, "
+         "key_file, ca_file, crl_file"),
+        ("key_file: k.pem, ", "", "8: tls.key_file: missing, allowed: text"),
+        ("k.pem", "5", "8: tls.key_file: found 5, allowed: text"),
+        ("k.pem", "''", "8: tls.key_file: found '', allowed: the path of a file"),
+        ("k.pem", "x.pem", "8: tls.key_file: found 'x.pem', which can't be read: No such file or "
+         "directory"),
+        ("a.pem", "a.pem, crl_file: .", "8: tls.crl_file: found '.', which can't be read: Is a "
+         "directory"),
+        ("a.pem", "a.pem, crl_file: ", "8: tls.crl_file: found nothing, allowed: text"),
+        ("a.pem", "a.pem, ca: a.pem", "8: tls.ca: unknown key, allowed: cert_file, key_file, "
+         "ca_file, crl_file"),
+        ("[engineer]", "engineer", f"10: rules[0].roles: found 'engineer', allowed: {SOME}"),
+        ("[engineer]", "[]", f"10: rules[0].roles: found an empty list, allowed: {SOME}"),
+        ("[engineer]", "", f"10: rules[0].roles: found nothing, allowed: {SOME}"),
+        ("[engineer]", "[5]", "10: rules[0].roles[0]: found 5, allowed: text of 0 to 255 bytes; "
+         "write '5' to make it text"),
+        ("[engineer]", "[a, a]", "10: rules[0].roles[1]: found 'a' again, allowed: once"),
+    ],
+)  # fmt: skip
+def test_a_tls_listener_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
+    line, _, rest = problem.partition(": ")
+    found = folder.problems(changed(TLS, old, new), **PEM)
+    assert f"p.yaml:{line}: listeners.tls.{rest}" in found
+
+
+def test_roles_are_for_tls_only(folder: Folder) -> None:
+    rule = "{sources: [10.0.0.0/8], roles: [a], units: {1: plant}, access: read-only}"
+    plain = MEMORIES + f"  udp: {{type: modbus-udp, bind: '127.0.0.1:1', rules: [{rule}]}}\n"
+    assert folder.problems(plain) == [
+        "p.yaml:5: listeners.udp.rules[0].roles: unknown key, allowed: sources, units, access, "
+        "functions, deny"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("roles", "never"),
+    [
+        ("roles: [engineer], ", "its sources and roles belong to rules[0] in line 10"),
+        ("roles: [engineer, operator], ", None),
+        ("roles: [''], ", None),
+        ("", None),
+    ],
+)
+def test_a_rule_that_earlier_ones_cover_in_all_its_roles_is_a_warning(
+    folder: Folder, roles: str, never: str | None
+) -> None:
+    for name in PEM:
+        (folder.path / name.replace("_", ".")).touch()
+    rule = f"      - {{sources: [10.1.0.0/16], {roles}units: {{1: plant}}, access: read-only}}\n"
+    place = "p.yaml:11: listeners.tls.rules[1]: never matches: "
+    assert folder.warnings(MEMORIES + TLS + rule) == ([place + never] if never else [])
+
+
+def test_a_rule_for_any_role_covers_those_for_one(folder: Folder) -> None:
+    for name in PEM:
+        (folder.path / name.replace("_", ".")).touch()
+    rules = (
+        "      - {sources: [10.0.0.0/8], units: {1: plant}, access: read-only}\n"
+        "      - {sources: [10.0.0.0/8], roles: [engineer, x], units: {1: plant}, "
+        "access: read-only}\n"
+    )
+    assert folder.warnings(MEMORIES + TLS + rules) == [
+        "p.yaml:12: listeners.tls.rules[2]: never matches: its sources and roles belong to "
+        "rules[0] in line 10 and rules[1] in line 11"
+    ]

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import wire
-from brokers import Certificates, Rig, command, settings, text
+from brokers import Rig, command, settings, text
+from certificates import Certificates
 from holdfast.adapters.mqtt import backoff, dialing
 
 if TYPE_CHECKING:

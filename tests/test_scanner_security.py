@@ -12,7 +12,7 @@ import pytest
 from nats.errors import NoRespondersError
 
 import wire
-from brokers import Certificates
+from certificates import Certificates
 from holdfast import logs
 from holdfast.scanner import Scanner, Servers, Settings, broker
 from nats_bus import Caller, NatsServer, subscription, tag

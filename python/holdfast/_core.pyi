@@ -20,6 +20,7 @@ __all__ = [
     "RawRule",
     "Request",
     "Rule",
+    "ServerTls",
     "Session",
     "__version__",
     "plan_blocks",
@@ -102,7 +103,8 @@ class Rule:
 
     `units` maps unit ids, 0 to 255, to memories; `sources` are networks or addresses, IPv4 or IPv6
     (an IPv4 address mapped into IPv6 is that IPv4 address). `functions` is a list of the function
-    codes that are allowed, `deny` of those that are not; both exclude each other.
+    codes that are allowed, `deny` of those that are not; both exclude each other. `roles` are those
+    that the certificate of a peer may name, over TLS only; "" is the null role, `None` any role.
 
     Raises `ValueError` for a source or access that can't be.
     """
@@ -115,6 +117,7 @@ class Rule:
         access: Access,
         functions: Sequence[int] | None = None,
         deny: Sequence[int] | None = None,
+        roles: Sequence[str] | None = None,
     ) -> Rule: ...
 
 @final
@@ -130,11 +133,30 @@ class RawRule:
     ) -> RawRule: ...
 
 @final
+class ServerTls:
+    """What a server needs for TLS with mutual authentication, of files in PEM that are read now.
+
+    `ca_file` has the authorities that vouch for clients, and self-signed certificates of clients;
+    `crl_file` the lists of what these authorities revoked. Raises `ValueError` for a file that
+    can't be used.
+    """
+
+    def __new__(
+        cls,
+        *,
+        cert_file: str | PathLike[str],
+        key_file: str | PathLike[str],
+        ca_file: str | PathLike[str],
+        crl_file: str | PathLike[str] | None = None,
+    ) -> ServerTls: ...
+
+@final
 class Listener:
     """The settings of a listener; as constructed, one for Modbus over TCP connections.
 
-    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP. Times are in seconds, `idle_timeout`
-    0 is for ever. Raises `ValueError` for an address, limit or time that can't be.
+    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP; with `tls` it is spoken inside TLS.
+    Times are in seconds, `idle_timeout` 0 is for ever. Raises `ValueError` for an address, limit or
+    time that can't be.
     """
 
     def __new__(
@@ -149,6 +171,7 @@ class Listener:
         when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
+        tls: ServerTls | None = None,
     ) -> Listener: ...
     @staticmethod
     def udp(name: str, bind: str, rules: Sequence[Rule]) -> Listener:
@@ -215,7 +238,10 @@ class Engine:
         """The counters of each listener by name, since the start."""
 
     def next_event(self, timeout: float) -> tuple[str, str, str | None, str | None] | None:
-        """Listener, kind, peer and reason of the next event, if one comes in `timeout` seconds."""
+        """Listener, kind, peer and reason of the next event, if one comes in `timeout` seconds.
+
+        The reason of `refused_role` is the role.
+        """
 
     @property
     def lost_events(self) -> int:

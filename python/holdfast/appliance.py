@@ -219,7 +219,7 @@ class _Running:
     def _log_event(self, listener: str, event: str, peer: str | None, reason: str | None) -> None:
         fields = {"listener": listener, "peer": peer or "-"}
         if reason is not None:
-            fields["reason"] = reason
+            fields["role" if event == "refused_role" else "reason"] = reason
         if event in LEVELS:
             logs.write(LEVELS[event], event, **fields)
         else:

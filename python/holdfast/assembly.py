@@ -17,6 +17,7 @@ from holdfast.config import (
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
     ModbusTcpListener,
+    ModbusTlsListener,
     ModbusUdpListener,
     RawIngestListener,
 )
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
         RawRuleConfig,
         RuleConfig,
         SerialRuleConfig,
+        ServerTlsConfig,
     )
     from holdfast.gateway import Settings as GatewaySettings
     from holdfast.scanner import Settings as ScannerSettings
@@ -87,17 +89,18 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
     """The native listener of that name."""
     settings: Listener = config.listeners[name]
     match settings:
-        case ModbusTcpListener() | ModbusRtuOverTcpListener():
+        case ModbusTcpListener() | ModbusTlsListener() | ModbusRtuOverTcpListener():
             return _core.Listener(
                 name,
                 str(settings.bind),
                 [_rule(rule, memories) for rule in settings.rules],
-                framing="mbap" if settings.type == "modbus-tcp" else "rtu",
+                framing="rtu" if settings.type == "modbus-rtu-over-tcp" else "mbap",
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
                 when_full=settings.when_full,
                 idle_timeout=settings.idle_timeout,
                 request_timeout=settings.request_timeout,
+                tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
             )
         case ModbusUdpListener():
             rules = [_rule(rule, memories) for rule in settings.rules]
@@ -128,6 +131,16 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
             )
         case _:
             assert_never(settings)
+
+
+def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
+    """The certificates of a listener. Raises `ValueError` for a file that can't be used."""
+    return _core.ServerTls(
+        cert_file=settings.cert_file,
+        key_file=settings.key_file,
+        ca_file=settings.ca_file,
+        crl_file=settings.crl_file,
+    )
 
 
 def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.Device:
@@ -213,6 +226,7 @@ def _rule(rule: RuleConfig | SerialRuleConfig, memories: Mapping[str, Memory]) -
         access=rule.access,
         functions=rule.functions,
         deny=rule.deny,
+        roles=getattr(rule, "roles", None),
     )
 
 

@@ -23,6 +23,8 @@ class ConnectionCounters(TypedDict):
 
     accepted: int
     refused_source: int
+    refused_role: int
+    tls_failed: int
     refused_full: int
     evicted: int
     idle: int

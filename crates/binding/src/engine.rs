@@ -71,8 +71,9 @@ impl Engine {
         let timeout = seconds("timeout", timeout)?;
         let event = py.detach(|| self.core.next_event(timeout));
         Ok(event.map(|event| {
-            let (kind, reason) = (event.kind.name(), event.kind.reason());
-            (event.listener.to_string(), kind, event.peer.map(canonical), reason)
+            let reason = event.role.or_else(|| event.kind.reason().map(Box::from));
+            let (kind, peer) = (event.kind.name(), event.peer.map(canonical));
+            (event.listener.to_string(), kind, peer, reason.map(String::from))
         }))
     }
 
@@ -102,8 +103,8 @@ impl Engine {
     }
 }
 
-/// Listener, kind, peer and reason.
-type Event = (String, &'static str, Option<String>, Option<&'static str>);
+/// Listener, kind, peer and reason; the role of a peer that was refused for it is the reason.
+type Event = (String, &'static str, Option<String>, Option<String>);
 
 /// A peer as text, an IPv4 address mapped into IPv6 as that IPv4 address.
 pub fn canonical(peer: SocketAddr) -> String {
@@ -141,6 +142,8 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bo
     for (key, counter) in [
         ("accepted", &counters.accepted),
         ("refused_source", &counters.refused_source),
+        ("refused_role", &counters.refused_role),
+        ("tls_failed", &counters.tls_failed),
         ("refused_full", &counters.refused_full),
         ("evicted", &counters.evicted),
         ("idle", &counters.idle),

@@ -22,7 +22,7 @@ mod _core {
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]
-    use super::listener::{Listener, RawRule, Rule};
+    use super::listener::{Listener, RawRule, Rule, ServerTls};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, write_across};
     #[pymodule_export]

@@ -1,9 +1,11 @@
-//! `Rule`, `RawRule` and `Listener`: what listeners are to be.
+//! `Rule`, `RawRule`, `ServerTls` and `Listener`: what listeners are to be.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_engine::policy::{Functions, Rights, Rule as CoreRule};
+use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
 use holdfast_engine::{
     Limits, ListenerKind, ListenerSettings, RawRule as CoreRawRule, RawSettings, SerialSettings,
     StreamFraming, StreamSettings, UdpSettings, WhenFull,
@@ -27,13 +29,14 @@ pub struct Rule {
 #[pymethods]
 impl Rule {
     #[new]
-    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None))]
+    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None))]
     fn new(
         units: &Bound<'_, PyMapping>,
         sources: Vec<String>,
         access: &str,
         functions: Option<Vec<i128>>,
         deny: Option<Vec<i128>>,
+        roles: Option<Vec<String>>,
     ) -> PyResult<Rule> {
         let allowed = [("read-only", Rights::ReadOnly), ("read-write", Rights::ReadWrite)];
         let rights = word("access", access, &allowed)?;
@@ -53,7 +56,8 @@ impl Rule {
         let units = targets(units)?;
         let units = units.into_iter().map(|(unit, memory)| Ok((byte("unit id", unit)?, memory)));
         let units = units.collect::<PyResult<_>>()?;
-        Ok(Rule { core: CoreRule { sources: networks(&sources)?, units, rights, functions } })
+        let sources = networks(&sources)?;
+        Ok(Rule { core: CoreRule { sources, roles, units, rights, functions } })
     }
 }
 
@@ -81,6 +85,28 @@ impl RawRule {
 }
 
 #[pyclass(frozen, module = "holdfast")]
+pub struct ServerTls {
+    core: Arc<CoreServerTls>,
+}
+
+#[pymethods]
+impl ServerTls {
+    #[new]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None))]
+    fn new(
+        cert_file: PathBuf,
+        key_file: PathBuf,
+        ca_file: PathBuf,
+        crl_file: Option<PathBuf>,
+    ) -> PyResult<ServerTls> {
+        let files = ServerFiles { cert_file, key_file, ca_file, crl_file };
+        let core = CoreServerTls::load(&files);
+        let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
+        Ok(ServerTls { core: Arc::new(core) })
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
 pub struct Listener {
     pub core: ListenerSettings,
 }
@@ -89,7 +115,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, tls=None))]
     fn new(
         name: String,
         bind: &str,
@@ -100,6 +126,7 @@ impl Listener {
         when_full: &str,
         idle_timeout: f64,
         request_timeout: f64,
+        tls: Option<PyRef<'_, ServerTls>>,
     ) -> PyResult<Listener> {
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
         let framings = [("mbap", StreamFraming::Mbap), ("rtu", StreamFraming::Rtu)];
@@ -110,6 +137,7 @@ impl Listener {
             limits: limits(max_connections, max_connections_per_source, when_full)?,
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
+            tls: tls.map(|tls| Arc::clone(&tls.core)),
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }

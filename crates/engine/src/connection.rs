@@ -1,4 +1,4 @@
-//! One Modbus connection over TCP: bytes in, all complete requests answered in order, bytes out.
+//! One Modbus connection over a stream: bytes in, all complete requests answered in order, bytes out.
 //!
 //! A worker thread has one pair of buffers for all of its connections ([`Scratch`]): between a read
 //! and the write that answers it nothing is awaited. What is left over is kept by the connection
@@ -7,7 +7,7 @@
 
 use std::cell::RefCell;
 use std::future::poll_fn;
-use std::io::{self, ErrorKind, Read, Write};
+use std::io;
 use std::marker::PhantomData;
 use std::net::SocketAddr;
 use std::pin::{Pin, pin};
@@ -17,11 +17,9 @@ use std::time::Duration;
 
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
-use tokio::io::{AsyncRead, ReadBuf};
-use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::task::yield_now;
-use tokio::time::{Instant, Sleep, sleep_until, timeout};
+use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::admission::Ticket;
 use crate::event::Kind;
@@ -29,6 +27,7 @@ use crate::framing::{Framing, Mbap, Next, Rtu};
 use crate::listener::Front;
 use crate::policy::Grant;
 use crate::station::Station;
+use crate::stream::{self, Stream};
 
 /// Bytes taken from a socket at once.
 const INPUT: usize = 4096;
@@ -74,12 +73,12 @@ pub(crate) struct Timeouts {
     pub(crate) request: Duration,
 }
 
-pub(crate) struct Connection<F> {
-    stream: TcpStream,
+pub(crate) struct Connection<F, S> {
+    stream: S,
     session: Session<F>,
     timeouts: Timeouts,
     ticket: Ticket,
-    /// Replies that the peer did not take yet.
+    /// What the peer is to get and did not take yet.
     unsent: Vec<u8>,
     last_request: Instant,
     /// When the request that is not complete yet began.
@@ -111,15 +110,15 @@ struct Answered {
     broken: bool,
 }
 
-impl<F: Framing> Connection<F> {
+impl<F: Framing, S: Stream> Connection<F, S> {
     pub(crate) fn new(
         front: Arc<Front>,
         station: Arc<Station>,
-        (stream, peer): (TcpStream, SocketAddr),
+        (stream, peer): (S, SocketAddr),
         grant: Arc<Grant>,
         timeouts: Timeouts,
         ticket: Ticket,
-    ) -> Connection<F> {
+    ) -> Connection<F, S> {
         let session = Session::new(front, peer, station, grant);
         let last_request = Instant::now();
         Connection {
@@ -138,7 +137,14 @@ impl<F: Framing> Connection<F> {
     pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
         let (front, peer) = (Arc::clone(&self.session.front), self.session.peer);
         match self.serve(stop).await {
-            Some(end) => front.ended(end, peer),
+            Some(end) => {
+                front.ended(end, peer);
+                // Behind replies that were cut off, nothing can be said.
+                if self.unsent.is_empty() {
+                    self.stream.end(&mut self.unsent);
+                    let _ = stream::write(self.stream.socket(), &mut self.unsent);
+                }
+            }
             None => {
                 self.finish();
                 front.ended(Kind::Closed, peer);
@@ -180,26 +186,17 @@ impl<F: Framing> Connection<F> {
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let kept = self.session.restore(input);
-            let mut buffer = ReadBuf::new(&mut input[kept..]);
-            let Poll::Ready(read) = Pin::new(&mut self.stream).poll_read(context, &mut buffer)
-            else {
+            let read = self.stream.poll_read(context, &mut input[kept..], &mut self.unsent);
+            let Poll::Ready(read) = read else {
                 self.turns = 0;
                 return Poll::Pending;
             };
             self.turns += 1;
-            let len = buffer.filled().len();
-            if read.is_err() || len == 0 {
-                return Poll::Ready(Err(Kind::Closed));
-            }
-            let answered = self.session.answer(&input[..kept + len], output);
+            let answered = self.session.answer(&input[..kept + read?], output);
             self.note(&answered);
             let output = &output[..answered.len];
-            match if output.is_empty() { Ok(0) } else { self.stream.try_write(output) } {
-                Ok(sent) => self.unsent.extend_from_slice(&output[sent..]),
-                Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                    self.unsent.extend_from_slice(output);
-                }
-                Err(_) => return Poll::Ready(Err(Kind::Closed)),
+            if !output.is_empty() {
+                self.stream.send(output, &mut self.unsent)?;
             }
             Poll::Ready(if answered.broken { Err(Kind::BrokenFrame) } else { Ok(()) })
         })
@@ -212,7 +209,7 @@ impl<F: Framing> Connection<F> {
             self.last_request = now;
             self.ticket.touch(now.into_std());
         }
-        if self.session.partial_len == 0 {
+        if self.session.partial_len == 0 && !self.stream.is_amid_record() {
             self.begun = None;
         } else if answered.consumed > 0 || self.begun.is_none() {
             self.begun = Some(now);
@@ -221,20 +218,9 @@ impl<F: Framing> Connection<F> {
 
     /// Waits for the peer to take the replies it is owed.
     async fn send_unsent(&mut self) -> Result<(), Kind> {
-        let mut sent = 0;
-        while sent < self.unsent.len() {
-            match timeout(self.timeouts.request, self.stream.writable()).await {
-                Err(_) => return Err(Kind::SlowReader),
-                Ok(Err(_)) => return Err(Kind::Closed),
-                Ok(Ok(())) => {}
-            }
-            match self.stream.try_write(&self.unsent[sent..]) {
-                Ok(len) => sent += len,
-                Err(error) if error.kind() == ErrorKind::WouldBlock => {}
-                Err(_) => return Err(Kind::Closed),
-            }
-        }
-        if sent > 0 {
+        if !self.unsent.is_empty() {
+            let patience = self.timeouts.request;
+            stream::send_all(self.stream.socket(), &self.unsent, patience).await?;
             // A slow peer's buffer is given back: most connections never need one.
             self.unsent = Vec::new();
         }
@@ -265,9 +251,10 @@ impl<F: Framing> Connection<F> {
 
     /// Answers what the system has received already, then ends.
     fn finish(mut self) {
-        if let Ok(mut stream) = self.stream.into_std() {
-            // A peer whose buffers are full, or who is gone, loses what it does not take.
-            let _ = self.session.drain(&mut stream, &self.unsent);
+        // A peer whose buffers are full, or who is gone, loses what it does not take.
+        if self.session.drain(&mut self.stream, &mut self.unsent).is_ok() {
+            self.stream.end(&mut self.unsent);
+            let _ = stream::write(self.stream.socket(), &mut self.unsent);
         }
     }
 }
@@ -340,15 +327,19 @@ impl<F: Framing> Session<F> {
     }
 
     /// Sends `unsent`, then reads, answers and sends until nothing more is there, without waiting.
-    fn drain(&mut self, stream: &mut std::net::TcpStream, unsent: &[u8]) -> io::Result<()> {
-        stream.write_all(unsent)?;
+    fn drain(&mut self, stream: &mut impl Stream, unsent: &mut Vec<u8>) -> io::Result<()> {
+        stream::write(stream.socket(), unsent)?;
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             for _ in 0..LAST_READS {
                 let kept = self.restore(input);
-                let len = stream.read(&mut input[kept..])?;
+                let Some(len) = stream.read_now(&mut input[kept..], unsent) else { break };
                 let answered = self.answer(&input[..kept + len], output);
-                stream.write_all(&output[..answered.len])?;
-                if len == 0 || answered.broken {
+                let output = &output[..answered.len];
+                if !output.is_empty() && stream.send(output, unsent).is_err() {
+                    break;
+                }
+                stream::write(stream.socket(), unsent)?;
+                if answered.broken {
                     break;
                 }
             }
@@ -371,6 +362,7 @@ mod tests {
             Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
         let rule = Rule {
             sources: Vec::new(),
+            roles: None,
             units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
             rights: Rights::ReadWrite,
             functions: Functions::All,

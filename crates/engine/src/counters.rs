@@ -79,8 +79,12 @@ pub struct ConnectionCounters {
     pub accepted: Counter,
     /// No rule names the peer.
     pub refused_source: Counter,
+    /// No rule names the role that the peer's certificate has.
+    pub refused_role: Counter,
     /// `max_connections` or `max_connections_per_source` was reached.
     pub refused_full: Counter,
+    /// TLS failed, most often in its handshake.
+    pub tls_failed: Counter,
     /// Closed in favour of a new connection.
     pub evicted: Counter,
     /// Closed after `idle_timeout`.

@@ -12,6 +12,9 @@ use holdfast_protocol::raw_ingest::Refusal;
 /// Events that wait to be taken.
 const CAPACITY: usize = 1024;
 
+/// Characters of a role that an event tells.
+const LONGEST_ROLE: usize = 64;
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Opened,
@@ -28,7 +31,11 @@ pub enum Kind {
     /// Closed in favour of a new connection.
     Evicted,
     RefusedSource,
+    /// No rule names the role of the peer, which the event tells.
+    RefusedRole,
     RefusedFull,
+    /// TLS failed, most often in its handshake; why, in a word.
+    TlsFailed(&'static str),
     AcceptError,
     /// A Raw Ingest packet was not written.
     PacketRefused(Refusal),
@@ -54,7 +61,9 @@ impl Kind {
             Kind::BrokenFrame => "broken_frame",
             Kind::Evicted => "evicted",
             Kind::RefusedSource => "refused_source",
+            Kind::RefusedRole => "refused_role",
             Kind::RefusedFull => "refused_full",
+            Kind::TlsFailed(_) => "tls_failed",
             Kind::AcceptError => "accept_error",
             Kind::PacketRefused(_) => "packet_refused",
             Kind::LineLost => "line_lost",
@@ -66,6 +75,7 @@ impl Kind {
     pub const fn reason(self) -> Option<&'static str> {
         match self {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
+            Kind::TlsFailed(reason) => Some(reason),
             _ => None,
         }
     }
@@ -77,6 +87,8 @@ pub struct Event {
     pub listener: Arc<str>,
     pub kind: Kind,
     pub peer: Option<SocketAddr>,
+    /// Of a peer that was refused for it; its first 64 characters.
+    pub role: Option<Box<str>>,
 }
 
 /// Which events are sent.
@@ -112,15 +124,24 @@ pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
 }
 
 impl Reporter {
-    pub(crate) fn report(&self, listener: &Arc<str>, kind: Kind, peer: Option<SocketAddr>) {
+    pub(crate) fn report(
+        &self,
+        listener: &Arc<str>,
+        kind: Kind,
+        peer: Option<SocketAddr>,
+        role: Option<&str>,
+    ) {
         let wanted = match self.verbosity {
             Verbosity::Nothing => false,
             Verbosity::Refusals => !kind.is_ordinary(),
             Verbosity::All => true,
         };
-        if wanted
-            && self.sender.try_send(Event { listener: Arc::clone(listener), kind, peer }).is_err()
-        {
+        if !wanted {
+            return;
+        }
+        let role = role.map(|role| role.chars().take(LONGEST_ROLE).collect());
+        let event = Event { listener: Arc::clone(listener), kind, peer, role };
+        if self.sender.try_send(event).is_err() {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }
     }

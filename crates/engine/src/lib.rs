@@ -30,7 +30,9 @@ pub mod poller;
 mod raw_ingest;
 mod serial;
 pub mod station;
+mod stream;
 pub mod tls;
+mod tls_stream;
 mod udp;
 
 pub use engine::{

@@ -1,7 +1,7 @@
 //! What every listener has: a name, a socket, connections that are admitted, counted and reported.
 
 use std::io;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Shutdown, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -9,6 +9,7 @@ use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
 use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
+use tokio::time::{Instant, timeout_at};
 
 use crate::admission::{Admission, Full, Ticket, attach};
 use crate::audit::Auditor;
@@ -23,6 +24,10 @@ const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Durati
 
 /// A pause after the system could not accept, most often for want of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// How long a refused peer is read, at most, and how many bytes at once.
+const DRAIN: Duration = Duration::from_secs(5);
+const DRAIN_CHUNK: usize = 16 * 1024;
 
 /// What becomes of a new connection when there is no room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -83,7 +88,7 @@ impl Front {
     }
 
     pub(crate) fn report(&self, kind: Kind, peer: Option<SocketAddr>) {
-        self.reporter.report(&self.name, kind, peer);
+        self.reporter.report(&self.name, kind, peer, None);
     }
 
     /// Counts and reports the end of a connection.
@@ -92,6 +97,7 @@ impl Front {
             Kind::Idle => self.connections.idle.add(),
             Kind::RequestTimeout => self.connections.request_timeout.add(),
             Kind::SlowReader => self.connections.slow_reader.add(),
+            Kind::TlsFailed(_) => self.connections.tls_failed.add(),
             _ => {}
         }
         self.report(kind, Some(peer));
@@ -100,6 +106,11 @@ impl Front {
     pub(crate) fn refuse_source(&self, peer: SocketAddr) {
         self.connections.refused_source.add();
         self.report(Kind::RefusedSource, Some(peer));
+    }
+
+    pub(crate) fn refuse_role(&self, peer: SocketAddr, role: &str) {
+        self.connections.refused_role.add();
+        self.reporter.report(&self.name, Kind::RefusedRole, Some(peer), Some(role));
     }
 }
 
@@ -252,6 +263,30 @@ pub(crate) fn set_options(stream: &TcpStream) {
     let _ = retries;
     let _ = stream.set_nodelay(true);
     let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
+}
+
+/// Ends the sending side, and reads until the peer has ended its own: a socket that is closed with
+/// unread bytes resets the connection, and the peer may lose what it was told.
+pub(crate) async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
+    if SockRef::from(stream).shutdown(Shutdown::Write).is_err() {
+        return;
+    }
+    let deadline = Instant::now() + DRAIN;
+    let mut chunk = vec![0; DRAIN_CHUNK];
+    loop {
+        let readable = tokio::select! {
+            readable = timeout_at(deadline, stream.readable()) => readable,
+            _ = stop.wait_for(|stop| *stop) => return,
+        };
+        let Ok(Ok(())) = readable else { return };
+        match stream.try_read(&mut chunk) {
+            Ok(0) => return,
+            Ok(_) if Instant::now() >= deadline => return,
+            Ok(_) => {}
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(_) => return,
+        }
+    }
 }
 
 /// Errors of `accept` that say something of one peer, not of the listener.

@@ -1,16 +1,23 @@
-//! Modbus over TCP connections: what a listener for Modbus TCP, or RTU over TCP, serves.
+//! Modbus over TCP connections: what a listener for Modbus TCP, with or without TLS, or RTU over TCP,
+//! serves.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::watch;
+use tokio::time::timeout;
 
+use crate::admission::Ticket;
 use crate::connection::{Connection, Timeouts};
+use crate::event::Kind;
 use crate::framing::{Framing, Mbap, Rtu};
-use crate::listener::{Admitted, Front, Limits, Service, set_options};
+use crate::listener::{Admitted, Front, Limits, Service, drain, set_options};
 use crate::policy::{Grant, Policy, Rule};
 use crate::station::Station;
+use crate::stream::Stream;
+use crate::tls::server::ServerTls;
+use crate::tls_stream::TlsStream;
 
 /// How a TCP stream carries Modbus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,7 +39,10 @@ pub struct StreamSettings {
     /// How long a connection may be without a request; `None` keeps it.
     pub idle_timeout: Option<Duration>,
     /// From the first byte of a request to its last, and for a peer to take its replies.
+    /// With TLS also for its handshake.
     pub request_timeout: Duration,
+    /// `None` is plain TCP.
+    pub tls: Option<Arc<ServerTls>>,
 }
 
 pub(crate) struct ModbusStream {
@@ -40,6 +50,7 @@ pub(crate) struct ModbusStream {
     policy: Policy<Grant>,
     timeouts: Timeouts,
     framing: StreamFraming,
+    tls: Option<Arc<ServerTls>>,
 }
 
 impl ModbusStream {
@@ -49,6 +60,7 @@ impl ModbusStream {
             policy: Policy::of(&settings.rules),
             timeouts: Timeouts { idle: settings.idle_timeout, request: settings.request_timeout },
             framing: settings.framing,
+            tls: settings.tls.clone(),
         }
     }
 
@@ -58,10 +70,66 @@ impl ModbusStream {
         admitted: Admitted<Grant>,
         stop: watch::Receiver<bool>,
     ) {
-        let Admitted { stream, peer, grant, ticket, .. } = admitted;
-        let (station, timeouts) = (Arc::clone(&self.station), self.timeouts);
+        match &self.tls {
+            None => {
+                let Admitted { stream, peer, grant, ticket, .. } = admitted;
+                self.modbus::<F, _>(front, (stream, peer), grant, ticket, stop).await;
+            }
+            // Apart, so that a plain connection takes no room for it.
+            Some(tls) => Box::pin(self.secure::<F>(tls, front, admitted, stop)).await,
+        }
+    }
+
+    /// Settles by the peer's certificate what it may do, and serves it.
+    async fn secure<F: Framing>(
+        &self,
+        tls: &ServerTls,
+        front: Arc<Front>,
+        admitted: Admitted<Grant>,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let Admitted { stream, peer, ticket, .. } = admitted;
+        let mut stream = match TlsStream::new(stream, tls) {
+            Ok(stream) => stream,
+            Err(end) => return front.ended(end, peer),
+        };
+        let patience = self.timeouts.request;
+        let shaken = tokio::select! {
+            biased;
+            _ = stop.wait_for(|stop| *stop) => return front.ended(Kind::Closed, peer),
+            shaken = timeout(patience, stream.handshake(patience)) => shaken,
+        };
+        let role = match shaken {
+            Ok(Ok(())) => stream.role(),
+            Ok(Err(Kind::Closed)) => return front.ended(Kind::TlsFailed("closed"), peer),
+            Ok(Err(end)) => Err(end),
+            Err(_) => return front.ended(Kind::TlsFailed("timeout"), peer),
+        };
+        match role {
+            Ok(role) => {
+                if let Some(grant) = self.policy.grant_of_role(peer.ip(), &role) {
+                    let grant = Arc::clone(grant);
+                    return self.modbus::<F, _>(front, (stream, peer), grant, ticket, stop).await;
+                }
+                front.refuse_role(peer, &role);
+                stream.say_end();
+            }
+            Err(end) => front.ended(end, peer),
+        }
+        drain(&stream.into_socket(), stop).await;
+    }
+
+    async fn modbus<F: Framing, S: Stream>(
+        &self,
+        front: Arc<Front>,
+        stream: (S, SocketAddr),
+        grant: Arc<Grant>,
+        ticket: Ticket,
+        stop: watch::Receiver<bool>,
+    ) {
+        let station = Arc::clone(&self.station);
         let connection =
-            Connection::<F>::new(front, station, (stream, peer), grant, timeouts, ticket);
+            Connection::<F, S>::new(front, station, stream, grant, self.timeouts, ticket);
         connection.run(stop).await;
     }
 }

@@ -26,38 +26,67 @@ pub enum Functions {
 #[derive(Debug, Clone)]
 pub struct Rule {
     pub sources: Vec<IpNet>,
+    /// The roles that certificates of these peers may name, empty text the null role; `None` for any
+    /// role. Only TLS has roles.
+    pub roles: Option<Vec<String>>,
     pub units: Vec<(u8, Arc<Memory>)>,
     pub rights: Rights,
     pub functions: Functions,
 }
 
-/// The rules of a listener: the first whose sources hold a peer settles what it may do.
+/// The rules of a listener: the first that holds a peer settles what it may do.
 #[derive(Debug)]
 pub struct Policy<G> {
-    rules: Vec<(Vec<IpNet>, Arc<G>)>,
+    rules: Vec<Entry<G>>,
+}
+
+#[derive(Debug)]
+struct Entry<G> {
+    sources: Vec<IpNet>,
+    roles: Option<Vec<String>>,
+    grant: Arc<G>,
 }
 
 impl<G> Policy<G> {
     /// Rules as the sources that each holds, and what it grants them.
     pub fn new(rules: impl IntoIterator<Item = (Vec<IpNet>, G)>) -> Policy<G> {
-        let rules = rules.into_iter().map(|(sources, grant)| (sources, Arc::new(grant)));
+        let rules = rules.into_iter().map(|(sources, grant)| {
+            let grant = Arc::new(grant);
+            Entry { sources, roles: None, grant }
+        });
         Policy { rules: rules.collect() }
     }
 
-    /// What a peer is granted; `None` for one that no rule names. An IPv4 address mapped into IPv6
-    /// is that IPv4 address.
+    /// What a peer is granted, whatever its role; `None` for one that no rule names. An IPv4 address
+    /// mapped into IPv6 is that IPv4 address.
     pub fn grant(&self, peer: IpAddr) -> Option<&Arc<G>> {
+        self.find(peer, |_| true)
+    }
+
+    /// What a peer of that role is granted.
+    pub fn grant_of_role(&self, peer: IpAddr, role: &str) -> Option<&Arc<G>> {
+        self.find(peer, |roles| roles.iter().any(|allowed| allowed == role))
+    }
+
+    fn find(&self, peer: IpAddr, allows: impl Fn(&[String]) -> bool) -> Option<&Arc<G>> {
         let peer = peer.to_canonical();
         let mut rules = self.rules.iter();
-        rules
-            .find(|(sources, _)| sources.iter().any(|network| network.contains(&peer)))
-            .map(|(_, grant)| grant)
+        let found = rules.find(|rule| {
+            rule.sources.iter().any(|network| network.contains(&peer))
+                && rule.roles.as_deref().is_none_or(&allows)
+        });
+        found.map(|rule| &rule.grant)
     }
 }
 
 impl Policy<Grant> {
     pub fn of(rules: &[Rule]) -> Policy<Grant> {
-        Policy::new(rules.iter().map(|rule| (rule.sources.clone(), Grant::new(rule))))
+        let rules = rules.iter().map(|rule| Entry {
+            sources: rule.sources.clone(),
+            roles: rule.roles.clone(),
+            grant: Arc::new(Grant::new(rule)),
+        });
+        Policy { rules: rules.collect() }
     }
 }
 

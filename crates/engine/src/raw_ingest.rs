@@ -6,7 +6,7 @@
 
 use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write as _};
-use std::net::{IpAddr, Shutdown, SocketAddr};
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,14 +21,11 @@ use tokio::time::{Instant, timeout_at};
 use crate::audit::{Record, Written};
 use crate::counters::PacketCounters;
 use crate::event::Kind;
-use crate::listener::{Admitted, Front, Limits, Service};
+use crate::listener::{Admitted, Front, Limits, Service, drain};
 use crate::policy::Policy;
 
 /// Bytes that are read at once.
 const CHUNK: usize = 16 * 1024;
-
-/// How long a refused peer is read, at most.
-const DRAIN: Duration = Duration::from_secs(5);
 
 /// What peers from some networks may write.
 #[derive(Debug, Clone)]
@@ -270,29 +267,6 @@ impl Service for RawIngest {
         }
         front.ended(Kind::Closed, peer);
         drop(ticket);
-    }
-}
-
-/// Ends the sending side, and reads until the peer has ended its own.
-async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
-    if SockRef::from(stream).shutdown(Shutdown::Write).is_err() {
-        return;
-    }
-    let deadline = Instant::now() + DRAIN;
-    let mut chunk = vec![0; CHUNK];
-    loop {
-        let readable = tokio::select! {
-            readable = timeout_at(deadline, stream.readable()) => readable,
-            _ = stop.wait_for(|stop| *stop) => return,
-        };
-        let Ok(Ok(())) = readable else { return };
-        match stream.try_read(&mut chunk) {
-            Ok(0) => return,
-            Ok(_) if Instant::now() >= deadline => return,
-            Ok(_) => {}
-            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
-            Err(_) => return,
-        }
     }
 }
 

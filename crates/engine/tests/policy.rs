@@ -9,6 +9,7 @@ use holdfast_memory::{Layout, Memory};
 fn rule(sources: &[&str], unit: u8, rights: Rights, functions: Functions) -> Rule {
     Rule {
         sources: sources.iter().map(|source| source.parse().unwrap()).collect(),
+        roles: None,
         units: vec![(unit, Arc::new(Memory::new(Layout::default(), None).unwrap()))],
         rights,
         functions,
@@ -33,6 +34,35 @@ fn the_first_rule_that_names_a_peer_holds() {
     for stranger in ["11.0.0.1", "fd00:0:0:1::1", "::1", "127.0.0.1"] {
         assert!(policy.grant(peer(stranger)).is_none(), "{stranger}");
     }
+}
+
+#[test]
+fn the_first_rule_that_names_peer_and_role_holds() {
+    let of_roles = |roles: &[&str], rule: Rule| Rule {
+        roles: Some(roles.iter().map(|role| (*role).to_owned()).collect()),
+        ..rule
+    };
+    let policy = Policy::of(&[
+        of_roles(&["a", "b"], rule(&["10.0.0.0/8"], 1, Rights::ReadWrite, Functions::All)),
+        of_roles(&["b", ""], rule(&["10.0.0.0/24"], 2, Rights::ReadOnly, Functions::All)),
+        rule(&["10.0.1.0/24"], 3, Rights::ReadOnly, Functions::All),
+    ]);
+    for (address, role, unit) in [
+        ("10.0.0.1", "a", Some(1)),
+        ("10.0.0.1", "b", Some(1)),
+        ("10.0.0.1", "", Some(2)),
+        ("10.0.0.1", "A", None),
+        ("10.0.1.1", "", Some(3)),
+        ("10.0.1.1", "x", Some(3)),
+        ("10.0.2.1", "x", None),
+        ("11.0.0.1", "a", None),
+    ] {
+        let grant = policy.grant_of_role(peer(address), role);
+        let units: Option<Vec<u8>> = grant.map(|grant| grant.one_unit_of_each_memory(|_| true));
+        assert_eq!(units, unit.map(|unit| vec![unit]), "{address} {role:?}");
+    }
+    assert!(policy.grant(peer("10.0.2.1")).is_some());
+    assert!(policy.grant(peer("11.0.0.1")).is_none());
 }
 
 #[test]

@@ -21,7 +21,7 @@ fn memory(registers: u32) -> Arc<Memory> {
 
 fn grant(units: &[(u8, &Arc<Memory>)], rights: Rights) -> Grant {
     let units = units.iter().map(|(unit_id, memory)| (*unit_id, Arc::clone(memory))).collect();
-    Grant::new(&Rule { sources: Vec::new(), units, rights, functions: Functions::All })
+    Grant::new(&Rule { sources: Vec::new(), roles: None, units, rights, functions: Functions::All })
 }
 
 fn station() -> Station {

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli.configuration import WRONG, load_or_exit
-from holdfast.config import ConfigError, load
+from holdfast.cli.configuration import WRONG, load_or_exit, load_whole
+from holdfast.config import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -32,7 +32,7 @@ def check(file: Path, as_json: bool) -> None:
         click.echo(load_or_exit(file).dump(), nl=False)
         return
     try:
-        config = load(file)
+        config = load_whole(file)
     except ConfigError as error:
         click.echo(json.dumps({"ok": False, "problems": _plain(error.problems)}, indent=2))
         sys.exit(WRONG)

@@ -3,17 +3,41 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.config import Config, ConfigError, load
+from holdfast import assembly
+from holdfast.config import ConfigError, ModbusTlsListener, load, source
+from holdfast.config.problems import Report
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from holdfast.config import Config
 
 WRONG = 2
 """The exit code for wrong usage or a wrong configuration."""
+
+
+def load_whole(path: Path | str) -> Config:
+    """The configuration, when what is in its certificates and keys is right too.
+
+    Raises `ConfigError` with every problem.
+    """
+    config = load(path)
+    file, problems = str(path), {}
+    for name, listener in config.listeners.items():
+        if isinstance(listener, ModbusTlsListener):
+            try:
+                assembly.server_tls(listener.tls)
+            except ValueError as error:
+                problems["listeners", name, "tls"] = str(error)
+    if problems:
+        report = Report(source.parse(source.read_text(Path(path), file), file)[0])
+        for place, message in problems.items():
+            report.add(place, message)
+        raise ConfigError(file, report.problems)
+    return config
 
 
 def load_or_exit(path: Path | str) -> Config:
@@ -22,7 +46,7 @@ def load_or_exit(path: Path | str) -> Config:
     What is right but has no effect is told on standard error, as a warning.
     """
     try:
-        config = load(path)
+        config = load_whole(path)
     except ConfigError as error:
         show_problems(error)
         sys.exit(WRONG)

@@ -170,7 +170,9 @@ def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
     to = f"units {units}" if units else f"memories {', '.join(getattr(rule, 'memories', ()))}"
     rights = getattr(rule, "access", None) or f"writes {', '.join(getattr(rule, 'areas', ()))}"
     sources = ", ".join(str(source) for source in getattr(rule, "sources", ()))
-    return f"{to}; {rights} for {sources or 'the line'}"
+    roles = getattr(rule, "roles", None)
+    of = "" if roles is None else f" as {', '.join(role or 'no role' for role in roles)}"
+    return f"{to}; {rights} for {sources or 'the line'}{of}"
 
 
 def _suggestions(appliance: Appliance, endpoints: list[Endpoint], file: Path) -> list[str]:

@@ -25,6 +25,7 @@ from holdfast.config.listeners import (
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
     ModbusTcpListener,
+    ModbusTlsListener,
     ModbusUdpListener,
     RawIngestListener,
     RawRuleConfig,
@@ -32,6 +33,8 @@ from holdfast.config.listeners import (
     RuleConfig,
     SerialConfig,
     SerialRuleConfig,
+    ServerTlsConfig,
+    TlsRuleConfig,
 )
 from holdfast.config.loading import load
 from holdfast.config.memories import MemoryConfig, Seal, Span
@@ -77,6 +80,7 @@ __all__ = [
     "ModbusRtuListener",
     "ModbusRtuOverTcpListener",
     "ModbusTcpListener",
+    "ModbusTlsListener",
     "ModbusUdpListener",
     "MqttConfig",
     "NatsConfig",
@@ -93,9 +97,11 @@ __all__ = [
     "Seal",
     "SerialConfig",
     "SerialRuleConfig",
+    "ServerTlsConfig",
     "Span",
     "StatusConfig",
     "SubscriptionConfig",
+    "TlsRuleConfig",
     "TokenConfig",
     "json_schema",
     "load",

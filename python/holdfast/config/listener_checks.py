@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.addresses import Network, covers, parse_source
 from holdfast.config.allowed import allowed
+from holdfast.config.files import unreadable
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.unique import refuse_repeats
@@ -14,6 +15,8 @@ from holdfast.config.values import WRITES
 from holdfast.config.words import show
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
@@ -25,9 +28,27 @@ _NAMING = {"v1": "units", "crc": "memories"}
 
 
 @dataclass
-class ListenerChecks:
-    """Checks the listeners of one file."""
+class _Holder:
+    """A rule: whom it holds."""
 
+    path: KeyPath
+    networks: list[Network]
+    roles: list[Any] | None
+    """`None` for any role."""
+
+    def overlaps(self, other: _Holder) -> bool:
+        """Whether some source is of both."""
+        mine, theirs = self.networks, other.networks
+        return any(covers(mine, network) for network in theirs) or any(
+            covers(theirs, network) for network in mine
+        )
+
+
+@dataclass
+class ListenerChecks:
+    """Checks the listeners of one file; files are relative to `folder`."""
+
+    folder: Path
     report: Report
     grants: GrantChecks
     ids: dict[Any, Any]
@@ -43,6 +64,8 @@ class ListenerChecks:
             self._limits(path, listener)
             if kind == "raw-ingest":
                 self._raw(path, listener)
+            if kind == "modbus-tls":
+                self._certificates((*path, "tls"), mapping(listener.get("tls")))
             for rule_path, rule in self._rules(path, listener):
                 if kind == "raw-ingest":
                     self._raw_rule(rule_path, rule, listener.get("format", "v1"))
@@ -69,6 +92,15 @@ class ListenerChecks:
             message = f"{of_source} has no effect: max_connections is {most}"
             self.report.doubt((*path, "max_connections_per_source"), message)
 
+    def _certificates(self, path: KeyPath, tls: dict[Any, Any]) -> None:
+        for key in ("cert_file", "key_file", "ca_file", "crl_file"):
+            file = tls.get(key)
+            if isinstance(file, str) and file and "\0" not in file:
+                reason = unreadable(self.folder / file)
+                if reason:
+                    message = f"found {show(file)}, which can't be read: {reason}"
+                    self.report.add((*path, key), message)
+
     def _line(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         for rule_path, rule in self._rules(path, listener):
             if "sources" in rule:
@@ -81,28 +113,28 @@ class ListenerChecks:
                 self.report.doubt(rule_path, message)
 
     def _shadows(self, path: KeyPath, listener: dict[Any, Any]) -> None:
-        earlier: list[tuple[KeyPath, list[Network]]] = []
+        earlier: list[_Holder] = []
         for here, rule in self._rules(path, listener):
             written = entries(rule.get("sources"))
             sources = [parsed(parse_source, text) for text in written]
             known = [source for source in sources if source is not None]
+            roles = entries(rule["roles"]) if "roles" in rule else None
+            holder = _Holder(here, known, roles)
             if known and len(known) == len(written):
-                self._shadow(here, known, earlier)
-            earlier.append((here, known))
+                self._shadow(holder, earlier)
+            earlier.append(holder)
 
-    def _shadow(
-        self, path: KeyPath, sources: list[Network], earlier: list[tuple[KeyPath, list[Network]]]
-    ) -> None:
-        before = [network for _, networks in earlier for network in networks]
-        if not all(covers(before, source) for source in sources):
-            return
-        taking = [
-            f"rules[{rule[-1]}] in line {self.report.line(rule)}"
-            for rule, networks in earlier
-            if any(covers(networks, s) or any(covers([s], n) for n in networks) for s in sources)
-        ]
-        message = f"never matches: all its sources belong to {' and '.join(taking)}"
-        self.report.doubt(path, message)
+    def _shadow(self, rule: _Holder, earlier: list[_Holder]) -> None:
+        taking: dict[KeyPath, None] = {}
+        for role in rule.roles or [None]:
+            before = [each for each in earlier if each.roles is None or role in each.roles]
+            networks = [network for each in before for network in each.networks]
+            if not all(covers(networks, source) for source in rule.networks):
+                return
+            taking |= {each.path: None for each in before if each.overlaps(rule)}
+        names = [f"rules[{path[-1]}] in line {self.report.line(path)}" for path in taking]
+        what = "all its sources belong" if rule.roles is None else "its sources and roles belong"
+        self.report.doubt(rule.path, f"never matches: {what} to {' and '.join(names)}")
 
     def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         if "crc" in listener and listener.get("format", "v1") == "v1":
@@ -145,7 +177,7 @@ class RuleCheck:
     def check(self) -> None:
         """Reports what is wrong."""
         self.grants.units((*self.path, "units"), self.rule.get("units"))
-        for key in ("functions", "deny"):
+        for key in ("functions", "deny", "roles"):
             refuse_repeats((*self.path, key), entries(self.rule.get(key)), self.report)
         if "functions" in self.rule and "deny" in self.rule:
             message = "found beside functions, allowed: one of both"

@@ -25,10 +25,12 @@ from holdfast.config.values import (
     Duration,
     DurationOrZero,
     EightBits,
+    FilePath,
     MemoryNames,
     Name,
     NotNull,
     RawUnitId,
+    Role,
     SerialUnitId,
     Sources,
     StopBits,
@@ -52,6 +54,15 @@ class RuleConfig(Model):
     """The only function codes that are allowed."""
     deny: DenyList = None
     """Function codes that are not allowed, the others are."""
+
+
+class TlsRuleConfig(RuleConfig):
+    """What some peers may do, by where they are and what their certificates say."""
+
+    roles: Annotated[
+        Annotated[tuple[Role, ...], Strict(False), Field(min_length=1)] | None, NotNull()
+    ] = None
+    """The roles that a certificate may name, "" for one that names none; any when left out."""
 
 
 class SerialRuleConfig(Model):
@@ -108,6 +119,32 @@ class ModbusTcpListener(_ConnectionListener):
 
     type: Literal["modbus-tcp"]
     """The protocol."""
+
+
+class ServerTlsConfig(Model):
+    """Certificates and keys of a server, in PEM; they are read at the start."""
+
+    cert_file: FilePath
+    """The certificate that clients are shown, and those between it and its authority."""
+    key_file: FilePath
+    """The key of that certificate, without a passphrase."""
+    ca_file: FilePath
+    """The authorities that vouch for clients, and self-signed certificates of clients."""
+    crl_file: Annotated[FilePath | None, NotNull()] = None
+    """What the authorities have revoked: a list of each authority above a client."""
+
+
+class ModbusTlsListener(_ConnectionListener):
+    """A Modbus TCP server inside TLS, for clients with a certificate (Modbus/TCP Security)."""
+
+    type: Literal["modbus-tls"]
+    """The protocol."""
+    tls: ServerTlsConfig
+    """Who the server is, and which clients it trusts."""
+    request_timeout: Duration = 10.0
+    """Seconds from the first byte of a request to its last, and for the handshake."""
+    rules: Annotated[tuple[TlsRuleConfig, ...], Strict(False), Field(min_length=1)]
+    """The first rule whose sources and roles hold the peer settles what it may do."""
 
 
 class ModbusRtuOverTcpListener(_ConnectionListener):
@@ -222,6 +259,7 @@ class RawIngestListener(Model):
 
 Listener: TypeAlias = (
     ModbusTcpListener
+    | ModbusTlsListener
     | ModbusRtuOverTcpListener
     | ModbusUdpListener
     | ModbusRtuListener
@@ -229,7 +267,7 @@ Listener: TypeAlias = (
     | RawIngestListener
 )
 
-CONNECTION_TYPES = ("modbus-tcp", "modbus-rtu-over-tcp", "raw-ingest")
+CONNECTION_TYPES = ("modbus-tcp", "modbus-tls", "modbus-rtu-over-tcp", "raw-ingest")
 DATAGRAM_TYPES = ("modbus-udp",)
 SERIAL_TYPES = ("modbus-rtu", "modbus-ascii")
 LISTENER_TYPES = (*CONNECTION_TYPES, *DATAGRAM_TYPES, *SERIAL_TYPES)

@@ -21,7 +21,6 @@ from holdfast.config.service_checks import ServiceChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
 from holdfast.config.tolerance import mapping
-from holdfast.config.unavailable import refuse_unavailable
 from holdfast.config.words import show
 
 
@@ -38,7 +37,6 @@ def load(path: Path | str) -> Config:
         raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
     report, data = Report(document), document.data
     folder = Path(path).absolute().parent
-    refuse_unavailable(data, report)
     memories = MemoryChecks(folder, report)
     memories.check(data.get("memories"))
     _check_others(data, folder, report)
@@ -54,7 +52,7 @@ def load(path: Path | str) -> Config:
 def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     memories = mapping(data.get("memories"))
     grants = GrantChecks(report, [str(name) for name in memories])
-    ListenerChecks(report, grants, memories).check(data.get("listeners"))
+    ListenerChecks(folder, report, grants, memories).check(data.get("listeners"))
     ServiceChecks(folder, report, grants).check(data)
     DeviceChecks(folder, report, grants, memories).check(data)
     check_sockets(data, report)

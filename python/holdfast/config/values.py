@@ -38,6 +38,7 @@ from holdfast.target import FORMS, in_folder, parse
 
 MOST_BYTES = 244
 LONGEST_DEVICE = 4095
+LONGEST_ROLE = 255
 LONGEST_TIME = 31_622_400
 SHORTEST_TIME = 0.001
 
@@ -167,9 +168,9 @@ def _function(value: object) -> int:
     raise ValueError(f"found {show(value)}, allowed: {choice(FUNCTIONS)}")
 
 
-def _text_of(most: int) -> Callable[[object], str]:
-    """Takes text of at most so many bytes."""
-    allowed = f"allowed: text of 1 to {most} bytes"
+def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
+    """Takes text of so many bytes."""
+    allowed = f"allowed: text of {least} to {most} bytes"
 
     def text(value: object) -> str:
         if not isinstance(value, str):
@@ -179,7 +180,7 @@ def _text_of(most: int) -> Callable[[object], str]:
             if unicodedata.category(character) in ("Cc", "Cs"):
                 raise ValueError(f"found {show(value)}, allowed: text without {character!r}")
         size = len(value.encode())
-        if not 1 <= size <= most:
+        if not least <= size <= most:
             raise ValueError(f"found text of {size} bytes, {allowed}")
         return value
 
@@ -254,6 +255,11 @@ Text = Annotated[
     str,
     PlainValidator(_text_of(MOST_BYTES)),
     WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MOST_BYTES}),
+]
+Role = Annotated[
+    str,
+    PlainValidator(_text_of(LONGEST_ROLE, least=0)),
+    WithJsonSchema({"type": "string", "maxLength": LONGEST_ROLE, "examples": ["operator"]}),
 ]
 DeviceName = Annotated[
     str,
