@@ -167,8 +167,8 @@ def test_a_device_takes_the_place_of_another_with_its_connection_and_counters(
         poller.add(device(fake))
         taken(poller, lambda polls, _: polls)
         poller.replace("a", device(fake, "b", reads=[("input_registers", 7, 2, None)]))
-        [poll], _ = taken(poller, lambda polls, _: polls)
-        assert (poll[0], poll[2]) == ("b", [("input_registers", 7, 2, bytes(4), 0)])
+        [(name, _, [block])], _ = taken(poller, lambda polls, _: polls)
+        assert (name, block[:5]) == ("b", ("input_registers", 7, 2, bytes(4), 0))
         assert fake.connections == 1
         [(name, counted)] = poller.counters().items()
         assert (name, counted["polls"], counted["valid"]) == ("b", 2, 2)

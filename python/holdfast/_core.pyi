@@ -450,11 +450,12 @@ class Poller:
     def add(self, device: Device) -> None:
         """Polls one more device. Raises `ValueError`, also for a name that is taken."""
 
-    def replace(self, name: str, device: Device) -> None:
+    def replace(self, name: str, device: Device, *, at_once: bool = True) -> None:
         """Polls a device in the place of the one called `name`; it may have the same name.
 
-        The poll under way is completed. The new device reads at once, then keeps to the schedule;
-        counters and connection stay. Raises `ValueError`; then nothing has changed.
+        The poll under way is completed; counters, connection and schedule stay. `at_once` the new
+        device reads once beside the schedule; not more often than each second, or each interval if
+        that is shorter. Raises `ValueError`; then nothing has changed.
         """
 
     def write(self, name: str, request: Request) -> int:

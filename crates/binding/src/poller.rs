@@ -117,9 +117,10 @@ impl Poller {
         self.core.add(device.core.clone()).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
-    fn replace(&self, name: &str, device: PyRef<'_, Device>) -> PyResult<()> {
+    #[pyo3(signature = (name, device, *, at_once=true))]
+    fn replace(&self, name: &str, device: PyRef<'_, Device>, at_once: bool) -> PyResult<()> {
         self.core
-            .replace(name, device.core.clone())
+            .replace(name, device.core.clone(), at_once)
             .map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
@@ -245,6 +246,7 @@ fn limits(
         max_bits: within("max_bits", max_bits, 1..=2000)? as u16,
         readable: stretches(readable)?,
         forbidden: stretches(forbidden)?,
+        cuts: Vec::new(),
     })
 }
 

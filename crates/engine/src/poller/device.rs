@@ -6,10 +6,11 @@
 //! asked before the next attempt. A poll begins behind the block that the one before it failed at,
 //! so that a block which is never answered does not keep the others waiting.
 //!
-//! A device whose settings change is succeeded by another one between two polls. The successor reads
-//! at once, and keeps to the schedule and the silence of the one before.
+//! A device whose settings change is succeeded by another one between two polls. The successor keeps
+//! to the schedule of the one before, and knows what that one knew; if it is to, it reads once beside
+//! the schedule.
 
-use std::cell::{Cell, RefCell};
+use std::cell::{Cell, RefCell, RefMut};
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::future::pending;
@@ -25,21 +26,16 @@ use tokio::time::{Instant, sleep, sleep_until};
 
 use super::backoff;
 use super::forward::{Forward, ForwardSettings};
+use super::learned::{Hole, Learned};
 use super::link::{Link, Weight};
 use super::plan::{self, Block, Field, Limits, Strategy};
 use super::price::Samples;
 use super::results::{BlockResult, Poll, Results};
+use super::search;
 use super::sink::Destination;
 use super::status::{Fault, Health, Status, StatusSettings};
 use crate::client::Endpoint;
 use crate::counters::Counter;
-
-/// Exceptions that speak of what was asked for, not of the device.
-const ILLEGAL: [u8; 2] = [2, ILLEGAL_VALUE];
-const ILLEGAL_VALUE: u8 = 3;
-
-/// Exceptions of a gateway that did not reach the unit.
-const UNREACHED: [u8; 2] = [0x0A, 0x0B];
 
 /// How often a status block is written at least.
 const TELLING: Duration = Duration::from_secs(1);
@@ -47,8 +43,8 @@ const TELLING: Duration = Duration::from_secs(1);
 /// Polls without an answer in a row after which a unit is held to be dead.
 const DEAD_AFTER: u32 = 3;
 
-/// How long a refused plan is remembered before the first one is tried again.
-const REMEMBERED: Duration = Duration::from_secs(600);
+/// Polls beside the schedule are at least so far apart, or an interval if that is shorter.
+const BESIDE: Duration = Duration::from_secs(1);
 
 /// A device and what is to become of what it answers.
 #[derive(Debug, Clone)]
@@ -227,43 +223,60 @@ pub(super) struct Device {
     parts: Vec<(usize, u32)>,
     report: Option<Arc<Results>>,
     name: Arc<str>,
-    limits: RefCell<Limits>,
+    learned: RefCell<Learned>,
     plan: RefCell<Rc<Vec<Block>>>,
     /// The block that a poll begins with.
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    /// When the first plan is tried again.
-    revise: Cell<Option<Instant>>,
     silent: Cell<u32>,
     /// When the next poll is to begin.
     due: Cell<Instant>,
     /// Whether that is so late because nothing would answer before.
     resting: Cell<bool>,
+    /// When one is to begin beside the schedule, and when the last did.
+    beside: Cell<Option<Instant>>,
+    last_beside: Cell<Option<Instant>>,
 }
 
 /// Held while a request is under way: a device gets one at a time, whoever sends it.
 pub(super) type Turn = tokio::sync::Mutex<()>;
 
-/// Where the successor of a device waits for it to end a poll.
+/// What a device is told while it waits for its next poll.
 #[derive(Default)]
-pub(super) struct Succession {
-    next: RefCell<Option<Device>>,
-    named: Notify,
+pub(super) struct Inbox {
+    successor: RefCell<Option<Device>>,
+    awake: Cell<bool>,
+    given: Notify,
 }
 
-impl Succession {
-    pub(super) fn name(&self, successor: Device) {
-        *self.next.borrow_mut() = Some(successor);
-        self.named.notify_one();
+enum Told {
+    /// Another one takes its place.
+    Successor(Box<Device>),
+    /// It answers: somebody else has asked it.
+    Awake,
+}
+
+impl Inbox {
+    pub(super) fn succeed(&self, successor: Device) {
+        *self.successor.borrow_mut() = Some(successor);
+        self.given.notify_one();
     }
 
-    async fn successor(&self) -> Device {
+    pub(super) fn wake(&self) {
+        self.awake.set(true);
+        self.given.notify_one();
+    }
+
+    async fn next(&self) -> Told {
         loop {
-            self.named.notified().await;
-            if let Some(successor) = self.next.take() {
-                return successor;
+            if let Some(successor) = self.successor.take() {
+                return Told::Successor(Box::new(successor));
             }
+            if self.awake.take() {
+                return Told::Awake;
+            }
+            self.given.notified().await;
         }
     }
 }
@@ -299,15 +312,16 @@ impl Device {
             parts: parted.iter().map(|(_, read, at)| (*read, *at)).collect(),
             report,
             name: settings.name.as_str().into(),
-            limits: RefCell::new(settings.limits.clone()),
+            learned: RefCell::default(),
             plan: RefCell::default(),
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
-            revise: Cell::new(None),
             silent: Cell::new(0),
             due: Cell::new(Instant::now()),
             resting: Cell::new(false),
+            beside: Cell::new(None),
+            last_beside: Cell::new(None),
             settings,
             state,
             link,
@@ -319,35 +333,43 @@ impl Device {
     }
 
     /// Polls for ever, first after `phase`, and keeps the status block true meanwhile.
-    pub(super) async fn run(mut self, phase: Duration, succession: Rc<Succession>) {
+    pub(super) async fn run(mut self, phase: Duration, inbox: Rc<Inbox>) {
         self.due.set(Instant::now() + phase);
-        let mut at_once = false;
         loop {
             self.tell();
             let successor = tokio::select! {
-                successor = self.poll_until_replaced(at_once, &succession) => successor,
+                successor = self.poll_until_replaced(&inbox) => successor,
                 never = self.tell_for_ever() => match never {},
             };
-            at_once = successor.follow(&self);
-            self = successor;
+            successor.follow(self);
+            self = *successor;
         }
     }
 
-    async fn poll_until_replaced(&self, mut at_once: bool, succession: &Succession) -> Device {
+    async fn poll_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
         let interval = self.settings.interval;
         loop {
-            let mut due = self.due.get();
-            let mut began = Instant::now();
-            if !at_once {
-                tokio::select! {
-                    biased;
-                    successor = succession.successor() => return successor,
-                    () = sleep_until(due) => {}
-                }
-                began = due;
+            let (mut due, beside) = (self.due.get(), self.beside.get());
+            let at = beside.map_or(due, |beside| beside.min(due));
+            tokio::select! {
+                biased;
+                told = inbox.next() => match told {
+                    Told::Successor(successor) => return successor,
+                    Told::Awake => {
+                        self.wake();
+                        continue;
+                    }
+                },
+                () = sleep_until(at) => {}
+            }
+            self.beside.set(None);
+            let mut began = due;
+            if at < due {
+                began = Instant::now();
+                self.last_beside.set(Some(began));
+            } else {
                 due += interval;
             }
-            at_once = false;
             self.poll(began).await;
             self.tell();
             let (mut due, missed) = first_from(Instant::now(), due, interval);
@@ -365,19 +387,44 @@ impl Device {
         }
     }
 
-    /// Goes on where the device before it ended; whether it reads at once, beside the schedule.
-    fn follow(&self, before: &Device) -> bool {
-        let soon = Instant::now() + self.settings.interval;
+    /// Ends a rest.
+    fn wake(&self) {
+        if self.resting.take() {
+            self.silent.set(0);
+            self.due.set(Instant::now());
+        }
+    }
+
+    /// That a poll is wanted soon, beside the schedule.
+    pub(super) fn want_soon(&self) {
+        self.beside.set(Some(Instant::now()));
+    }
+
+    /// Goes on where the device before it ended.
+    fn follow(&self, before: Device) {
+        let now = Instant::now();
         let (old, new) = (&before.settings, &self.settings);
         if !Rc::ptr_eq(&before.link, &self.link) || old.unit_id != new.unit_id {
-            self.due.set(soon);
-            return true;
+            self.beside.set(None);
+            return self.due.set(now);
         }
-        let resting = before.resting.get();
+        let apart = new.interval.min(BESIDE);
+        self.last_beside.set(before.last_beside.get());
+        let not_before = before.last_beside.get().map(|last| last + apart);
+        let wanted = self.beside.get().or(before.beside.get());
+        self.beside.set(wanted.map(|wanted| not_before.map_or(wanted, |time| time.max(wanted))));
         self.silent.set(before.silent.get());
-        self.resting.set(resting);
-        self.due.set(if resting { before.due.get() } else { before.due.get().min(soon) });
-        !resting
+        self.resting.set(before.resting.get());
+        if before.resting.get() {
+            self.beside.set(None);
+            self.due.set(before.due.get());
+        } else {
+            self.due.set(before.due.get().min(now + new.interval));
+        }
+        if old.limits == new.limits {
+            self.learned.replace(before.learned.take());
+            self.draw_plan();
+        }
     }
 
     async fn tell_for_ever(&self) -> Infallible {
@@ -399,11 +446,28 @@ impl Device {
         })
     }
 
-    fn draw_plan(&self) {
+    /// Draws the plan from what is known; what can't be read is left out.
+    pub(super) fn draw_plan(&self) {
+        let learned = self.learned.borrow();
+        let known: Vec<usize> =
+            (0..self.fields.len()).filter(|at| !learned.is_refused(&self.fields[*at])).collect();
+        let fields: Vec<Field> = known.iter().map(|at| self.fields[*at]).collect();
+        let limits = learned.limits(&self.settings.limits, &self.fields);
         // That every field can be read was checked when the poller was made.
-        let plan = plan::plan(&self.fields, &self.limits.borrow(), self.strategy.get());
-        *self.plan.borrow_mut() = Rc::new(plan.unwrap_or_default());
-        self.note_plan();
+        let mut plan = plan::plan(&fields, &limits, self.strategy.get()).unwrap_or_default();
+        for at in plan.iter_mut().flat_map(|block| &mut block.fields) {
+            *at = known[*at];
+        }
+        self.state.requests_per_poll.store(plan.len() as u32, Ordering::Relaxed);
+        *self.plan.borrow_mut() = Rc::new(plan);
+    }
+
+    pub(super) fn learned(&self) -> RefMut<'_, Learned> {
+        self.learned.borrow_mut()
+    }
+
+    pub(super) fn fields(&self) -> &[Field] {
+        &self.fields
     }
 
     /// Draws the plan anew when enough answers have shown what a request costs.
@@ -415,23 +479,13 @@ impl Device {
         if let Some((request, item)) = self.samples.get().price(item) {
             self.strategy.set(Strategy::Cost { request, item });
             self.samples.take();
-            // A plan that was made smaller for what the device refuses stays until its time comes.
-            if self.revise.get().is_none() {
-                self.draw_plan();
-            }
+            self.draw_plan();
         }
-    }
-
-    fn note_plan(&self) {
-        let requests = self.plan.borrow().len() as u32;
-        self.state.requests_per_poll.store(requests, Ordering::Relaxed);
     }
 
     /// Reads every block, and hands on every read that came whole.
     async fn poll(&self, due: Instant) {
-        if self.revise.get().is_some_and(|time| Instant::now() >= time) {
-            self.revise.set(None);
-            self.limits.replace(self.settings.limits.clone());
+        if self.learned().forget(Instant::now()) {
             self.draw_plan();
         }
         self.learn();
@@ -439,11 +493,12 @@ impl Device {
         let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
         let (mut fault, mut answered) = (None, false);
         let plan = Rc::clone(&self.plan.borrow());
+        let known = self.learned().holes().to_vec();
         let first = self.first.take();
         for index in (0..plan.len()).map(|offset| (first + offset) % plan.len()) {
             match self.read(&plan[index], &mut gathered).await {
                 Ok(()) => answered = true,
-                Err(refused @ Fault::Exception(code)) if !UNREACHED.contains(&code) => {
+                Err(refused) if refused.is_answer() => {
                     answered = true;
                     fault = Some(refused);
                 }
@@ -455,6 +510,10 @@ impl Device {
                 }
             }
         }
+        if answered || plan.is_empty() {
+            fault = fault.or(self.look_at_holes(&known, &mut gathered).await);
+            answered |= fault.is_some_and(Fault::is_answer);
+        }
         if let Some(results) = &self.report {
             let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
             results.push(Poll { device, due: results.counted(due.into_std()), blocks });
@@ -462,10 +521,7 @@ impl Device {
         if self.settings.release {
             self.link.release();
         }
-        let silent = match fault {
-            Some(Fault::Timeout | Fault::Refused | Fault::Reset | Fault::Exception(_)) => !answered,
-            Some(Fault::Invalid) | None => false,
-        };
+        let silent = fault.is_some() && !answered;
         self.silent.set(if silent { self.silent.get().saturating_add(1) } else { 0 });
         match fault {
             None => self.state.good(),
@@ -473,44 +529,53 @@ impl Device {
         }
     }
 
-    /// Reads a block, or what becomes of it when the device refuses: smaller ones, until a bad field
-    /// is alone.
-    async fn read(&self, block: &Block, gathered: &mut Gathered) -> Result<(), Fault> {
-        let bytes = match self.ask(block).await {
-            Ok(bytes) => bytes,
-            Err(Fault::Exception(code)) if ILLEGAL.contains(&code) => {
-                let smaller = plan::smaller(&self.fields, block);
-                if smaller.is_empty() {
-                    gathered.note(block, Err(Fault::Exception(code)));
-                    return Err(Fault::Exception(code));
-                }
-                if code == ILLEGAL_VALUE {
-                    self.lower_limit(block);
-                }
-                self.replace(block, &smaller);
-                let mut done = Ok(());
-                for part in &smaller {
-                    match Box::pin(self.read(part, gathered)).await {
-                        Ok(()) => {}
-                        Err(refused @ Fault::Exception(code)) if !UNREACHED.contains(&code) => {
-                            done = Err(refused);
-                        }
-                        Err(other) => return Err(other),
+    /// Tells of the ranges that can't be read, and tries one again from time to time; a fault of
+    /// one of them.
+    async fn look_at_holes(&self, known: &[Hole], gathered: &mut Gathered) -> Option<Fault> {
+        let only = self.plan.borrow().is_empty();
+        let retried = self.learned().retry(Instant::now(), only);
+        let mut fault = None;
+        for hole in known.iter().filter(|hole| self.fields.iter().any(|field| hole.holds(field))) {
+            let block = hole.block();
+            let mut found = hole.fault;
+            if retried.as_ref().is_some_and(|retried| retried.is(hole)) {
+                match self.ask(&block).await {
+                    Err(fault) => found = fault,
+                    Ok(_) => {
+                        // It is read with the next poll.
+                        *self.learned() = Learned::default();
+                        self.draw_plan();
+                        continue;
                     }
                 }
-                return done;
             }
-            Err(other) => {
-                gathered.note(block, Err(other));
-                return Err(other);
-            }
-        };
-        self.spread(block, &bytes, gathered);
-        gathered.note(block, Ok(bytes));
-        Ok(())
+            gathered.note(&block, Err(found));
+            fault = Some(found);
+        }
+        fault
     }
 
-    async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
+    async fn read(&self, block: &Block, gathered: &mut Gathered) -> Result<(), Fault> {
+        match self.ask(block).await {
+            Ok(bytes) => {
+                self.take(block, bytes, gathered);
+                Ok(())
+            }
+            Err(fault) if search::is_illegal(fault) => self.search(block, fault, gathered).await,
+            Err(other) => {
+                gathered.note(block, Err(other));
+                Err(other)
+            }
+        }
+    }
+
+    /// Hands on what a block brought.
+    pub(super) fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
+        self.spread(block, &bytes, gathered);
+        gathered.note(block, Ok(bytes));
+    }
+
+    pub(super) async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
         let range = Range { address: block.address, quantity: block.count };
         let request = match block.area {
             Area::Coils => Request::ReadCoils(range),
@@ -541,39 +606,6 @@ impl Device {
             Err(_) => counters.transport_errors.add(),
         }
         answer
-    }
-
-    /// A device that can't bear so many items in one request gets fewer in all its requests, as far as
-    /// its fields allow.
-    fn lower_limit(&self, refused: &Block) {
-        let longest = self.fields.iter().filter(|field| field.area == refused.area);
-        let longest = longest.map(|field| field.count).max().unwrap_or(1);
-        let limit = (refused.count / 2).max(longest);
-        let mut limits = self.limits.borrow_mut();
-        let now =
-            if refused.area.is_bits() { &mut limits.max_bits } else { &mut limits.max_registers };
-        *now = limit.min(*now);
-        drop(limits);
-        self.draw_plan();
-        self.remember();
-    }
-
-    /// Sets the time when the first plan is tried again.
-    fn remember(&self) {
-        if self.revise.get().is_none() {
-            self.revise.set(Some(Instant::now() + REMEMBERED));
-        }
-    }
-
-    /// Puts smaller blocks in the place of one that was refused.
-    fn replace(&self, refused: &Block, smaller: &[Block]) {
-        let mut plan = self.plan.borrow_mut();
-        if let Some(at) = plan.iter().position(|block| block == refused) {
-            Rc::make_mut(&mut plan).splice(at..=at, smaller.iter().cloned());
-        }
-        drop(plan);
-        self.note_plan();
-        self.remember();
     }
 
     /// Takes the fields of a block out of its bytes; reads that are whole then are handed on.
@@ -630,14 +662,14 @@ fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) 
 /// What one poll brings together: reads that come in parts, and how many items are missing; and
 /// all blocks, where somebody wants them.
 #[derive(Default)]
-struct Gathered {
+pub(super) struct Gathered {
     parts: HashMap<usize, (Vec<u8>, u32)>,
     blocks: Vec<BlockResult>,
     report: bool,
 }
 
 impl Gathered {
-    fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
+    pub(super) fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
         if self.report {
             let Block { area, address, count, .. } = *block;
             let time = SystemTime::now();

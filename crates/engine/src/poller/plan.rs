@@ -40,6 +40,13 @@ pub struct Stretch {
     pub end: u32,
 }
 
+/// What ends at an address or before is not read together with what begins there or behind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Cut {
+    pub area: Area,
+    pub address: u32,
+}
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strategy {
     /// Holes of up to `max_gap` items are read.
@@ -58,6 +65,7 @@ pub struct Limits {
     pub readable: Vec<Stretch>,
     /// Never read, not even as a hole.
     pub forbidden: Vec<Stretch>,
+    pub cuts: Vec<Cut>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -74,13 +82,27 @@ pub enum PlanError {
 
 impl Default for Limits {
     fn default() -> Limits {
-        Limits { max_registers: 125, max_bits: 2000, readable: Vec::new(), forbidden: Vec::new() }
+        Limits {
+            max_registers: 125,
+            max_bits: 2000,
+            readable: Vec::new(),
+            forbidden: Vec::new(),
+            cuts: Vec::new(),
+        }
     }
 }
 
 impl Limits {
     fn most(&self, area: Area) -> u16 {
         if area.is_bits() { self.max_bits } else { self.max_registers }
+    }
+
+    /// Whether what ends at `end` may be read together with what begins at `start`. What overlaps
+    /// always may.
+    fn joins(&self, area: Area, end: u32, start: u32) -> bool {
+        let between = |cut: &Cut| cut.area == area && end <= cut.address && cut.address <= start;
+        start < end
+            || (!self.cuts.iter().any(between) && (start == end || self.bears(area, end, start)))
     }
 
     /// Whether a hole may be read.
@@ -157,8 +179,8 @@ fn by_gap(
         let start = u32::from(field.address);
         let fits =
             field.end().max(end) - u32::from(first.address) <= u32::from(limits.most(field.area));
-        let near = start <= end
-            || (start - end <= u32::from(max_gap) && limits.bears(field.area, end, start));
+        let near =
+            start <= end.saturating_add(max_gap.into()) && limits.joins(field.area, end, start);
         if at > from && !(fits && near) {
             blocks.push(block(fields, &order[from..at]));
             from = at;
@@ -199,8 +221,7 @@ fn by_cost(
                 break;
             }
             if let Some(next) = next_start
-                && next > ends[from]
-                && !limits.bears(field.area, ends[from], next)
+                && !limits.joins(field.area, ends[from], next)
             {
                 break;
             }
@@ -241,29 +262,22 @@ fn block(fields: &[Field], order: &[usize]) -> Block {
     Block { area: first.area, address: first.address, count, fields: order.to_vec(), holes }
 }
 
-/// The blocks to try in place of one that the device refused: without its holes, or, when it has
-/// none, in two halves. Empty for a block of one field: that one is bad.
-pub fn smaller(fields: &[Field], refused: &Block) -> Vec<Block> {
-    if refused.holes > 0 {
-        let mut blocks = Vec::new();
-        by_gap(fields, &refused.fields, &Limits::default(), 0, &mut blocks);
-        return blocks;
-    }
+/// The two blocks to try in place of one that the device refused; `None` for a block of one field.
+pub fn halves(fields: &[Field], refused: &Block) -> Option<[Block; 2]> {
     // Fields that overlap stay together: only a cut between fields helps.
-    let cuts = 1..refused.fields.len();
-    let cut = cuts
+    let cut = (1..refused.fields.len())
         .filter(|cut| {
             let (left, right) = refused.fields.split_at(*cut);
             reach(fields, left) <= u32::from(fields[right[0]].address)
         })
-        .min_by_key(|cut| cut.abs_diff(refused.fields.len() / 2));
-    match cut {
-        None => Vec::new(),
-        Some(cut) => {
-            let (left, right) = refused.fields.split_at(cut);
-            vec![block(fields, left), block(fields, right)]
-        }
-    }
+        .min_by_key(|cut| cut.abs_diff(refused.fields.len() / 2))?;
+    let (left, right) = refused.fields.split_at(cut);
+    Some([block(fields, left), block(fields, right)])
+}
+
+/// One block in the place of two neighbours.
+pub fn joined(fields: &[Field], left: &Block, right: &Block) -> Block {
+    block(fields, &[&left.fields[..], &right.fields[..]].concat())
 }
 
 #[cfg(test)]
@@ -328,16 +342,29 @@ mod tests {
     }
 
     #[test]
-    fn a_refused_block_loses_its_holes_then_halves_until_one_field_is_alone() {
+    fn a_refused_block_is_halved_until_one_field_is_alone() {
         let fields = [field(0, 1), field(1, 1), field(2, 2), field(9, 1)];
         let all = plan(&fields, &Limits::default(), Strategy::Gap { max_gap: 9 }).unwrap();
         assert_eq!(spans(&all), [(0, 10)]);
-        let without_holes = smaller(&fields, &all[0]);
-        assert_eq!(spans(&without_holes), [(0, 4), (9, 1)]);
-        let halves = smaller(&fields, &without_holes[0]);
-        assert_eq!(spans(&halves), [(0, 1), (1, 3)]);
-        assert_eq!(smaller(&fields, &halves[0]), []);
-        assert_eq!(spans(&smaller(&fields, &halves[1])), [(1, 1), (2, 2)]);
+        let [left, right] = halves(&fields, &all[0]).unwrap();
+        assert_eq!(spans(&[left.clone(), right.clone()]), [(0, 2), (2, 8)]);
+        assert_eq!(joined(&fields, &left, &right), all[0]);
+        let [left, right] = halves(&fields, &right).unwrap();
+        assert_eq!(spans(&[left.clone(), right]), [(2, 2), (9, 1)]);
+        assert_eq!(halves(&fields, &left), None);
+    }
+
+    #[test]
+    fn nothing_is_read_across_a_cut() {
+        let area = Area::HoldingRegisters;
+        let cuts = [4, 10, 30].map(|address| Cut { area, address }).to_vec();
+        let limits = Limits { cuts, ..Limits::default() };
+        let fields = [field(0, 4), field(4, 2), field(8, 4), field(11, 5), field(20, 1)];
+        for strategy in [Strategy::Gap { max_gap: 50 }, Strategy::Cost { request: 1e6, item: 1.0 }]
+        {
+            let blocks = plan(&fields, &limits, strategy).unwrap();
+            assert_eq!(spans(&blocks), [(0, 4), (4, 17)]);
+        }
     }
 
     #[test]

@@ -62,7 +62,15 @@ pub enum Fault {
     Invalid,
 }
 
+/// Exceptions of a gateway that did not reach the unit.
+const UNREACHED: [u8; 2] = [0x0A, 0x0B];
+
 impl Fault {
+    /// Whether the device has answered, if only with an exception.
+    pub(super) fn is_answer(self) -> bool {
+        matches!(self, Fault::Exception(code) if !UNREACHED.contains(&code))
+    }
+
     pub const fn code(self) -> u16 {
         match self {
             Fault::Exception(code) => code as u16,

@@ -14,7 +14,7 @@ use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::device::{Device, DeviceSettings, DeviceState, Succession, Turn, fields};
+use super::device::{Device, DeviceSettings, DeviceState, Inbox, Turn, fields};
 use super::forward::{Forward, ForwardCounters};
 use super::link::{Link, Weight};
 use super::plan::{self, PlanError};
@@ -72,7 +72,12 @@ pub struct Poller {
 enum Order {
     Add(Box<DeviceSettings>, Polled),
     /// The device of that name gives way to another one.
-    Replace(String, Box<DeviceSettings>, Polled),
+    Replace {
+        name: String,
+        device: Box<DeviceSettings>,
+        polled: Polled,
+        at_once: bool,
+    },
     Remove(String),
     Write {
         device: String,
@@ -139,12 +144,17 @@ impl Poller {
     }
 
     /// Polls a device in the place of the one called `name`, whose poll under way is completed. It
-    /// may have the same name. It reads at once, keeps the counters and the connection, and goes on
-    /// with the schedule.
+    /// may have the same name. It keeps counters, connection and schedule. `at_once` it reads once
+    /// beside the schedule; not more often than each second, or each interval if that is shorter.
     ///
     /// # Errors
     /// [`PollerError`]; then nothing has changed.
-    pub fn replace(&self, name: &str, device: DeviceSettings) -> Result<(), PollerError> {
+    pub fn replace(
+        &self,
+        name: &str,
+        device: DeviceSettings,
+        at_once: bool,
+    ) -> Result<(), PollerError> {
         check(&device)?;
         let mut all = self.polled();
         if device.name != name && all.iter().any(|other| other.name == device.name) {
@@ -155,7 +165,8 @@ impl Poller {
         };
         *before = Polled::new(&device, Arc::clone(&before.state));
         let polled = before.clone();
-        let _ = self.orders.send(Order::Replace(name.to_owned(), Box::new(device), polled));
+        let (name, device) = (name.to_owned(), Box::new(device));
+        let _ = self.orders.send(Order::Replace { name, device, polled, at_once });
         Ok(())
     }
 
@@ -223,7 +234,7 @@ struct Running {
     unit_id: u8,
     timeout: Duration,
     release: bool,
-    succession: Rc<Succession>,
+    inbox: Rc<Inbox>,
     device: AbortHandle,
     forwards: Vec<AbortHandle>,
 }
@@ -254,12 +265,12 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                 let link = link_to(&settings.endpoint, &mut links);
                 running.insert(name, Running::start(*settings, polled, link, phase, &results));
             }
-            Order::Replace(before, settings, polled) => {
-                let name = settings.name.clone();
+            Order::Replace { name, device: settings, polled, at_once } => {
                 let link = link_to(&settings.endpoint, &mut links);
                 // It is there as long as nobody removes it.
-                if let Some(mut device) = running.remove(&before) {
-                    device.replace(*settings, polled, link, &results);
+                if let Some(mut device) = running.remove(&name) {
+                    let name = settings.name.clone();
+                    device.replace(*settings, polled, link, at_once, &results);
                     running.insert(name, device);
                 }
                 links.retain(|_, link| link.strong_count() > 0);
@@ -281,13 +292,13 @@ impl Running {
         phase: Duration,
         results: &Arc<Results>,
     ) -> Running {
-        let succession = Rc::new(Succession::default());
+        let inbox = Rc::new(Inbox::default());
         let DeviceSettings { unit_id, timeout, release, .. } = settings;
         let turn = Rc::new(Turn::default());
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let (device, forwards) = made(settings, polled, to, results);
-        let device = spawn_local(device.run(phase, Rc::clone(&succession))).abort_handle();
-        Running { link, turn, unit_id, timeout, release, succession, device, forwards }
+        let device = spawn_local(device.run(phase, Rc::clone(&inbox))).abort_handle();
+        Running { link, turn, unit_id, timeout, release, inbox, device, forwards }
     }
 
     fn replace(
@@ -295,6 +306,7 @@ impl Running {
         settings: DeviceSettings,
         polled: Polled,
         link: Rc<Link>,
+        at_once: bool,
         results: &Arc<Results>,
     ) {
         self.stop_forwards();
@@ -302,12 +314,16 @@ impl Running {
         (self.release, self.link) = (settings.release, Rc::clone(&link));
         let (device, forwards) = made(settings, polled, (link, Rc::clone(&self.turn)), results);
         self.forwards = forwards;
-        self.succession.name(device);
+        if at_once {
+            device.want_soon();
+        }
+        self.inbox.succeed(device);
     }
 
     /// Writes between two reads, as soon as it can; the end of the device does not break it off.
     fn write(&self, ticket: u64, pdu: Vec<u8>, results: &Arc<Results>) {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
+        let inbox = Rc::clone(&self.inbox);
         let results = Arc::clone(results);
         let Running { unit_id, timeout, release, .. } = *self;
         spawn_local(async move {
@@ -316,6 +332,9 @@ impl Running {
             drop(turn);
             if release {
                 link.release();
+            }
+            if answer.is_ok() {
+                inbox.wake();
             }
             results.push_write(Written { ticket, outcome: answer.map(drop) });
         });

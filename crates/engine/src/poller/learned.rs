@@ -1,0 +1,136 @@
+//! What a device has taught by its refusals: what can't be read, what not together, and how much at
+//! once. It is remembered for a while, then tried again.
+
+use std::time::Duration;
+
+use holdfast_memory::Area;
+use tokio::time::Instant;
+
+use super::plan::{Block, Cut, Field, Limits};
+use super::status::Fault;
+
+/// How long it is remembered.
+const REMEMBERED: Duration = Duration::from_secs(600);
+
+/// How often something that can't be read is tried again.
+const RETRY: Duration = Duration::from_secs(60);
+
+#[derive(Debug, Default)]
+pub(super) struct Learned {
+    max_registers: Option<u16>,
+    max_bits: Option<u16>,
+    cuts: Vec<Cut>,
+    holes: Vec<Hole>,
+    /// When all of it is forgotten.
+    until: Option<Instant>,
+}
+
+/// A range that the device refuses to read.
+#[derive(Debug, Clone)]
+pub(super) struct Hole {
+    pub(super) area: Area,
+    pub(super) address: u16,
+    pub(super) count: u16,
+    pub(super) fault: Fault,
+    retry_at: Instant,
+}
+
+impl Hole {
+    fn end(&self) -> u32 {
+        u32::from(self.address) + u32::from(self.count)
+    }
+
+    /// It as a request.
+    pub(super) fn block(&self) -> Block {
+        let Hole { area, address, count, .. } = *self;
+        Block { area, address, count, fields: Vec::new(), holes: 0 }
+    }
+
+    pub(super) fn is(&self, other: &Hole) -> bool {
+        (self.area, self.address, self.count) == (other.area, other.address, other.count)
+    }
+
+    /// Whether a field is in it.
+    pub(super) fn holds(&self, field: &Field) -> bool {
+        let end = u32::from(field.address) + u32::from(field.count);
+        field.area == self.area && self.address <= field.address && end <= self.end()
+    }
+}
+
+impl Learned {
+    /// Forgets everything when its time has come; whether it has.
+    pub(super) fn forget(&mut self, now: Instant) -> bool {
+        let over = self.until.is_some_and(|until| until <= now);
+        if over {
+            *self = Learned::default();
+        }
+        over
+    }
+
+    /// A device bears fewer items in one request.
+    pub(super) fn lower(&mut self, area: Area, most: u16) {
+        let known = if area.is_bits() { &mut self.max_bits } else { &mut self.max_registers };
+        *known = Some(known.map_or(most, |known| known.min(most)));
+        self.remember();
+    }
+
+    /// What ends before an address is not read together with what begins there.
+    pub(super) fn cut(&mut self, area: Area, address: u32) {
+        let cut = Cut { area, address };
+        if !self.cuts.contains(&cut) {
+            self.cuts.push(cut);
+        }
+        self.remember();
+    }
+
+    /// A block can't be read at all.
+    pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
+        let Block { area, address, count, .. } = *block;
+        let retry_at = Instant::now() + RETRY;
+        self.holes.push(Hole { area, address, count, fault, retry_at });
+        self.remember();
+    }
+
+    pub(super) fn holes(&self) -> &[Hole] {
+        &self.holes
+    }
+
+    /// The hole that is to be tried again, if its time has come, or in any case: each in its turn.
+    pub(super) fn retry(&mut self, now: Instant, in_any_case: bool) -> Option<Hole> {
+        let hole = self.holes.iter_mut().min_by_key(|hole| hole.retry_at)?;
+        if hole.retry_at > now && !in_any_case {
+            return None;
+        }
+        hole.retry_at = now + RETRY;
+        Some(hole.clone())
+    }
+
+    /// Whether a field is known not to be readable.
+    pub(super) fn is_refused(&self, field: &Field) -> bool {
+        self.holes.iter().any(|hole| hole.holds(field))
+    }
+
+    /// The limits of a device with these fields, none of which is made unreadable by them.
+    pub(super) fn limits(&self, of: &Limits, fields: &[Field]) -> Limits {
+        let longest = |bits: bool| {
+            let alike = fields.iter().filter(|field| field.area.is_bits() == bits);
+            alike.map(|field| field.count).max().unwrap_or(1)
+        };
+        let within = |known: Option<u16>, most: u16, bits: bool| {
+            known.map_or(most, |known| most.min(known.max(longest(bits))))
+        };
+        let mut limits = of.clone();
+        limits.max_registers = within(self.max_registers, of.max_registers, false);
+        limits.max_bits = within(self.max_bits, of.max_bits, true);
+        limits.cuts.extend(&self.cuts);
+        for hole in &self.holes {
+            let of_hole = [hole.address.into(), hole.end()];
+            limits.cuts.extend(of_hole.map(|address| Cut { area: hole.area, address }));
+        }
+        limits
+    }
+
+    fn remember(&mut self) {
+        self.until.get_or_insert_with(|| Instant::now() + REMEMBERED);
+    }
+}
