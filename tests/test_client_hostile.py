@@ -526,6 +526,35 @@ def test_a_device_that_reads_nothing_times_out(make: Make, dial: Dial) -> None:
     assert connections(device) == 1
 
 
+@pytest.mark.parametrize(("timeouts", "made"), [(2, 1), (3, 2), (5, 2)])
+def test_a_connection_that_has_gone_silent_is_made_anew(
+    make: Make, dial: Dial, timeouts: int, made: int
+) -> None:
+    device = make("tcp", *[silent] * timeouts)
+    client = dial(device.url, timeout=SHORT)
+    for _ in range(timeouts):
+        with pytest.raises(holdfast.RequestTimeout):
+            client.read_holding_registers(7, 1)
+    client.timeout = wire.DEADLINE
+
+    assert client.read_holding_registers(8, 1) == [8]
+    assert connections(device) == made
+
+
+def test_a_late_reply_shows_that_a_connection_is_alive(make: Make, dial: Dial) -> None:
+    device = make("tcp", silent, silent)
+    device.script.append(lambda _: device.asked[0].answer())
+    device.script.append(silent)
+    client = dial(device.url, timeout=SHORT)
+    for _ in range(4):
+        with pytest.raises(holdfast.RequestTimeout):
+            client.read_holding_registers(7, 1)
+    client.timeout = wire.DEADLINE
+
+    assert client.read_holding_registers(8, 1) == [8]
+    assert connections(device) == 1
+
+
 def test_a_late_reply_is_not_taken_for_the_next_one(make: Make, dial: Dial) -> None:
     device = make("tcp", silent)
 
@@ -853,6 +882,20 @@ def test_a_port_where_nobody_listens_is_lost(dial: Dial) -> None:
 
 def read_all(plc: holdfast.Client, count: int) -> list[asyncio.Task[list[int]]]:
     return [asyncio.create_task(plc.read_holding_registers(at, 1)) for at in range(count)]
+
+
+def test_requests_that_time_out_together_count_as_one() -> None:
+    async def main() -> None:
+        with Stream("tcp", *[silent] * 32) as device:
+            async with holdfast.Client(device.url, timeout=SHORT) as plc:
+                for _ in range(2):
+                    found = await asyncio.gather(*read_all(plc, 16), return_exceptions=True)
+                    assert {type(each) for each in found} == {holdfast.RequestTimeout}
+                plc.timeout = wire.DEADLINE
+                assert await plc.read_holding_registers(8, 1) == [8]
+                assert device.connections == 1
+
+    run(main)
 
 
 def test_replies_may_come_in_any_order() -> None:

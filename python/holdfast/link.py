@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 CLOSED = "connection lost: closed by this side"
 
+SILENT = 3
+"""Timeouts one after the other, without a byte between them, after which a connection is given up:
+the other side may have gone without a word."""
+
 
 class Link:
     """The connection of a client, in one event loop at a time."""
@@ -236,6 +240,9 @@ class _Connection(asyncio.Protocol):
         self._alarm: asyncio.TimerHandle | None = None
         self._alarm_at = inf
         self._flushing = False
+        self._timeouts = 0
+        self._timed_out = -inf
+        """Timeouts since something came, and when the last of them was."""
         self._transport: asyncio.Transport
 
     def send(
@@ -292,6 +299,7 @@ class _Connection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self._heard = True
+        self._timeouts = 0
         completed, broken = self.session.receive(data)
         for number, result in completed:
             future = self._futures.pop(number)
@@ -336,9 +344,15 @@ class _Connection(asyncio.Protocol):
                 self.give_up(number)
                 future.set_exception(RequestTimeout(f"no reply within {timeout:g} s"))
                 timed_out = True
+                # Requests that were under way together count as one.
+                if deadline - timeout >= self._timed_out:
+                    self._timeouts += 1
+                    self._timed_out = now
             self._by_deadline.popleft()
         if timed_out and self.session.is_amid_reply:
             self.end(ConnectionLost("connection lost: a reply broke off"))
+        elif self._timeouts >= SILENT and not self._futures:
+            self.end(ConnectionLost("connection lost: nothing came any more"))
 
 
 def _again(error: ModbusError) -> ModbusError:

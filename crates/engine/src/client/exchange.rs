@@ -3,7 +3,7 @@
 //! The connection is made when it is needed and kept. A call that fails after its request may have been
 //! sent is never repeated; only a read over UDP is, which changes nothing. What leaves the state of
 //! a connection in doubt ends it: then the next call makes a new one. Over TCP a timeout does not,
-//! because a late reply is known by its transaction id.
+//! because a late reply is known by its transaction id; only several do, with nothing between them.
 
 use std::io::{self, ErrorKind};
 use std::net::UdpSocket;
@@ -28,6 +28,10 @@ const CHUNK: usize = 512;
 
 /// After this time without use a connection is looked at before it is trusted.
 const IDLE: Duration = Duration::from_millis(50);
+
+/// Timeouts one after the other, without a byte between them, after which a connection is given up:
+/// the other side may have gone without a word.
+const SILENT: u32 = 3;
 
 /// How often a read is sent over UDP within its deadline.
 const UDP_ATTEMPTS: u32 = 3;
@@ -69,6 +73,8 @@ pub struct BlockingClient {
 struct Connection {
     kind: Kind,
     used: Instant,
+    /// Timeouts since something came.
+    timeouts: u32,
 }
 
 enum Kind {
@@ -155,12 +161,18 @@ impl BlockingClient {
         let mut give = |response: Response<'_>| {
             taken = take.take().map(|take| take(response));
         };
+        let late = self.late();
         let done = connection.exchange(&call, &mut give, &self.late);
         connection.used = Instant::now();
         match done {
-            Ok(()) => taken.ok_or_else(|| ClientError::Invalid("there was no response".into())),
+            Ok(()) => {
+                connection.timeouts = 0;
+                taken.ok_or_else(|| ClientError::Invalid("there was no response".into()))
+            }
             Err(Failure { error, usable }) => {
-                if !usable {
+                let silent = matches!(error, ClientError::Timeout(_)) && late == self.late();
+                connection.timeouts = if silent { connection.timeouts + 1 } else { 0 };
+                if !usable || connection.timeouts == SILENT {
                     *held = None;
                 }
                 Err(error)
@@ -223,7 +235,7 @@ impl BlockingClient {
                 }
             }
         };
-        Ok(Connection { kind, used: Instant::now() })
+        Ok(Connection { kind, used: Instant::now(), timeouts: 0 })
     }
 }
 
