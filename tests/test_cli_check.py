@@ -53,6 +53,22 @@ def test_check_prints_the_effective_configuration(good: Path) -> None:
     assert result.stdout == load(good).dump()
 
 
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_what_is_in_the_certificates_of_a_device_is_checked(tmp_path: Path, command: str) -> None:
+    path = tmp_path / "p.yaml"
+    (tmp_path / "ca.pem").write_text("nothing")
+    path.write_text(
+        f"{GOOD}devices:\n  meter:\n    url: tls://127.0.0.1?ca=ca.pem\n    unit: 1\n"
+        "    interval: 1\n    reads: [{area: coils, address: 0, count: 1,"
+        " into: {memory: plant, area: coils, address: 0}}]\n"
+    )
+    result = CliRunner().invoke(main, [command, str(path)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    found, number = result.stderr.splitlines()
+    assert found.startswith(f"{path}:9: devices.meter.url: {tmp_path / 'ca.pem'}: found ")
+    assert number == "1 problem"
+
+
 def test_check_prints_every_problem_and_their_number(bad: Path) -> None:
     result = CliRunner().invoke(main, ["check", str(bad)])
     assert (result.exit_code, result.stdout) == (2, "")

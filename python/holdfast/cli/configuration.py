@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast import assembly
+from holdfast.client import endpoint
 from holdfast.config import ConfigError, ModbusTlsListener, load, source
 from holdfast.config.problems import Report
 
@@ -32,6 +33,11 @@ def load_whole(path: Path | str) -> Config:
                 assembly.server_tls(listener.tls)
             except ValueError as error:
                 problems["listeners", name, "tls"] = str(error)
+    for name, device in config.devices.items():
+        try:
+            endpoint(device.target)
+        except (OSError, ValueError) as error:
+            problems["devices", name, "url"] = str(error)
     if problems:
         report = Report(source.parse(source.read_text(Path(path), file), file)[0])
         for place, message in problems.items():
