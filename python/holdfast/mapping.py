@@ -184,7 +184,8 @@ class Survey:
 
     def _samples(self) -> list[int]:
         """Addresses to look at: evenly spread, and where ranges like to begin."""
-        likely = {0, 1, 10, 20, 50, *range(100, 10000, 100), *range(1000, ADDRESSES, 1000)}
+        thousands = range(1000, ADDRESSES, 1000)
+        likely = {1, 10, 20, *range(0, 10000, 50), *thousands, *(each + 1 for each in thousands)}
         first, stop = self.span.start, self.span.stop
         spread = set(range(first, stop, self._step))
         return sorted(spread | {stop - 1} | {each for each in likely if first <= each < stop})
