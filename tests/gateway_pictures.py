@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 MOST_BYTES = 120 * 1024
 SCHEMES: tuple[Scheme, ...] = ("light", "dark")
-LOW: Any = {"viewport": {"width": 1100, "height": 360}}
+LOW: Any = {"viewport": {"width": 1100, "height": 400}}
 
 RANGES = {
     1: [range(64), range(512, 640)],

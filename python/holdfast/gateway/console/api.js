@@ -39,7 +39,10 @@ export async function stream(path, options, onEvent) {
   const reader = reply.body.pipeThrough(new TextDecoderStream()).getReader();
   let held = "";
   for (;;) {
-    const { value, done } = await reader.read();
+    const { value, done } = await reader.read().catch((error) => {
+      if (error.name === "AbortError") throw error;
+      throw new Problem("gateway_gone", "the connection to the gateway ended");
+    });
     if (done) return;
     const events = (held + value).split("\n\n");
     held = events.pop();
@@ -104,13 +107,32 @@ function askForToken(error) {
 }
 
 /** A problem as a notice: what it means in plain words, what to try, what was said. */
-export function notice(error) {
+export function notice(error, heading = null) {
   const [title, tries] = explained(error);
   return h("div", { class: "notice bad" },
-    h("strong", {}, title),
+    heading === null ? null : h("strong", {}, heading),
+    heading === null ? h("strong", {}, title) : h("p", {}, title),
     tries.length > 0 ? h("ul", {}, tries.map((each) => h("li", {}, each))) : null,
     h("span", { class: "said" }, error.message));
 }
+
+/** Fields of the page by what the gateway calls them, where that is not their name. */
+const FIELDS = {
+  unitid: "unit", servername: "server", datatype: "type", byteorder: "order", values: "write-value", value: "write-value",
+};
+
+/** Marks the field that an error begins with; whether it is on the page. */
+function mark(error) {
+  const name = /^\w+/.exec(error.message)?.[0].toLowerCase() ?? "";
+  const known = FIELDS[name] ?? name;
+  const field = [...document.querySelectorAll("input, select")]
+    .find((each) => (each.id || each.name) === known && each.checkVisibility());
+  field?.setAttribute("aria-invalid", "true");
+  return field !== undefined;
+}
+
+/** A field is no longer the one that was wrong. */
+export const unmark = (field) => field.removeAttribute("aria-invalid");
 
 const WORDS = {
   timeout: ["No answer in time.", [
@@ -127,6 +149,12 @@ const WORDS = {
     "It may allow few connections: is another master connected?",
     "It may speak something else on this port: check port and transport.",
   ]],
+  tls_failed: ["TLS was not agreed on.", [
+    "Is the certificate for another name? If that is the device, give it as the name in its certificate.",
+    "Is its issuer unknown? Whoever runs the gateway says who is trusted: with --tls-ca, or tls in its configuration.",
+    "Does the device ask for a certificate, or refuse the gateway's? That is --tls-cert and --tls-key, or tls in its configuration.",
+    "Is this the port of TLS? It is 802 as a rule.",
+  ]],
   invalid_reply: ["Something answers, but not as Modbus should.", [
     "Is the transport right? A serial gateway may want RTU over TCP.",
     "Is the port right?",
@@ -134,12 +162,12 @@ const WORDS = {
   no_such_name: ["Nobody knows this name.", ["Is it spelled right?", "Try the IP address instead."]],
   refused_target: ["This gateway may not connect there.", [
     "Whoever runs the gateway says which networks and ports it may use: with --allow, or allow in its configuration.",
-    "Is the port in that list too? Without ports it is 502 only.",
+    "Is the port in that list too? Without ports it is 502, and 802 with TLS.",
   ]],
   writes_off: ["This gateway only reads.", ["Whoever runs it can allow writing: with --writes, or access: read-write in its configuration."]],
   unauthorized: ["This gateway needs a token.", ["`holdfast token --line` makes one for its token file, `holdfast token --gateway` one for its configuration."]],
-  malformed: ["The gateway can't take this request.", ["Check the marked values."]],
   busy: ["The gateway has too much to do.", ["Try again in a moment."]],
+  stopping: ["The gateway is being stopped.", ["Reload the page when it runs again."]],
   gateway_gone: ["The gateway does not answer.", ["Is it still running?", "Reload the page when it is."]],
 };
 
@@ -160,5 +188,6 @@ const EXCEPTIONS = {
 function explained(error) {
   const code = /\(code (0x[0-9a-f]+)\)/.exec(error.message);
   if (code && EXCEPTIONS[code[1]]) return EXCEPTIONS[code[1]];
+  if (error.reason === "malformed") return ["The gateway can't take this request.", [mark(error) ? "Check the marked value." : "Check the values."]];
   return WORDS[error.reason] ?? ["This did not work.", []];
 }

@@ -17,7 +17,25 @@ export function h(tag, properties = {}, ...children) {
 
 /** Puts a message into a live region; it is read out even if it is the same as before. */
 export function say(region, ...content) {
-  region.replaceChildren(...content.map((each) => (typeof each === "string" ? h("p", {}, each) : each)));
+  const shown = content.filter((each) => each !== null);
+  region.replaceChildren(...shown.map((each) => (typeof each === "string" ? h("p", {}, each) : each)));
+}
+
+/** Does one thing at a time for a button, which keeps the focus meanwhile. */
+export async function once(button, work) {
+  if (button.getAttribute("aria-disabled") === "true") return;
+  button.setAttribute("aria-disabled", "true");
+  try {
+    await work();
+  } finally {
+    button.removeAttribute("aria-disabled");
+  }
+}
+
+/** Hides a field with its label, or shows it; what is hidden is not checked. */
+export function show(field, is) {
+  field.closest("label").hidden = !is;
+  field.disabled = !is;
 }
 
 /** Tabs that the arrow keys move between. */

@@ -1,12 +1,16 @@
 // The console: which device, and what to do with it.
 
-import { forgetToken, get, hasToken, notice, post } from "./api.js";
+import { forgetToken, get, hasToken, notice, post, unmark } from "./api.js";
 import { $, h, say, tabs } from "./dom.js";
 import { Map_ } from "./mapping.js";
 import { Values } from "./values.js";
 
 const may = { write: false };
-const fields = ["host", "port", "unit", "transport", "timeout"];
+const fields = ["host", "port", "unit", "transport", "timeout", "server"];
+/** Problems of the probe that say nothing of other areas. */
+const UNPROVEN = new Set(["timeout", "connection_lost", "invalid_reply", "exception"]);
+const PROBE = "It did not answer this probe, holding register 0; other areas may";
+const isSecure = () => $("transport").value === "tls";
 
 /** The device that the form names. */
 const target = () => ({
@@ -15,14 +19,20 @@ const target = () => ({
   unitId: Number($("unit").value),
   transport: $("transport").value,
   timeout: Number($("timeout").value),
+  ...(isSecure() && $("server").value.trim() ? { serverName: $("server").value.trim() } : {}),
 });
 
 const choose = tabs(document.querySelector("[role=tablist]"));
-const values = new Values(target, may);
-new Map_(target, (area, address, quantity) => {
+const values = new Values(may);
+const map = new Map_((area, address, length) => {
   choose($("tab-values"));
-  values.open(area, address, quantity);
+  $("read").focus();
+  values.open(area, address, length);
 });
+
+/** The device that was connected to; what the form names meanwhile is another. */
+let device = null;
+let connecting = null;
 
 /** Asks the gateway what it may do. */
 async function begin() {
@@ -44,7 +54,8 @@ async function begin() {
 
 /** The device is part of the address of the page, so that it can be kept and passed on. */
 function remember() {
-  const query = new URLSearchParams(fields.map((id) => [id, $(id).value.trim()]));
+  const given = fields.filter((id) => id !== "server" || target().serverName);
+  const query = new URLSearchParams(given.map((id) => [id, $(id).value.trim()]));
   history.replaceState(null, "", `#${query}`);
 }
 
@@ -52,42 +63,89 @@ function recall() {
   for (const [id, value] of new URLSearchParams(location.hash.slice(1))) {
     if (fields.includes(id)) $(id).value = value;
   }
+  $("server-label").hidden = !isSecure();
+}
+
+/** What goes with the transport: a port that is not the usual one stays. */
+function chooseTransport() {
+  $("server-label").hidden = !isSecure();
+  const [other, usual] = isSecure() ? ["502", "802"] : ["802", "502"];
+  if ($("port").value === other) $("port").value = usual;
 }
 
 async function connect() {
-  values.stop();
+  leave();
   remember();
-  $("connect").disabled = true;
-  $("identity").hidden = true;
+  const asked = target();
+  const aborting = new AbortController();
+  connecting = aborting;
   say($("connection"), "Connecting…");
   try {
     const began = performance.now();
-    const found = await post("/api/modbus/connect", target());
+    const found = await post("/api/modbus/connect", asked, aborting.signal);
+    if (connecting !== aborting) return;
     const took = Math.round(performance.now() - began);
-    const what = found.exception
-      ? `The device answers, in ${took} ms. Holding register 0 it refuses: ${found.exception}.`
-      : `The device answers, in ${took} ms.`;
-    say($("connection"), h("p", {}, h("span", { class: "dot" }), what));
-    $("work").hidden = false;
-    identify();
+    if (found.exception) use(asked, `The device answers, in ${took} ms. ${PROBE}: ${found.exception}.`);
+    else use(asked, `The device answers, in ${took} ms.`);
   } catch (error) {
-    say($("connection"), notice(error));
-  } finally {
-    $("connect").disabled = false;
+    if (connecting !== aborting) return;
+    connecting = null;
+    say($("connection"), notice(error), UNPROVEN.has(error.reason) ? offer(asked) : null);
   }
+}
+
+/** Lets one go on with a device that did not answer. */
+const offer = (asked) =>
+  h("p", { class: "offer" }, "Only holding register 0 was asked for; other areas may answer. ",
+    h("button", {
+      type: "button",
+      onclick: () => {
+        use(asked, `${PROBE}.`, false);
+        $("tab-values").focus();
+      },
+    }, "Go on all the same"));
+
+/** Takes a device to work on. */
+function use(asked, what, proven = true) {
+  device = asked;
+  connecting = null;
+  say($("connection"), h("p", {}, h("span", { class: proven ? "dot" : "dot unproven" }), what));
+  $("work").disabled = $("work").hidden = false;
+  values.use(device);
+  map.use(device);
+  if (proven) identify();
+}
+
+/** The device is another from now on, or connected to anew: nothing is read or written meanwhile. */
+function leave() {
+  connecting?.abort();
+  connecting = device = null;
+  $("work").disabled = true;
+  $("identity").hidden = true;
+  values.leave();
+  map.leave();
+}
+
+/** The form names another device. */
+function changed() {
+  const was = device ?? connecting;
+  leave();
+  $("connection").querySelector(".offer")?.remove();
+  const below = $("work").hidden ? "" : " What is shown below is old.";
+  if (was) say($("connection"), `Not connected: connect to go on.${below}`);
 }
 
 /** What the device says of itself, if it does; many don't. */
 async function identify() {
-  const asked = JSON.stringify(target());
-  const facts = await told().catch(() => []);
-  if (asked !== JSON.stringify(target()) || facts.length === 0) return;
+  const asked = device;
+  const facts = await told(asked).catch(() => []);
+  if (asked !== device || facts.length === 0) return;
   $("identity").replaceChildren(...facts.map(([name, text]) => h("div", {}, h("dt", {}, name), h("dd", {}, text))));
   $("identity").hidden = false;
 }
 
-async function told() {
-  const found = await post("/api/modbus/identify", target());
+async function told(asked) {
+  const found = await post("/api/modbus/identify", asked);
   const names = {
     vendorName: "Vendor", productName: "Product", productCode: "Code", modelName: "Model",
     revision: "Revision", userApplicationName: "Application", vendorUrl: "Web",
@@ -99,7 +157,9 @@ $("device").addEventListener("submit", (event) => {
   event.preventDefault();
   connect();
 });
-$("device").addEventListener("input", () => values.stop());
+$("device").addEventListener("input", changed);
+document.addEventListener("input", (event) => unmark(event.target));
+$("transport").addEventListener("change", chooseTransport);
 $("forget").addEventListener("click", () => {
   forgetToken();
   location.reload();

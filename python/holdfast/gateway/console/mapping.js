@@ -4,21 +4,21 @@ import { notice, stream } from "./api.js";
 import { $, colour, h, onTheme, say } from "./dom.js";
 
 const AREAS = {
-  coils: ["Coils", 1, 2000],
-  discrete_inputs: ["Discrete inputs", 2, 2000],
-  holding_registers: ["Holding registers", 3, 125],
-  input_registers: ["Input registers", 4, 125],
+  coils: ["Coils", 1],
+  discrete_inputs: ["Discrete inputs", 2],
+  holding_registers: ["Holding registers", 3],
+  input_registers: ["Input registers", 4],
 };
 const FAILURES = { timeout: "no answer", connection: "connection lost", invalid: "wrong reply" };
 const CELLS = 1024;
 const NARROW = 640;
 const MOST_LISTED = 200;
 
-/** The view of the map of the device that `target()` is; `open` shows a range in the other view. */
+/** The view of the map of a device; `open` shows a range in the other view. */
 export class Map_ {
-  constructor(target, open) {
-    this.target = target;
+  constructor(open) {
     this.open = open;
+    this.device = null;
     this.running = null;
     this.pictures = [];
     $("survey").addEventListener("submit", (event) => {
@@ -27,6 +27,20 @@ export class Map_ {
       else this.start(new FormData($("survey")));
     });
     onTheme(() => this.pictures.forEach((each) => each.draw()));
+  }
+
+  /** Takes a device to work on; the map of another goes. */
+  use(device) {
+    this.device = device;
+    this.pictures = [];
+    $("pictures").replaceChildren();
+    say($("survey-state"));
+  }
+
+  /** There is no device; what was found stays. */
+  leave() {
+    if (this.running) this.stop();
+    this.device = null;
   }
 
   async start(form) {
@@ -40,7 +54,7 @@ export class Map_ {
     const stopping = new AbortController();
     this.running = stopping;
     this.prepare(areas, first, last);
-    const body = JSON.stringify({ ...this.target(), areas, first, last, exact: form.has("exact") });
+    const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact") });
     try {
       await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal }, (name, data) => {
         if (this.running === stopping) this.happened(name, data);
@@ -71,8 +85,20 @@ export class Map_ {
       return;
     }
     this.pictures.forEach((each) => each.list());
-    if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`);
-    else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: "timeout" })), `Until then: ${counted}.`);
+    if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`, data.exact ? null : this.sampled(data.step));
+    else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: data.reason ?? "timeout" })), `Until then: ${counted}.`);
+  }
+
+  /** That not every address was asked, and a way to do so. */
+  sampled(step) {
+    return h("p", { class: "offer" }, `Asked every ${step} addresses, and where ranges like to begin; gaps may hide more. `,
+      h("button", { type: "button", onclick: () => this.startExact() }, "Ask every address (slow)"));
+  }
+
+  startExact() {
+    $("survey").elements.exact.checked = true;
+    $("survey-go").focus();
+    this.start(new FormData($("survey")));
   }
 
   stop() {
@@ -92,7 +118,7 @@ export class Map_ {
 /** One area: every cell is some addresses, the darker the more of them are there. */
 class Picture {
   constructor(area, first, last, open) {
-    [this.title, this.code, this.limit] = AREAS[area];
+    [this.title, this.code] = AREAS[area];
     this.first = first;
     this.columns = innerWidth < NARROW ? 32 : 64;
     this.each = Math.max(1, Math.ceil((last - first + 1) / CELLS));
@@ -167,7 +193,7 @@ class Picture {
   /** The ranges, each to be read with a click. */
   list() {
     const items = this.ranges.slice(0, MOST_LISTED).map(([from, to]) => {
-      const onclick = () => this.open(this.code, from, Math.min(to - from + 1, this.limit));
+      const onclick = () => this.open(this.code, from, to - from + 1);
       const text = from === to ? `${from}` : `${from}–${to}`;
       return h("li", {}, h("button", { type: "button", "aria-label": `Read ${this.title.toLowerCase()} ${text}`, onclick }, text));
     });

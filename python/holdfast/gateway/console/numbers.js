@@ -3,11 +3,31 @@
 export const hex = (register) => register.toString(16).toUpperCase().padStart(4, "0");
 export const binary = (register) => register.toString(2).padStart(16, "0").replace(/(....)(?=.)/g, "$1 ");
 
-export const WIDTHS = {
+const WIDTHS = {
+  bool: 1, bit: 1,
   int16: 1, uint16: 1, bcd16: 1, float16: 1,
   int32: 2, uint32: 2, bcd32: 2, float32: 2,
   int64: 4, uint64: 4, float64: 4,
 };
+
+/** A type by its kind, and which bit or how many bytes it has; `width` is in registers. */
+export function typeOf(kind, size) {
+  const ofBytes = kind === "string" || kind === "bytes";
+  const width = ofBytes ? Math.ceil(size / 2) : WIDTHS[kind];
+  const name = ofBytes || kind === "bit" ? `${kind}:${size}` : kind;
+  return { name, kind, size, width, bytes: ofBytes ? size : 2 * width };
+}
+
+/** What is wrong with eight letters as the order of a type; "" if nothing is. */
+export function flaw(letters, type) {
+  const wire = [...letters];
+  if (wire.toSorted().join("") !== "ABCDEFGH") return "An order of eight letters has A to H once each.";
+  if (type.bytes !== 8) return `Eight letters are for values of eight bytes; ${type.name} has ${type.bytes}.`;
+  const from = wire.map((letter) => letter.charCodeAt(0) - 65);
+  if (from.some((byte, at) => at % 2 === 0 && byte >> 1 !== from[at + 1] >> 1)) return "A register stays whole: AB, CD, EF and GH stay together.";
+  if (from.some((byte, at) => from[byte] !== at)) return "An order that is applied twice changes nothing; this one does.";
+  return "";
+}
 
 const DIGITS = { 1: "0", 2: "1", 3: "4", 4: "3" };
 
@@ -34,6 +54,33 @@ export function bit(text) {
   throw new Error(`“${text.trim()}” is no bit: 0, 1, on or off`);
 }
 
+/** A value of a type as it is shown, and as JSON. Throws what is wrong with it. */
+export function literal(text, type) {
+  if (type.kind === "string") return characters(text, type);
+  if (type.kind === "bytes") return octets(text, type);
+  if (type.kind === "bool" || type.kind === "bit") {
+    const is = String(bit(text));
+    return { shown: is, json: is };
+  }
+  const number = numeral(text, type.name);
+  return { shown: number, json: number };
+}
+
+function characters(text, type) {
+  if (!/^[\x00-\x7f]*$/.test(text) || text.length > type.size) {
+    throw new Error(`“${text}” is no ${type.name}: up to ${type.size} characters of ASCII`);
+  }
+  return { shown: text, json: JSON.stringify(text) };
+}
+
+function octets(text, type) {
+  const plain = text.replace(/\s/g, "").toLowerCase();
+  if (!/^([0-9a-f]{2})*$/.test(plain) || plain.length !== 2 * type.size) {
+    throw new Error(`“${text.trim()}” is no ${type.name}: ${type.size} pairs of hexadecimal digits`);
+  }
+  return { shown: plain.replace(/(..)(?=.)/g, "$1 "), json: JSON.stringify(plain) };
+}
+
 /** The least and the most of types of whole numbers. */
 const EXTENTS = {
   int16: [-(2n ** 15n), 2n ** 15n - 1n], uint16: [0n, 2n ** 16n - 1n], bcd16: [0n, 9999n],
@@ -56,13 +103,28 @@ export function numeral(text, type) {
 const READERS = {
   int16: [2, (view) => view.getInt16(0)],
   uint16: [2, (view) => view.getUint16(0)],
+  float16: [2, (view) => Number(half(view.getUint16(0)).toPrecision(4))],
+  bcd16: [2, (view) => digits(view.getUint16(0), 4)],
   int32: [4, (view) => view.getInt32(0)],
   uint32: [4, (view) => view.getUint32(0)],
   float32: [4, (view) => Number(view.getFloat32(0).toPrecision(7))],
+  bcd32: [4, (view) => digits(view.getUint32(0), 8)],
   int64: [8, (view) => view.getBigInt64(0)],
   uint64: [8, (view) => view.getBigUint64(0)],
   float64: [8, (view) => Number(view.getFloat64(0).toPrecision(12))],
 };
+
+function half(bits) {
+  const [sign, exponent, fraction] = [bits >> 15 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
+}
+
+/** Binary coded decimals; a digit above 9 is none. */
+function digits(number, count) {
+  const text = number.toString(16).padStart(count, "0");
+  return /^\d+$/.test(text) ? Number(text) : "–";
+}
 
 const ORDERS = {
   ABCD: (bytes) => bytes,
@@ -71,24 +133,44 @@ const ORDERS = {
   DCBA: (bytes) => [...bytes].reverse(),
 };
 
-const pairs = (bytes) => bytes.filter((_, at) => at % 2 === 0).map((byte, at) => [byte, bytes[2 * at + 1]]);
+const SPELLED = ["CDABGHEF", "EFGHABCD", "FEHGBADC", "DCBAHGFE"];
 
-/** What registers are in every type and order: rows of a type and its texts by order. */
-export function everyType(registers) {
-  const bytes = registers.flatMap((each) => [each >> 8, each & 255]);
-  const rows = [];
-  for (const [type, [size, read]] of Object.entries(READERS)) {
-    if (bytes.length < size) continue;
+const pairs = (bytes) => bytes.filter((_, at) => at % 2 === 0).map((byte, at) => [byte, bytes[2 * at + 1]]);
+const spelled = (letters) => (bytes) => [...letters].map((letter) => bytes[letter.charCodeAt(0) - 65]);
+
+function rows(bytes, arrangements, fits) {
+  return Object.entries(READERS).filter(([, [size]]) => fits(size) && size <= bytes.length).map(([type, [size, read]]) => {
     const own = bytes.slice(0, size);
-    const texts = Object.values(ORDERS).map((order) => {
-      const view = new DataView(Uint8Array.from(order(own)).buffer);
-      return String(read(view));
-    });
-    rows.push([type, texts]);
-  }
-  const letters = bytes.map((byte) => (byte >= 32 && byte < 127 ? String.fromCharCode(byte) : "·"));
-  rows.push(["text", [letters.join(""), null, pairs(letters).flatMap(([a, b]) => [b, a]).join(""), null]]);
-  return rows;
+    return [type, arrangements.map((arrange) => String(read(new DataView(Uint8Array.from(arrange(own)).buffer))))];
+  });
 }
 
-export const orders = Object.keys(ORDERS);
+/** The bits of a register that are on, "0 3–5", or "none". */
+function bitsOn(register) {
+  const runs = [];
+  for (let at = 0; at < 16; at += 1) {
+    if (!(register & (1 << at))) continue;
+    if (runs.at(-1)?.[1] === at - 1) runs.at(-1)[1] = at;
+    else runs.push([at, at]);
+  }
+  return runs.map(([from, to]) => (from === to ? from : `${from}–${to}`)).join(" ") || "none";
+}
+
+/** What registers are in every type and order: tables of a head, and of rows with texts by order. */
+export function everyType(registers) {
+  const bytes = registers.flatMap((each) => [each >> 8, each & 255]);
+  const arrangements = Object.values(ORDERS);
+  const letters = (each) => each.map((byte) => (byte >= 32 && byte < 127 ? String.fromCharCode(byte) : "·")).join("");
+  const octet = (byte) => byte.toString(16).padStart(2, "0");
+  const first = (arrange) => arrange(bytes.slice(0, 2)).reduce((high, low) => 256 * high + low);
+  const four = [
+    ...rows(bytes, arrangements, () => true),
+    ["text", arrangements.map((arrange) => letters(arrange(bytes)))],
+    ["bytes", arrangements.map((arrange) => arrange(bytes).map(octet).join(""))],
+    ["bits on", arrangements.map((arrange) => bitsOn(first(arrange)))],
+    ["bool", [String(registers[0] !== 0), "", "", ""]],
+  ];
+  const tables = [[Object.keys(ORDERS), four]];
+  if (bytes.length >= 8) tables.push([SPELLED, rows(bytes, SPELLED.map(spelled), (size) => size === 8)]);
+  return tables;
+}

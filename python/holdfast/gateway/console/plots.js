@@ -13,19 +13,20 @@ const now = () => Date.now() / 1000;
 
 /** The plots of one watch. */
 export class Plots {
-  /** `number(address)` is the value of now, or undefined for an address that is not watched. */
-  constructor(number) {
+  /** `number(address)` is the value of now of an address of the range. */
+  constructor(range, number) {
+    this.first = range.address;
+    this.last = range.address + range.quantity - 1;
     this.number = number;
     this.place = $("plots");
     this.shown = new Map();
     this.chosen = false;
-    const input = h("input", { type: "number", min: 0, max: 65535, id: "plot-address" });
-    const add = () => {
-      if (input.value !== "") this.choose(Number(input.value));
-    };
+    const input = h("input", { type: "number", min: this.first, max: this.last, id: "plot-address" });
+    this.told = h("p", { class: "dim", role: "status" });
+    const add = () => this.wish(input.value);
     this.place.replaceChildren(h("div", { class: "bar" },
       h("label", {}, "Plot address", input),
-      h("button", { type: "button", onclick: add }, "Add plot")));
+      h("button", { type: "button", onclick: add }, "Add plot"), this.told));
     this.place.hidden = false;
     this.timer = setInterval(() => this.draw(), TICK);
     this.resized = new ResizeObserver(() => this.fit());
@@ -33,10 +34,24 @@ export class Plots {
     onTheme(() => this.restyle());
   }
 
+  /** Adds the plot of an address that was typed in, or says why not. */
+  wish(text) {
+    const address = Number(text);
+    if (text === "" || !(address >= this.first && address <= this.last)) {
+      this.told.textContent = `${text || "Nothing"} is not watched: ${this.first} to ${this.last} are.`;
+    } else if (this.shown.has(address)) {
+      this.told.textContent = `${address} is plotted.`;
+    } else {
+      this.choose(address);
+    }
+  }
+
   /** Adds the plot of an address, or takes it away. */
   choose(address) {
+    this.told.textContent = "";
     if (this.shown.has(address)) this.remove(address);
-    else if (this.number(address) !== undefined) this.add(address);
+    else if (this.shown.size < MOST) this.add(address);
+    else this.told.textContent = `There are ${MOST} plots, which is the most.`;
     this.chosen = true;
   }
 
@@ -47,7 +62,6 @@ export class Plots {
   }
 
   add(address) {
-    if (this.shown.size >= MOST) return;
     const plot = new Plot(address, () => this.choose(address));
     this.shown.set(address, plot);
     this.place.append(plot.root);
@@ -116,6 +130,7 @@ class Plot {
   /** Makes it anew, in the colours of now. */
   show() {
     this.plot?.destroy();
+    this.scale = 1;
     const axis = { stroke: colour("--dim"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { show: false }, font: "11px system-ui" };
     this.plot = new uPlot({
       width: this.width(),
@@ -124,15 +139,17 @@ class Plot {
       cursor: { show: false },
       scales: { x: { time: true }, y: { range: (_, low, high) => padded(low, high) } },
       series: [{}, { stroke: colour("--plot"), width: 1.75, points: { show: false }, paths: uPlot.paths.stepped({ align: 1 }) }],
-      axes: [{ ...axis, size: 24, space: 80, values: (_, ticks) => ticks.map(clock) }, { ...axis, size: 52, space: 26, values: (_, ticks) => ticks.map(shortened) }],
+      axes: [{ ...axis, size: 24, space: 80, values: (_, ticks) => ticks.map(clock) }, { ...axis, size: 58, space: 26, values: (_, ticks) => ticks.map((each) => short(each / this.scale)) }],
     }, [[], []], this.body);
     this.draw();
   }
 
   draw() {
     const end = now();
+    this.scale = scaled(this.values);
+    const values = this.values.map((each) => each * this.scale);
     this.plot.batch(() => {
-      this.plot.setData([[...this.times, end], [...this.values, this.values.at(-1)]], false);
+      this.plot.setData([[...this.times, end], [...values, values.at(-1)]], false);
       this.plot.setScale("x", { min: Math.max(end - SPAN, Math.min(this.times[0], end - 10)), max: end });
     });
   }
@@ -152,6 +169,18 @@ class Plot {
 }
 
 const shortened = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5))));
+
+/** The same for an axis, where there is little room. */
+function short(value) {
+  const text = shortened(value);
+  return text.length <= 8 ? text : value.toExponential(2).replace("e+", "e");
+}
+
+/** What tiny values are to be multiplied with: the plots know no steps below 1e-16. */
+function scaled(values) {
+  const most = Math.max(...values.map(Math.abs));
+  return most > 0 && most < 1e-6 ? 10 ** Math.min(300, -Math.floor(Math.log10(most))) : 1;
+}
 
 const clock = (seconds) => new Date(1000 * seconds).toTimeString().slice(0, 8);
 

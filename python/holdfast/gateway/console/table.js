@@ -1,7 +1,7 @@
 // The table of registers, or the field of bits, and what changes in it.
 
 import { $, h } from "./dom.js";
-import { binary, everyType, hex, modicon, orders } from "./numbers.js";
+import { binary, everyType, hex, modicon } from "./numbers.js";
 
 const MARKED = 1500;
 
@@ -14,15 +14,19 @@ export class Table {
     this.texts = [];
     this.actions = actions;
     this.cells = new Map();
-    place.replaceChildren(range.ofBits ? this.bits() : this.registers());
-    this.root = place.firstChild;
+    const { host, port, unitId } = range.device;
+    this.where = `${host}:${port}, unit ${unitId}`;
+    this.age = h("p", { class: "age" });
+    this.root = range.ofBits ? this.bits() : this.registers();
+    place.replaceChildren(this.age, this.root);
+    this.stale(false);
   }
 
   /** All values, and the texts of typed ones; what differs is marked if asked for. */
   set(values, texts, mark = false) {
     values.forEach((value, at) => this.put(at, value, mark));
     (texts ?? []).forEach((text, index) => this.putTyped(index, text, mark));
-    this.root.classList.remove("stale");
+    this.stale(false);
   }
 
   put(at, value, mark = true) {
@@ -63,12 +67,16 @@ export class Table {
   /** Whether the values are of now. */
   stale(is) {
     this.root.classList.toggle("stale", is);
+    this.age.classList.toggle("old", is);
+    this.age.textContent = is ? `Old values of ${this.where}: not of now.` : `Values of ${this.where}.`;
   }
 
   /** The number that is plotted for an address: of its type where one begins there. */
   number(at) {
-    const { width, ofBits } = this.range;
+    const { width, ofBits, type } = this.range;
     if (ofBits) return Number(this.values[at]);
+    if (type.kind === "string" || type.kind === "bytes") return this.values[at];
+    if (type.kind === "bool" || type.kind === "bit") return Number(this.texts[at] === "true");
     const text = at % width === 0 ? this.texts[at / width] : undefined;
     const number = Number(text);
     return text === undefined || text === "" || Number.isNaN(number) ? this.values[at] : number;
@@ -84,7 +92,7 @@ export class Table {
         binary: h("td", { role: "cell", class: "binary" }),
       };
       if (at % width === 0) {
-        cells.typed = h("td", { role: "cell", class: "typed", rowSpan: width, "data-type": type });
+        cells.typed = h("td", { role: "cell", class: "typed", rowSpan: width, "data-type": type.name });
       }
       this.cells.set(at, cells);
       body.append(h("tr", { role: "row", "data-address": address + at },
@@ -92,7 +100,7 @@ export class Table {
           String(address + at), h("span", { class: "modicon" }, modicon(area, address + at))),
         cells.decimal, cells.hex, cells.binary, cells.typed, this.buttons(at)));
     }
-    const head = ["Address", "Decimal", "Hex", "Binary", type, ""].map((text) =>
+    const head = ["Address", "Decimal", "Hex", "Binary", type.name, ""].map((text) =>
       h("th", { role: "columnheader", scope: "col" }, text || h("span", { class: "unseen" }, "Actions")));
     return h("table", { role: "table", class: "values", "aria-label": this.range.title },
       h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, head)), body);
@@ -132,11 +140,10 @@ export class Table {
   showTypes(at) {
     const own = this.values.slice(at, at + 4);
     $("types-title").textContent = `All types from ${this.range.address + at}: ${own.map(hex).join(" ")}`;
-    const rows = everyType(own).map(([type, texts]) =>
-      h("tr", {}, h("th", { scope: "row" }, type), texts.map((text) => h("td", {}, text ?? ""))));
-    $("types-table").replaceChildren(h("table", { class: "review" },
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Type"), orders.map((each) => h("th", { scope: "col" }, each)))),
-      h("tbody", {}, rows)));
+    $("types-table").replaceChildren(...everyType(own).map(([orders, rows]) => h("table", { class: "review" },
+      h("thead", {}, h("tr", {}, ["Type", ...orders].map((each) => h("th", { scope: "col" }, each)))),
+      h("tbody", {}, rows.map(([type, texts]) =>
+        h("tr", {}, h("th", { scope: "row" }, type), texts.map((text) => h("td", {}, text))))))));
     $("types-dialog").showModal();
   }
 }

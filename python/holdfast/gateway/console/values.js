@@ -1,89 +1,140 @@
 // Reading a range, once or again and again, and what can be done with what is there.
 
 import { notice, post, stream } from "./api.js";
-import { $, say } from "./dom.js";
-import { modicon, WIDTHS } from "./numbers.js";
+import { $, h, say, show } from "./dom.js";
+import { flaw, modicon, typeOf } from "./numbers.js";
 import { Plots } from "./plots.js";
 import { Table } from "./table.js";
 import { Writer } from "./writing.js";
 
 const AREAS = { 1: "Coils", 2: "Discrete inputs", 3: "Holding registers", 4: "Input registers" };
+const LAST = 65535;
+const RESUME = 1000;
+const WRITTEN = { written: "Written", refused: "Not written", unknown: "Not known whether it was written" };
+/** Problems that waiting for the gateway does not solve. */
+const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
 
-/** The view of values of the device that `target()` is; `may.write` says whether it may change. */
+/** The view of values of a device; `may.write` says whether it may change. */
 export class Values {
-  constructor(target, may) {
-    this.target = target;
+  constructor(may) {
     this.may = may;
-    this.writer = new Writer(target);
-    this.table = this.plots = this.watching = null;
+    this.writer = new Writer();
+    this.device = this.table = this.plots = this.watching = this.reading = null;
     $("range").addEventListener("submit", (event) => {
       event.preventDefault();
       this.read();
     });
     $("range").addEventListener("input", () => this.adapt());
-    $("watch").addEventListener("click", () => (this.watching ? this.stop() : this.watch()));
+    $("type").addEventListener("change", () => {
+      $("size").value = $("type").value === "bit" ? 0 : 20;
+      this.adapt();
+    });
+    $("watch").addEventListener("click", () => {
+      if (this.watching) this.stop();
+      else if ($("range").reportValidity()) this.watch(this.range());
+    });
     this.adapt();
   }
 
-  /** Makes the fields those of the area. */
+  /** Takes a device to work on; what was shown goes. */
+  use(device) {
+    this.device = device;
+    this.plots?.end();
+    this.table = this.plots = null;
+    $("table").replaceChildren(h("p", { class: "card empty" }, "Choose a range, then read it once, or watch it."));
+    say($("outcome"));
+  }
+
+  /** There is no device; what was read last stays, as old. */
+  leave() {
+    this.stop();
+    this.device = null;
+    this.table?.stale(true);
+  }
+
+  /** Makes the fields those of the area and the type, and says which don't go together. */
   adapt() {
     const area = Number($("area").value);
     const ofBits = area < 3;
-    for (const id of ["type", "order"]) $(id).closest("label").hidden = ofBits;
+    const kind = $("type").value;
+    const ofLetters = !ofBits && $("order").value === "letters";
+    for (const id of ["type", "order"]) show($(id), !ofBits);
+    show($("letters"), ofLetters);
+    show($("size"), !ofBits && ["bit", "string", "bytes"].includes(kind));
+    $("size-name").textContent = kind === "bit" ? "Which bit" : "Bytes each";
+    [$("size").min, $("size").max] = kind === "bit" ? [0, 15] : [1, 250];
     $("quantity").max = ofBits ? 2000 : 125;
     const address = Number($("address").value);
     $("modicon").textContent = Number.isInteger(address) && address >= 0 ? `= ${modicon(area, address)}` : "";
+    const past = address + whole(Number($("quantity").value), this.type().width) > LAST + 1;
+    $("quantity").setCustomValidity(past ? `The last address is ${LAST}: from ${address} there are ${LAST + 1 - address}.` : "");
+    $("letters").setCustomValidity(ofLetters ? flaw(this.order(), this.type()) : "");
   }
 
-  /** Shows a range that was chosen elsewhere. */
-  open(area, address, quantity) {
+  type() {
+    return Number($("area").value) < 3 ? typeOf("bool") : typeOf($("type").value, Number($("size").value));
+  }
+
+  order() {
+    return $("order").value === "letters" ? $("letters").value.trim().toUpperCase() : $("order").value;
+  }
+
+  /** Shows a range that was chosen elsewhere: all of it, as far as one read goes. */
+  open(area, address, length) {
     $("area").value = area;
     $("address").value = address;
-    $("quantity").value = quantity;
     this.adapt();
-    return this.read();
+    const most = Number($("quantity").max);
+    if (length <= most && length % this.type().width > 0) $("type").value = "uint16";
+    $("quantity").value = whole(Math.min(length, most), this.type().width);
+    this.adapt();
+    this.read(length > most ? `The range has ${length.toLocaleString("en")}, which one read does not take.` : null);
   }
 
-  /** What the form asks for; a type takes whole values. */
+  /** What the form asks for: whole values of the type. */
   range() {
     const area = Number($("area").value);
-    const ofBits = area < 3;
-    const type = ofBits ? "bool" : $("type").value;
-    let quantity = Number($("quantity").value);
-    const width = type === "string" ? quantity : (WIDTHS[type] ?? 1);
-    quantity = Math.min(Math.ceil(quantity / width) * width, Math.floor((ofBits ? 2000 : 125) / width) * width);
-    $("quantity").value = quantity;
     const address = Number($("address").value);
+    const type = this.type();
+    const asked = Number($("quantity").value);
+    const quantity = whole(asked, type.width);
+    $("quantity").value = quantity;
     return {
-      area, address, quantity, ofBits, width,
-      type: type === "string" ? "text" : type,
-      order: $("order").value,
+      device: this.device,
+      area, address, quantity, type,
+      ofBits: area < 3,
+      width: type.width,
+      order: this.order(),
       title: `${AREAS[area]} ${address} to ${address + quantity - 1}`,
+      note: asked === quantity ? null : `Each ${type.name} takes ${type.width} registers: ${quantity} rather than ${asked}.`,
     };
   }
 
   /** The range as the gateway wants it. */
   request(range) {
-    const { area, address, quantity, ofBits, type, order } = range;
-    const typed = ofBits ? {} : { datatype: type === "text" ? `string:${2 * quantity}` : type, byteOrder: order };
-    return { ...this.target(), functionCode: area, address, quantity, ...typed };
+    const { device, area, address, quantity, ofBits, type, order } = range;
+    const typed = ofBits ? {} : { datatype: type.name, byteOrder: order };
+    return { ...device, functionCode: area, address, quantity, ...typed };
   }
 
-  async read() {
+  async read(more = null) {
     this.stop();
     const range = this.range();
-    $("read").disabled = true;
+    const reading = new AbortController();
+    this.reading = reading;
+    say($("outcome"), "Reading…");
     try {
       const began = performance.now();
-      const found = await post("/api/modbus/read", this.request(range));
+      const found = await post("/api/modbus/read", this.request(range), reading.signal);
+      if (this.reading !== reading) return;
       this.show(range).set(found.values, found.typedText);
-      say($("outcome"), `${range.title}: read in ${Math.round(performance.now() - began)} ms.`);
+      say($("outcome"), `${range.title}: read in ${Math.round(performance.now() - began)} ms.`, range.note, more);
     } catch (error) {
+      if (this.reading !== reading) return;
       this.table?.stale(true);
-      say($("outcome"), notice(error));
-    } finally {
-      $("read").disabled = false;
+      say($("outcome"), notice(error), range.note);
     }
+    this.reading = null;
   }
 
   show(range) {
@@ -99,36 +150,87 @@ export class Values {
   }
 
   async write(range, address) {
-    if (!(await this.writer.ask(range, address)) || this.watching) return;
-    const found = await post("/api/modbus/read", this.request(range)).catch(() => null);
-    if (!found || this.table.range !== range) return;
-    this.table.set(found.values, found.typedText, true);
-    say($("outcome"), `Written, and read back: what has changed is marked.`);
+    const outcome = await this.writer.ask(range, address);
+    if (outcome === null) return;
+    const told = WRITTEN[outcome];
+    if (this.table?.range !== range || this.device !== range.device) {
+      say($("outcome"), `${told}: address ${address} of ${range.device.host}:${range.device.port}.`);
+      return;
+    }
+    if (this.watching) {
+      say($("outcome"), `${told}. Watching goes on.`);
+      return;
+    }
+    try {
+      const found = await post("/api/modbus/read", this.request(range));
+      if (this.table?.range !== range || this.device !== range.device) return;
+      this.table.set(found.values, found.typedText, true);
+      const changed = `${told}, and read back: what has changed is marked.`;
+      say($("outcome"), outcome === "written" ? changed : `${told}. Read back: this is what is there.`);
+    } catch (error) {
+      if (this.table?.range !== range) return;
+      this.table.stale(true);
+      say($("outcome"), notice(error, `${told}. It could not be read back.`));
+    }
   }
 
+  /** The plot of an address of the table, whose range is watched for that. */
   plot(address) {
-    if (!this.watching) this.watch();
+    if (!this.watching) {
+      if (!$("interval").reportValidity()) return;
+      this.watch(this.table.range);
+    }
     this.wanted = address;
     this.plots?.choose(address);
   }
 
-  async watch() {
-    const range = this.range();
+  /** Polls a range until it is stopped; begins again when the gateway was gone. */
+  async watch(range) {
+    this.stop();
     const stopping = new AbortController();
     this.watching = stopping;
     this.wanted = null;
+    this.interval = $("interval").value;
+    this.plots?.end();
+    this.plots = null;
     this.pressed(true);
+    say($("outcome"), "Reading…");
     const { unitId, ...rest } = this.request(range);
-    const query = new URLSearchParams({ ...rest, unitId, interval: $("interval").value });
-    try {
-      await stream(`/api/modbus/watch?${query}`, { signal: stopping.signal }, (name, data) => {
-        if (this.watching === stopping) this.happened(range, name, data);
-      });
-      if (this.watching === stopping) say($("outcome"), "The gateway has ended the watch.");
-    } catch (error) {
-      if (this.watching === stopping) say($("outcome"), notice(error));
+    const query = new URLSearchParams({ ...rest, unitId, interval: this.interval });
+    let began = false;
+    let told = null;
+    while (this.watching === stopping) {
+      try {
+        await stream(`/api/modbus/watch?${query}`, { signal: stopping.signal }, (name, data) => {
+          if (this.watching !== stopping) return;
+          [began, told] = [true, null];
+          this.happened(range, name, data);
+        });
+        if (this.watching === stopping) told = this.interrupted(null, told);
+      } catch (error) {
+        if (this.watching !== stopping) return;
+        if (!began || FINAL.has(error.reason)) {
+          this.stop();
+          this.table?.stale(true);
+          say($("outcome"), notice(error));
+          return;
+        }
+        told = this.interrupted(error, told);
+      }
+      await new Promise((resolve) => setTimeout(resolve, RESUME));
     }
-    if (this.watching === stopping) this.stop();
+  }
+
+  /** There is nothing to watch for now; says it once. */
+  interrupted(error, told) {
+    const reason = error?.reason ?? "ended";
+    this.table?.stale(true);
+    const gone = ["ended", "gateway_gone"];
+    if (reason === told || (gone.includes(reason) && gone.includes(told))) return told;
+    const goes = "It goes on by itself when that is over; Stop ends it.";
+    if (gone.includes(reason)) say($("outcome"), "The gateway has ended the watch, or is gone. It goes on by itself when the gateway is back; Stop ends it.");
+    else say($("outcome"), notice(error), goes);
+    return reason;
   }
 
   happened(range, name, data) {
@@ -152,20 +254,22 @@ export class Values {
   begin(range, data) {
     if (this.table?.range !== range) this.show(range);
     this.table.set(data.values, data.typedText, true);
-    this.plots ??= new Plots((address) => this.table.number(address - range.address));
+    this.plots ??= new Plots(range, (address) => this.table.number(address - range.address));
     if (this.wanted !== null) this.plots.choose(this.wanted);
     this.wanted = null;
-    say($("outcome"), `Watching ${range.title.toLowerCase()}, every ${$("interval").value} ms.`);
+    say($("outcome"), `Watching ${range.title.toLowerCase()}, every ${this.interval} ms.`, range.note);
   }
 
-  /** Ends watching; what was seen last stays. */
+  /** Ends reading and watching; what was seen last stays. */
   stop() {
+    this.reading?.abort();
+    this.reading = null;
     if (!this.watching) return;
     this.watching.abort();
     this.watching = null;
     this.plots?.stop();
     this.pressed(false);
-    if ($("outcome").textContent.startsWith("Watching")) say($("outcome"), "Stopped.");
+    say($("outcome"), "Stopped.");
   }
 
   pressed(is) {
@@ -173,3 +277,6 @@ export class Values {
     $("watch").textContent = is ? "Stop" : "Watch";
   }
 }
+
+/** As many registers as hold whole values, but one at least. */
+const whole = (quantity, width) => Math.max(width, Math.floor(quantity / width) * width);

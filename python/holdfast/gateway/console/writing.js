@@ -1,95 +1,129 @@
 // Writing: a new value, then what is there and what will be, side by side, then it is written.
 
-import { post, Problem } from "./api.js";
-import { $, h } from "./dom.js";
-import { binary, bit, hex, modicon, numeral, register } from "./numbers.js";
+import { notice, post, Problem } from "./api.js";
+import { $, h, once } from "./dom.js";
+import { binary, bit, hex, literal, modicon, register } from "./numbers.js";
 
 const BITS_HELP = "0, 1, on or off. Several, with commas between them, go to the coils that follow.";
 const HELP = {
-  register: "Decimal, 0x… or 0b…. Several, with commas between them, go to the registers that follow.",
-  text: "What is shorter is filled with zeros.",
-  typed: "Several, with commas between them, go to the registers that follow.",
+  register: () => "Decimal, 0x… or 0b…. Several, with commas between them, go to the registers that follow.",
+  string: ({ size }) => `Up to ${size} characters of ASCII. What is shorter is filled with zeros.`,
+  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. Several, with commas between them, go to the registers that follow.`,
+  bit: () => "0, 1, on or off. It needs function 22; a device without it takes the whole register as it is.",
 };
+const TYPED_HELP = () => "Several, with commas between them, go to the registers that follow.";
 const MOST_REVIEWED = 16;
 
-/** Asks for a value and writes it; resolves to true when something may have changed. */
+/** Reasons that come before anything is sent to the device. */
+const UNSENT = new Set(["no_connection", "no_such_name", "refused_target", "writes_off", "malformed", "busy", "unauthorized",
+  "foreign_page", "too_large", "not_json"]);
+/** Exceptions that leave open what has become of a request: it is worked on, or was passed on. */
+const OPEN = /\(code 0x[5b]\)/;
+/** What the gateway says of a request that did not leave it. */
+const KEPT = /was not sent/;
+
+/** Asks for a value and writes it. */
 export class Writer {
-  constructor(target) {
-    this.target = target;
+  constructor() {
+    this.asked = null;
     this.dialog = $("write-dialog");
-    $("write-cancel").addEventListener("click", () => (this.change ? this.back() : this.dialog.close()));
+    const form = this.dialog.querySelector("form");
+    $("write-cancel").addEventListener("click", () => {
+      if (this.asked.sending) return;
+      if (this.asked.change) this.back();
+      else this.dialog.close();
+    });
     $("write-as").addEventListener("change", () => this.help());
-    this.dialog.querySelector("form").addEventListener("submit", (event) => {
+    form.addEventListener("submit", (event) => {
       event.preventDefault();
-      this.guarded(() => (this.change ? this.write() : this.review()));
+      this.step(this.asked);
+    });
+    form.addEventListener("keydown", (event) => {
+      // A key that is held down confirms nothing.
+      if (event.key === "Enter" && event.repeat) event.preventDefault();
     });
   }
 
-  /** Opens the dialog for an address of a range. */
+  /**
+   * Opens the dialog for an address of a range. Resolves to `written`, `refused` or `unknown`, or
+   * to null when nothing was sent.
+   */
   ask(range, address) {
-    this.range = range;
-    this.address = address;
-    const { host, port, unitId } = this.target();
+    const asked = { range, address, change: null, sending: null, outcome: null };
+    this.asked = asked;
+    const { host, port, unitId } = range.device;
     const what = range.ofBits ? "coil" : "holding register";
     $("write-title").textContent = `Write ${what} ${address}`;
     $("write-where").textContent = `${modicon(range.area, address)} of unit ${unitId} at ${host}:${port}`;
-    const forms = range.ofBits ? ["bit"] : ["register", ...(range.type === "text" ? [] : [range.type])];
-    $("write-as").replaceChildren(...forms.map((form) => h("option", { value: form }, form === "register" ? "register as it is" : form)));
+    const forms = range.ofBits ? [["bit", "bit"]] : [["register", "register as it is"], ["typed", range.type.name]];
+    $("write-as").replaceChildren(...forms.map(([value, text]) => h("option", { value }, text)));
     $("write-as-label").hidden = range.ofBits;
-    const plain = ["int16", "uint16"].includes(range.type);
-    if (!plain && (address - range.address) % range.width === 0) $("write-as").value = forms.at(-1);
+    const plain = ["int16", "uint16"].includes(range.type.kind);
+    if (!plain && (address - range.address) % range.width === 0) $("write-as").value = forms.at(-1)[0];
     $("write-value").value = "";
+    $("write-error").replaceChildren();
     this.back();
     this.help();
     this.dialog.showModal();
     $("write-value").focus();
     return new Promise((resolve) => {
-      this.written = false;
-      this.dialog.addEventListener("close", () => resolve(this.written), { once: true });
+      this.dialog.addEventListener("close", async () => {
+        await asked.sending;
+        resolve(asked.outcome);
+      }, { once: true });
     });
   }
 
   help() {
-    const form = $("write-as").value;
-    $("write-help").textContent = form === "bit" ? BITS_HELP : (HELP[form] ?? HELP.typed);
+    const { range } = this.asked;
+    const typed = $("write-as").value === "typed";
+    const kind = typed ? range.type.kind : "register";
+    $("write-help").textContent = range.ofBits ? BITS_HELP : (HELP[kind] ?? TYPED_HELP)(range.type);
+    $("write-value").required = !(typed && kind === "string");
   }
 
   /** Back to the question. */
   back() {
-    this.change = null;
-    $("write-error").textContent = "";
+    this.asked.change = null;
     $("write-ask").hidden = false;
     $("write-review").hidden = true;
     $("write-go").textContent = "Review";
     $("write-cancel").textContent = "Cancel";
   }
 
-  async guarded(step) {
-    $("write-go").disabled = true;
-    $("write-error").textContent = "";
-    try {
-      await step();
-    } catch (error) {
-      $("write-error").textContent = error.message;
-    } finally {
-      $("write-go").disabled = false;
-    }
+  /** Whether the dialog is still about this. */
+  isAbout(asked) {
+    return this.asked === asked && this.dialog.open;
+  }
+
+  step(asked) {
+    return once($("write-go"), async () => {
+      $("write-error").replaceChildren();
+      try {
+        if (!asked.change) {
+          await this.review(asked);
+          return;
+        }
+        asked.sending = this.write(asked);
+        await asked.sending;
+      } catch (error) {
+        if (this.isAbout(asked)) $("write-error").replaceChildren(error instanceof Problem ? notice(error) : error.message);
+      } finally {
+        asked.sending = null;
+      }
+    });
   }
 
   /** Reads what is there now, and shows it beside what was asked for. */
-  async review() {
-    const form = $("write-as").value;
-    const parts = $("write-value").value.split(",");
-    const typed = form !== "bit" && form !== "register";
-    const wanted = typed ? parts.map((part) => numeral(part, form)) : parts.map(form === "bit" ? bit : register);
-    const count = wanted.length * (typed ? this.range.width : 1);
-    const now = await this.read(count, typed ? { datatype: form, byteOrder: this.range.order } : {});
-    const before = typed ? now.typedText : now.values;
-    this.change = { wanted, typed, form };
-    const step = typed ? this.range.width : 1;
-    $("write-review").replaceChildren(form === "register" && count === 1
-      ? table("by-row", ["", "Decimal", "Hex", "Binary"], forms(before[0], wanted[0]))
-      : table("by-column", ["", "Now", "New"], wanted.map((value, at) => [String(this.address + at * step), shown(before[at]), shown(value)])));
+  async review(asked) {
+    const change = wanted(asked.range, $("write-as").value, $("write-value").value);
+    change.before = await this.read(asked, change);
+    if (!this.isAbout(asked)) return;
+    asked.change = change;
+    const { form, step, shown, before } = change;
+    $("write-review").replaceChildren(form === "register" && shown.length === 1
+      ? table("by-row", [h("span", { class: "unseen" }, "When"), "Decimal", "Hex", "Binary"], forms(before[0], shown[0]))
+      : table("by-column", ["Address", "Now", "New"], shown.map((value, at) => [String(asked.address + at * step), inWords(before[at]), inWords(value)])));
     $("write-review").hidden = false;
     $("write-ask").hidden = true;
     $("write-go").textContent = "Write it";
@@ -97,30 +131,85 @@ export class Writer {
     $("write-go").focus();
   }
 
-  async write() {
-    const { wanted, typed, form } = this.change;
-    const about = { ...this.target(), address: this.address };
-    this.written = true;
-    if (typed) {
-      const more = JSON.stringify({ ...about, datatype: form, byteOrder: this.range.order });
-      await post("/api/modbus/write/registers", `${more.slice(0, -1)},"values":[${wanted.join()}]}`);
-    } else if (wanted.length === 1) {
-      await post(form === "bit" ? "/api/modbus/write/coil" : "/api/modbus/write/register", { ...about, value: wanted[0] });
-    } else {
-      await post(form === "bit" ? "/api/modbus/write/coils" : "/api/modbus/write/registers", { ...about, values: wanted });
+  /** Writes what was confirmed. Does not fail: what has become of it is the outcome. */
+  async write(asked) {
+    const doubt = asked.outcome === "unknown" ? "unknown" : "refused";
+    asked.outcome = "unknown";
+    try {
+      await post(...request(asked));
+      asked.outcome = "written";
+      if (this.isAbout(asked)) this.dialog.close();
+    } catch (error) {
+      const refused = error.reason === "exception"
+        ? !OPEN.test(error.message)
+        : UNSENT.has(error.reason) || KEPT.test(error.message);
+      if (refused) asked.outcome = doubt;
+      const told = refused ? "Not written." : "Not known whether it was written.";
+      const back = await this.read(asked, asked.change).catch(() => null);
+      if (!this.isAbout(asked)) return;
+      $("write-error").replaceChildren(notice(error, told), h("p", {}, compared(asked.change, back)));
+      this.back();
     }
-    this.dialog.close();
   }
 
-  async read(quantity, typed) {
-    const { area, ofBits } = this.range;
-    const most = ofBits ? 2000 : 125;
-    if (quantity > most) throw new Problem("malformed", `${quantity} are too many, allowed are ${most}`);
-    return post("/api/modbus/read", { ...this.target(), functionCode: area, address: this.address, quantity, ...typed });
+  /** What is there of what a change is about. */
+  async read({ range, address }, { count, typed }) {
+    const most = range.ofBits ? 2000 : 125;
+    if (count > most) throw new Error(`${count} are too many: ${most} at most`);
+    const found = await post("/api/modbus/read", { ...range.device, functionCode: range.area, address, quantity: count, ...typed });
+    return found.typedText ?? found.values;
   }
 }
 
-function shown(value) {
+/** What was typed in, as values that are shown and as JSON. Throws what is wrong with it. */
+function wanted(range, form, text) {
+  const { type, order } = range;
+  if (form !== "typed") {
+    const shown = text.split(",").map(form === "bit" ? bit : register);
+    return { form, shown, json: shown, step: 1, count: shown.length, typed: {} };
+  }
+  const parts = type.kind === "string" ? [text] : text.split(",");
+  if (type.kind === "bit" && parts.length > 1) throw new Error("One bit at a time");
+  const values = parts.map((part) => literal(part, type));
+  return {
+    form,
+    shown: values.map((each) => each.shown),
+    json: values.map((each) => each.json),
+    step: type.width,
+    count: values.length * type.width,
+    typed: { datatype: type.name, byteOrder: order },
+  };
+}
+
+/** Where a change is sent, and as what. */
+function request({ range, address, change }) {
+  const about = { ...range.device, address };
+  const { form, json, typed } = change;
+  if (form === "typed" && range.type.kind === "bit") {
+    const swapped = ["BADC", "DCBA"].includes(range.order) ? 8 : 0;
+    const mask = 1 << (range.type.size ^ swapped);
+    return ["/api/modbus/write/mask", { ...about, andMask: 65535 ^ mask, orMask: json[0] === "true" ? mask : 0 }];
+  }
+  if (form === "typed") {
+    const more = JSON.stringify({ ...about, ...typed });
+    return ["/api/modbus/write/registers", `${more.slice(0, -1)},"values":[${json.join()}]}`];
+  }
+  const [one, many] = form === "bit" ? ["coil", "coils"] : ["register", "registers"];
+  return json.length === 1
+    ? [`/api/modbus/write/${one}`, { ...about, value: json[0] }]
+    : [`/api/modbus/write/${many}`, { ...about, values: json }];
+}
+
+/** What reading back tells after a write that failed. */
+function compared({ shown, before }, back) {
+  if (back === null) return "It could not be read back: read it before you go on.";
+  const same = (others) => back.every((value, at) => value === others[at]);
+  if (same(before)) return "Read back: it is as it was before.";
+  if (same(shown)) return "Read back: it is what was to be written.";
+  return `Read back: it is neither as before nor what was to be written, but ${back.slice(0, MOST_REVIEWED).map(inWords).join(", ")}.`;
+}
+
+function inWords(value) {
   if (typeof value === "boolean") return value ? "on" : "off";
   return typeof value === "number" ? `${value}  0x${hex(value)}` : value;
 }
