@@ -179,10 +179,10 @@ def costs() -> dict[str, float]:
     found = {}
     for name, change in (("scan", False), ("change", True)):
         publisher = Publisher("modbus", "device1")
-        publisher.regroup([Group(50, change, tags, (0.0,) * TAGS)], 50, set())
+        publisher.regroup([Group(50, change, tags, (0.0,) * TAGS)], set())
         rounds, start = 3000, time.perf_counter()
         for moment in range(rounds):
-            publisher.messages(moment, [("holding_registers", 0, TAGS, data, 0)])
+            publisher.messages(moment, [("holding_registers", 0, TAGS, data, 0, 0.0)])
         found[name] = (time.perf_counter() - start) / rounds / TAGS * 1e6
     return found
 

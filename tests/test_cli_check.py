@@ -69,6 +69,24 @@ def test_what_is_in_the_certificates_of_a_device_is_checked(tmp_path: Path, comm
     assert number == "1 problem"
 
 
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_what_is_in_the_certificates_of_subscribed_devices_is_checked(
+    tmp_path: Path, command: str
+) -> None:
+    path = tmp_path / "p.yaml"
+    (tmp_path / "ca.pem").write_text("nothing")
+    path.write_text(
+        "nats:\n  servers: [nats://127.0.0.1]\n  devices: [127.0.0.1]\n"
+        "  device_tls: {ca_file: ca.pem}\n"
+    )
+    result = CliRunner().invoke(main, [command, str(path)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    found, number = result.stderr.splitlines()
+    assert found.startswith(f"{path}:4: nats.device_tls: ")
+    assert f"{tmp_path / 'ca.pem'}: found " in found
+    assert number == "1 problem"
+
+
 def test_check_prints_every_problem_and_their_number(bad: Path) -> None:
     result = CliRunner().invoke(main, ["check", str(bad)])
     assert (result.exit_code, result.stdout) == (2, "")

@@ -211,7 +211,7 @@ def test_it_ends_with_its_own_server(start: Start) -> None:
     os.kill(int(children[0]), signal.SIGKILL)
     _, log = process.communicate(timeout=wire.DEADLINE)
     assert process.returncode == 1
-    assert "holdfast: nats-server ended" in log
+    assert "holdfast: nats-server ended: killed by signal 9" in log
     assert "Traceback" not in log
 
 
@@ -251,6 +251,8 @@ def test_a_server_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch)
         (["--prefix", "a.>"], "found 'a.>', allowed: the first part of subjects"),
         (["--password-file", __file__], "--password-file goes with --user."),
         (["--tls-cert", __file__], "--tls-cert goes with --tls-key."),
+        (["--device-key", __file__], "--device-key goes with --device-cert."),
+        (["--device-ca", "missing"], "'missing' does not exist."),
         (["--user", "a", "--token-file", __file__], "--user and --token-file exclude each other."),
         (["--user", "a", "--creds", __file__], "--user and --creds exclude each other."),
         (["--creds", "missing"], "'missing' does not exist."),
@@ -287,3 +289,16 @@ def test_a_file_that_can_not_be_used_is_told(start: Start, nats: NatsServer, opt
     assert process.returncode == 1
     assert "holdfast: " in log
     assert "Traceback" not in log
+
+
+@pytest.mark.parametrize("embedded", [False, True])
+def test_a_file_for_devices_that_can_not_be_used_is_told_before_anything_is_served(
+    start: Start, nats: NatsServer, embedded: bool
+) -> None:
+    where = ("--embedded", "--nats", "nats://127.0.0.1:0") if embedded else ("--nats", nats.url)
+    process = start(*where, "--device-ca", __file__)
+    out, log = process.communicate(timeout=wire.DEADLINE)
+    assert (process.returncode, out) == (1, "")
+    assert log.startswith("holdfast: ")
+    assert __file__ in log
+    assert log.count("\n") == 1

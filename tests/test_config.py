@@ -588,6 +588,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "AsciiSerialConfig": ["device"],
         "AuditConfig": ["file"],
         "BrokerTlsConfig": None,
+        "DeviceTlsConfig": None,
         "CostConfig": ["per_request", "per_register"],
         "DestinationConfig": ["memory", "area", "address"],
         "DeviceConfig": ["url", "unit", "interval", "reads"],

@@ -9,7 +9,8 @@ import pytest
 from config_folder import Folder
 from holdfast import assembly
 from holdfast.gateway import Limits as GatewayLimits
-from holdfast.scanner import Limits, Servers
+from holdfast.scanner import DeviceTls, Limits, Servers
+from holdfast.target import Tls
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,7 +49,7 @@ POLLABLE = (
 )
 EGRESS = (
     "NETWORK[:PORTS] as 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
-    "[fd00::]/8:502; without ports it is 502"
+    "[fd00::]/8:502; without ports it is 502, and 802 with TLS"
 )
 ONE = "one of username, token_file or credentials_file"
 NO_FILE = "which can't be read: No such file or directory"
@@ -82,11 +83,13 @@ def gateway_of(folder: Folder, text: str) -> GatewayConfig:
 
 def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("s3cret")
+    (tmp_path / "ca.pem").touch()
     text = (
         "nats:\n  servers: [nats://a, 'tls://[fd00::1]:4443']\n"
         "  devices: [10.0.0.7, 'fd00::/8', /dev/ttyUSB0, COM3]\n"
         "  username: scanner\n  password_file: secret\n"
         "  tls: {ca_file: p.yaml, cert_file: p.yaml, key_file: p.yaml}\n"
+        "  device_tls: {ca_file: ca.pem, cert_file: p.yaml, key_file: secret}\n"
         "  prefix: plant.modbus-1\n  limits: {devices: 7, tags: 8}\n"
     )
     nats = nats_of(folder, text)
@@ -103,6 +106,7 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
     assert settings.allow == ("10.0.0.7/32", "fd00::/8", "/dev/ttyUSB0", "COM3")
     assert settings.prefix == "plant.modbus-1"
     assert settings.limits == Limits(devices=7, tags=8)
+    assert settings.device_tls == DeviceTls(tmp_path / "ca.pem", file, tmp_path / "secret")
     assert "s3cret" not in repr(nats) + repr(settings)
 
 
@@ -118,17 +122,19 @@ def test_the_scanner_has_the_documented_defaults(folder: Folder) -> None:
     assert (nats.prefix, nats.limits.devices, nats.limits.tags) == ("modbus", 5000, 500_000)
     assert (nats.username, nats.tls) == (None, None)
     assert assembly.scanner(nats).limits == Limits()
+    assert assembly.scanner(nats).device_tls == DeviceTls()
 
 
-def test_the_gateway_is_told_what_the_file_says(folder: Folder) -> None:
+def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) -> None:
     text = changed(GATEWAY, "[10.0.0.0/8]\n  access: read-only", "['10.0.0.5:*', '[fd00::]/8']\n"
-                   "  in_flight: 4\n  access: read-write")  # fmt: skip
+                   "  in_flight: 4\n  tls: {ca_file: p.yaml}\n  access: read-write")  # fmt: skip
     settings = assembly.gateway(gateway_of(folder, text))
-    assert [str(entry) for entry in settings.allow] == ["10.0.0.5:*", "[fd00::]/8:502"]
+    assert [str(entry) for entry in settings.allow] == ["10.0.0.5:*", "[fd00::]/8"]
     assert [str(network) for network in settings.sources] == ["10.0.0.0/8"]
     assert settings.tokens == (("panel", bytes.fromhex(HASH)),)
     assert settings.writes
     assert settings.limits == GatewayLimits(in_flight=4)
+    assert settings.tls == Tls(ca=str(tmp_path / "p.yaml"))
 
 
 @pytest.mark.parametrize("source", ["127.0.0.0/8", "127.0.0.1", "::1"])
@@ -149,7 +155,7 @@ def test_the_effective_configuration_shows_every_default(folder: Folder) -> None
         "gateway:\n"
         "  bind: 127.0.0.1:8090\n"
         "  sources: [10.0.0.0/8]\n"
-        "  allow: [10.0.0.0/8:502]\n"
+        "  allow: [10.0.0.0/8]\n"
         "  access: read-only\n"
         "  tokens:\n"
         f"    - {{name: panel, sha256: {HASH}}}\n"
@@ -236,6 +242,10 @@ def test_everything_else_needs_memories(
          f"3: tls.ca_file: found 'none', {NO_FILE}"),
         ("  devices", "  tls: {key_file: p.yaml}\n  devices",
          "3: tls.key_file: found without cert_file, allowed: both or none"),
+        ("  devices", "  device_tls: {ca_file: none}\n  devices",
+         f"3: device_tls.ca_file: found 'none', {NO_FILE}"),
+        ("  devices", "  device_tls: {cert_file: p.yaml}\n  devices",
+         "3: device_tls.cert_file: found without key_file, allowed: both or none"),
         ("  devices", "  prefix: a b\n  devices", f"3: prefix: found 'a b', allowed: {FORM}"),
         ("  devices", "  prefix: a.>\n  devices", f"3: prefix: found 'a.>', allowed: {FORM}"),
         ("  devices", "  prefix: \n  devices", f"3: prefix: found nothing, allowed: {FORM}"),
@@ -246,7 +256,8 @@ def test_everything_else_needs_memories(
         ("  devices", "  limits: {tag: 1}\n  devices",
          "3: limits.tag: unknown key, allowed: devices, tags; did you mean 'tags'?"),
         ("  devices", "  embedded: true\n  devices", "3: embedded: unknown key, allowed: servers, "
-         "devices, username, password_file, token_file, credentials_file, tls, prefix, limits"),
+         "devices, username, password_file, token_file, credentials_file, tls, device_tls, prefix, "
+         "limits"),
     ],
 )  # fmt: skip
 def test_nats_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
@@ -329,7 +340,7 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
         ("  access", "  in_flight: 65\n  access",
          "5: in_flight: found 65, allowed: an integer from 1 to 64"),
         ("  access", "  writes: true\n  access", "5: writes: unknown key, allowed: bind, sources, "
-         "allow, access, tokens, in_flight"),
+         "allow, access, tokens, tls, in_flight"),
         ("panel", "''", f"7: tokens[0].name: found '', allowed: {NAME}"),
         ("    - name: panel\n      sha256", "    - sha256",
          "7: tokens[0].name: missing, allowed: text"),

@@ -74,7 +74,8 @@ def test_a_write_is_confirmed_under_its_number(poller: Poller) -> None:
         ]
         numbers = [poller.write("a", request) for request in requests]
         assert len(set(numbers)) == len(numbers)
-        assert [written(poller, number) for number in numbers] == [0] * len(numbers)
+        _, writes = taken(poller, lambda _, writes: len(writes) == len(numbers))
+        assert sorted(writes) == [(number, 0) for number in sorted(numbers)]
         assert [each.pdu for each in fake.requests if each.pdu[0] > 4] == [
             request.pdu for request in requests
         ]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.aio.msg import Msg
 
 import holdfast
 import wire
+from holdfast.scanner import service as services
+from holdfast.scanner.registry import understood
 from nats_bus import leaving, subscription, tag
 
 if TYPE_CHECKING:
@@ -324,6 +328,7 @@ def test_what_is_browsed_tells_all_of_a_device(caller: Caller, server: holdfast.
     assert found.pop("lastAnswer") > 1_700_000_000_000
     assert found.pop("scans") >= 1
     assert found.pop("roundTrip") > 0
+    assert found.pop("stateSince") > 1_700_000_000_000
     assert found == {
         "deviceId": "plc1",
         "url": f"tcp://127.0.0.1:{server.address[1]}",
@@ -386,3 +391,170 @@ def test_the_prefix_of_all_subjects_can_be_chosen(
     assert caller.request("plant2.modbus.subscribe", request)["success"]
     assert data.next()["moduleId"] == "plant2.modbus"
     assert json.dumps(caller.request("modbus.browse", b"")["devices"]) == "[]"
+
+
+@pytest.mark.parametrize("who", ["historian", "hmi"])
+def test_who_subscribes_to_known_tags_of_a_slow_device_gets_values_and_the_state_soon(
+    caller: Caller, server: holdfast.Server, who: str
+) -> None:
+    request = subscription(server, tag("a", 0), tag("b", 1), scanRate=3_600_000)
+    data = caller.listen("modbus.data.plc1")
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert {data.next()["variableId"] for _ in range(2)} == {"a", "b"}
+
+    status = caller.listen("modbus.status.plc1")
+    again = request | {"subscriberId": who, "tags": [tag("a", 0)]}
+    assert caller.request("modbus.subscribe", again)["success"]
+    assert status.next()["state"] == "online"
+    assert data.next()["variableId"] == "a"
+    assert data.take() == []
+
+
+def test_who_leaves_a_slow_device_causes_no_scan(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    polling = run_scanner().scanner._polling
+    poller, replaced = polling._poller, []
+
+    class Spy:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(poller, name)
+
+        def replace(self, name: str, device: Any, *, at_once: bool) -> None:
+            replaced.append(at_once)
+            poller.replace(name, device, at_once=at_once)
+
+    monkeypatch.setattr(polling, "_poller", Spy())
+    data = caller.listen("modbus.data.plc1")
+    for who, id, address in (("hmi", "a", 0), ("historian", "b", 100)):
+        request = subscription(server, tag(id, address), scanRate=3_600_000, subscriberId=who)
+        assert caller.request("modbus.subscribe", request)["success"]
+        while data.next()["variableId"] != id:
+            pass
+    assert replaced == [True]
+    assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
+    wire.until(lambda: len(replaced) == 2, "it is polled for what is left")
+    assert replaced == [True, False]
+
+
+def test_numbers_without_a_fraction_are_integers_as_in_javascript(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    host, port = server.address
+    text = f"""{{"deviceId": "plc1", "subscriberId": "x", "host": "{host}", "port": {port}.0,
+        "unitId": 1.0, "scanRate": 1e3, "timeout": 1000.0, "plan": {{"max_gap": 5.0}},
+        "tags": [{{"id": "a", "address": 3.0, "functionCode": "holding", "datatype": "float32",
+                   "null": [-9999.0, 1e300, 0.5]}}]}}"""
+    answer = caller.request("modbus.subscribe", text)
+    assert "1e+300" in answer["error"]
+    answer = caller.request("modbus.subscribe", text.replace("1e300", "1e30"))
+    assert answer == {"success": True, "count": 1}
+    found = device(caller)
+    assert (found["scanRate"], found["tags"][0]["address"]) == (1000, 3)
+    assert caller.request("modbus.browse", '{"offset": 0.0}')["count"] == 1
+
+
+def test_a_subscriber_can_leave_without_naming_its_tags(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    for who in ("hmi", "historian"):
+        request = subscription(server, tag("a", 0), tag(who, 1), subscriberId=who)
+        assert caller.request("modbus.subscribe", request)["success"]
+    assert caller.request("modbus.unsubscribe", leaving()) == {"success": True}
+    assert len(device(caller)["subscribers"]) == 2
+    first = {"deviceId": "plc1", "subscriberId": "hmi"}
+    assert caller.request("modbus.unsubscribe", first) == {"success": True}
+    found = device(caller)
+    assert [each["id"] for each in found["subscribers"]] == ["historian"]
+    assert [each["id"] for each in found["tags"]] == ["a", "historian"]
+    last = {"deviceId": "plc1", "subscriberId": "historian", "tagIds": None}
+    assert caller.request("modbus.unsubscribe", last) == {"success": True}
+    assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+def test_who_subscribes_to_no_tags_is_no_subscriber(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    nothing = subscription(server, scanRate=100)
+    assert caller.request("modbus.subscribe", nothing) == {"success": True, "count": 0}
+    assert caller.request("modbus.browse", b"")["count"] == 0
+    assert connections(server) == 0
+    refused = caller.request("modbus.subscribe", nothing | {"host": "8.8.8.8"})
+    assert "8.8.8.8 is not allowed" in refused["error"]
+
+    assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    assert caller.request("modbus.subscribe", nothing) == {"success": True, "count": 0}
+    assert device(caller)["scanRate"] == 100
+    stranger = nothing | {"subscriberId": "other"}
+    assert caller.request("modbus.subscribe", stranger) == {"success": True, "count": 0}
+    assert [each["id"] for each in device(caller)["subscribers"]] == ["hmi"]
+
+
+def test_an_address_may_have_the_brackets_of_urls(caller: Caller, server: holdfast.Server) -> None:
+    request = subscription(server, tag("a", 0), host="[::1]", scanRate=60_000)
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert device(caller)["url"] == f"tcp://[::1]:{server.address[1]}"
+    same = request | {"host": "::1"}
+    assert caller.request("modbus.subscribe", same)["success"]
+
+
+def test_a_device_that_does_not_fit_into_one_answer_is_browsed_in_pages(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    tags = [tag(f"tag{number:05}", 2 * number % 900) for number in range(3000)]
+    for who in range(30):
+        request = subscription(server, *tags, subscriberId=f"s{who}", scanRate=60_000)
+        assert caller.request("modbus.subscribe", request)["count"] == 3000
+    assert "tags" not in caller.request("modbus.browse", b"")["devices"][0]
+
+    ids: list[str] = []
+    wanted: dict[str, list[str]] = {f"s{who}": [] for who in range(30)}
+    blocks = set()
+    asked: dict[str, Any] = {"deviceId": "plc1"}
+    while True:
+        answer = caller.request("modbus.browse", asked)
+        [found] = answer["devices"]
+        ids += [each["id"] for each in found["tags"]]
+        blocks |= {(each["address"], each["count"], each["tags"]) for each in found["blocks"]}
+        for subscriber in found["subscribers"]:
+            wanted[subscriber["id"]] += subscriber["tagIds"]
+        if "nextTag" not in answer:
+            break
+        assert answer["nextTag"] == len(ids)
+        asked["tagOffset"] = answer["nextTag"]
+    assert ids == [each["id"] for each in tags]
+    assert all(each == ids for each in wanted.values())
+    assert sum(count for *_, count in blocks) == 3000
+    last = caller.request("modbus.browse", {"deviceId": "plc1", "tagOffset": 3000})
+    assert last["devices"][0]["tags"] == []
+    lost = caller.request("modbus.browse", {"tagOffset": 1})
+    assert lost == {"success": False, "error": "tagOffset goes with deviceId"}
+
+
+def test_between_two_large_requests_others_have_their_turn(
+    run_scanner: Run, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scanner = run_scanner()
+    turn, turns = 0, []
+
+    def noted(*arguments: Any) -> Any:
+        turns.append(turn)
+        return understood(*arguments)
+
+    monkeypatch.setattr(services, "understood", noted)
+    monkeypatch.setattr(services, "LARGE", 100)
+
+    async def ask() -> None:
+        nonlocal turn
+        handle = scanner.scanner._handlers()["modbus.subscribe"]
+        client = scanner.scanner._broker.client
+        assert client is not None
+        for number in range(20):
+            request = subscription(server, tag("a", 0), deviceId=f"d{number}", scanRate=60_000)
+            await handle(Msg(client, data=json.dumps(request).encode()))
+        while len(turns) < 20:
+            turn += 1
+            await asyncio.sleep(0)
+
+    scanner.do(ask())
+    assert len(set(turns)) == 20

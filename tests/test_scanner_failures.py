@@ -154,6 +154,50 @@ def test_nats_that_hangs_holds_up_nothing(
     data.until(lambda message: message["value"] == 7, "the newest values")
 
 
+def test_what_nats_took_before_it_died_is_published_anew(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+) -> None:
+    scanner = run_scanner(own_nats)
+    data = own_caller.listen("modbus.data.plc1")
+    status = own_caller.listen("modbus.status.plc1")
+    changes = subscription(server, tag("a", 0), tag("b", 1), publish="change")
+    seldom = subscription(server, tag("c", 2), subscriberId="x", scanRate=3_600_000)
+    for request in (changes, seldom):
+        assert own_caller.request("modbus.subscribe", request)["success"]
+    assert {data.next()["variableId"] for _ in range(3)} == {"a", "b", "c"}
+    status.until(lambda message: message["state"] == "online", "it is online")
+
+    own_nats.signal(signal.SIGSTOP)
+    memory.write("holding_registers", 0, [7])
+    device = scanner.scanner._registry.devices["plc1"]
+    seen = device.health.scans + 3
+    wire.until(lambda: device.health.scans > seen, "the change was handed to NATS")
+    own_nats.kill()
+    own_nats.start()
+    wire.until(lambda: own_caller.client.is_connected, "the caller is back")
+    found: dict[str, int] = {}
+    while len(found) < 3:
+        message = data.next()
+        found[message["variableId"]] = message["value"]
+    assert found == {"a": 7, "b": 0, "c": 0}
+    assert status.next()["state"] == "online"
+
+
+def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Run) -> None:
+    broker = run_scanner().scanner._broker
+    client = broker.client
+    assert client is not None
+    broker._lost("tested")
+    for _ in range(50):
+        broker._note(client, OSError("no route"))
+        assert client.options["reconnect_time_wait"] <= 2
+    broker._made(client)
+
+
 # Devices
 
 
@@ -345,10 +389,31 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
             data.next()
             for _ in range(3):
                 scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
-        assert events(caplog).count("no_heartbeat") == 1
+        [told] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
+        reason = "the server has no JetStream, or none for this account"
+        assert told.__dict__["fields"]["reason"] == reason
         scanner.stop()
     finally:
         bare.kill()
+
+
+def test_a_bucket_in_which_heartbeats_stay_for_ever_is_told_of_once(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    own_caller.do(_bucket_without_end(own_caller))
+    scanner = run_scanner(own_nats)
+    wire.until(lambda: "heartbeat" in events(caplog), "there is a heartbeat")
+    heart, broker = scanner.scanner._heart, scanner.scanner._broker
+    heart._works = None
+    scanner.do(heart.beat(broker.client))
+    [told] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
+    assert told.__dict__["fields"]["bucket"] == "service_heartbeats"
+    assert "remove it" in told.__dict__["fields"]["todo"]
+
+
+async def _bucket_without_end(caller: Caller) -> None:
+    await caller.client.jetstream().create_key_value(bucket="service_heartbeats")
 
 
 # The end
@@ -403,3 +468,85 @@ def test_it_ends_while_everything_hangs(
     finally:
         own_nats.signal(signal.SIGCONT)
         os.kill(plc.pid, signal.SIGCONT)
+
+
+# Messages that are none
+
+
+def _raw(server: NatsServer, lines: bytes) -> None:
+    """Sends bytes as they are, and returns when the server has dealt with them."""
+    with socket.create_connection(("127.0.0.1", server.port), wire.DEADLINE) as raw:
+        options = {"verbose": False, "pedantic": False, "headers": True, "protocol": 1}
+        raw.sendall(b"CONNECT %b\r\n%bPING\r\n" % (json.dumps(options).encode(), lines))
+        seen = b""
+        while b"PONG\r\n" not in seen:
+            part = raw.recv(4096)
+            assert part, seen
+            seen += part
+        assert b"-ERR" not in seen, seen
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        b"PUB modbus.command.\xff\xfe 1\r\n1\r\n",
+        b"PUB modbus.browse _I.\xff 0\r\n\r\n",
+        b"PUB modbus.command.\x0b 1\r\n1\r\n",
+        b"PUB modbus.command.a\x0bb\x0cc 1\r\n1\r\n",
+        b"PUB modbus.command.%b a\x0bb 1\r\n1\r\n" % (b"x\x0b" * 1500),
+        *(
+            b"HPUB modbus.browse _I.h %d %d\r\n%b\r\n" % (len(header), len(header), header)
+            for header in (
+                b"garbage",
+                b"NATS/1.0\r\n\r\n",
+                b"NATS/1.0 \xff\xff\xff\r\n\r\n",
+                b"NATS/1.0 503 \xff\xff\r\n\r\n",
+                b"NATS/1.0\r\n\xff: \xfe\r\n\r\n",
+            )
+        ),
+    ],
+)
+def test_a_message_that_is_none_costs_no_other(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, lines: bytes
+) -> None:
+    scanner = run_scanner(own_nats)
+    client = scanner.scanner._broker.client
+    _raw(own_nats, 3 * lines)
+    assert own_caller.request("modbus.browse", b"")["success"]
+    _raw(own_nats, lines)
+    assert own_caller.request("modbus.browse", b"")["success"]
+    assert scanner.scanner._broker.client is client
+    assert client is not None
+    assert client.stats["reconnects"] == 0
+
+
+def test_a_message_that_is_none_is_told_of_now_and_then(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    run_scanner(own_nats)
+    _raw(own_nats, 200 * b"PUB modbus.command.\xff 1\r\n1\r\n")
+    assert own_caller.request("modbus.browse", b"")["success"]
+    assert 1 <= events(caplog).count("message_malformed") <= 40
+    [record, *_] = [each for each in caplog.records if each.getMessage() == "message_malformed"]
+    assert record.__dict__["fields"] == {
+        "subject": "modbus.command.\\xff",
+        "reason": "no UTF-8 in the subject, the reply subject or a header",
+    }
+
+
+def test_what_a_device_is_asked_for_is_told_though_it_is_not_there(
+    run_scanner: Run, caller: Caller
+) -> None:
+    run_scanner()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    status = caller.listen("modbus.status.plc1")
+    tags = [tag("a", 0), tag("b", 100), tag("c", 200)]
+    request = {"deviceId": "plc1", "subscriberId": "x", "host": "127.0.0.1", "port": port}
+    assert caller.request("modbus.subscribe", request | {"tags": tags})["success"]
+    status.until(lambda message: message["state"] == "offline", "it is offline")
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    assert sorted(block["address"] for block in device["blocks"]) == [0, 100, 200]
+    assert [each["error"] for each in device["blocks"] if "error" in each] == ["no connection"]
+    assert device["lastError"] == device["error"] == "no connection"
+    assert device["lastErrorAt"] >= device["stateSince"] > 1_700_000_000_000

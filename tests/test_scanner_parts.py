@@ -11,13 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.scanner import outbox as outboxes
+from holdfast.scanner.browsing import browsed
 from holdfast.scanner.decoding import decoder
 from holdfast.scanner.devices import Device, Plan, Source, Subscriber, Wanted
 from holdfast.scanner.groups import Group, grouped
 from holdfast.scanner.health import Health
+from holdfast.scanner.messages import BrowseRequest, ServiceReport
 from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.tags import Tag
+from holdfast.scanner.tags import Places, Tag
 from holdfast.target import NetworkTarget
 
 if TYPE_CHECKING:
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
     from holdfast.scanner.polling import Block
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
+ANSWERED = 1_700_000_000.0
+"""Seconds since 1970."""
 
 
 def made(id: str, address: int = 0, type: str = "uint16") -> Tag:
@@ -117,9 +121,9 @@ class Line:
     def at(self, seconds: float, *registers: int, address: int = 0) -> dict[str, Any]:
         """The values that are published for registers."""
         data = b"".join(register.to_bytes(2) for register in registers)
-        block: Block = ("holding_registers", address, len(registers), data, 0)
+        block: Block = ("holding_registers", address, len(registers), data, 0, ANSWERED)
         found = {}
-        for id, text in self.publisher.messages(1_700_000_000 + seconds, [block]):
+        for id, text in self.publisher.messages(seconds, [block]):
             head, _, payload = text.partition(b"\r\n")
             word, subject, size = head.decode().split()
             assert (word, subject, int(size) + 2) == ("PUB", "modbus.data.plc", len(payload))
@@ -136,26 +140,110 @@ class Line:
         (1000, 2000, [0, 2, 4, 6]),
         (1000, 2500, [0, 3, 6]),
         (1000, 60_000, [0]),
+        (900, 1000, [0, 2, 4, 6]),
+        (1000, 1250, [0, 2, 4, 6]),
     ],
 )
 def test_messages_are_never_closer_than_their_rate(
     interval: int, rate: int, published: list[int]
 ) -> None:
     line = Line()
-    line.publisher.regroup([Group(rate, False, (made("a"),), (0.0,))], interval, set())
-    jitter = [0.0, 0.01, -0.01, 0.02, 0.0, 0.01, 0.0]
-    assert [second for second in range(7) if line.at(second + jitter[second], 1)] == published
+    line.publisher.regroup([Group(rate, False, (made("a"),), (0.0,))], set())
+    scans = [line.at(0.123456789 + scan * interval / 1000, 1) for scan in range(7)]
+    assert [scan for scan, values in enumerate(scans) if values] == published
 
 
 def test_a_device_that_is_scanned_anew_does_not_publish_too_early() -> None:
     line = Line()
     group = Group(1000, False, (made("a"),), (0.0,))
-    line.publisher.regroup([group], 1000, set())
+    line.publisher.regroup([group], set())
     assert line.at(0, 1)
     more = Group(1000, False, (made("a"), made("b", 1)), (0.0, 0.0))
-    line.publisher.regroup([more], 1000, {"b"})
+    line.publisher.regroup([more], {"b"})
     assert line.at(0.3, 1, 2) == {"b": 2}
     assert line.at(1.3, 1, 2) == {"a": 1, "b": 2}
+
+
+@pytest.mark.parametrize("change", [False, True])
+def test_everything_is_published_anew_when_that_is_asked_for(change: bool) -> None:
+    line = Line()
+    tags = tuple(made(id, ord(id) - ord("a")) for id in "abc")
+    seldom = Group(60_000, change, tags[:2], (0.0, 0.0))
+    often = Group(1000, False, tags[2:], (0.0,))
+    line.publisher.want(lambda: [often, seldom])
+    assert line.at(0, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
+    assert line.at(1, 1, 2, 3) == {"c": 3}
+    line.publisher.renew()
+    assert line.at(1.5, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
+    assert line.at(2.5, 1, 2, 3) == {"c": 3}
+
+
+def test_who_comes_to_known_tags_gets_their_next_values() -> None:
+    line = Line()
+    tags = tuple(made(id, ord(id) - ord("a")) for id in "ab")
+    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+    assert line.at(0, 1, 2) == {"a": 1, "b": 2}
+    for newcomers in (["a"], ["b"]):
+        line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], newcomers)
+    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+    assert line.at(10, 1, 2) == {"a": 1, "b": 2}
+    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], ["b", "gone"])
+    assert line.at(20, 1, 2) == {"b": 2}
+    assert line.at(30, 1, 2) == {}
+
+
+def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    count = 0
+    end: Any = Tag.end
+
+    def counted(tag: Tag) -> int:
+        nonlocal count
+        count += 1
+        return int(end.fget(tag))
+
+    monkeypatch.setattr(Tag, "end", property(counted))
+    tags = {f"t{at}": made(f"t{at}", 12 * at) for at in range(2000)}
+    plc = device()
+    plc.tags = tags
+    plc.subscribers["x"] = Subscriber(1000, "scan", 0.0, dict.fromkeys(tags, Wanted(False, None)))
+    blocks: list[Block] = [
+        ("holding_registers", 12 * at, 1, b"\0\1", 0, ANSWERED) for at in range(2000)
+    ]
+    line = Line()
+    line.publisher.want(lambda: grouped(plc))
+    assert len(line.publisher.messages(0, blocks)) == 2000
+    assert count <= 2 * 2000
+    plc.health.judge([(*block[:3], None, 2, ANSWERED) for block in blocks])
+    service = ServiceReport(0, 0, 0, 0, 0)
+    answer = browsed(BrowseRequest("plc"), {"plc": (plc, {})}, {}, service, 2**20)
+    [report] = answer.devices
+    assert len(report.blocks or []) == len(report.tags or []) == 2000
+    assert all(each.error for each in report.tags or [])
+    assert count <= 8 * 2000
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 60), st.integers(1, 5)), max_size=20),
+    st.integers(0, 60),
+    st.integers(1, 20),
+)
+def test_tags_are_found_where_a_block_has_them_whole(
+    places: list[tuple[int, int]], address: int, count: int
+) -> None:
+    tags = [
+        Tag(f"{at}", area, start, f"uint16[{size}]", "ABCD", frozenset())
+        for at, (start, size) in enumerate(places)
+        for area in ("holding_registers", "input_registers")
+    ]
+    found = Places(tags).inside("input_registers", address, count)
+    assert sorted(tag.id for tag in found) == sorted(
+        tag.id
+        for tag in tags
+        if tag.area == "input_registers" and address <= tag.address
+        if tag.address + tag.count <= address + count
+    )
 
 
 @pytest.mark.parametrize("change", [False, True])
@@ -165,13 +253,13 @@ def test_a_new_tag_does_not_wait_for_the_others(change: bool) -> None:
     def regroup(ids: str, *newcomers: str) -> None:
         tags = tuple(made(id, ord(id) - ord("a")) for id in ids)
         group = Group(60_000, change, tags, (0.0,) * len(tags))
-        line.publisher.regroup([group], 60_000, set(newcomers))
+        line.publisher.regroup([group], set(newcomers))
 
     regroup("a", "a")
     assert line.at(0, 1, 2, 3) == {"a": 1}
     regroup("ab", "b")
     regroup("abc", "c")
-    assert line.publisher.messages(1_700_000_000, []) == []
+    assert line.publisher.messages(0, []) == []
     assert line.at(0.1, 9, 2, 3) == {"b": 2, "c": 3}
     regroup("ab")
     assert line.at(0.2, 9, 2, 3) == {}
@@ -181,45 +269,62 @@ def test_a_new_tag_does_not_wait_for_the_others(change: bool) -> None:
 
 def test_a_new_tag_comes_once_when_the_others_are_due_too() -> None:
     line = Line()
-    line.publisher.regroup([Group(1000, False, (made("a"),), (0.0,))], 1000, set())
+    line.publisher.regroup([Group(1000, False, (made("a"),), (0.0,))], set())
     assert line.at(0, 1)
     more = Group(1000, False, (made("a"), made("b", 1)), (0.0, 0.0))
-    line.publisher.regroup([more], 1000, set())
-    block: Block = ("holding_registers", 0, 2, b"\0\1\0\2", 0)
-    ids = [id for id, _ in line.publisher.messages(1_700_000_001, [block])]
+    line.publisher.regroup([more], set())
+    block: Block = ("holding_registers", 0, 2, b"\0\1\0\2", 0, ANSWERED)
+    ids = [id for id, _ in line.publisher.messages(1, [block])]
     assert sorted(ids) == ["a", "b"]
-
-
-def test_a_clock_that_goes_back_stops_nothing() -> None:
-    line = Line()
-    line.publisher.regroup([Group(5000, False, (made("a"),), (0.0,))], 1000, set())
-    assert line.at(0, 1)
-    assert not line.at(1, 1)
-    assert line.at(-3600, 1)
 
 
 def test_a_value_that_somebody_else_got_is_no_change() -> None:
     line = Line()
     scans = Group(2000, False, (made("a"),), (0.0,))
     changes = Group(1000, True, (made("a"),), (0.0,))
-    line.publisher.regroup([scans, changes], 1000, set())
+    line.publisher.regroup([scans, changes], set())
     assert [line.at(second, 7) for second in range(4)] == [{"a": 7}, {}, {"a": 7}, {}]
     assert line.at(5, 8) == {"a": 8}
 
 
 def test_a_tag_that_two_blocks_have_is_published_once() -> None:
     line = Line()
-    line.publisher.regroup([Group(1000, False, (made("a", 1),), (0.0,))], 1000, set())
-    one: Block = ("holding_registers", 0, 2, b"\0\0\0\1", 0)
-    two: Block = ("holding_registers", 1, 1, b"\0\1", 0)
-    assert len(line.publisher.messages(1_700_000_000, [one, two])) == 1
-    failed: Block = ("holding_registers", 0, 2, None, 2)
-    assert len(line.publisher.messages(1_700_000_001, [failed, two])) == 1
+    line.publisher.regroup([Group(1000, False, (made("a", 1),), (0.0,))], set())
+    one: Block = ("holding_registers", 0, 2, b"\0\0\0\1", 0, ANSWERED)
+    two: Block = ("holding_registers", 1, 1, b"\0\1", 0, ANSWERED)
+    assert len(line.publisher.messages(0, [one, two])) == 1
+    failed: Block = ("holding_registers", 0, 2, None, 2, ANSWERED)
+    assert len(line.publisher.messages(1, [failed, two])) == 1
+
+
+def test_a_block_has_all_of_its_tags_again_when_no_other_has_them() -> None:
+    line = Line()
+    tags = (made("a", 0), made("b", 1), made("c", 2))
+    line.publisher.regroup([Group(1, False, tags, (0.0,) * 3)], set())
+    one: Block = ("holding_registers", 0, 2, b"\0\0\0\1", 0, ANSWERED)
+    two: Block = ("holding_registers", 1, 2, b"\0\1\0\2", 0, ANSWERED)
+    assert [id for id, _ in line.publisher.messages(0, [one, two])] == ["a", "b", "c"]
+    assert [id for id, _ in line.publisher.messages(1, [two])] == ["b", "c"]
+    assert [id for id, _ in line.publisher.messages(2, [two, one])] == ["b", "c", "a"]
+    assert [id for id, _ in line.publisher.messages(3, [one])] == ["a", "b"]
+
+
+@pytest.mark.parametrize("change", [False, True])
+def test_a_first_value_that_a_scan_does_not_bring_is_waited_for(change: bool) -> None:
+    line = Line()
+    tags = (made("a", 0), made("b", 50), made("c", 99))
+    seldom = Group(60_000, change, tags[:2], (0.0, 0.0))
+    line.publisher.regroup([Group(1000, False, tags[2:], (0.0,)), seldom], set())
+    assert line.at(0, 1) == {"a": 1}
+    assert line.at(1, 9) == {}
+    assert line.at(2, 2, address=50) == {"b": 2}
+    assert line.at(3, 3, address=50) == {}
+    assert line.at(60, 4) == {"a": 4}
 
 
 def test_blocks_that_change_all_the_time_are_not_all_remembered() -> None:
     line = Line()
-    line.publisher.regroup([Group(50, False, (made("a", 500),), (0.0,))], 50, set())
+    line.publisher.regroup([Group(50, False, (made("a", 500),), (0.0,))], set())
     for start in range(300):
         assert line.at(start, *range(501), address=start)["a"] == 500 - start
     assert len(line.publisher._shapes) <= 64
@@ -318,24 +423,71 @@ def judged(*polls: Sequence[int]) -> list[tuple[bool, str, int, str | None]]:
     found: list[tuple[bool, str, int, str | None]] = []
     for faults in polls:
         blocks: list[Block] = [
-            ("coils", at, 1, None if fault else b"\0", fault) for at, fault in enumerate(faults)
+            ("coils", at, 1, None if fault else b"\0", fault, ANSWERED)
+            for at, fault in enumerate(faults)
         ]
-        worth = health.judge(1.0, blocks)
+        worth = health.judge(blocks)
         found.append((worth, health.state, health.failures, health.error))
     return found
 
 
 def test_a_device_is_told_of_when_it_comes_or_goes_or_refuses_something_new() -> None:
     refused = "exception 02 (Illegal Data Address)"
-    assert judged([0], [0], [0, 2], [0, 2], [0, 0], [0x8001], [0x8002], [2], [0x0B], [0]) == [
+    assert judged([0], [0], [0, 2], [0, 2], [0, 0], [0x8001], [0x8001], [0x8002], [2]) == [
         (True, "online", 0, None),
         (False, "online", 0, None),
         (True, "online", 0, refused),
         (False, "online", 0, refused),
         (True, "online", 0, None),
-        (True, "offline", 1, "no reply in time"),
-        (False, "offline", 2, "no connection"),
+        (True, "online", 1, "no reply in time"),
+        (True, "offline", 2, "no reply in time"),
+        (False, "offline", 3, "no connection"),
         (True, "online", 0, refused),
-        (True, "offline", 1, "exception 0B (Gateway Target Device Failed to Respond)"),
-        (True, "online", 0, None),
     ]
+
+
+def test_one_scan_without_an_answer_is_forgiven_unless_there_is_no_connection() -> None:
+    gateway = "exception 0B (Gateway Target Device Failed to Respond)"
+    assert [found[1:] for found in judged([0], [0x0B], [0], [0x8003], [0], [0x8002], [0])] == [
+        ("online", 0, None),
+        ("online", 1, gateway),
+        ("online", 0, None),
+        ("online", 1, "the connection was lost"),
+        ("online", 0, None),
+        ("offline", 1, "no connection"),
+        ("online", 0, None),
+    ]
+    assert judged([0x8001]) == [(True, "offline", 1, "no reply in time")]
+
+
+def poll(*blocks: tuple[int, int, float]) -> list[Block]:
+    """Blocks of one register with address, fault and time."""
+    return [
+        ("holding_registers", at, 1, None if fault else b"\0\0", fault, time)
+        for at, fault, time in blocks
+    ]
+
+
+def test_the_last_error_stays_with_its_time_and_so_does_that_of_the_state() -> None:
+    health = Health()
+    health.judge(poll((0, 0, 10.0)))
+    assert (health.since, health.last_error, health.last_error_at) == (10.0, None, None)
+    for time in (20.0, 30.0):
+        health.judge(poll((0, 0x8002, time)))
+    assert (health.since, health.last_error_at) == (20.0, 30.0)
+    health.judge(poll((0, 0, 40.0)))
+    assert (health.state, health.error, health.since) == ("online", None, 40.0)
+    assert (health.last_error, health.last_error_at) == ("no connection", 30.0)
+    assert not health.judge([])
+    assert health.state == "online"
+
+
+def test_blocks_that_a_scan_did_not_come_to_stay_as_they_were() -> None:
+    health = Health()
+    health.judge(poll((0, 0, 1.0), (5, 2, 1.0), (9, 0, 1.0)))
+    health.judge(poll((9, 0x8001, 2.0)))
+    assert sorted((block[1], block[4]) for block in health.blocks) == [(0, 0), (5, 2), (9, 0x8001)]
+    health.judge([("holding_registers", 4, 3, None, 0x8001, 3.0)])
+    assert sorted(block[1] for block in health.blocks) == [0, 4, 9]
+    health.judge(poll((0, 0, 4.0)))
+    assert [block[1] for block in health.blocks] == [0]

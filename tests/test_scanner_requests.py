@@ -37,11 +37,13 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"port": "502"}, "Expected `int | null`, got `str` - at `$.port`"),
     ({"url": "tcp://127.0.0.1"}, "host stands beside url, allowed is one of both"),
     ({"host": None, "port": None, "url": "http://127.0.0.1"}, "url: 'http://127.0.0.1' is no URL"),
-    ({"host": None, "port": None, "url": "tls://127.0.0.1"}, "url: tls is not available in this"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1?ca=/etc/passwd"}, "url: ca is given, al"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1?cert=a&key=b"}, "url: cert is given, al"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1?sni=a"}, "url: sni is given, allo"),
     ({"host": None, "port": None, "unitId": 0, "url": "rtu:///dev/ttyS0"}, "unitId is 0, which is"),
     ({"plan": {"forbidden": [[0, 1]] * 33}}, "Expected `array` of length <= 32"),
     ({"unitId": 256}, "Expected `int` <= 255 - at `$.unitId`"),
-    ({"transport": "tls"}, "transport tls is not available in this version"),
+    ({"transport": "rtu+tcp", "unitId": 0}, "unitId is 0, which is the broadcast of a serial line"),
     ({"transport": "can"}, "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp"),
     ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed are ABCD"),
     ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
@@ -58,7 +60,25 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"plan": {"readable": [[1, 2, 3]]}}, "plan.readable[0] is [1, 2, 3], allowed are"),
     ({"plan": {"forbidden": [[0, 9]]}}, "tag 'a' from address 5 on: plan.forbidden has 0 to 9"),
     ({"scanrate": 100}, "Object contains unknown field `scanrate`"),
-    ({"tags": []}, "Expected `array` of length >= 1 - at `$.tags`"),
+    ({"tags": None}, "Expected `array`, got `null` - at `$.tags`"),
+    (
+        {"tags": [tag("a", 0) | {"address": 0.5}]},
+        "Expected `int`, got `float` - at `$.tags[0].address`",
+    ),
+    ({"tags": [tag("a", 0, encoding="ascii")]}, "tags[0]: encoding 'ascii' is for strings, uint16"),
+    ({"tags": [tag("a", 0, "string:2", encoding="x")]}, "tags[0]: encoding 'x' is unknown"),
+    (
+        {"tags": [tag("a", 0, "uint16[124]", writable=True)]},
+        "tags[0]: uint16[124] takes 124 registers, one request writes at most 123",
+    ),
+    (
+        {"tags": [tag("a", 0, "boolean[1969]", functionCode="coil", writable=True)]},
+        "tags[0]: boolean[1969] takes 1969 coils, one request writes at most 1968",
+    ),
+    (
+        {"tags": [tag("a", 0, "bit:3[2]", writable=True)]},
+        "tags[0]: bit:3[2] can't be written, only one bit can",
+    ),
     ({"tags": [{"id": "a"}]}, "Object missing required field `address` - at `$.tags[0]`"),
     ({"tags": [tag("", 0)]}, "Expected `str` of length >= 1 - at `$.tags[0].id`"),
     ({"tags": [tag("a", 0), tag("a", 1)]}, "tags[1]: the id 'a' is there twice"),
@@ -110,8 +130,9 @@ def _browsed(caller: Caller) -> Any:
     answer = caller.request("modbus.browse", b"")
     del answer["service"]
     for device in answer["devices"]:
-        for key in ("scans", "missed", "roundTrip", "lastAnswer", "state", "blocks"):
+        for key in ("scans", "missed", "roundTrip", "lastAnswer", "state", "stateSince"):
             device.pop(key, None)
+        del device["blocks"]
     return answer
 
 
@@ -211,6 +232,28 @@ def test_networks_that_are_given_take_the_place_of_the_private_ones(
         assert caller.request("modbus.subscribe", request)["success"]
 
 
+def test_devices_on_one_serial_line_have_the_same_settings(
+    run_scanner: Run, caller: Caller
+) -> None:
+    run_scanner(allow=("/dev/ttyNONE0", "/dev/ttyNONE1"))
+
+    def ask(id: str, url: str) -> Any:
+        request = {"deviceId": id, "subscriberId": "x", "url": url, "tags": [tag("a", 0)]}
+        return caller.request("modbus.subscribe", request)
+
+    assert ask("one", "rtu:///dev/ttyNONE0?baud=9600")["success"]
+    for url, error in (
+        ("rtu:///dev/ttyNONE0", "baud of /dev/ttyNONE0 is 9600 for one already, not 19200; dev"),
+        ("rtu:///dev/ttyNONE0?baud=9600&parity=none", "parity of /dev/ttyNONE0 is even for one"),
+        ("ascii:///dev/ttyNONE0?baud=9600", "mode of /dev/ttyNONE0 is rtu for one already"),
+        ("rtu:///dev/ttyNONE0?baud=9600&silence=0.1", "is the default for one already, not 0.1"),
+    ):
+        assert error in ask("two", url)["error"]
+    assert "baud 9600" in ask("one", "rtu:///dev/ttyNONE0")["error"]
+    assert ask("two", "rtu:///dev/ttyNONE0?baud=9600&parity=even")["success"]
+    assert ask("three", "rtu:///dev/ttyNONE1")["success"]
+
+
 def test_a_serial_device_is_refused_that_is_not_named(scanner: Running, caller: Caller) -> None:
     del scanner
     request = {
@@ -277,6 +320,6 @@ def test_the_schema_takes_what_the_program_takes(server: holdfast.Server) -> Non
     right = subscription(server, tag("a", 0, null=["nan", -9999]), plan={"readable": [[1, 2]]})
     assert validator.is_valid(right)
     assert validator.is_valid(right | {"port": None})
-    wrong: list[dict[str, Any]] = [{"port": 0}, {"tags": []}, {"more": 1}, {"transport": "can"}]
+    wrong: list[dict[str, Any]] = [{"port": 0}, {"tags": 1}, {"more": 1}, {"transport": "can"}]
     for change in wrong:
         assert not validator.is_valid(right | change)

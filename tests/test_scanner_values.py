@@ -117,7 +117,8 @@ def test_what_can_not_be_decoded_costs_only_its_own_tag(
     tags = [tag("bcd", 0, "bcd16"), tag("good", 1), tag("text", 2, "string:2")]
     data = caller.listen("modbus.data.plc1")
     caller.request("modbus.subscribe", subscription(server, *tags))
-    assert [data.next()["variableId"] for _ in range(3)] == ["good"] * 3
+    values = {id: message["value"] for id, message in first_values(data, 3).items()}
+    assert values == {"bcd": None, "good": 5, "text": None}
     [device] = caller.request("modbus.browse", b"")["devices"]
     errors = {each["id"]: each.get("error") for each in device["tags"]}
     assert errors["good"] is None
@@ -125,7 +126,57 @@ def test_what_can_not_be_decoded_costs_only_its_own_tag(
     assert errors["text"]
 
     memory.write("holding_registers", 0, [0x0012])
-    data.until(lambda message: message["variableId"] == "bcd", "the value that is right now")
+    data.until(lambda message: message["value"] == 12, "the value that is right now")
+
+
+def test_what_can_not_be_decoded_is_a_change_to_null_and_back(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    data = caller.listen("modbus.data.plc1")
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0, "bcd16"), publish="change"))
+    assert data.next()["value"] == 0
+    for registers, value in (([0x1A2B], None), ([0x0042], 42), ([0xFFFF], None)):
+        memory.write("holding_registers", 0, registers)
+        assert data.next()["value"] == value
+    memory.write("holding_registers", 0, [0xAAAA])
+    _seen(caller, server)
+    assert data.take() == []
+
+
+def test_texts_have_the_encoding_that_is_said(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [0x35B0, 0x4300, 0xC3BC, 0x2121])
+    tags = [
+        tag("latin", 0, "string:4", encoding="latin-1", writable=True),
+        tag("utf", 2, "string:4", encoding="utf-8"),
+        tag("ascii", 2, "string:4"),
+        tag("marked", 2, "string:4", encoding="utf-8", null=["ü!!"]),
+    ]
+    data = caller.listen("modbus.data.plc1")
+    answer = caller.request("modbus.subscribe", subscription(server, *tags))
+    assert answer["success"], answer
+    found = {id: message["value"] for id, message in first_values(data, 4).items()}
+    assert found == {"latin": "5°C", "utf": "ü!!", "ascii": None, "marked": None}
+    assert caller.request("modbus.command.latin", "ßä")["success"]
+    assert memory.read("holding_registers", 0, 2) == [0xDFE4, 0]
+    assert "latin-1" in caller.request("modbus.command.latin", "€")["error"]
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    assert [each.get("encoding") for each in device["tags"]] == ["latin-1", "utf-8", None, "utf-8"]
+
+
+def test_an_array_changes_when_one_of_its_values_does(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [100, 200, 0])
+    data = caller.listen("modbus.data.plc1")
+    request = subscription(server, tag("a", 0, "uint16[3]"), publish="change", deadband=5)
+    caller.request("modbus.subscribe", request)
+    assert data.next()["value"] == [100, 200, 0]
+    for values in ([105, 195, 5], [105, 195, 6], [100, 200, 1], [105, 206, 1]):
+        memory.write("holding_registers", 0, values)
+        _seen(caller, server)
+    assert [message["value"] for message in data.take()] == [[105, 195, 6], [105, 206, 1]]
 
 
 def test_values_that_mean_not_available_are_null(

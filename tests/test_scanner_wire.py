@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nats.errors import ProtocolError
 
 from holdfast.scanner import wire
 from holdfast.scanner.messages import Answer
+from holdfast.scanner.receiving import SafeClient
 from nats_bus import Caller
 from wire import until as wire_until
 
@@ -56,3 +64,67 @@ def test_what_waits_when_the_connection_breaks_goes_with_the_next(own_nats: Nats
         caller.do(wire.send(caller.client, wire.text("wire.a", b"1") * 10, 10))
         own_nats.start()
         assert [inbox.next() for _ in range(10)] == [1] * 10
+
+
+class _Heard(SafeClient):
+    """A client that notes what it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[Any] = []
+
+    async def _process_msg(self, *told: Any) -> None:
+        self.heard.append(told)
+
+    async def _process_ping(self) -> None:
+        self.heard.append("ping")
+
+    async def _process_pong(self) -> None:
+        self.heard.append("pong")
+
+    async def _process_err(self, err_msg: str) -> None:
+        self.heard.append(err_msg)
+
+    async def _process_info(self, info: Any, initial_connection: bool = False) -> None:
+        assert not initial_connection
+        self.heard.append(info)
+
+
+LINES = (
+    b'PING\r\nMSG a.b 1 2\r\n\r\n\r\nMSG a\x0bb\xff 12\t_I.\x0c  5\r\nMSG 1\r\nINFO {"a": "b"} \r\n'
+    b"HMSG c 3 12 13\r\nNATS/1.0\r\n\r\nx\r\n+OK\r\n"
+    b"HMSG c 3 r 7 7\r\ngarbage\r\n-ERR 'Some Thing'\r\n"
+    b"PONG\r\nMSG d 4 0\r\n\r\n"
+)
+
+
+@given(st.lists(st.integers(0, len(LINES)), max_size=40))
+def test_what_the_server_sends_is_taken_apart_wherever_it_is_cut(cuts: list[int]) -> None:
+    async def heard() -> list[Any]:
+        client = _Heard()
+        for start, end in pairwise(sorted({0, *cuts, len(LINES)})):
+            await client._ps.parse(LINES[start:end])
+        return client.heard
+
+    assert asyncio.run(heard()) == [
+        "ping",
+        (1, b"a.b", b"", b"\r\n", b""),
+        (12, b"a\x0bb\xff", b"_I.\x0c", b"MSG 1", b""),
+        {"a": "b"},
+        (3, b"c", b"", b"x", b"NATS/1.0\r\n\r\n"),
+        (3, b"c", b"r", b"", b"garbage"),
+        "'some thing'",
+        "pong",
+        (4, b"d", b"", b"", b""),
+    ]
+
+
+@pytest.mark.parametrize(
+    "line", [b"HELLO", b"MSG a", b"MSG a b 1", b"MSG a 1 x", b"HMSG a 1 2", b"INFO {", b""]
+)
+def test_a_line_that_no_server_sends_ends_the_connection(line: bytes) -> None:
+    async def parse() -> None:
+        await _Heard()._ps.parse(line + b"\r\n")
+
+    with pytest.raises(ProtocolError):
+        asyncio.run(parse())

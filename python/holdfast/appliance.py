@@ -18,6 +18,7 @@ from holdfast import _core, assembly, logs
 from holdfast.adapters import foreign
 from holdfast.adapters.supervisor import Supervisor
 from holdfast.audit import Audit
+from holdfast.client import check_files
 from holdfast.config import ModbusAsciiListener, ModbusRtuListener
 from holdfast.diagnostics import Diagnostics, fault
 from holdfast.ingest import Door
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
         MetricsConfig,
         RestConfig,
     )
+    from holdfast.target import Tls
 
 # Everything else that a listener reports is a refusal or a fault.
 LEVELS = {
@@ -133,10 +135,12 @@ class _Running:
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         self._health = dict.fromkeys(config.devices, "unknown")
         self._looked = time.monotonic()
-        # An adapter that is not installed, and a file that a device's TLS can't use, are told
+        # An adapter that is not installed, and a file that TLS of devices can't use, are told
         # before any socket is opened.
         for name, settings in config.adapters.items():
             foreign.entry_point(name, settings)
+        if config.gateway is not None and config.gateway.tls is not None:
+            _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
         devices = [
             assembly.device(name, config, memories)
             for name, device in config.devices.items()
@@ -356,6 +360,14 @@ def _listening(name: str, bind: Bind) -> socket.socket:
     except OSError as error:
         message = f"{name}: can't listen on {bind}: {error.strerror or error}"
         raise OSError(error.errno, message) from error
+
+
+def _check_files(name: str, tls: Tls) -> None:
+    """Raises `OSError`, which names them, for files that can't be used."""
+    try:
+        check_files(tls)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{name}: {error}") from error
 
 
 def _joined(endpoint: Endpoint) -> str:

@@ -22,6 +22,7 @@ from holdfast.config import (
     RawIngestListener,
 )
 from holdfast.identity import Identity
+from holdfast.target import Tls
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -190,12 +191,20 @@ def gateway(settings: GatewayConfig) -> GatewaySettings:
         tokens=tuple((token.name, bytes.fromhex(token.sha256)) for token in tokens),
         sources=settings.sources,
         limits=Limits(in_flight=settings.in_flight),
+        tls=gateway_tls(settings),
     )
+
+
+def gateway_tls(settings: GatewayConfig) -> Tls:
+    """Whom the gateway trusts among devices, and what it shows them."""
+    given = settings.tls
+    files = () if given is None else (given.ca_file, given.cert_file, given.key_file)
+    return Tls(*(None if file is None else str(file) for file in files))
 
 
 def scanner(settings: NatsConfig) -> ScannerSettings:
     """What the scanner is told."""
-    from holdfast.scanner import Limits, Servers, Settings
+    from holdfast.scanner import DeviceTls, Limits, Servers, Settings
 
     tls = settings.tls or BrokerTlsConfig()
     servers = Servers(
@@ -210,7 +219,9 @@ def scanner(settings: NatsConfig) -> ScannerSettings:
     )
     devices = tuple(str(entry) for entry in settings.devices)
     limits = Limits(devices=settings.limits.devices, tags=settings.limits.tags)
-    return Settings(servers, settings.prefix, devices, limits)
+    of = settings.device_tls
+    trust = DeviceTls() if of is None else DeviceTls(of.ca_file, of.cert_file, of.key_file)
+    return Settings(servers, settings.prefix, devices, limits, trust)
 
 
 def _place(

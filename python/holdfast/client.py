@@ -17,14 +17,14 @@ from holdfast import operations, tls
 from holdfast._core import BlockingClient, Endpoint, Request
 from holdfast.errors import ConnectionLost, ModbusException
 from holdfast.link import CLOSED, Link
-from holdfast.target import IN_FLIGHT, NetworkTarget, SerialTarget, parse
+from holdfast.target import IN_FLIGHT, TLS_PORT, NetworkTarget, SerialTarget, parse
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
     from ssl import SSLContext
 
     from holdfast.operations import Identification, Plan, Result, ServerId, Steps
-    from holdfast.target import Target
+    from holdfast.target import Target, Tls
     from holdfast.types import Area
 
 LONGEST_TIMEOUT = 86_400.0
@@ -532,6 +532,11 @@ def _context(target: NetworkTarget) -> SSLContext | None:
         return None
     endpoint(target)  # It says what is wrong with files and names, as in the other client.
     return tls.context(target.tls)
+
+
+def check_files(tls: Tls) -> None:
+    """Raises `OSError` and `ValueError` for files that can't be used."""
+    _context(NetworkTarget("tls", "localhost", TLS_PORT, tls))
 
 
 def _unit(unit: int) -> int:

@@ -41,6 +41,12 @@ class Tls:
     name: str | None = None
     """The name that the device's certificate has, if that is not its host."""
 
+    @property
+    def query(self) -> str:
+        """It in a URL, behind the question mark."""
+        given = {key: value for key, value in asdict(self).items() if value is not None}
+        return "&".join(f"{key}={quote(value)}" for key, value in given.items())
+
     def files(self) -> Iterator[tuple[str, str]]:
         """The files that are given, with their keys."""
         for key in ("ca", "cert", "key"):
@@ -122,9 +128,7 @@ def in_folder(url: str, folder: Path) -> str:
     tls = replace(target.tls, **{key: str(folder / file) for key, file in target.tls.files()})
     if tls == target.tls:
         return url
-    given = {key: value for key, value in asdict(tls).items() if value is not None}
-    query = "&".join(f"{key}={quote(value)}" for key, value in given.items())
-    return f"{url.partition('?')[0]}?{query}"
+    return f"{url.partition('?')[0]}?{tls.query}"
 
 
 @dataclass(frozen=True)

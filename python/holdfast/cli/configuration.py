@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast import assembly
-from holdfast.client import endpoint
+from holdfast.client import check_files, endpoint
 from holdfast.config import ConfigError, ModbusTlsListener, load, source
 from holdfast.config.problems import Report
 
 if TYPE_CHECKING:
     from holdfast.config import Config
+    from holdfast.config.source import KeyPath
 
 WRONG = 2
 """The exit code for wrong usage or a wrong configuration."""
@@ -26,7 +27,8 @@ def load_whole(path: Path | str) -> Config:
     Raises `ConfigError` with every problem.
     """
     config = load(path)
-    file, problems = str(path), {}
+    file = str(path)
+    problems: dict[KeyPath, str] = {}
     for name, listener in config.listeners.items():
         if isinstance(listener, ModbusTlsListener):
             try:
@@ -38,6 +40,16 @@ def load_whole(path: Path | str) -> Config:
             endpoint(device.target)
         except (OSError, ValueError) as error:
             problems["devices", name, "url"] = str(error)
+    if config.nats is not None and config.nats.device_tls is not None:
+        try:
+            assembly.scanner(config.nats).device_tls.check()
+        except OSError as error:
+            problems["nats", "device_tls"] = str(error)
+    if config.gateway is not None and config.gateway.tls is not None:
+        try:
+            check_files(assembly.gateway_tls(config.gateway))
+        except (OSError, ValueError) as error:
+            problems["gateway", "tls"] = str(error)
     if problems:
         report = Report(source.parse(source.read_text(Path(path), file), file)[0])
         for place, message in problems.items():

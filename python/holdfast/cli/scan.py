@@ -18,7 +18,7 @@ import click
 from holdfast import logs
 from holdfast.cli.open_files import allow_open_files
 from holdfast.config.scanning import PREFIX, SERVER_PORT, parse_prefix, parse_server
-from holdfast.scanner import Limits, Scanner, Servers, Settings
+from holdfast.scanner import DeviceTls, Limits, Scanner, Servers, Settings
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE, Allowed
 from holdfast.scanner.schema import json_schema
@@ -110,6 +110,15 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option("--tls-cert", type=FILE, metavar="FILE", help="Our certificate.")
 @click.option("--tls-key", type=FILE, metavar="FILE", help="Its key.")
 @click.option(
+    "--device-ca",
+    type=FILE,
+    metavar="FILE",
+    help="Who is trusted among devices with TLS: authorities, or devices themselves; without it "
+    "the system's authorities.",
+)
+@click.option("--device-cert", type=FILE, metavar="FILE", help="Our certificate for devices.")
+@click.option("--device-key", type=FILE, metavar="FILE", help="Its key.")
+@click.option(
     "--max-devices",
     type=click.IntRange(1),
     default=Limits.devices,
@@ -150,6 +159,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     """
     urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
+    device_tls = DeviceTls(options["device_ca"], options["device_cert"], options["device_key"])
     allow = _allowed(options["allow"])
     if store is not None and not embedded:
         raise click.UsageError("--store goes with --embedded.")
@@ -159,10 +169,11 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     with ExitStack() as stack:
         check: Callable[[], None] | None = None
         try:
+            device_tls.check()
             if embedded:
                 server = stack.enter_context(Embedded(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
-            settings = Settings(servers, options["prefix"], allow, limits)
+            settings = Settings(servers, options["prefix"], allow, limits, device_tls)
             click.echo(_greeting(settings))
             asyncio.run(_serve(settings, check))
         except (EmbeddedFailed, OSError) as error:
@@ -181,7 +192,13 @@ def _allowed(entries: tuple[str, ...]) -> tuple[str, ...]:
 
 def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
     """The servers, and who we are there; a usage error for what does not go together."""
-    together = (("password_file", "user"), ("tls_cert", "tls_key"), ("tls_key", "tls_cert"))
+    together = (
+        ("password_file", "user"),
+        ("tls_cert", "tls_key"),
+        ("tls_key", "tls_cert"),
+        ("device_cert", "device_key"),
+        ("device_key", "device_cert"),
+    )
     for key, other in together:
         if options[key] is not None and options[other] is None:
             given, missing = (f"--{name.replace('_', '-')}" for name in (key, other))

@@ -66,6 +66,7 @@ class ServiceChecks:
 
     def _gateway(self, gateway: dict[Any, Any]) -> None:
         self._tokens("gateway", gateway)
+        self._certificates(("gateway", "tls"), mapping(gateway.get("tls")))
         if gateway.get("tokens") != "none":
             return
         for index, source in enumerate(entries(gateway.get("sources"))):
@@ -96,7 +97,7 @@ class ServiceChecks:
         if "tls" in mqtt and broker is not None and not broker.secure:
             message = "found beside a url that begins with mqtt://, allowed: beside mqtts:// only"
             self.report.add(("mqtt", "tls"), message, of_key=True)
-        self._certificates("mqtt", mapping(mqtt.get("tls")))
+        self._certificates(("mqtt", "tls"), mapping(mqtt.get("tls")))
         topics = Owners(self.report, "topic")
         for index, subscription in enumerate(entries(mqtt.get("subscriptions"))):
             path: KeyPath = ("mqtt", "subscriptions", index)
@@ -117,7 +118,8 @@ class ServiceChecks:
         if "tls" in nats and servers and all(each and each.scheme == "nats" for each in servers):
             message = "found beside servers that begin with nats://, allowed: beside tls:// only"
             self.report.add(("nats", "tls"), message, of_key=True)
-        self._certificates("nats", mapping(nats.get("tls")))
+        self._certificates(("nats", "tls"), mapping(nats.get("tls")))
+        self._certificates(("nats", "device_tls"), mapping(nats.get("device_tls")))
 
     def _password(self, section: str, settings: dict[Any, Any]) -> None:
         if "password_file" in settings and "username" not in settings:
@@ -125,13 +127,13 @@ class ServiceChecks:
             self.report.add((section, "password_file"), message, of_key=True)
         self._readable((section, "password_file"), settings.get("password_file"))
 
-    def _certificates(self, section: str, tls: dict[Any, Any]) -> None:
+    def _certificates(self, section: KeyPath, tls: dict[Any, Any]) -> None:
         for key, other in (("cert_file", "key_file"), ("key_file", "cert_file")):
             if key in tls and other not in tls:
                 message = f"found without {other}, allowed: both or none"
-                self.report.add((section, "tls", key), message, of_key=True)
+                self.report.add((*section, key), message, of_key=True)
         for key in ("ca_file", "cert_file", "key_file"):
-            self._readable((section, "tls", key), tls.get(key))
+            self._readable((*section, key), tls.get(key))
 
     def _readable(self, path: KeyPath, file: object) -> None:
         if isinstance(file, str) and file and "\0" not in file:

@@ -97,6 +97,17 @@ class BrokerTlsConfig(Model):
     """The key of that certificate, in PEM."""
 
 
+class DeviceTlsConfig(Model):
+    """Certificates for TLS with devices, which without them are judged by the system's own."""
+
+    ca_file: Annotated[FilePath | None, NotNull()] = None
+    """The certificates that are trusted, of authorities or of devices themselves, in PEM."""
+    cert_file: Annotated[FilePath | None, NotNull()] = None
+    """The certificate that is shown to devices, in PEM; together with key_file."""
+    key_file: Annotated[FilePath | None, NotNull()] = None
+    """The key of that certificate, in PEM."""
+
+
 class SubscriptionConfig(Model):
     """Topics to listen to, and what their messages may write."""
 
@@ -177,6 +188,8 @@ class NatsConfig(Model):
     """A file with a JWT and the seed of its key, in the place of a user."""
     tls: Annotated[BrokerTlsConfig | None, NotNull()] = None
     """Certificates; beside tls:// only."""
+    device_tls: Annotated[DeviceTlsConfig | None, NotNull()] = None
+    """Certificates for devices that are subscribed to with TLS."""
     prefix: SubjectPrefix = PREFIX
     """The first part of all subjects."""
     limits: NatsLimitsConfig = Field(default_factory=NatsLimitsConfig)
@@ -191,11 +204,13 @@ class GatewayConfig(Model):
     sources: Sources
     """Networks and addresses of the clients, IPv4 or IPv6."""
     allow: Annotated[tuple[EgressEntry, ...], Strict(False), Field(min_length=1)]
-    """Whom it may connect to: networks and addresses, with ports; without, it is port 502."""
+    """Whom it may connect to: networks, addresses and ports; without, 502, and 802 with TLS."""
     access: Access
     """Whether it may write to devices."""
     tokens: Tokens[GatewayTokenConfig]
     """Who may use it; `none` lets everyone, from this machine only."""
+    tls: Annotated[DeviceTlsConfig | None, NotNull()] = None
+    """Certificates for devices that are talked to with TLS."""
     in_flight: Annotated[int, Field(ge=1, le=64)] = 1
     """Requests on their way to one device at once."""
 

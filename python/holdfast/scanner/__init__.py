@@ -3,15 +3,16 @@
 It has no configuration of devices: a device is connected to when somebody wants tags of it, and let
 go with the last who does. Nothing is kept over a restart.
 
-The rooms, from the outside in: `service` wires all; `broker`, `outbox` and `wire` talk to NATS,
-`polling` and `commands` to devices; `registry` knows who wants what; `groups`, `decoding` and
-`publishing` make messages of what was read. The last four do no I/O.
+The rooms, from the outside in: `service` wires all; `broker`, `receiving`, `outbox` and `wire` talk
+to NATS, `polling` and `commands` to devices; `registry` knows who wants what; `groups`, `decoding`
+and `publishing` make messages of what was read. The last four do no I/O.
 """
 
 from __future__ import annotations
 
 from holdfast.scanner.broker import Servers
+from holdfast.scanner.device_tls import DeviceTls
 from holdfast.scanner.limits import Limits
 from holdfast.scanner.service import Scanner, Settings
 
-__all__ = ["Limits", "Scanner", "Servers", "Settings"]
+__all__ = ["DeviceTls", "Limits", "Scanner", "Servers", "Settings"]

@@ -16,19 +16,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from nats.aio.client import Client
 from nats.errors import Error
 
 from holdfast import logs
 from holdfast.scanner.credentials import Credentials
+from holdfast.scanner.receiving import SafeClient, TlsClient
 
 if TYPE_CHECKING:
+    from nats.aio.client import Client
     from nats.aio.msg import Msg
 
 Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
 
 FIRST_PAUSE = 0.25
-LONGEST_PAUSE = 10.0
+LONGEST_PAUSE = 2.0
 """Seconds between attempts to connect: doubled with each failure, up to the longest."""
 
 SILENCE = 600.0
@@ -122,7 +123,7 @@ class Broker:
     async def run(self) -> None:
         """Connects, and connects again, until it is cancelled. Raises `OSError` for files."""
         while True:
-            client = _TlsClient() if self._servers.secure else Client()
+            client = TlsClient() if self._servers.secure else SafeClient()
             ended = asyncio.Event()
             try:
                 await self._connect(client, ended)
@@ -223,15 +224,6 @@ class Broker:
             return
         self._told = (reason, now)
         logs.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=self._failures)
-
-
-class _TlsClient(Client):
-    """Says nothing to a server that does not use TLS; the client by itself would go on without."""
-
-    async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
-        if initial_connection and not info.get("tls_required"):
-            raise Error("the server does not use TLS")
-        await super()._process_info(info, initial_connection)
 
 
 async def _given_up(client: Client, ended: asyncio.Event) -> None:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.scanner.health import described
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.health import beside, described
 from holdfast.scanner.messages import (
     BlockReport,
     BrowseAnswer,
@@ -15,16 +16,25 @@ from holdfast.scanner.messages import (
     SubscriberReport,
     TagReport,
 )
-from holdfast.scanner.tags import FUNCTION_CODES
+from holdfast.scanner.tags import FUNCTION_CODES, Places
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence, Set
 
     from holdfast.scanner.devices import Device
     from holdfast.scanner.messages import BrowseRequest, ServiceReport
+    from holdfast.scanner.tags import Tag
+
+_encode = msgspec.json.Encoder().encode
 
 ENVELOPE = 300
 """Bytes of an answer that are no device."""
+
+SMALLEST_TAG = 100
+"""Bytes that a tag takes at least, by which it is known that some tags can't fit."""
+
+SMALLEST_ID = 4
+"""Bytes that each subscriber takes at least for each of its tags."""
 
 
 def browsed(
@@ -34,113 +44,159 @@ def browsed(
     service: ServiceReport,
     most: int,
 ) -> BrowseAnswer:
-    """The answer, in at most so many bytes. `devices` come with their tags that have no value."""
-    if request.device_id is not None:
-        wanted = [request.device_id] if request.device_id in devices else []
-    else:
-        wanted = sorted(devices)[request.offset or 0 :]
+    """The answer, in at most so many bytes. `devices` come with why their tags have no value.
+
+    Raises `Refused` for an offset into nothing.
+    """
+    answer = BrowseAnswer(True, len(devices), service, [])
     room = most - ENVELOPE
-    reports: list[DeviceReport] = []
-    for id in wanted:
+    if request.device_id is not None:
+        if request.device_id in devices:
+            device, undecoded = devices[request.device_id]
+            report = _Report(device, undecoded, counters.get(device.polled_as, {}))
+            page, answer.next_tag = report.page(request.tag_offset or 0, room)
+            answer.devices.append(page)
+        return answer
+    if request.tag_offset is not None:
+        raise Refused("tagOffset goes with deviceId")
+    for at, id in enumerate(sorted(devices)[request.offset or 0 :], request.offset or 0):
         device, undecoded = devices[id]
-        report = _report(device, undecoded, counters.get(device.polled_as, {}))
-        size = len(msgspec.json.encode(report)) + 1
-        if size > most - ENVELOPE:
-            report = msgspec.structs.replace(report, blocks=None, tags=None, subscribers=None)
-            size = len(msgspec.json.encode(report)) + 1
+        whole = _Report(device, undecoded, counters.get(device.polled_as, {})).whole(most)
+        size = len(_encode(whole)) + 1
         if size > room:
-            following = (request.offset or 0) + len(reports)
-            return BrowseAnswer(True, len(devices), service, reports, following)
+            answer.next = at
+            break
         room -= size
-        reports.append(report)
-    return BrowseAnswer(True, len(devices), service, reports)
+        answer.devices.append(whole)
+    return answer
 
 
-def _report(
-    device: Device, undecoded: Mapping[str, str], counters: Mapping[str, Any]
-) -> DeviceReport:
-    health, source, plan = device.health, device.source, device.source.plan
-    return DeviceReport(
-        device_id=device.id,
-        url=str(source.target),
-        address=str(device.address),
-        unit_id=source.unit,
-        state=health.state,
-        failures=health.failures,
-        error=health.error,
-        last_answer=None if health.last_answer is None else int(health.last_answer * 1000),
-        scan_rate=device.rate,
-        timeout=source.timeout,
-        release=source.release,
-        scans=health.scans,
-        missed=counters.get("missed", 0),
-        round_trip=round(counters.get("round_trip", 0.0) * 1000, 3),
-        tag_count=len(device.tags),
-        plan=PlanReport(
-            max_gap=plan.max_gap,
-            max_registers=plan.max_registers,
-            max_bits=plan.max_bits,
-            readable=list(plan.readable) or None,
-            forbidden=list(plan.forbidden) or None,
-        ),
-        blocks=list(_blocks(device)),
-        tags=list(_tags(device, undecoded)),
-        subscribers=[
-            SubscriberReport(
-                id=id,
-                scan_rate=subscriber.rate,
-                publish=subscriber.publish,
-                deadband=subscriber.deadband or None,
-                tag_ids=list(subscriber.tags),
-            )
-            for id, subscriber in device.subscribers.items()
-        ],
-    )
+class _Report:
+    """What there is to tell of one device."""
 
+    def __init__(
+        self, device: Device, undecoded: Mapping[str, str], counters: Mapping[str, Any]
+    ) -> None:
+        self._device = device
+        self._undecoded = undecoded
+        self._counters = counters
+        self._tags = list(device.tags.values())
+        self._places = Places(self._tags)
+        self._least = SMALLEST_TAG + SMALLEST_ID * len(device.subscribers)
 
-def _blocks(device: Device) -> Iterator[BlockReport]:
-    tags = list(device.tags.values())
-    if not device.health.blocks:
-        for area, address, count, members, holes in device.source.plan.blocks(tags):
+    def whole(self, most: int) -> DeviceReport:
+        """All of it; without tags, blocks and subscribers if an answer could not have it."""
+        if len(self._tags) * SMALLEST_TAG <= most:
+            report = self._with(self._tags)
+            if len(_encode(report)) < most - ENVELOPE:
+                return report
+        return self._head()
+
+    def page(self, offset: int, room: int) -> tuple[DeviceReport, int | None]:
+        """As many tags as fit, and the offset of the next one if there is one."""
+        left = self._tags[offset:]
+        count = min(len(left), max(room // self._least, 1))
+        while True:
+            report = self._with(left[:count])
+            size = len(_encode(report)) + 1
+            if size <= room:
+                return report, None if count == len(left) else offset + count
+            if count <= 1:
+                return self._head(), None
+            count = min(count - 1, max(count * room // size, 1))
+
+    def _head(self) -> DeviceReport:
+        device, health = self._device, self._device.health
+        source, plan = device.source, device.source.plan
+        return DeviceReport(
+            device_id=device.id,
+            url=str(source.target),
+            address=str(device.address),
+            unit_id=source.unit,
+            state=health.state,
+            state_since=_milliseconds(health.since),
+            failures=health.failures,
+            error=health.error,
+            last_answer=_milliseconds(health.last_answer),
+            last_error=health.last_error,
+            last_error_at=_milliseconds(health.last_error_at),
+            scan_rate=device.rate,
+            timeout=source.timeout,
+            release=source.release,
+            scans=health.scans,
+            missed=self._counters.get("missed", 0),
+            round_trip=round(self._counters.get("round_trip", 0.0) * 1000, 3),
+            tag_count=len(device.tags),
+            plan=PlanReport(
+                max_gap=plan.max_gap,
+                max_registers=plan.max_registers,
+                max_bits=plan.max_bits,
+                readable=list(plan.readable) or None,
+                forbidden=list(plan.forbidden) or None,
+            ),
+        )
+
+    def _with(self, tags: Sequence[Tag]) -> DeviceReport:
+        """With some of the tags, their blocks, and who wants them."""
+        ids = {tag.id for tag in tags}
+        return msgspec.structs.replace(
+            self._head(),
+            blocks=list(self._blocks(ids)),
+            tags=list(self._reports(tags)),
+            subscribers=[
+                SubscriberReport(
+                    id=id,
+                    scan_rate=subscriber.rate,
+                    publish=subscriber.publish,
+                    deadband=subscriber.deadband or None,
+                    tag_ids=[id for id in subscriber.tags if id in ids],
+                )
+                for id, subscriber in self._device.subscribers.items()
+            ],
+        )
+
+    def _blocks(self, ids: Set[str]) -> Iterator[BlockReport]:
+        """The blocks that have some of these tags."""
+        asked = self._device.health.blocks
+        if self._device.health.state != "online":
+            planned = self._device.source.plan.blocks(self._tags)
+            unasked = [(*block[:3], None, 0, 0.0) for block in beside(planned, asked)]
+            asked = [*asked, *unasked]
+        for area, address, count, _, fault, _ in asked:
+            inside = self._places.inside(area, address, count)
+            if not any(tag.id in ids for tag in inside):
+                continue
+            wanted = {at for tag in inside for at in range(tag.address, tag.end)}
             yield BlockReport(
-                area=area, address=address, count=count, tags=len(members), holes=holes
+                area=area,
+                address=address,
+                count=count,
+                tags=len(inside),
+                holes=count - len(wanted),
+                error=described(fault) if fault else None,
             )
-    for area, address, count, _, fault, _ in device.health.blocks:
-        inside = [
-            tag
-            for tag in tags
-            if tag.area == area and tag.address >= address and tag.end <= address + count
-        ]
-        wanted = {at for tag in inside for at in range(tag.address, tag.end)}
-        yield BlockReport(
-            area=area,
-            address=address,
-            count=count,
-            tags=len(inside),
-            holes=count - len(wanted),
-            error=described(fault) if fault else None,
-        )
+
+    def _reports(self, tags: Sequence[Tag]) -> Iterator[TagReport]:
+        errors = dict(self._undecoded)
+        for area, address, count, _, fault, _ in self._device.health.blocks:
+            if fault:
+                inside = self._places.inside(area, address, count)
+                errors |= dict.fromkeys((tag.id for tag in inside), described(fault))
+        subscribers = self._device.subscribers.values()
+        for tag in tags:
+            said = [each.tags[tag.id] for each in subscribers if tag.id in each.tags]
+            yield TagReport(
+                id=tag.id,
+                address=tag.address,
+                function_code=FUNCTION_CODES[tag.area],
+                datatype=tag.asked_type,
+                byte_order=tag.order,
+                encoding=tag.encoding,
+                writable=any(wanted.writable for wanted in said),
+                description=next((each.description for each in said if each.description), None),
+                error=errors.get(tag.id),
+            )
 
 
-def _tags(device: Device, undecoded: Mapping[str, str]) -> Iterator[TagReport]:
-    faults = [block for block in device.health.blocks if block[4]]
-    for tag in device.tags.values():
-        error = undecoded.get(tag.id)
-        for area, address, count, _, fault, _ in faults:
-            if tag.area == area and tag.address >= address and tag.end <= address + count:
-                error = described(fault)
-        descriptions = (
-            subscriber.tags[tag.id].description
-            for subscriber in device.subscribers.values()
-            if tag.id in subscriber.tags
-        )
-        yield TagReport(
-            id=tag.id,
-            address=tag.address,
-            function_code=FUNCTION_CODES[tag.area],
-            datatype=tag.asked_type,
-            byte_order=tag.order,
-            writable=device.writable(tag.id),
-            description=next(filter(None, descriptions), None),
-            error=error,
-        )
+def _milliseconds(seconds: float | None) -> int | None:
+    return None if seconds is None else int(seconds * 1000)

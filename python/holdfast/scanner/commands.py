@@ -49,30 +49,30 @@ def value(text: str, tag: Tag) -> Any:
 def _checked(made: Any, tag: Tag) -> Any:
     """A value that the type of the tag can hold."""
     try:
-        encode(made, tag.type, tag.order)
+        encode(made, tag.type, tag.order, encoding=tag.encoding)
     except ConversionError as error:
-        raise Refused(str(error)) from None
+        raise Refused(str(error).replace(tag.type, tag.asked_type)) from None
     return made
 
 
 def _boolean(text: str, tag: Tag) -> bool:
     found = BOOLEANS.get(text.strip().lower())
     if found is None:
-        raise Refused(f"{_shown(text)} is no {tag.type}, allowed are true, false, 1 and 0")
+        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed are true, false, 1 and 0")
     return found
 
 
 def _number(text: str, tag: Tag, is_float: bool) -> int | float:
     if _NUMBER.fullmatch(text) is None:
-        raise Refused(f"{_shown(text)} is no {tag.type}, allowed is a number as JSON has it")
+        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed is a number as JSON has it")
     if is_float:
         number = float(text)
         if math.isinf(number):
-            raise Refused(f"{_shown(text)} does not fit {tag.type}")
+            raise Refused(f"{_shown(text)} does not fit {tag.asked_type}")
         return number
     exact = Decimal(text)
     if exact.adjusted() > 20 or exact != exact.to_integral_value():
-        raise Refused(f"{_shown(text)} is no {tag.type}")
+        raise Refused(f"{_shown(text)} is no {tag.asked_type}")
     return int(exact)
 
 
@@ -80,7 +80,7 @@ def _bytes(text: str, tag: Tag) -> bytes:
     try:
         return base64.b64decode(text.strip(), validate=True)
     except (binascii.Error, ValueError):
-        raise Refused(f"{_shown(text)} is no {tag.type}, allowed is base64") from None
+        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed is base64") from None
 
 
 def _array(text: str, tag: Tag) -> list[Any]:
@@ -89,7 +89,7 @@ def _array(text: str, tag: Tag) -> list[Any]:
     except (msgspec.DecodeError, RecursionError):
         items = None
     if not isinstance(items, list):
-        raise Refused(f"{_shown(text)} is no {tag.type}, allowed is a JSON array")
+        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed is a JSON array")
     base = parsed(tag.type).base
     if base == "bytes":
         items = [_bytes(item, tag) if isinstance(item, str) else item for item in items]
@@ -110,7 +110,9 @@ async def write(polling: Polling, device: Device, tag: Tag, text: str) -> None:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable")
     made = value(text, tag)
     try:
-        [request] = write_typed(tag.area, tag.address, made, tag.type, tag.order, None, split=False)
+        [request] = write_typed(
+            tag.area, tag.address, made, tag.type, tag.order, tag.encoding, split=False
+        )
     except ValueError as error:
         raise Refused(f"not written: {error}") from None
     fault = await polling.write(device, request)

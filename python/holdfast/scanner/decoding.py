@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.values import ConversionError, Layout, decode
+from holdfast.values import ConversionError, Field, Layout, decode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from holdfast.scanner.tags import Tag
 
 Decoder: TypeAlias = Callable[[bytes], Sequence[Any]]
+
+LAYOUTS = 1024
+"""Layouts that are remembered."""
 
 _BITS = [tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256)]
 
@@ -28,8 +32,9 @@ def decoder(tags: Sequence[Tag], address: int, count: int) -> Decoder:
     """What makes the values of tags of one area from the bytes of a block that has them all."""
     if tags[0].of_bits:
         return _bits(tags, address)
-    fields = [(tag.id, tag.type, tag.address - address, tag.order) for tag in tags]
-    layout = Layout(fields, size=count)
+    layout = _layout(
+        count, *((tag.type, tag.address - address, tag.order, tag.encoding) for tag in tags)
+    )
 
     def decoded(data: bytes) -> Sequence[Any]:
         try:
@@ -40,11 +45,22 @@ def decoder(tags: Sequence[Tag], address: int, count: int) -> Decoder:
     return decoded
 
 
+@lru_cache(LAYOUTS)
+def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
+    """How the registers of a block become values. Devices of one kind have the same layouts, and so
+    have the blocks of one tag each.
+    """
+    named = [Field(f"{at}", *field) for at, field in enumerate(fields)]
+    return Layout(named, size=count)
+
+
 def _alone(tag: Tag, data: bytes, address: int) -> Any:
     """The value of one tag, whatever becomes of the others."""
     start = 2 * (tag.address - address)
     try:
-        return decode(data[start : start + 2 * tag.count], tag.type, tag.order)
+        return decode(
+            data[start : start + 2 * tag.count], tag.type, tag.order, encoding=tag.encoding
+        )
     except ConversionError as error:
         return Undecoded(str(error))
 

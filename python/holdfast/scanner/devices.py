@@ -13,6 +13,7 @@ from holdfast.scanner.tags import AREAS, Tag
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
+    from holdfast._core import Endpoint
     from holdfast.scanner.health import Health
     from holdfast.scanner.messages import PlanRequest, Publish, Range
     from holdfast.target import Target
@@ -127,6 +128,8 @@ class Device:
         self.source = source
         self.address = address
         """The target that is connected to: an address where `source` may have a name."""
+        self.endpoint: Endpoint | None = None
+        """The same as the poller has it."""
         self.subscribers: dict[str, Subscriber] = {}
         self.tags: dict[str, Tag] = {}
         """What the subscribers want, all together, by id."""
@@ -149,6 +152,10 @@ class Device:
             return False
         self._looked_up = now
         return True
+
+    def is_extended_by(self, subscriber: str, ids: Collection[str]) -> bool:
+        """Whether a subscriber that is known asks for tags beside those that there are."""
+        return subscriber in self.subscribers and self.tags.keys().isdisjoint(ids)
 
     def writable(self, id: str) -> bool:
         """Whether one of the subscribers of a tag says so."""

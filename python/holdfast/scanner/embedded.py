@@ -79,7 +79,7 @@ class Embedded:
     def check(self) -> None:
         """Raises `EmbeddedFailed` if it has ended."""
         if self._process.poll() is not None:
-            raise EmbeddedFailed(f"nats-server ended: {self._last_words()}")
+            raise EmbeddedFailed(f"nats-server ended: {self._reason()}")
 
     def _started(self, folder: Path) -> str:
         """Waits until it serves; where it does."""
@@ -95,9 +95,14 @@ class Embedded:
             time.sleep(0.01)
         raise EmbeddedFailed(f"nats-server did not start within {STARTING:g} s")
 
-    def _last_words(self) -> str:
+    def _reason(self) -> str:
+        """Its last words, if they are those of an error, or what ended it."""
         lines = self._log.read_text(errors="replace").splitlines()
-        return next((line for line in reversed(lines) if "[FTL]" in line), *lines[-1:] or ["?"])
+        for line in reversed(lines):
+            if "[FTL]" in line or "[ERR]" in line or not line.startswith("["):
+                return line
+        code = self._process.returncode
+        return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
 
     def _end(self) -> None:
         self._process.terminate()

@@ -7,11 +7,12 @@ is published for both.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterator, Mapping
 
     from holdfast.scanner.devices import Device
     from holdfast.scanner.tags import Tag
@@ -31,30 +32,38 @@ class Group:
 
 def grouped(device: Device) -> list[Group]:
     """The groups of a device: those that are always published first, then by rate."""
+    demands: dict[tuple[bool, int, float], set[str]] = {}
+    for subscriber in device.subscribers.values():
+        demand = (subscriber.publish == "change", subscriber.rate, subscriber.deadband)
+        demands.setdefault(demand, set()).update(subscriber.tags)
     members: dict[tuple[bool, int], dict[str, float]] = {}
-    for id in device.tags:
-        demands = (
-            (subscriber.publish == "change", subscriber.rate, subscriber.deadband)
-            for subscriber in device.subscribers.values()
-            if id in subscriber.tags
-        )
-        for change, rate, deadband in _needed(demands):
-            members.setdefault((change, rate), {})[id] = deadband
-    return [
-        Group(rate, change, tuple(device.tags[id] for id in ids), tuple(ids.values()))
-        for (change, rate), ids in sorted(members.items())
-    ]
+    for (change, rate, deadband), ids in _needed(demands):
+        members.setdefault((change, rate), {}).update(dict.fromkeys(ids, deadband))
+    groups = []
+    for (change, rate), deadbands in sorted(members.items()):
+        tags = tuple(tag for id, tag in device.tags.items() if id in deadbands)
+        groups.append(Group(rate, change, tags, tuple(deadbands[tag.id] for tag in tags)))
+    return groups
 
 
-def _needed(demands: Iterable[tuple[bool, int, float]]) -> list[tuple[bool, int, float]]:
-    """The demands of one tag without those that others include."""
-    needed: list[tuple[bool, int, float]] = []
-    for demand in sorted(set(demands)):
-        change, rate, deadband = demand
-        included = any(
-            other_rate <= rate and (not other_change or (change and other_deadband <= deadband))
-            for other_change, other_rate, other_deadband in needed
-        )
-        if not included:
-            needed.append(demand)
-    return needed
+def _needed(
+    demands: Mapping[tuple[bool, int, float], set[str]],
+) -> Iterator[tuple[tuple[bool, int, float], list[str]]]:
+    """The demands with those of their tags for which no other demand includes them."""
+    scanned: dict[str, int] = {}
+    """The rate at which a tag is always published."""
+    narrowest: dict[str, float] = {}
+    """The least deadband that was asked for, at this rate or sooner."""
+    for (change, rate, deadband), ids in sorted(demands.items()):
+        if change:
+            needed = [
+                id
+                for id in ids
+                if scanned.get(id, math.inf) > rate and narrowest.get(id, math.inf) > deadband
+            ]
+            narrowest.update(dict.fromkeys(needed, deadband))
+        else:
+            needed = [id for id in ids if id not in scanned]
+            scanned.update(dict.fromkeys(needed, rate))
+        if needed:
+            yield (change, rate, deadband), needed

@@ -9,7 +9,8 @@ import time
 from typing import TYPE_CHECKING
 
 import msgspec
-from nats.js.errors import NotFoundError
+from nats.errors import NoRespondersError, TimeoutError
+from nats.js.errors import APIError, NotFoundError, ServiceUnavailableError
 
 from holdfast import logs
 from holdfast.scanner.messages import Heartbeat
@@ -37,6 +38,7 @@ class Heart:
         self.started = _now()
         """Milliseconds since 1970."""
         self._works: bool | None = None
+        self._checked = False
 
     async def beat(self, client: Client | None) -> None:
         """Renews the sign. Where there is no JetStream, says so once."""
@@ -51,11 +53,21 @@ class Heart:
         )
         try:
             bucket = await _bucket(client)
+            if not self._works:
+                await self._check(bucket)
             await bucket.put(self._key, msgspec.json.encode(sign))
         except Exception as error:  # A heartbeat is a courtesy, whatever keeps it from being given.
-            self._told(False, str(error) or type(error).__name__)
+            self._told(False, _reason(error))
         else:
             self._told(True, "")
+
+    async def _check(self, bucket: KeyValue) -> None:
+        """Says it once if signs would stay for ever."""
+        if self._checked or (await bucket.status()).ttl:
+            return
+        self._checked = True
+        todo = f"remove it, so that it is made anew, or give its stream max_age {KEPT:g} s"
+        logs.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
 
     async def stop(self, client: Client | None) -> None:
         """Takes the sign away."""
@@ -73,6 +85,16 @@ class Heart:
         else:
             logs.write(logging.WARNING, "no_heartbeat", bucket=BUCKET, key=self._key, reason=reason)
         self._works = works
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, APIError) and error.description:
+        return error.description
+    if isinstance(error, ServiceUnavailableError | NoRespondersError):
+        return "the server has no JetStream, or none for this account"
+    if isinstance(error, TimeoutError):
+        return f"JetStream did not answer within {PATIENCE:g} s"
+    return str(error) or type(error).__name__
 
 
 async def _bucket(client: Client) -> KeyValue:

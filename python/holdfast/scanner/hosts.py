@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner.errors import Refused
-from holdfast.target import NetworkTarget, SerialTarget
+from holdfast.target import NetworkTarget, SerialTarget, Tls
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -62,7 +62,8 @@ class Allowed:
     async def address(self, target: Target, *, after: Target | None = None) -> Target:
         """The target with the address that its host has, allowed. Raises `Refused`.
 
-        Of several addresses it is the first, or the one that follows on `after`.
+        With TLS it keeps the name that the certificate must have. Of several addresses it is the
+        first, or the one that follows on `after`.
         """
         if isinstance(target, SerialTarget):
             if target.device not in self._devices:
@@ -77,7 +78,8 @@ class Allowed:
             raise Refused(f"{target.host}{told} is not allowed, allowed are {networks}")
         last = after.host if isinstance(after, NetworkTarget) else ""
         at = (allowed.index(last) + 1) % len(allowed) if last in allowed else 0
-        return replace(target, host=allowed[at])
+        tls = replace(target.tls, name=target.tls.name or target.host)
+        return replace(target, host=allowed[at], tls=tls if target.transport == "tls" else Tls())
 
     async def _found(self, target: NetworkTarget) -> list[str]:
         """The addresses of a host, IPv4 first: few devices have another."""

@@ -27,6 +27,9 @@ Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)
 Ranges = Annotated[list[Range], Meta(max_length=32)]
 Marker = bool | int | float | str
 
+EXACT = 2.0**53
+"""Below this, floats hold every integer."""
+
 CHOICES = {
     "functionCode": get_args(FunctionCode),
     "transport": get_args(Transport),
@@ -53,6 +56,8 @@ class TagRequest(_Request):
     """`boolean`, `int16`, `float32`, `string:10` and every other type of `holdfast.values`."""
     byte_order: str | None = None
     """That of the device, if left out."""
+    encoding: Annotated[str, Meta(max_length=64)] | None = None
+    """Of a `string:N`; ASCII if left out."""
     writable: bool | None = None
     description: str | None = None
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
@@ -78,10 +83,10 @@ class SubscribeRequest(_Request):
 
     device_id: Annotated[str, Meta(min_length=1, max_length=128)]
     subscriber_id: Id
-    tags: Annotated[list[TagRequest], Meta(min_length=1)]
+    tags: list[TagRequest]
     host: Annotated[str, Meta(min_length=1, max_length=253)] | None = None
     port: Annotated[int, Meta(ge=1, le=65535)] | None = None
-    """502 if left out."""
+    """502 if left out, 802 with `tls`."""
     transport: Transport | None = None
     """`tcp` if left out."""
     url: Annotated[str, Meta(max_length=512)] | None = None
@@ -108,7 +113,8 @@ class UnsubscribeRequest(_Request):
 
     device_id: str
     subscriber_id: str
-    tag_ids: list[str]
+    tag_ids: list[str] | None = None
+    """All that the subscriber has, if left out."""
 
 
 class BrowseRequest(_Request):
@@ -117,6 +123,8 @@ class BrowseRequest(_Request):
     device_id: str | None = None
     offset: Annotated[int, Meta(ge=0)] | None = None
     """How many devices are left out."""
+    tag_offset: Annotated[int, Meta(ge=0)] | None = None
+    """How many tags of `deviceId` are left out."""
 
 
 class Answer(_Message, omit_defaults=True):
@@ -182,6 +190,7 @@ class TagReport(_Message, omit_defaults=True):
     datatype: str
     byte_order: str
     writable: bool
+    encoding: str | None = None
     description: str | None = None
     error: str | None = None
     """Why there is no value."""
@@ -229,13 +238,18 @@ class DeviceReport(_Message, omit_defaults=True):
     tag_count: int
     plan: PlanReport
     blocks: list[BlockReport] | None = None
-    """The requests of the last scan; where there was none yet, those of the first."""
+    """The requests of the last scan that came to them; where there was none yet, the first ones."""
     tags: list[TagReport] | None = None
-    """`blocks`, `tags` and `subscribers` are missing where the answer would be too long."""
+    """`blocks`, `tags` and `subscribers` are missing where the answer would be too long; whoever
+    asks for the device by its id gets them."""
     subscribers: list[SubscriberReport] | None = None
     error: str | None = None
+    state_since: int | None = None
+    """Milliseconds since 1970, as the following times."""
     last_answer: int | None = None
-    """Milliseconds since 1970."""
+    last_error: str | None = None
+    """What went wrong last, though it may be well again."""
+    last_error_at: int | None = None
 
 
 class ServiceReport(_Message):
@@ -262,6 +276,9 @@ class BrowseAnswer(_Message, omit_defaults=True):
     devices: list[DeviceReport]
     next: int | None = None
     """The offset to ask for, where not all devices fit into one answer."""
+    next_tag: int | None = None
+    """The tag offset to ask for, where a device does not fit into one answer: it has some of its
+    tags then, their blocks, and which of them each subscriber wants."""
 
 
 Asked = TypeVar("Asked", bound=_Request)
@@ -272,11 +289,27 @@ def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
     if len(data) > most:
         raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
     try:
-        return msgspec.json.decode(data, type=kind)
+        try:
+            return msgspec.json.decode(data, type=kind)
+        except msgspec.ValidationError as error:
+            if "got `float`" not in str(error):
+                raise
+            return msgspec.convert(_with_integers(msgspec.json.decode(data)), type=kind)
     except msgspec.ValidationError as error:
         raise Refused(_explained(str(error))) from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused(f"not JSON: {error}") from None
+
+
+def _with_integers(value: Any) -> Any:
+    """JSON in which numbers without a fraction are integers, as callers in JavaScript have it."""
+    if type(value) is dict:
+        return {key: _with_integers(item) for key, item in value.items()}
+    if type(value) is list:
+        return [_with_integers(item) for item in value]
+    if type(value) is float and value.is_integer() and abs(value) < EXACT:
+        return int(value)
+    return value
 
 
 def _explained(text: str) -> str:

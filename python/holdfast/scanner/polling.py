@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import _core
-from holdfast.client import endpoint
 
 if TYPE_CHECKING:
     from holdfast.scanner.devices import Device
@@ -51,6 +50,8 @@ class Polling:
         """By what they are polled as."""
         self._renewed: dict[Device, float] = {}
         self._waiting: dict[Device, asyncio.TimerHandle] = {}
+        self._urgent: set[Device] = set()
+        """Those of which somebody waits for values that nobody has yet."""
         self._writes: dict[int, asyncio.Future[int]] = {}
         """By the number that the poller gave them: what will have the fault."""
         self._loop = asyncio.get_running_loop()
@@ -61,8 +62,12 @@ class Polling:
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
         self._thread.start()
 
-    def renew(self, device: Device) -> None:
-        """Polls a device as it is now wanted: at once, or soon if that has just changed."""
+    def renew(self, device: Device, *, at_once: bool = True) -> None:
+        """Polls a device as it is now wanted: at once, or soon if that has just changed; without
+        `at_once` when it is its turn.
+        """
+        if at_once:
+            self._urgent.add(device)
         if device in self._waiting:
             return
         left = self._renewed.get(device, 0.0) + RENEWED - self._loop.time()
@@ -76,9 +81,11 @@ class Polling:
         taken for the new one's.
         """
         self._waiting.pop(device, None)
+        at_once = device in self._urgent
+        self._urgent.discard(device)
         old, name = device.polled_as, next(self._names)
         if old:
-            self._poller.replace(old, _made(device, name))
+            self._poller.replace(old, _made(device, name), at_once=at_once)
             del self._devices[old]
         else:
             self._poller.add(_made(device, name))
@@ -91,6 +98,7 @@ class Polling:
         waiting = self._waiting.pop(device, None)
         if waiting is not None:
             waiting.cancel()
+        self._urgent.discard(device)
         self._poller.remove(device.polled_as)
         del self._devices[device.polled_as]
         del self._renewed[device]
@@ -150,11 +158,12 @@ class Polling:
 
 def _made(device: Device, name: str) -> _core.Device:
     source, plan = device.source, device.source.plan
+    assert device.endpoint is not None
     interval = device.rate / 1000
     reads = dict.fromkeys((tag.area, tag.address, tag.count, None) for tag in device.tags.values())
     return _core.Device(
         name,
-        endpoint(device.address),
+        device.endpoint,
         unit=source.unit,
         interval=interval,
         timeout=source.timeout / 1000,

@@ -15,15 +15,20 @@ import msgspec
 
 from holdfast.scanner.decoding import Undecoded, decoder
 from holdfast.scanner.groups import Group
+from holdfast.scanner.tags import Places
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
     from holdfast.scanner.decoding import Decoder
     from holdfast.scanner.polling import Block
     from holdfast.scanner.tags import Tag
+    from holdfast.types import Area
 
-Shape: TypeAlias = tuple[tuple[str, int, int], ...]
+Place: TypeAlias = "tuple[Area, int, int]"
+"""Area, address and count of a block."""
+
+Shape: TypeAlias = tuple[Place, ...]
 Message: TypeAlias = tuple[str, bytes]
 """The id of a tag, and the text that publishes its value."""
 
@@ -43,33 +48,65 @@ class Publisher:
     def __init__(self, prefix: str, device: str) -> None:
         self._prefix = prefix
         self._device = device
+        self._wanted: Callable[[], Sequence[Group]] | None = None
+        """The groups that are published from the next poll on, if others than before."""
+        self._newcomers: set[str] = set()
+        self._anew = False
         self._groups: list[_Due] = []
-        self._shapes: dict[Shape, list[tuple[_Due, list[_Part]]]] = {}
+        self._shapes: dict[Shape, list[tuple[_Due, list[_Placed]]]] = {}
         self._fresh: set[str] = set()
-        """Tags that were never published."""
+        """Tags whose next value is published whenever it comes."""
         self._last: dict[str, Any] = {}
         """The values that were published last, of tags whose changes somebody wants."""
         self.undecoded: dict[str, str] = {}
         """Why tags have no value though their registers were read."""
 
-    def regroup(self, groups: Sequence[Group], newcomers: set[str]) -> None:
+    def want(self, groups: Callable[[], Sequence[Group]], newcomers: Iterable[str] = ()) -> None:
+        """Publishes other groups, from the next poll on: as `regroup`, but many changes that come
+        before it are one.
+        """
+        self._wanted = groups
+        self._newcomers.update(newcomers)
+
+    def renew(self) -> None:
+        """Publishes the next values of all tags, changed or not, due or not."""
+        self._anew = True
+
+    def regroup(self, groups: Sequence[Group], newcomers: Collection[str]) -> None:
         """Publishes these groups from now on; of newcomers the next value, changed or not."""
         before = {(due.group.change, due.group.rate): due for due in self._groups if not due.once}
+        tags = {tag.id: tag for group in groups for tag in group.tags}
         known = {tag.id for due in before.values() for tag in due.group.tags} - self._fresh
-        self._fresh = {tag.id for group in groups for tag in group.tags} - known
-        self._groups = [
-            *(_Due(group, None, once=True) for group in self._firsts(groups, before)),
-            *(_Due(group, before.get((group.change, group.rate))) for group in groups),
-        ]
+        self._fresh = (tags.keys() - known) | (tags.keys() & newcomers)
         ids = {tag.id for group in groups for tag in group.tags if group.change}
-        self._last = {id: value for id, value in self._last.items() if id in ids - newcomers}
-        for id in ids:
-            self._last.setdefault(id, _UNKNOWN)
-        self.undecoded.clear()
-        self._shapes.clear()
+        same = ids == self._last.keys()
+        self._last = {id: self._last.get(id, _UNKNOWN) for id in ids}
+        self._last |= dict.fromkeys(ids & self._fresh, _UNKNOWN)
+        self._groups = []
+        for group in groups:
+            due = before.get((group.change, group.rate))
+            is_same = same and due is not None and due.group == group
+            self._groups.append(due if is_same and due is not None else _Due(group, due))
+        hurried = {id for due in self._groups for id in due.hurried(self._fresh)}
+        self._await_firsts(self._fresh - hurried)
+        self.undecoded = {id: why for id, why in self.undecoded.items() if id in tags}
+
+    def _settle(self) -> None:
+        """Does what was asked for since the last poll."""
+        groups = None if self._wanted is None else self._wanted()
+        if groups is None and self._anew:
+            groups = [due.group for due in self._groups if not due.once]
+        if groups is None:
+            return
+        newcomers = self._newcomers
+        if self._anew:
+            newcomers = {tag.id for group in groups for tag in group.tags}
+        self.regroup(groups, newcomers)
+        self._wanted, self._newcomers, self._anew = None, set(), False
 
     def messages(self, due: float, blocks: Sequence[Block]) -> list[Message]:
         """What is to be published after a poll that the schedule wanted at this time in seconds."""
+        self._settle()
         shape = tuple(block[:3] for block in blocks if block[3] is not None)
         parts = self._shapes.get(shape)
         if parts is None:
@@ -82,32 +119,27 @@ class Publisher:
         for group, compiled in parts:
             if not compiled or not group.now(due):
                 continue
-            for part in compiled:
-                found = self._made(part, *answered[part.block])
+            for block, part in compiled:
+                found = self._made(part, *answered[block])
                 if first and not group.once:
                     found = (message for message in found if message[0] not in first)
                 made += found
             if group.once:
                 first = {id for id, _ in made}
-        if self._fresh and any(compiled for _, compiled in parts):
-            self._forget_firsts()
+        if self._fresh and any(id in self._fresh for id, _ in made):
+            self._fresh.difference_update(id for id, _ in made)
+            self._await_firsts(self._fresh)
         return made
 
-    def _firsts(
-        self, groups: Sequence[Group], before: Mapping[tuple[bool, int], _Due]
-    ) -> Iterator[Group]:
-        """Groups for the first values of new tags, which need not wait until their group is due."""
-        for group in groups:
-            tags = tuple(tag for tag in group.tags if tag.id in self._fresh)
-            if tags and (group.change, group.rate) in before:
-                yield Group(group.rate, False, tags, (0.0,) * len(tags))
-
-    def _forget_firsts(self) -> None:
-        """The first values have been published."""
-        self._fresh.clear()
-        if any(due.once for due in self._groups):
-            self._groups = [due for due in self._groups if not due.once]
-            self._shapes.clear()
+    def _await_firsts(self, ids: Set[str]) -> None:
+        """Publishes the next values of these tags though their groups are not due."""
+        groups = [due for due in self._groups if not due.once]
+        tags = {tag.id: tag for due in groups for tag in due.group.tags if tag.id in ids}
+        if tags:
+            first = Group(0, False, tuple(tags.values()), (0.0,) * len(tags))
+            groups.insert(0, _Due(first, None, once=True))
+        self._groups = groups
+        self._shapes.clear()
 
     def _made(self, part: _Part, data: bytes, timestamp: bytes) -> Iterable[Message]:
         """The messages of the tags of one group in one block."""
@@ -117,7 +149,7 @@ class Publisher:
         if part.plain:
             texts = _encode(values)[1:-1].split(b",")
         else:
-            texts = [b"" if type(value) is Undecoded else _encode(value) for value in values]
+            texts = [b"null" if type(value) is Undecoded else _encode(value) for value in values]
         rows: Iterator[Any] = zip(part.ids, part.lengths, part.templates, texts, strict=True)
         if part.picky:
             rows = compress(rows, self._picked(part, values))
@@ -128,14 +160,16 @@ class Publisher:
         )
 
     def _picked(self, part: _Part, values: Sequence[Any]) -> list[bool]:
-        """Which values are to be published: those that can be, of a change group the changed."""
+        """Which values are to be published: of a change group the changed. Those that can't be
+        decoded are noted; they are as no value.
+        """
         picked = []
         for id, value, deadband in zip(part.ids, values, part.deadbands, strict=True):
             if type(value) is Undecoded:
                 self.undecoded[id] = value.error
-                picked.append(False)
-                continue
-            self.undecoded.pop(id, None)
+                value = None
+            else:
+                self.undecoded.pop(id, None)
             last = self._last.get(id, _UNKNOWN)
             wanted = not part.change or _differs(value, last, deadband)
             if wanted and id in self._last:
@@ -143,40 +177,42 @@ class Publisher:
             picked.append(wanted)
         return picked
 
-    def _compiled(self, shape: Shape) -> list[tuple[_Due, list[_Part]]]:
+    def _compiled(self, shape: Shape) -> list[tuple[_Due, list[_Placed]]]:
         """The parts of all groups for the blocks that came; each tag is taken from the first."""
         if len(self._shapes) >= SHAPES:
             self._shapes.clear()
-        parts = [(due, list(self._parts(due.group, shape))) for due in self._groups]
+        parts = [(due, list(self._parts(due, shape))) for due in self._groups]
         self._shapes[shape] = parts
         return parts
 
-    def _parts(self, group: Group, shape: Shape) -> Iterator[_Part]:
-        left = dict(zip(group.tags, group.deadbands, strict=True))
-        for index, (area, address, count) in enumerate(shape):
-            tags = [
-                tag
-                for tag in left
-                if tag.area == area and tag.address >= address and tag.end <= address + count
-            ]
-            if tags:
-                made = decoder(tags, address, count)
-                yield self._part(group, tags, [left.pop(tag) for tag in tags], index, made)
+    def _parts(self, due: _Due, shape: Shape) -> Iterator[_Placed]:
+        taken: set[str] = set()
+        for index, block in enumerate(shape):
+            part = due.parts.get(block)
+            if part is None or not taken.isdisjoint(part.ids):
+                inside = due.places.inside(*block)
+                tags = [tag for tag in inside if tag.id not in taken]
+                if not tags:
+                    continue
+                part = self._part(due, tags, block)
+                if len(tags) == len(inside):
+                    due.keep(block, part)
+            taken.update(part.ids)
+            yield index, part
 
-    def _part(
-        self, group: Group, tags: list[Tag], deadbands: list[float], block: int, made: Decoder
-    ) -> _Part:
+    def _part(self, due: _Due, tags: list[Tag], block: Place) -> _Part:
+        _, address, count = block
+        group = due.group
         texts = [_template(self._prefix, self._device, tag) for tag in tags]
         infallible = all(tag.type in _INFALLIBLE for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
         return _Part(
-            block,
-            made,
+            decoder(tags, address, count),
             tags,
             [tag.id for tag in tags],
             [text for text, _ in texts],
             [length for _, length in texts],
-            deadbands,
+            [due.deadbands[tag.id] for tag in tags],
             plain=infallible,
             special=remembered or any(tag.null for tag in tags),
             change=group.change,
@@ -196,7 +232,6 @@ _INFALLIBLE = {
 class _Part(NamedTuple):
     """The tags of a group that are in one block."""
 
-    block: int
     decoder: Decoder
     tags: Sequence[Tag]
     ids: Sequence[str]
@@ -214,6 +249,10 @@ class _Part(NamedTuple):
     """Whether some values may be left out, or have to be remembered."""
 
 
+_Placed: TypeAlias = tuple[int, _Part]
+"""A part, and which of the blocks has it."""
+
+
 class _Due:
     """A group, and when it is published next."""
 
@@ -221,6 +260,24 @@ class _Due:
         self.group = group
         self.once = once
         self._last: float = -math.inf if before is None else before._last
+        self.places = Places(group.tags)
+        self.deadbands = {
+            tag.id: deadband for tag, deadband in zip(group.tags, group.deadbands, strict=True)
+        }
+        self.parts: dict[Place, _Part] = {}
+        """What was compiled for blocks; every shape has parts of the same."""
+
+    def hurried(self, fresh: Collection[str]) -> Iterable[str]:
+        """Makes it due if all of its tags are fresh; its tags if it is due whatever comes."""
+        if all(id in fresh for id in self.deadbands):
+            self._last = -math.inf
+        return self.deadbands if self._last == -math.inf else ()
+
+    def keep(self, place: Place, part: _Part) -> None:
+        """Remembers a part; not one from each of ever other blocks."""
+        if len(self.parts) >= SHAPES + 2 * len(self.group.tags):
+            self.parts.clear()
+        self.parts[place] = part
 
     def now(self, due: float) -> bool:
         """Whether it is published with the values of this scan, which is noted then."""
@@ -253,6 +310,9 @@ def _clean(value: Any, tag: Tag) -> Any:
 
 def _differs(value: Any, last: Any, deadband: float) -> bool:
     """Whether a value is another one, a number by more than the deadband."""
+    if type(value) is list and type(last) is list:
+        pairs = zip(value, last, strict=True)
+        return any(_differs(one, other, deadband) for one, other in pairs)
     if type(value) in (int, float) and type(last) in (int, float):
         # The difference of two equal infinities is NaN, which is no more than anything.
         return bool(abs(value - last) > deadband)

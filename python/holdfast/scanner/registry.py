@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from urllib.parse import parse_qsl, urlsplit
 
 from holdfast import target as targets
 from holdfast.scanner.devices import Device, Plan, Source, Subscriber, Wanted
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 SCAN_RATE = 1000
 TIMEOUT = 1000
+
+SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence", "echo")
+"""What all devices on one serial line have alike."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,8 @@ def understood(request: SubscribeRequest, limits: Limits) -> Subscription:
         bool(request.release),
         Plan.of(request.plan),
     )
-    if isinstance(source.target, SerialTarget) and source.unit == 0:
+    target = source.target
+    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport == "rtu+tcp"):
         raise Refused("unitId is 0, which is the broadcast of a serial line")
     tags: dict[str, Tag] = {}
     for index, entry in enumerate(request.tags):
@@ -101,19 +106,25 @@ def _target(request: SubscribeRequest) -> Target:
         if beside:
             raise Refused(f"{beside[0]} stands beside url, allowed is one of both")
         try:
-            target = targets.parse(request.url)
+            parts = urlsplit(request.url)
+            for key in dict(parse_qsl(parts.query, keep_blank_values=True)):
+                if parts.scheme == "tls" and key != "name":
+                    raise Refused(f"url: {key} is given, allowed is name; files are the scanner's")
+            return targets.parse(request.url)
         except ValueError as error:
             raise Refused(f"url: {error}") from None
-        if isinstance(target, NetworkTarget) and target.transport == "tls":
-            raise Refused("url: tls is not available in this version")
-        return target
     if request.host is None:
         raise Refused("host is missing; a url in its place would do")
     transport = request.transport or "tcp"
-    if transport == "tls":
-        raise Refused("transport tls is not available in this version")
-    port = targets.PORT if request.port is None else request.port
-    return NetworkTarget(transport, request.host, port)
+    usual = targets.TLS_PORT if transport == "tls" else targets.PORT
+    port = usual if request.port is None else request.port
+    return NetworkTarget(transport, _unbracketed(request.host), port)
+
+
+def _unbracketed(host: str) -> str:
+    """An IPv6 address without the brackets that it has in URLs; any other host as it is."""
+    inner = host[1:-1]
+    return inner if host == f"[{inner}]" and ":" in inner else host
 
 
 def _within(key: str, value: int | None, default: int, least: int, most: int) -> int:
@@ -134,20 +145,25 @@ class Registry:
         self._holders: dict[str, set[str]] = {}
         """The devices that have a tag of an id."""
 
-    def subscribe(self, asked: Subscription, address: Target) -> tuple[Device, bool]:
+    def subscribe(self, asked: Subscription, address: Target) -> tuple[Device | None, bool]:
         """Adds a subscription; the device, and whether what it is to be polled for changed.
 
-        Raises `Refused`.
+        Who wants no tags is no subscriber; there is no device if nobody wants tags of it. Raises
+        `Refused`.
         """
         device = self.devices.get(asked.device)
         new = [id for id in asked.tags if device is None or id not in device.tags]
         self._check_limits(device, asked, len(new))
         if device is None:
-            device = Device(asked.device, asked.source, address, Health())
-            self.devices[device.id] = device
+            self._check_line(asked)
         else:
             _check_known(device, asked)
             device.source.plan.check([asked.tags[id] for id in new])
+        if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
+            return device, False
+        if device is None:
+            device = Device(asked.device, asked.source, address, Health())
+            self.devices[device.id] = device
         before = device.rate if device.subscribers else None
         subscriber = device.subscribers.setdefault(
             asked.subscriber, Subscriber(asked.rate, "scan", 0.0)
@@ -172,11 +188,12 @@ class Registry:
         if device is None or subscriber is None:
             return device, False
         before = device.rate
-        for id in request.tag_ids:
+        ids = list(subscriber.tags) if request.tag_ids is None else request.tag_ids
+        for id in ids:
             subscriber.tags.pop(id, None)
         if not subscriber.tags:
             del device.subscribers[request.subscriber_id]
-        unwanted = device.forget(request.tag_ids)
+        unwanted = device.forget(ids)
         for id in unwanted:
             self._holders[id].discard(device.id)
             if not self._holders[id]:
@@ -202,6 +219,23 @@ class Registry:
             raise Refused(f"{name!r} is ambiguous: {known}")
         [(of, id)] = found
         return self.devices[of], self.devices[of].tags[id]
+
+    def _check_line(self, asked: Subscription) -> None:
+        """That a new device says of its serial line what the others on it say."""
+        target = asked.source.target
+        if not isinstance(target, SerialTarget):
+            return
+        for device in self.devices.values():
+            other = device.source.target
+            if not isinstance(other, SerialTarget) or other.device != target.device:
+                continue
+            for key in SETTINGS:
+                known, said = getattr(other, key), getattr(target, key)
+                if known != said:
+                    raise Refused(
+                        f"{key} of {target.device} is {_shown(known)} for {device.id} already, "
+                        f"not {_shown(said)}; devices on one serial line have the same settings"
+                    )
 
     def _check_limits(self, device: Device | None, asked: Subscription, new: int) -> None:
         limits = self._limits
@@ -242,6 +276,21 @@ def check_address(device: Device, asked: Subscription) -> None:
     known, said = device.source, asked.source
     if (known.target, known.unit) != (said.target, said.unit):
         raise Refused(
-            f"{device.id} is known as {known.target} unit {known.unit}, not as {said.target} "
-            f"unit {said.unit}; unsubscribe all of it first"
+            f"{device.id} is known as {_told(known)}, not as {_told(said)}; unsubscribe all of it "
+            "first"
         )
+
+
+def _told(source: Source) -> str:
+    """Where a device is, with all that makes it another one."""
+    target = source.target
+    more = ""
+    if isinstance(target, SerialTarget):
+        more = f" ({', '.join(f'{key} {_shown(getattr(target, key))}' for key in SETTINGS[1:])})"
+    elif target.tls.name is not None:
+        more = f" with the name {target.tls.name}"
+    return f"{target}{more} unit {source.unit}"
+
+
+def _shown(setting: object) -> object:
+    return "the default" if setting is None else setting

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import WeakValueDictionary
@@ -19,6 +19,7 @@ from holdfast import logs
 from holdfast.scanner import commands, wire
 from holdfast.scanner.broker import Broker, Servers
 from holdfast.scanner.browsing import browsed
+from holdfast.scanner.device_tls import DeviceTls
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
+    from holdfast._core import Endpoint
     from holdfast.scanner.devices import Device
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.polling import Block
@@ -49,6 +51,12 @@ if TYPE_CHECKING:
     from holdfast.target import Target
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer]]"
+
+LARGE = 16 * 1024
+"""Bytes of a request from which on it takes milliseconds to understand it."""
+
+SOON = 1000
+"""Milliseconds to the next scan for which nobody needs one before it."""
 
 ENDING = 2.0
 """Seconds that each step of a stop may take."""
@@ -64,6 +72,8 @@ class Settings:
     allow: tuple[str, ...] = ()
     """Networks and serial devices, see `Allowed`."""
     limits: Limits = field(default_factory=Limits)
+    device_tls: DeviceTls = field(default_factory=DeviceTls)
+    """Whom it trusts among devices, and what it shows them."""
 
 
 class Scanner:
@@ -74,6 +84,8 @@ class Scanner:
         self._allowed = Allowed(settings.allow)
         self._ended = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._one_by_one = asyncio.Lock()
+        """Held while a request is understood."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._registry = Registry(settings.limits)
         self._publishers: dict[str, Publisher] = {}
@@ -85,6 +97,7 @@ class Scanner:
 
     async def run(self) -> None:
         """Serves until `end` is called or asked for. Raises `OSError` for files of the settings."""
+        self._settings.device_tls.check()
         self._polling = Polling(self._take)
         running: list[asyncio.Task[object]] = [
             asyncio.create_task(work)
@@ -112,8 +125,13 @@ class Scanner:
         self._ended.set()
 
     def _connected(self, client: Client | None) -> None:
+        """What NATS took before it went away may be lost, so all that is true is told again."""
         self.outbox.connected(client)
         self._due.set()
+        if client is not None:
+            for device in self._registry.devices.values():
+                self._publishers[device.id].renew()
+                self._publish_state(device)
 
     def _handlers(self) -> dict[str, Callable[[Msg], Awaitable[None]]]:
         prefix = self._settings.prefix
@@ -163,19 +181,20 @@ class Scanner:
 
     async def _subscribe(self, message: Msg) -> Answer:
         limits = self._settings.limits
-        asked = understood(decode(message.data, SubscribeRequest, limits.request), limits)
+        async with self._in_order(message):
+            asked = understood(decode(message.data, SubscribeRequest, limits.request), limits)
         async with self._turn(asked.device):
-            address = await self._address(asked)
-            newcomers = set(asked.tags)
+            address, endpoint = await self._place(asked)
+            known = self._registry.devices.get(asked.device)
+            is_extended = known is not None and known.is_extended_by(asked.subscriber, asked.tags)
             device, changed = self._registry.subscribe(asked, address)
-            publisher = self._publishers.get(device.id)
-            if publisher is None:
-                publisher = Publisher(self._settings.prefix, device.id)
-                self._publishers[device.id] = publisher
-                self._tell(device)
-            publisher.regroup(grouped(device), newcomers)
-            if changed:
-                self._polling.renew(device)
+            if device is not None and asked.subscriber in device.subscribers:
+                device.endpoint = endpoint
+                self._begin_publishing(device, asked)
+                if not is_extended:
+                    self._publish_state(device)
+                if changed or (asked.tags and device.rate > SOON):
+                    self._polling.renew(device)
         logs.write(
             logging.INFO,
             "subscribed",
@@ -186,23 +205,32 @@ class Scanner:
         )
         return Answer(success=True, count=len(asked.tags))
 
-    async def _address(self, asked: Subscription) -> Target:
+    def _begin_publishing(self, device: Device, asked: Subscription) -> None:
+        publisher = self._publishers.get(device.id)
+        if publisher is None:
+            publisher = Publisher(self._settings.prefix, device.id)
+            self._publishers[device.id] = publisher
+        publisher.want(lambda: grouped(device), asked.tags)
+
+    async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
         """Where a device is: where it is known to be, or what its name says."""
         device = self._registry.devices.get(asked.device)
         if device is None:
-            return await self._allowed.address(asked.source.target)
+            address = await self._allowed.address(asked.source.target)
+            return address, self._settings.device_tls.endpoint(address)
         check_address(device, asked)
-        return device.address
+        return device.address, device.endpoint
 
     async def _unsubscribe(self, message: Msg) -> Answer:
-        request = decode(message.data, UnsubscribeRequest, self._settings.limits.request)
+        async with self._in_order(message):
+            request = decode(message.data, UnsubscribeRequest, self._settings.limits.request)
         async with self._turn(request.device_id):
             device, changed = self._registry.unsubscribe(request)
             if device is not None:
                 if device.subscribers:
-                    self._publishers[device.id].regroup(grouped(device), set())
+                    self._publishers[device.id].want(lambda: grouped(device))
                     if changed:
-                        self._polling.renew(device)
+                        self._polling.renew(device, at_once=False)
                 elif changed:
                     self._drop(device)
         logs.write(
@@ -210,9 +238,17 @@ class Scanner:
             "unsubscribed",
             device=request.device_id,
             subscriber=request.subscriber_id,
-            tags=len(request.tag_ids),
+            tags="all" if request.tag_ids is None else len(request.tag_ids),
         )
         return Answer(success=True)
+
+    @contextlib.asynccontextmanager
+    async def _in_order(self, message: Msg, *, is_large: bool = False) -> AsyncIterator[None]:
+        """One request after the other; polls have their turn before one that takes milliseconds."""
+        async with self._one_by_one:
+            if is_large or len(message.data) > LARGE:
+                await asyncio.sleep(0)
+            yield
 
     def _drop(self, device: Device) -> None:
         """Forgets a device that nobody wants."""
@@ -232,7 +268,8 @@ class Scanner:
             text = message.data.decode()
         except UnicodeDecodeError:
             raise Refused("the value is no text") from None
-        device, tag = self._registry.commanded(name)
+        async with self._in_order(message):
+            device, tag = self._registry.commanded(name)
         await commands.write(self._polling, device, tag, text)
         return Answer(success=True)
 
@@ -240,6 +277,10 @@ class Scanner:
         request = BrowseRequest()
         if message.data:
             request = decode(message.data, BrowseRequest, self._settings.limits.request)
+        async with self._in_order(message, is_large=True):
+            return self._browsed(request)
+
+    def _browsed(self, request: BrowseRequest) -> BrowseAnswer:
         devices = {
             id: (device, self._publishers[id].undecoded)
             for id, device in self._registry.devices.items()
@@ -278,16 +319,24 @@ class Scanner:
                 return
             try:
                 address = await self._allowed.address(device.source.target, after=device.address)
+                endpoint = self._settings.device_tls.endpoint(address)
             except Refused as refused:
                 logs.refused("not_found", kind="name", device=device.id, reason=str(refused))
                 return
             if address != device.address:
-                device.address = address
+                device.address, device.endpoint = address, endpoint
                 self._polling.renew(device)
                 logs.write(logging.INFO, "moved", device=device.id, address=str(address))
 
     def _tell(self, device: Device) -> None:
         """Publishes and logs how a device does."""
+        self._publish_state(device)
+        health = device.health
+        level = logging.WARNING if health.error else logging.INFO
+        told = {} if health.error is None else {"error": health.error}
+        logs.write(level, f"device_{health.state}", device=device.id, **told)
+
+    def _publish_state(self, device: Device) -> None:
         health = device.health
         status = Status(
             device_id=device.id,
@@ -298,10 +347,6 @@ class Scanner:
         )
         subject = f"{self._settings.prefix}.status.{device.id}"
         self.outbox.put([((device.id,), wire.message(subject, status))])
-        if health.state != "connecting":
-            level = logging.WARNING if health.error else logging.INFO
-            told = {} if health.error is None else {"error": health.error}
-            logs.write(level, f"device_{health.state}", device=device.id, **told)
 
     async def _beat(self) -> None:
         while True:

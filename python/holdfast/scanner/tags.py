@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from holdfast.operations import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
 from holdfast.values import ConversionError, decode, encode
 from holdfast.values.codec import codec_of
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from holdfast.scanner.messages import DataType, FunctionCode, Marker, TagRequest
     from holdfast.types import Area
     from holdfast.values.types import Type
@@ -46,6 +50,8 @@ class Tag:
     order: str
     null: frozenset[Marker]
     """As the device would send them."""
+    encoding: str | None = None
+    """Of a text; `None` for ASCII."""
 
     @property
     def count(self) -> int:
@@ -75,10 +81,26 @@ class Tag:
         return self.area in BITS
 
 
+class Places:
+    """Tags by where they are, to find those of a block without a look at all others."""
+
+    def __init__(self, tags: Iterable[Tag]) -> None:
+        self._tags: dict[Area, list[Tag]] = {}
+        for tag in sorted(tags, key=lambda tag: tag.address):
+            self._tags.setdefault(tag.area, []).append(tag)
+        self._starts = {area: [tag.address for tag in tags] for area, tags in self._tags.items()}
+
+    def inside(self, area: Area, address: int, count: int) -> list[Tag]:
+        """The tags that a block has whole, by address."""
+        starts, end = self._starts.get(area, []), address + count
+        first, last = bisect_left(starts, address), bisect_left(starts, end)
+        return [tag for tag in self._tags.get(area, [])[first:last] if tag.end <= end]
+
+
 def tag(request: TagRequest, order: str, where: str) -> Tag:
     """The tag of a request in which `order` is that of the device. Raises `Refused`."""
     area = AREAS[request.function_code]
-    name = request.datatype
+    asked = name = request.datatype
     if name == "boolean" or name.startswith("boolean["):
         name = "bool" + name.removeprefix("boolean")
     order = request.byte_order or order
@@ -86,7 +108,7 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
         type = parsed(name)
         if type.base == "bool":
             order = "ABCD"
-        codec_of(name, order, None)
+        codec_of(name, order, request.encoding)
     except ConversionError as error:
         raise Refused(f"{where}: {error}") from None
     if area in BITS and type.base != "bool":
@@ -95,20 +117,37 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
         )
     if request.writable and area not in WRITABLE:
         raise Refused(f"{where}: what functionCode {request.function_code} reads can't be written")
+    if request.writable:
+        _check_writable(asked, type, area, where)
     if request.address + type.registers > 65536:
         raise Refused(f"{where}: {name} from address {request.address} on, the last is 65535")
-    null = frozenset(_marker(marker, type, where) for marker in request.null or ())
-    return Tag(request.id, area, request.address, name, order, null)
+    null = frozenset(
+        _marker(marker, type, request.encoding, where) for marker in request.null or ()
+    )
+    return Tag(request.id, area, request.address, name, order, null, request.encoding)
 
 
-def _marker(marker: Marker, type: Type, where: str) -> Marker:
+def _check_writable(name: str, type: Type, area: Area, where: str) -> None:
+    """That one request can write a tag. Raises `Refused`."""
+    if type.base == "bit" and type.count is not None:
+        raise Refused(f"{where}: {name} can't be written, only one bit can")
+    most = WRITE_LIMITS[area]
+    if type.registers > most:
+        kind = "coils" if area in BITS else "registers"
+        raise Refused(
+            f"{where}: {name} takes {type.registers} {kind}, one request writes at most {most}"
+        )
+
+
+def _marker(marker: Marker, type: Type, encoding: str | None, where: str) -> Marker:
     """A marker as the device would send it: of a float the nearest that the type has."""
     if type.base == "bytes":
         raise Refused(f"{where}.null: not for {type.name}")
     if marker == "nan" and type.base in FLOATS:
         return math.nan
     try:
-        made: Marker = decode(encode(marker, type.element), type.element)
+        registers = encode(marker, type.element, encoding=encoding)
+        made: Marker = decode(registers, type.element, encoding=encoding)
     except (ConversionError, TypeError) as error:
         raise Refused(f"{where}.null: {error}") from None
     return made

@@ -1,0 +1,118 @@
+"""A client of NATS that nothing which anyone may send puts out of order.
+
+The server passes on subjects that are no UTF-8 or have vertical tabs, and headers that are none.
+nats-py takes no more messages after any of them, or not for a while. Here they are left out, and
+what follows is taken.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from nats.aio.client import Client
+from nats.errors import Error, ProtocolError
+from nats.protocol.parser import AWAITING_CONTROL_LINE, AWAITING_MSG_PAYLOAD, Parser
+
+from holdfast import logs
+
+END = b"\r\n"
+LONGEST_LINE = 1024 * 1024
+"""Bytes of a line of the protocol; the longest are those that tell of the server."""
+
+
+class SafeClient(Client):
+    """Leaves out messages that it can't take, and says so in the log now and then."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ps = _Parser(self)
+
+    async def _process_msg(
+        self, sid: int, subject: bytes, reply: bytes, data: bytes, headers: bytes
+    ) -> None:
+        try:
+            await super()._process_msg(sid, subject, reply, data, headers)
+        except Exception as error:  # Whoever sends such a message must not cost the others theirs.
+            shown = subject.decode(errors="backslashreplace")
+            logs.refused("message_malformed", kind="nats", subject=shown, reason=_reason(error))
+
+
+class TlsClient(SafeClient):
+    """Says nothing to a server that does not use TLS; the client by itself would go on without."""
+
+    async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
+        if initial_connection and not info.get("tls_required"):
+            raise Error("the server does not use TLS")
+        await super()._process_info(info, initial_connection)
+
+
+def _decoded(info: bytes) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(info)
+    except ValueError:
+        raise ProtocolError("nats: malformed INFO") from None
+    return found
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return "no UTF-8 in the subject, the reply subject or a header"
+    return f"headers that are none ({type(error).__name__})"
+
+
+class _Parser(Parser):
+    """Takes apart what the server sends where the server does: lines at blanks and tabs only."""
+
+    nc: Client
+
+    async def parse(self, data: bytes = b"") -> None:
+        """Deals with all that is whole. Raises `ProtocolError` for what is no line of NATS."""
+        self.buf.extend(data)
+        while self.buf:
+            if self.state == AWAITING_CONTROL_LINE:
+                end = self.buf.find(END)
+                if end < 0:
+                    if len(self.buf) > LONGEST_LINE:
+                        raise ProtocolError("nats: a line without an end")
+                    return
+                line = bytes(self.buf[:end])
+                del self.buf[: end + len(END)]
+                await self._take(line)
+            else:
+                if len(self.buf) < self.needed + len(END):
+                    return
+                head = bytes(self.buf[: self.header_needed])
+                payload = bytes(self.buf[self.header_needed : self.needed])
+                del self.buf[: self.needed + len(END)]
+                self.state = AWAITING_CONTROL_LINE
+                of = self.msg_arg
+                await self.nc._process_msg(of["sid"], of["subject"], of["reply"], payload, head)
+
+    async def _take(self, line: bytes) -> None:
+        """Deals with one line."""
+        word, _, rest = line.replace(b"\t", b" ").partition(b" ")
+        if word in (b"MSG", b"HMSG"):
+            self._begin(rest, with_header=word == b"HMSG")
+        elif word == b"PING":
+            await self.nc._process_ping()
+        elif word == b"PONG":
+            await self.nc._process_pong()
+        elif word == b"INFO":
+            await self.nc._process_info(_decoded(rest))
+        elif word == b"-ERR":
+            await self.nc._process_err(rest.decode(errors="backslashreplace").lower())
+        elif word != b"+OK":
+            raise ProtocolError("nats: unknown protocol")
+
+    def _begin(self, rest: bytes, *, with_header: bool) -> None:
+        """Takes note of a message whose bytes follow."""
+        parts = [part for part in rest.split(b" ") if part]
+        try:
+            subject, sid, *reply = parts[: len(parts) - 1 - with_header]
+            sizes = [int(part) for part in parts[len(parts) - 1 - with_header :]]
+            self.msg_arg = {"subject": subject, "sid": int(sid), "reply": b"".join(reply)}
+        except ValueError:
+            raise ProtocolError("nats: malformed MSG") from None
+        self.header_needed, self.needed = sizes if with_header else (0, *sizes)
+        self.state = AWAITING_MSG_PAYLOAD
