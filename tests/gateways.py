@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from holdfast.client import Client
     from holdfast.gateway.egress import Resolve
-    from holdfast.target import Transport
+    from holdfast.target import NetworkTarget
 
 API = "/api/modbus"
 PLC = "plc.factory.local"
@@ -31,15 +31,14 @@ class Dialed:
     """Makes clients as the gateway does, and notes of whom; some are led elsewhere."""
 
     def __init__(self, elsewhere: dict[tuple[str, int], tuple[str, int]] | None = None) -> None:
-        self.calls: list[tuple[Transport, str, int]] = []
+        self.calls: list[NetworkTarget] = []
         self._elsewhere = elsewhere or {}
 
-    def __call__(
-        self, transport: Transport, address: str, port: int, *, timeout: float, in_flight: int
-    ) -> Client:
-        self.calls.append((transport, address, port))
-        there = self._elsewhere.get((address, port), (address, port))
-        return dial(transport, *there, timeout=timeout, in_flight=in_flight)
+    def __call__(self, target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
+        self.calls.append(target)
+        host, port = self._elsewhere.get((target.host, target.port), (target.host, target.port))
+        there = replace(target, host=host, port=port)
+        return dial(there, timeout=timeout, in_flight=in_flight)
 
 
 class Names:

@@ -426,12 +426,6 @@ def test_every_transport_reads_and_writes(client: web.Client, tmp_path: Path, ki
         assert client.get("/api/gateway").json["connections"] == 1
 
 
-def test_tls_is_not_there_yet(client: web.Client) -> None:
-    answer = ask(client, "/connect", transport="tls")
-    assert answer.status == 400
-    assert "not available" in answer.json["error"]
-
-
 def read(client: web.Client, device: FakeDevice, **more: Any) -> web.Answer:
     where = {"host": "127.0.0.1", "port": device.port, "functionCode": 3, "address": 0}
     return ask(client, "/read", **where, **more)
@@ -528,6 +522,7 @@ def test_the_next_address_of_a_name_is_tried(device: tuple[str, int]) -> None:
         ("/write/registers", {"host": PLC, "address": 1}, "Missing required parameter: values"),
         ("/connect", {"host": ""}, "host"),
         ("/connect", {"host": "a b"}, "host"),
+        ("/connect", {"host": "plc\n"}, "host"),
         ("/connect", {"host": "/dev/ttyUSB0"}, "host"),
         ("/connect", {"host": "rtu:///dev/ttyUSB0"}, "host"),
         ("/connect", {"host": "tcp://10.0.0.1"}, "host"),
@@ -541,11 +536,19 @@ def test_the_next_address_of_a_name_is_tried(device: tuple[str, int]) -> None:
         ("/connect", {"host": PLC, "port": 502.0}, "port"),
         ("/connect", {"host": PLC, "port": None}, "port"),
         ("/connect", {"host": PLC, "unitId": 256}, "unitId is 256"),
+        ("/read", {"byteOrder": "abcd"}, 'byteOrder is "abcd", allowed is ABCD, CDAB, BADC, DCBA'),
+        ("/read", {"datatype": ""}, 'datatype is "", allowed is a type as int16'),
+        ("/read", {"quantity": 2001}, "allowed is an integer 1 to 125 for registers"),
+        ("/write/registers", {"values": []}, "has 0 elements, allowed are 1 to 123"),
         ("/connect", {"host": PLC, "unitId": -1}, "unitId"),
         ("/connect", {"host": PLC, "unitId": True}, "unitId"),
         ("/connect", {"host": PLC, "timeout": 0}, "timeout"),
         ("/connect", {"host": PLC, "timeout": 60001}, "timeout is 60001"),
         ("/connect", {"host": PLC, "transport": "rtu"}, "transport"),
+        ("/connect", {"host": PLC, "serverName": "plc"}, "serverName goes with transport tls"),
+        ("/connect", {"host": PLC, "transport": "tls", "serverName": ""}, "serverName"),
+        ("/connect", {"host": PLC, "transport": "tls", "serverName": "a b"}, "serverName"),
+        ("/connect", {"host": PLC, "transport": "tls", "serverName": "plc-"}, "as the name of a"),
         ("/connect", {"host": PLC, "unitid": 3}, '"unitid" is not a parameter'),
         ("/read", {"functionCode": 5}, "Invalid read function code: 0x5"),
         ("/read", {"functionCode": 6}, "Invalid read function code: 0x6"),
@@ -578,7 +581,7 @@ def test_the_next_address_of_a_name_is_tried(device: tuple[str, int]) -> None:
         ("/write/registers", {"values": [1.5]}, "values[0] is 1.5"),
         ("/write/registers", {"values": [True]}, "values[0] is true"),
         ("/write/registers", {"values": ["1"]}, 'values[0] is "1"'),
-        ("/write/registers", {"values": [0] * 124}, "124 registers, allowed are 123"),
+        ("/write/registers", {"values": [0] * 124}, "124 elements, allowed are 1 to 123"),
         ("/write/registers", {"values": [0] * 62, "datatype": "int32"}, "124 registers"),
         ("/write/registers", {"values": [1e39], "datatype": "float32"}, "values[0]"),
         ("/write/registers", {"values": [1, 2], "datatype": "int16[3]"}, "2 elements"),
@@ -630,7 +633,16 @@ def test_what_is_wrong_is_named_before_a_device_is_asked(
 
 @pytest.mark.parametrize(
     "body",
-    [b"", b"[]", b"null", b"{", b'{"host":"a"}x', b'\xef\xbb\xbf{"host":"a"}', b"[" * 60000],
+    [
+        b"",
+        b"[]",
+        b"null",
+        b"{",
+        b'{"host":"a"}x',
+        b'{"host":"a","host":"a"}',
+        b'\xef\xbb\xbf{"host":"a"}',
+        b"[" * 60000,
+    ],
 )
 def test_what_is_no_object_is_malformed(client: web.Client, body: bytes) -> None:
     answer = client.ask("POST", "/api/modbus/connect", body)
@@ -669,6 +681,10 @@ def test_there_is_nothing_elsewhere(client: web.Client) -> None:
         ({"Content-Type": "application/json; charset=utf-8"}, 200),
         ({"Content-Type": "application/x-www-form-urlencoded"}, 200),
         ({"Content-Type": "text/plain"}, 415),
+        ({"Content-Type": "text/plain;charset=UTF-8"}, 415),
+        ({"Content-Type": "application/json;"}, 200),
+        ({"Content-Type": "Application/JSON; v=1"}, 200),
+        ({"Content-Type": "application/jsonx"}, 415),
         ({"Content-Type": "application/json", "Content-Encoding": "gzip"}, 415),
     ],
 )
@@ -684,7 +700,7 @@ def test_a_gateway_says_what_it_may_do(client: web.Client) -> None:
         "version": holdfast.__version__,
         "writes": True,
         "tokens": False,
-        "allow": ["10.0.0.0/8:502", "192.168.1.0/24:5020", "127.0.0.0/8:*"],
+        "allow": ["10.0.0.0/8", "192.168.1.0/24:5020", "127.0.0.0/8:*"],
         "limits": {"timeout": 60000, "interval": 100},
         "connections": 0,
     }

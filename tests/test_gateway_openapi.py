@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from schemathesis import Case
 
     from gateways import Running
+    from holdfast.target import NetworkTarget
 
 EXAMPLES = 25
 
@@ -51,8 +53,9 @@ class Everywhere(Dialed):
         super().__init__()
         self._device = device
 
-    def __call__(self, transport: Any, *_: Any, **options: Any) -> Any:
-        return super().__call__(transport, *self._device, **options)
+    def __call__(self, target: NetworkTarget, **options: Any) -> Any:
+        host, port = self._device
+        return super().__call__(replace(target, host=host, port=port), **options)
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +99,20 @@ def test_what_is_answered_is_what_the_document_says(
         assert response.headers.get("holdfast-reason") != ["internal_error"]
 
     asked()
+
+
+def test_every_request_of_a_device_may_have_tls() -> None:
+    for path, methods in DOCUMENT["paths"].items():
+        if not path.startswith(gateways.API):
+            continue
+        [operation] = methods.values()
+        if "parameters" in operation:
+            fields = {each["name"]: each["schema"] for each in operation["parameters"]}
+        else:
+            content = operation["requestBody"]["content"]
+            fields = content["application/json"]["schema"]["properties"]
+        assert "tls" in fields["transport"]["enum"], path
+        assert fields["serverName"]["type"] == "string", path
 
 
 def test_every_example_is_answered_as_the_document_says(gateway: Running) -> None:

@@ -27,12 +27,16 @@ from fake_device import FakeDevice, registers
 from gateways import PLC, Dialed, Names
 from holdfast import logs
 from holdfast.cli import main
+from holdfast.cli.gateway import _greeting
 from holdfast.config.egress import parse_allowed
-from holdfast.gateway import egress, tokens
+from holdfast.gateway import Settings, egress, tokens
+from holdfast.target import NetworkTarget
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from holdfast.target import Transport
 
 SECRET = "correct-horse-battery-staple"
 TOKENS = (("edge", hashlib.sha256(SECRET.encode()).digest()),)
@@ -66,19 +70,25 @@ def read(device: FakeDevice, **more: Any) -> dict[str, Any]:
     return {"host": "127.0.0.1", "port": device.port, "functionCode": 3, "address": 0, **more}
 
 
+def write(device: FakeDevice) -> dict[str, Any]:
+    """The body of a write to a device."""
+    return {"host": "127.0.0.1", "port": device.port, "address": 0, "value": 1}
+
+
 # The egress list.
 
 
 @pytest.mark.parametrize(
     ("text", "means"),
     [
-        ("10.0.0.0/8", "10.0.0.0/8:502"),
-        ("10.0.0.5", "10.0.0.5:502"),
+        ("10.0.0.0/8", "10.0.0.0/8"),
+        ("10.0.0.5", "10.0.0.5"),
         ("10.0.0.5:5020", "10.0.0.5:5020"),
         ("10.0.0.0/24:502-510", "10.0.0.0/24:502-510"),
         ("10.0.0.5:*", "10.0.0.5:*"),
         ("0.0.0.0/0:*", "0.0.0.0/0:*"),
-        ("[fd00::]/8", "[fd00::]/8:502"),
+        ("[fd00::]/8", "[fd00::]/8"),
+        ("[fd00::5]:502", "[fd00::5]:502"),
         ("[fd00::5]:1502", "[fd00::5]:1502"),
         ("[::]/0:*", "[::]/0:*"),
     ],
@@ -120,21 +130,36 @@ def test_what_is_no_entry_is_refused(text: str) -> None:
 )
 def test_the_list_says_which_addresses(address: str, port: int, allowed: bool) -> None:
     entries = ["10.0.0.0/8", "192.168.1.0/24:5020-5029", "[fd00::]/8"]
-    assert egress.Egress(map(parse_allowed, entries)).allows(address, port) is allowed
+    assert egress.Egress(map(parse_allowed, entries)).allows(address, port, "tcp") is allowed
+
+
+@pytest.mark.parametrize(
+    ("entry", "port", "transports"),
+    [
+        ("10.0.0.0/8", 502, {"tcp", "udp", "rtu+tcp", "tls"}),
+        ("10.0.0.0/8", 802, {"tls"}),
+        ("10.0.0.0/8:502", 802, set()),
+        ("10.0.0.0/8:802", 802, {"tcp", "udp", "rtu+tcp", "tls"}),
+        ("10.0.0.0/8:802", 502, set()),
+    ],
+)
+def test_without_ports_only_tls_may_go_to_802(entry: str, port: int, transports: set[str]) -> None:
+    listed = egress.Egress([parse_allowed(entry)])
+    every: tuple[Transport, ...] = ("tcp", "udp", "rtu+tcp", "tls")
+    assert {each for each in every if listed.allows("10.1.2.3", port, each)} == transports
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0", "::", "224.0.0.1", "ff02::1", "::ffff:0.0.0.0"])
 def test_no_list_lets_one_to_everybody_or_nobody(address: str) -> None:
     everything = egress.Egress(map(parse_allowed, ["0.0.0.0/0:*", "[::]/0:*"]))
-    assert not everything.allows(address, 502)
+    assert not everything.allows(address, 502, "tcp")
 
 
 @pytest.mark.parametrize(
     "host",
     [
         *("192.168.7.7", "127.0.0.1", "::1", "[::1]", "::ffff:127.0.0.1", "[::ffff:c0a8:707]"),
-        *("0.0.0.0", "localhost", "2130706433", "0x7f000001", "127.1", "017700000001", PLC),
-        "evil.example",
+        *("0.0.0.0", "localhost", PLC, "evil.example"),
     ],
 )
 @pytest.mark.parametrize("path", ["/connect", "/write/coil", "/map", "/watch"])
@@ -157,6 +182,23 @@ def test_a_target_outside_is_refused_before_a_socket_is_opened(host: str, path: 
     assert dialed.calls == []
 
 
+@pytest.mark.parametrize(
+    "host",
+    [
+        *("2130706433", "0x7f000001", "127.1", "017700000001", "999.1.1.1", "1.2.3.4."),
+        *("127.0.0.1:502", "[::1]:502", "::1:", "plc.7"),
+    ],
+)
+def test_what_is_neither_an_address_nor_a_name_is_refused(host: str) -> None:
+    dialed = Dialed()
+    with gateways.running(dialed=dialed) as running:
+        answer = running.ask("/connect", {"host": host})
+    assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
+    allowed = "a name or an IP address; the port is a field of its own"
+    assert answer.json["error"] == f'host is "{host}", allowed is {allowed}'
+    assert dialed.calls == []
+
+
 def test_a_port_outside_is_refused() -> None:
     dialed = Dialed()
     with gateways.running(allow=["127.0.0.0/8"], dialed=dialed) as running:
@@ -172,12 +214,12 @@ def test_of_several_addresses_only_those_in_the_list_are_used(
     with gateways.running(resolve=names, dialed=dialed) as running:
         answer = running.ask("/connect", {"host": PLC, "port": server.address[1]})
     assert answer.json["success"] is True
-    assert dialed.calls == [("tcp", "127.0.0.1", server.address[1])]
+    assert dialed.calls == [NetworkTarget("tcp", "127.0.0.1", server.address[1])]
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp", "rtu+tcp"])
 def test_the_address_that_was_checked_is_the_one_that_is_connected_to(
-    server: holdfast.Server, transport: str
+    server: holdfast.Server, transport: Transport
 ) -> None:
     names = Names(plc_factory_local=[["127.0.0.1"], ["192.0.2.1"]])
     dialed = Dialed()
@@ -186,11 +228,11 @@ def test_the_address_that_was_checked_is_the_one_that_is_connected_to(
     with gateways.running(resolve=names, dialed=dialed) as running:
         first = running.ask("/connect", asked)
         assert first.status == (200 if transport == "tcp" else 500)
-        assert dialed.calls == [(transport, "127.0.0.1", port)]
+        assert dialed.calls == [NetworkTarget(transport, "127.0.0.1", port)]
         assert names.asked == [PLC]
         second = running.ask("/connect", asked)
     assert (second.status, second.headers["holdfast-reason"]) == (403, "refused_target")
-    assert dialed.calls == [(transport, "127.0.0.1", port)]
+    assert dialed.calls == [NetworkTarget(transport, "127.0.0.1", port)]
 
 
 def test_a_name_is_looked_up_once_by_a_request(
@@ -274,6 +316,37 @@ def test_a_write_is_logged_without_its_value(server: holdfast.Server, log: web.R
     ]
     assert written[0]["target"] == f"127.0.0.1:{server.address[1]}"
     assert "54321" not in "".join(log.lines)
+
+
+def test_a_write_that_is_refused_is_logged_without_its_value(log: web.Records) -> None:
+    with gateways.running() as running:
+        body = {"host": "127.0.0.1", "address": 5}
+        for path, value in (
+            ("/write/registers", {"values": [70001]}),
+            ("/write/registers", {"values": [70001], "datatype": "uint16"}),
+            ("/write/register", {"value": 70001}),
+            ("/write/registers", {"values": ["70001"]}),
+        ):
+            assert running.ask(path, {**body, **value}).status == 400
+        assert running.gateway.status()["writes"] == 0
+    assert len(log.of("gateway_refused")) == 4
+    assert "70001" not in "".join(log.lines)
+
+
+def test_a_write_that_was_not_sent_is_told_apart(server: holdfast.Server, log: web.Records) -> None:
+    with FakeDevice(registers) as gone:
+        port = gone.port
+    with (
+        FakeDevice(lambda _: None) as mute,
+        gateways.running(allow=["127.0.0.0/8:1024-65535"]) as running,
+    ):
+        body = {"host": "127.0.0.1", "address": 0, "value": 1, "timeout": 50}
+        for each in (port, 502, mute.port, server.address[1]):
+            running.ask("/write/register", {**body, "port": each})
+        running.ask("/write/register", {**body, "host": "no-such-name.invalid", "timeout": 9000})
+        assert running.gateway.status()["writes"] == 2
+    outcomes = [each["outcome"] for each in log.of("gateway_write")]
+    assert outcomes == ["not sent", "refused", "failed", "done", "not sent"]
 
 
 # Tokens.
@@ -468,6 +541,137 @@ def test_too_many_requests_are_told_to_come_again(server: holdfast.Server) -> No
         assert answer.status == 200
 
 
+def test_a_dead_device_leaves_places_for_others(server: holdfast.Server) -> None:
+    asked = threading.Semaphore(0)
+
+    def mute(_: bytes) -> None:
+        asked.release()
+
+    with (
+        FakeDevice(mute) as device,
+        gateways.running(
+            limits={"requests": 3, "requests_of_device": 2, "in_flight": 2}
+        ) as running,
+        ThreadPoolExecutor(2) as threads,
+    ):
+        body = read(device, timeout=1000)
+        waiting = [threads.submit(running.ask, "/read", body) for _ in range(2)]
+        for _ in waiting:
+            assert asked.acquire(timeout=wire.DEADLINE)
+        answer = running.ask("/read", body)
+        assert answer.headers["holdfast-reason"] == "busy"
+        assert f"2 requests to 127.0.0.1:{device.port} are under way" in answer.json["error"]
+        live = {"host": "127.0.0.1", "port": server.address[1]}
+        assert running.ask("/connect", live).status == 200
+        assert [each.result(wire.DEADLINE).status for each in waiting] == [500, 500]
+        assert running.ask("/read", read(device, timeout=1)).status == 500
+
+
+def test_a_request_that_had_no_turn_says_that_it_was_not_sent() -> None:
+    asked = threading.Semaphore(0)
+
+    def mute(_: bytes) -> None:
+        asked.release()
+
+    with (
+        FakeDevice(mute) as device,
+        gateways.running() as running,
+        ThreadPoolExecutor(1) as threads,
+    ):
+        waiting = threads.submit(running.ask, "/read", read(device, timeout=1000))
+        assert asked.acquire(timeout=wire.DEADLINE)
+        answer = running.ask("/read", read(device, timeout=50))
+        assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
+        assert answer.json["error"] == (
+            "Connection timeout: it waited for its turn behind other requests to this device, "
+            "and was not sent"
+        )
+        assert waiting.result(wire.DEADLINE).json["error"] == "Connection timeout"
+        assert len(device.asked) == 1
+
+
+@pytest.mark.parametrize("path", ["/read", "/write/register"])
+def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str) -> None:
+    asked = threading.Semaphore(0)
+
+    def mute(_: bytes) -> None:
+        asked.release()
+
+    with (
+        FakeDevice(mute) as device,
+        gateways.running(limits={"ending": 0.05}) as running,
+        ThreadPoolExecutor(1) as threads,
+    ):
+        body = {"/read": read(device), "/write/register": write(device)}[path]
+        waiting = threads.submit(running.ask, path, {**body, "timeout": 60000})
+        assert asked.acquire(timeout=wire.DEADLINE)
+        running.stop.set()
+        answer = waiting.result(wire.DEADLINE)
+    assert (answer.status, answer.headers["holdfast-reason"]) == (503, "stopping")
+    assert "may have been carried out" in answer.json["error"]
+
+
+def test_a_request_that_can_still_be_done_when_the_gateway_ends_is_done() -> None:
+    asked, go_on = threading.Semaphore(0), threading.Event()
+
+    def answer(pdu: bytes) -> bytes:
+        asked.release()
+        assert go_on.wait(wire.DEADLINE)
+        return registers(pdu, 7)
+
+    with (
+        FakeDevice(answer) as device,
+        gateways.running(limits={"ending": 60}) as running,
+        ThreadPoolExecutor(1) as threads,
+    ):
+        waiting = threads.submit(running.ask, "/read", read(device))
+        assert asked.acquire(timeout=wire.DEADLINE)
+        running.stop.set()
+        go_on.set()
+        assert waiting.result(wire.DEADLINE).json["values"] == [7]
+
+
+# Requests that are none.
+
+
+def received(connection: wire.Connection) -> bytes:
+    """What one answer has at least."""
+    connection.socket.settimeout(wire.DEADLINE)
+    data = b""
+    while b"}" not in data:
+        piece = connection.socket.recv(65536)
+        assert piece, data
+        data += piece
+    return data
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"FOO / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: a\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.0\r\nHost: 127.0.0.1\r\nHost: 127.0.0.1\r\n\r\n",
+    ],
+)
+def test_what_is_no_request_is_answered_as_all_errors_are(sent: bytes) -> None:
+    with gateways.running() as running, wire.Connection(running.address) as connection:
+        connection.send(sent)
+        [answer] = web.answers(received(connection))
+    assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
+    assert set(answer.json) == {"success", "error"}
+    assert answer.json["success"] is False
+
+
+def test_a_request_of_http_1_0_needs_no_host() -> None:
+    with gateways.running() as running, wire.Connection(running.address) as connection:
+        connection.send(b"GET /api/gateway HTTP/1.0\r\n\r\n")
+        [answer] = web.answers(connection.rest())
+    assert answer.status == 200
+
+
 def test_too_many_streams_are_told_to_come_again(server: holdfast.Server) -> None:
     query = f"/watch?host=127.0.0.1&port={server.address[1]}&functionCode=3&address=0"
     with gateways.running(limits={"streams": 1}) as running:
@@ -605,6 +809,35 @@ def test_a_signal_ends_it_with_exit_code_0(server: holdfast.Server, number: int)
         command.process.kill()
         command.process.communicate()
     assert (command.process.returncode, log) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("allow", "example"),
+    [
+        ("127.0.0.1:*", '{"host":"127.0.0.1","port":502}'),
+        ("0.0.0.0/0", '{"host":"plc.local","port":502}'),
+        ("0.0.0.0/0:5020-5030", '{"host":"plc.local","port":5020}'),
+        ("[::]/0:802", '{"host":"plc.local","port":802}'),
+        ("10.0.0.0/8", '{"host":"10.0.0.1","port":502}'),
+        ("10.0.0.4/31:400-600", '{"host":"10.0.0.4","port":502}'),
+    ],
+)
+def test_the_greeting_has_an_example_that_may_be(allow: str, example: str) -> None:
+    settings = Settings((parse_allowed(allow),))
+    assert f"-d '{example}'" in _greeting("127.0.0.1:8090", settings)
+
+
+@pytest.mark.parametrize(
+    ("address", "url"),
+    [
+        ("0.0.0.0:8090", "http://127.0.0.1:8090"),
+        ("[::]:8090", "http://[::1]:8090"),
+        ("10.0.0.9:8090", "http://10.0.0.9:8090"),
+    ],
+)
+def test_the_greeting_names_an_address_that_can_be_opened(address: str, url: str) -> None:
+    lines = _greeting(address, Settings((parse_allowed("10.0.0.0/8"),))).splitlines()
+    assert lines[0] == f"The console is at {url}/, the API is described at {url}/docs"
 
 
 def test_it_needs_an_egress_list() -> None:

@@ -173,6 +173,17 @@ def test_while_nothing_changes_there_are_signs_of_life(server: holdfast.Server) 
         assert [next(events).name for _ in range(4)] == ["values", ":", ":", ":"]
 
 
+def test_while_a_device_is_waited_for_there_are_signs_of_life() -> None:
+    def answer(pdu: bytes) -> bytes | None:
+        return registers(pdu) if len(device.asked) == 1 else None
+
+    limits = {"interval": SOON, "heartbeat": 0.02}
+    with FakeDevice(answer) as device, gateways.running(limits=limits) as gateway:
+        events = iter(watch(gateway, device.port, timeout=60000))
+        assert [next(events).name for _ in range(4)] == ["values", ":", ":", ":"]
+        assert len(device.asked) == 2
+
+
 def test_a_watch_ends_when_its_client_goes(server: holdfast.Server) -> None:
     port = server.address[1]
     with gateways.running(limits={"streams": 1, "interval": SOON}) as gateway:
@@ -212,6 +223,7 @@ def test_a_map_tells_the_ranges_of_all_areas(gateway: Running, serve: Serve) -> 
     assert last.name == "result"
     assert last.data["success"] is True
     assert (last.data["first"], last.data["last"], last.data["exact"]) == (0, 65535, False)
+    assert last.data["step"] == 256
     assert last.data["requests"] == sum(area["requests"] for area in last.data["areas"])
     assert ranges(last.data) == {
         "coils": [[0, 16]],
@@ -231,6 +243,7 @@ def test_a_map_can_be_of_a_part_and_exact(gateway: Running, serve: Serve) -> Non
     result = mapped(gateway, serve({1: plant}).address[1], **options).next("result")
     assert ranges(result) == {"holding_registers": [[37, 38]]}
     assert (result["exact"], result["first"], result["last"]) == (True, 30, 45)
+    assert result["step"] is None
 
 
 def test_what_fails_otherwise_is_told_apart(gateway: Running) -> None:
@@ -245,6 +258,25 @@ def test_what_fails_otherwise_is_told_apart(gateway: Running) -> None:
         [area] = mapped(gateway, device.port, **options).next("result")["areas"]
     assert area["ranges"] == [[0, 2], [4, 7]]
     assert area["failures"] == {"4": [[3, 3]]}
+
+
+def test_only_the_areas_that_are_asked_for_are_read(gateway: Running) -> None:
+    def answer(pdu: bytes) -> bytes | None:
+        if pdu[0] != 4:
+            return None
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return registers(pdu) if first + count <= 8 else exception(pdu, 2)
+
+    with FakeDevice(answer) as device:
+        asked = {"areas": ["input_registers"], "last": 20}
+        [area] = mapped(gateway, device.port, **asked).next("result")["areas"]
+        assert area["ranges"] == [[0, 7]]
+        assert {pdu[0] for pdu in device.asked} == {4}
+        asked = {"areas": ["holding_registers", "input_registers"], "last": 20, "timeout": 50}
+        result = mapped(gateway, device.port, **asked).next("result")
+        assert result["success"] is True
+        assert [each["area"] for each in result["areas"]] == asked["areas"]
+        assert [each["ranges"] for each in result["areas"]] == [[], [[0, 7]]]
 
 
 def test_a_device_that_is_silent_is_no_map(gateway: Running) -> None:
@@ -262,6 +294,7 @@ def test_a_device_that_falls_silent_ends_its_map(gateway: Running) -> None:
         result = mapped(gateway, device.port, **options).next("result")
     assert result["success"] is False
     assert "ceased to answer" in result["error"]
+    assert result["reason"] == "timeout"
     [[first, last]] = result["areas"][0]["ranges"]
     assert first == 0
     assert last > 100
@@ -274,6 +307,7 @@ def test_a_map_has_a_longest_time() -> None:
     ):
         result = mapped(gateway, device.port, exact=True).next("result")
     assert (result["success"], result["error"]) == (False, "not done within 0.1 s")
+    assert result["reason"] == "unfinished"
 
 
 def test_a_map_ends_when_its_client_goes() -> None:

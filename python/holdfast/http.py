@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     Send: TypeAlias = Callable[[MutableMapping[str, Any]], Awaitable[None]]
     App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
     Headers: TypeAlias = list[tuple[bytes, bytes]]
+    Rejection: TypeAlias = Callable[[str, str], tuple[Headers, bytes]]
 
 BACKLOG = 512
 """Connections that the system holds before they are accepted."""
@@ -100,6 +101,17 @@ def _unmapped(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     return getattr(address, "ipv4_mapped", None) or address
 
 
+def rejection(reason: str, detail: str, status: str = "rejected") -> tuple[Headers, bytes]:
+    """The headers and the JSON of a refusal."""
+    body = msgspec.json.encode({"status": status, "reason": reason, "detail": detail})
+    return headers_of(b"application/json", body), body
+
+
+def headers_of(kind: bytes, body: bytes) -> Headers:
+    """The headers of an answer with this body."""
+    return [(b"content-type", kind), (b"content-length", b"%d" % len(body)), *SAFE]
+
+
 @dataclass
 class Counts:
     """What became of connections: how many are `open`, and why others were refused or closed."""
@@ -121,6 +133,8 @@ class Host:
     did not arrive in time, `scope["state"]["late"]` is set and `receive` returns: the application
     has a moment to answer, then the connection is dropped.
 
+    `rejection` makes what a request is answered with that the application never sees.
+
     A peer that has sent its last byte still gets its answers, unless `leaving` says that it has
     left then: the end of what it sends is all that tells that it closed the connection.
     """
@@ -135,8 +149,10 @@ class Host:
         max_connections: int,
         request_timeout: float,
         leaving: bool = False,
+        rejection: Rejection = rejection,
     ) -> None:
         self.name = name
+        self.rejection = rejection
         self.leaving = leaving
         self.max_connections = max_connections
         self.request_timeout = request_timeout
@@ -225,17 +241,6 @@ async def respond(send: Send, status: int, headers: Headers, body: bytes = b"") 
     """Sends a whole answer."""
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})
-
-
-def rejection(reason: str, detail: str, status: str = "rejected") -> tuple[Headers, bytes]:
-    """The headers and the JSON of a refusal."""
-    body = msgspec.json.encode({"status": status, "reason": reason, "detail": detail})
-    return headers_of(b"application/json", body), body
-
-
-def headers_of(kind: bytes, body: bytes) -> Headers:
-    """The headers of an answer with this body."""
-    return [(b"content-type", kind), (b"content-length", b"%d" % len(body)), *SAFE]
 
 
 async def _end(connections: set[_Connection]) -> None:
@@ -506,7 +511,7 @@ class _Connection(HttpToolsProtocol):
         elif self.pipeline or (self._busy() and self.cycle.response_started):
             self.transport.abort()
         else:
-            headers, body = rejection("malformed", detail)
+            headers, body = self.host.rejection("malformed", detail)
             lines = [b"%b: %b\r\n" % header for header in [*headers, (b"connection", b"close")]]
             self.transport.write(b"".join([STATUS_LINE[status], *lines, b"\r\n", body]))
             self.transport.close()

@@ -25,6 +25,7 @@ LINGER = 2.0
 """Seconds that a client has to end a body that is too large, so that it gets the answer."""
 
 _JSON = re.compile(rb'application/json[ \t]*(;[ \t]*charset="?utf-?8"?[ \t]*)?', re.I)
+_JSON_WITH_PARAMETERS = re.compile(rb"application/json[ \t]*(;.*)?", re.I)
 _LONGEST_SHOWN = 40
 
 
@@ -73,10 +74,14 @@ class Request:
         """Whether it did not arrive in time."""
         return "late" in self.scope["state"]
 
-    def check_json(self, *also: bytes) -> None:
-        """Raises `Unfit` unless the body is plain JSON, or of one of these types in name."""
+    def check_json(self, *also: bytes, parameters: bool = False) -> None:
+        """Raises `Unfit` unless the body is plain JSON, or of one of these types in name.
+
+        With `parameters` the type may have any.
+        """
         kind = self.header(b"content-type")
-        if (kind is None or not _JSON.fullmatch(kind)) and (kind or b"") not in also:
+        form = _JSON_WITH_PARAMETERS if parameters else _JSON
+        if (kind is None or not form.fullmatch(kind)) and (kind or b"") not in also:
             raise Unfit("not_json", f"Content-Type is {_found(kind)}, allowed is application/json")
         coding = self.header(b"content-encoding")
         if coding is not None and coding.lower() != b"identity":

@@ -15,11 +15,13 @@ import click
 from holdfast import logs
 from holdfast.adapters import Stop
 from holdfast.cli.run import PATIENCE, Signals
+from holdfast.client import check_files
 from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.egress import parse_allowed
 from holdfast.gateway import Gateway, Limits, Settings, tokens
 from holdfast.gateway.settings import LOOPBACK
 from holdfast.http import listen
+from holdfast.target import PORT, Tls
 
 if TYPE_CHECKING:
     import socket
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from holdfast.config.egress import Allowed
 
 FAILED = 1
+FILE = click.Path(exists=True, dir_okay=False)
 
 Parsed = TypeVar("Parsed")
 
@@ -61,7 +64,8 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     multiple=True,
     required=True,
     metavar="NETWORK[:PORTS]",
-    help="Whom it may connect to; again for more. Without ports it is port 502; `*` is all.",
+    help="Whom it may connect to; again for more. Without ports it is 502, and 802 with TLS; `*` "
+    "is all.",
 )
 @click.option("--writes", is_flag=True, help="Let requests change devices.")
 @click.option(
@@ -80,6 +84,15 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     help="Who may connect to it; again for more.",
 )
 @click.option(
+    "--tls-ca",
+    type=FILE,
+    metavar="FILE",
+    help="Who is trusted among devices with TLS: authorities, or devices themselves; without it "
+    "the system's authorities.",
+)
+@click.option("--tls-cert", type=FILE, metavar="FILE", help="Our certificate for devices.")
+@click.option("--tls-key", type=FILE, metavar="FILE", help="Its key.")
+@click.option(
     "--in-flight",
     type=click.IntRange(1, 64),
     default=1,
@@ -94,6 +107,9 @@ def gateway(
     writes: bool,
     token_file: Path | None,
     sources: tuple[Network, ...],
+    tls_ca: str | None,
+    tls_cert: str | None,
+    tls_key: str | None,
     in_flight: int,
     json_log: bool,
 ) -> None:
@@ -105,6 +121,9 @@ def gateway(
 
     Who may connect, --sources says: this machine, if nothing else. Anyone else needs a token.
 
+    With TLS a device's certificate is checked against --tls-ca, and a device that asks for one is
+    shown --tls-cert.
+
     Exit codes: 0 stopped by a signal, 1 it could not listen, 2 wrong usage.
     """
     settings = Settings(
@@ -113,6 +132,7 @@ def gateway(
         tokens=() if token_file is None else _tokens(token_file),
         sources=sources,
         limits=replace(Limits(), in_flight=in_flight),
+        tls=_tls(tls_ca, tls_cert, tls_key),
     )
     if not settings.tokens and any(not each.is_loopback for each in sources):
         raise click.UsageError("--sources beyond this machine go with --token-file.")
@@ -151,13 +171,28 @@ def _tokens(file: Path) -> tuple[tokens.Token, ...]:
         raise click.BadParameter(f"{error}.", param_hint="'--token-file'") from error
 
 
+def _tls(ca: str | None, cert: str | None, key: str | None) -> Tls:
+    """The files, which can be used."""
+    if (cert is None) != (key is None):
+        given, missing = (
+            ("--tls-key", "--tls-cert") if cert is None else ("--tls-cert", "--tls-key")
+        )
+        raise click.UsageError(f"{given} goes with {missing}.")
+    tls = Tls(ca, cert, key)
+    if tls != Tls():
+        try:
+            check_files(tls)
+        except (OSError, ValueError) as error:
+            raise click.UsageError(f"TLS of devices: {error}.") from error
+    return tls
+
+
 def _greeting(address: str, settings: Settings) -> str:
-    url = f"http://{address}"
+    url = f"http://{_reachable(address)}"
     can = "reads and writes" if settings.writes else "reads"
     who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
-    [first, *_] = settings.allow
-    host = first.network[1] if first.network.num_addresses > 2 else first.network[0]
-    body = f'{{"host":"{host}","port":{first.first}}}'
+    host, port = _example(settings.allow[0])
+    body = f'{{"host":"{host}","port":{port}}}'
     header = "-H 'Content-Type: application/json'"
     if settings.tokens:
         header += ' -H "Authorization: Bearer $TOKEN"'
@@ -175,3 +210,20 @@ def _greeting(address: str, settings: Settings) -> str:
             "Ctrl-C stops it.",
         ]
     )
+
+
+def _example(entry: Allowed) -> tuple[str, int]:
+    """A host and a port that an entry of the list allows."""
+    network, (first, last) = entry.network, entry.ports or (PORT, PORT)
+    if network.prefixlen == 0:
+        host = "plc.local"
+    else:
+        host = str(network[1] if network.num_addresses > 2 else network[0])
+    return host, PORT if first <= PORT <= last else first
+
+
+def _reachable(address: str) -> str:
+    """The address that a client on this machine can connect to."""
+    host, _, port = address.rpartition(":")
+    local = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+    return f"{local.get(host, host)}:{port}"

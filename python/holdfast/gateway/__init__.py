@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.config.egress import Allowed
-from holdfast.gateway.app import App
+from holdfast.gateway.app import App, rejection
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import Limits, Settings
 from holdfast.http import Host, address_of
@@ -46,6 +46,7 @@ class Gateway:
             max_connections=settings.limits.connections,
             request_timeout=settings.limits.request_timeout,
             leaving=True,
+            rejection=rejection,
         )
 
     def run(self, stop: Stop) -> None:

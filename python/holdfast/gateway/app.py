@@ -17,10 +17,11 @@ from holdfast import __version__, logs
 from holdfast.adapters.rest import page
 from holdfast.errors import ModbusException
 from holdfast.gateway import assets, identifying, openapi, reading, surveying, watching, writing
+from holdfast.gateway.broadcasting import NOTE
 from holdfast.gateway.device import Device, Failed
 from holdfast.gateway.egress import Egress
 from holdfast.gateway.events import Stream
-from holdfast.gateway.fields import from_json, from_query, timeout
+from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
 from holdfast.http import SAFE, headers_of, respond
 from holdfast.http_requests import Gone, Request, Unfit, respond_to_its_end, shown
@@ -55,10 +56,12 @@ STATUSES = {
     "too_large": 413,
     "not_json": 415,
     "busy": 503,
+    "stopping": 503,
 }
 """The status of a refusal by its reason; everything else is 500."""
 
 
+STOPPING = "the gateway stops; a write that was under way may have been carried out"
 WRITES_ON = "--writes, or access: read-write in the configuration, lets this gateway write"
 
 
@@ -81,9 +84,12 @@ class App:
             in_flight=limits.in_flight,
             idle=limits.idle,
             longest=limits.timeout,
+            tls=settings.tls,
             dial=dial,
         )
         self._running = {"requests": 0, "streams": 0}
+        self._shares: dict[tuple[str, int], int] = {}
+        """Requests that are under way by host and port."""
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
@@ -143,6 +149,9 @@ class App:
                 await self._reply(request, send, body, status=500, reason="internal_error")
 
     async def _answer(self, request: Request, send: Send) -> None:
+        hosts = len(request.headers(b"host"))
+        if hosts > 1 or (hosts == 0 and request.scope["http_version"] == "1.1"):
+            raise malformed(f"{hosts} headers Host, HTTP/1.1 has one")
         route = self.routes.get(request.path)
         if route is None:
             raise Unfit("not_found", f"there is nothing at {shown(request.path)}")
@@ -169,7 +178,8 @@ class App:
             who=request.who,
             path=request.path[:100],
             reason=unfit.reason,
-            detail=unfit.detail,
+            # It may repeat values that were to be written.
+            detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
         if status == 401:
             request.more_headers.append((b"www-authenticate", b"Bearer"))
@@ -177,8 +187,7 @@ class App:
             request.more_headers.append((b"retry-after", b"1"))
         body = _error(unfit.detail)
         if status in (408, 413):
-            headers = [*headers_of(JSON, body), (REASON, unfit.reason.encode())]
-            await respond_to_its_end(request, send, status, headers, body)
+            await respond_to_its_end(request, send, status, *rejection(unfit.reason, unfit.detail))
             return
         await self._reply(request, send, body, status=status, reason=unfit.reason)
 
@@ -222,14 +231,35 @@ class App:
         finally:
             self._running[kind] -= 1
 
+    @contextlib.contextmanager
+    def _share(self, device: Device) -> Iterator[None]:
+        """One of the places that requests of one device have. Raises `Unfit`."""
+        key, most = (device.host.lower(), device.port), self._limits.requests_of_device
+        if self._shares.get(key, 0) >= most:
+            where = f"{device.host}:{device.port}"
+            raise Unfit("busy", f"{most} requests to {where} are under way, which is the limit")
+        self._shares[key] = self._shares.get(key, 0) + 1
+        try:
+            yield
+        finally:
+            self._shares[key] -= 1
+            if not self._shares[key]:
+                del self._shares[key]
+
+    async def _end(self, grace: float) -> None:
+        """Returns when the gateway has been ending for so many seconds."""
+        await self._ending.wait()
+        await asyncio.sleep(grace)
+
     async def _while_there(
-        self, request: Request, work: Coroutine[Any, Any, None], *, until_the_end: bool = False
+        self, request: Request, work: Coroutine[Any, Any, None], *, grace: float
     ) -> None:
-        """Work that is given up when the client is gone, or when the gateway ends."""
+        """Work that is given up when the client is gone, and `grace` after the gateway ends."""
         task = asyncio.create_task(work)
-        others: list[asyncio.Task[Any]] = [asyncio.create_task(request.gone())]
-        if until_the_end:
-            others.append(asyncio.create_task(self._ending.wait()))
+        others: list[asyncio.Task[Any]] = [
+            asyncio.create_task(request.gone()),
+            asyncio.create_task(self._end(grace)),
+        ]
         try:
             await asyncio.wait([task, *others], return_when=asyncio.FIRST_COMPLETED)
             if not task.done():
@@ -248,17 +278,27 @@ class App:
 
         async def handle(request: Request, send: Send) -> None:
             self._admit(request)
-            request.check_json(b"", FORM)
+            request.check_json(b"", FORM, parameters=True)
             with self._place("requests", self._limits.requests):
                 given = from_json(await request.body(self._limits.body), fields)
                 changes = endpoint.writes(given)
                 if changes and not self._settings.writes:
                     raise Unfit("writes_off", f"writes are off: {WRITES_ON}")
-                device = Device(self._egress, self._pool, given)
-                work = self._carry_out(request, send, endpoint, given, device, changes)
-                await self._while_there(request, work)
+                device = Device(self._egress, self._pool, given, broadcast=endpoint.broadcast)
+                with self._share(device):
+                    work = self._carry_out(request, send, endpoint, given, device, changes)
+                    await self._while_there_or_told(request, work)
 
         return handle
+
+    async def _while_there_or_told(self, request: Request, work: Coroutine[Any, Any, None]) -> None:
+        """The same for a request that is answered when the gateway ends."""
+        try:
+            await self._while_there(request, work, grace=self._limits.ending)
+        except Gone:
+            if self._ending.is_set():
+                raise Unfit("stopping", STOPPING) from None
+            raise
 
     async def _carry_out(
         self,
@@ -272,40 +312,51 @@ class App:
         outcome = "failed"
         try:
             answer = await endpoint.carry_out(given, device)
-            outcome = "done"
+            outcome = "sent" if device.is_broadcast else "done"
+            if device.is_broadcast:
+                answer["note"] = NOTE
         except ModbusException as error:
             outcome = f"exception {error.code:02X}"
             answer = endpoint.on_exception(given, device, error)
+        except Unfit:
+            outcome = "refused"
+            raise
         finally:
             if changes:
-                self._note_write(request, given, outcome)
+                sent = device.asked and outcome != "refused"
+                told = outcome if sent or outcome == "refused" else "not sent"
+                self._note_write(request, given, device, told, sent=sent)
         await self._reply(request, send, msgspec.json.encode(answer))
 
-    def _note_write(self, request: Request, given: dict[str, Any], outcome: str) -> None:
-        """Counts a write, and tells who wrote where, without the values."""
-        self._writes += 1
+    def _note_write(
+        self, request: Request, given: dict[str, Any], device: Device, outcome: str, *, sent: bool
+    ) -> None:
+        """Counts a write that was sent, and tells who wrote where, without the values."""
+        self._writes += sent
         logs.write(
             logging.INFO,
             "gateway_write",
             peer=request.peer,
             who=request.who,
             path=request.path,
-            target=f"{given['host']}:{given['port']}",
-            unit=given["unitId"],
+            target=f"{device.host}:{device.port}",
+            unit=device.unit,
             address=given.get("address", given.get("writeAddress", "-")),
             outcome=outcome,
         )
 
     async def _map(self, request: Request, send: Send) -> None:
         self._admit(request)
-        request.check_json(b"", FORM)
+        request.check_json(b"", FORM, parameters=True)
         with self._place("streams", self._limits.streams):
             body = await request.body(self._limits.body)
             given = from_json(body, surveying.fields(self._limits))
             device = Device(self._egress, self._pool, given)
             survey = surveying.planned(given)
             stream = Stream(send, self._limits.heartbeat)
-            work = surveying.survey(survey, device, stream, self._limits.mapping)
+            work = surveying.survey(
+                survey, device, stream, step=given["step"], longest=self._limits.mapping
+            )
             await self._while_streaming(request, stream, work)
 
     async def _watch(self, request: Request, send: Send) -> None:
@@ -320,10 +371,10 @@ class App:
         self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
     ) -> None:
         try:
-            await self._while_there(request, work, until_the_end=True)
+            await self._while_there(request, work, grace=0)
         except Gone:
             if self._ending.is_set() and not stream.began:
-                raise Unfit("busy", "the gateway is about to end") from None
+                raise Unfit("stopping", STOPPING) from None
             if self._ending.is_set():
                 await stream.end()
 
@@ -356,6 +407,12 @@ class App:
         kind, body = assets.read(request.path)
         request.more_headers += assets.HEADERS
         await self._reply(request, send, body, kind=kind)
+
+
+def rejection(reason: str, detail: str) -> tuple[Headers, bytes]:
+    """The headers and the JSON of a refusal."""
+    body = _error(detail)
+    return [*headers_of(JSON, body), (REASON, reason.encode())], body
 
 
 def _error(detail: str) -> bytes:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import os
+import ssl
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from holdfast import logs, tls
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusException, RequestTimeout
+from holdfast.gateway.broadcasting import broadcast
 from holdfast.gateway.egress import NoSuchName, Refused
 from holdfast.gateway.fields import malformed
-from holdfast.gateway.pool import Full, could_not_connect
+from holdfast.gateway.pool import Full, Unusable, could_not_connect
 from holdfast.http_requests import Unfit
+from holdfast.target import PORT, TLS_PORT
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -19,8 +23,21 @@ if TYPE_CHECKING:
     from holdfast.client import Client
     from holdfast.gateway.egress import Egress
     from holdfast.gateway.pool import Pool
+    from holdfast.target import Transport
 
 Result = TypeVar("Result")
+
+TOO_MANY_BEFORE = (
+    "Connection timeout: it waited for its turn behind other requests to this device, and was not "
+    "sent"
+)
+NO_BROADCAST = (
+    "unitId 0 is the broadcast of a serial line, which nobody answers; with transport rtu+tcp "
+    "allowed are writes by functions 5, 6, 15, 16 and 22"
+)
+UNIT_0 = "unit id 0 is the broadcast of serial lines, which nobody answers"
+NOT_AGREED = (tls.ENDED, tls.REFUSES, *tls.REASONS.values())
+"""What is told of a connection that ended because of TLS, beside flaws of certificates."""
 
 
 class Failed(Exception):
@@ -35,16 +52,27 @@ class Failed(Exception):
 class Device:
     """The device that a request names, for as long as the request takes."""
 
-    def __init__(self, egress: Egress, pool: Pool, given: Mapping[str, Any]) -> None:
-        if given["transport"] == "tls":
-            raise malformed("transport is tls, which is not available in this version")
+    def __init__(
+        self, egress: Egress, pool: Pool, given: Mapping[str, Any], *, broadcast: bool = False
+    ) -> None:
+        """`broadcast` says whether the request may go to all units of a serial line."""
+        self.transport: Transport = given["transport"]
+        secure = self.transport == "tls"
+        if given["serverName"] is not None and not secure:
+            raise malformed("serverName goes with transport tls")
         self.host: str = given["host"]
-        self.port: int = given["port"]
+        self.port: int = given["port"] or (TLS_PORT if secure else PORT)
         self.unit: int = given["unitId"]
-        self.transport = given["transport"]
+        self.is_broadcast = self.unit == 0 and self.transport == "rtu+tcp"
+        if self.is_broadcast and not broadcast:
+            raise malformed(NO_BROADCAST)
+        self._name: str | None = given["serverName"]
         self.timeout: float = given["timeout"] / 1000
         self.rtt = 0
         """Milliseconds that the last call took."""
+        self.asked = False
+        """Whether a call has had its turn: then the device may have got something."""
+        self._waits = False
         self._egress = egress
         self._pool = pool
 
@@ -60,15 +88,18 @@ class Device:
 
         Raises `Failed`, `Unfit`, and `ModbusException` for what the device answers.
         """
+        if self.is_broadcast:
+            call = broadcast(call)
         try:
             return await self.attempt(call, repeat=repeat)
         except ModbusException:
             raise
         except RequestTimeout:
-            raise Failed("timeout", "Connection timeout") from None
+            raise Failed("timeout", self._timed_out()) from None
         except ConnectionLost as error:
-            reason = "no_connection" if could_not_connect(error) else "connection_lost"
-            raise Failed(reason, self._explained(error)) from None
+            if could_not_connect(error):
+                self.asked = False
+            raise Failed(self._reason(error), self._explained(error)) from None
         except InvalidResponse as error:
             raise Failed("invalid_reply", str(error)) from None
 
@@ -77,16 +108,27 @@ class Device:
     ) -> Result:
         """The same, but what goes wrong between here and the device raises a `ModbusError`."""
         began = time.monotonic()
+
+        def turn(client: Client) -> Awaitable[Result]:
+            self.asked, self._waits = True, False
+            return call(client)
+
+        self._waits = False
         try:
             async with asyncio.timeout(self.timeout):
-                route = await self._egress.route(self.transport, self.host, self.port)
-                return await self._pool.run(route, self.timeout, call, repeat=repeat)
+                route = await self._egress.route(self.transport, self.host, self.port, self._name)
+                self._waits = True
+                return await self._pool.run(route, self.timeout, turn, repeat=repeat)
         except Refused as error:
             raise Unfit("refused_target", str(error)) from None
         except NoSuchName as error:
             raise Failed("no_such_name", str(error)) from None
         except Full:
             raise Unfit("busy", "too many devices are talked to right now") from None
+        except Unusable as error:
+            logs.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))
+            detail = "its certificates can't be used now, see the log of the gateway"
+            raise Failed("internal_error", detail) from None
         except TimeoutError:
             raise RequestTimeout(f"no reply within {self.timeout} s") from None
         except ValueError as error:  # The client's own checks, before anything is sent.
@@ -94,11 +136,27 @@ class Device:
         finally:
             self.rtt = round(1000 * (time.monotonic() - began))
 
+    def _timed_out(self) -> str:
+        if self._waits:
+            return TOO_MANY_BEFORE
+        return "Connection timeout" if self.unit else f"Connection timeout: {UNIT_0}"
+
+    def _reason(self, error: ConnectionLost) -> str:
+        """Why a connection could not be made or ended, in a word."""
+        told = str(error)
+        if isinstance(error.__cause__, ssl.SSLError) or any(each in told for each in NOT_AGREED):
+            return "tls_failed"
+        return "no_connection" if could_not_connect(error) else "connection_lost"
+
     def _explained(self, error: ConnectionLost) -> str:
+        """The same in a sentence, which has the host as the caller named it."""
         cause = error.__cause__
-        if isinstance(cause, OSError) and cause.errno is not None:
-            return f"can't connect to {self.host}:{self.port}: {os.strerror(cause.errno)}"
-        return str(error)
+        if not isinstance(cause, OSError):
+            return str(error)
+        told = str(error).partition(": ")[2]
+        if told == str(cause) and cause.errno is not None and not isinstance(cause, ssl.SSLError):
+            told = os.strerror(cause.errno)
+        return f"can't connect to {self.host}:{self.port}: {told}"
 
 
 def exception_name(error: ModbusException) -> str:

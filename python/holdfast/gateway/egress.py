@@ -42,6 +42,8 @@ class Route:
     transport: Transport
     addresses: tuple[str, ...]
     port: int
+    name: str | None = None
+    """The name that the device's certificate must have, with TLS."""
 
 
 class Egress:
@@ -51,28 +53,44 @@ class Egress:
         self.entries = tuple(entries)
         self._resolve = Lookups() if resolve is None else resolve
 
-    def allows(self, address: str, port: int) -> bool:
+    def allows(self, address: str, port: int, transport: Transport) -> bool:
         """Whether a connection may be made; an IPv4 address in IPv6 is that IPv4 address."""
         found = plain(address)
         if found.is_multicast or found.is_unspecified:
             return False
-        return any(entry.holds(found, port) for entry in self.entries)
+        return any(entry.holds(found, port, transport) for entry in self.entries)
 
-    async def route(self, transport: Transport, host: str, port: int) -> Route:
-        """The way to a target. Raises `Refused` and `NoSuchName`."""
-        name = host.removeprefix("[").removesuffix("]")
+    async def route(
+        self, transport: Transport, host: str, port: int, name: str | None = None
+    ) -> Route:
+        """The way to a target; `name` is that of its certificate, if it is not the host.
+
+        Raises `Refused` and `NoSuchName`.
+        """
+        bare = host.removeprefix("[").removesuffix("]")
         try:
-            found = [str(ip_address(name))]
+            found = [str(ip_address(bare))]
         except ValueError:
             found = await self._resolve(host)
-        allowed = [str(plain(each)) for each in found if self.allows(each, port)]
+        allowed = [str(plain(each)) for each in found if self.allows(each, port, transport)]
         if not allowed:
-            is_name = name not in found
+            is_name = bare not in found
             where = f" ({', '.join(found[:4])})" if is_name else ""
             raise Refused(f"{host}{where}, port {port}, is not in the egress list of this gateway")
         # IPv4 first: a device that has both seldom answers Modbus on IPv6 only.
         allowed.sort(key=lambda each: ":" in each)
-        return Route(transport, tuple(dict.fromkeys(allowed)), port)
+        addresses = tuple(dict.fromkeys(allowed))
+        secure = transport == "tls"
+        return Route(transport, addresses, port, certified(name or host) if secure else None)
+
+
+def certified(host: str) -> str:
+    """What a certificate has for a host: an address without brackets, a name in lower case."""
+    bare = host.removeprefix("[").removesuffix("]")
+    try:
+        return str(plain(bare))
+    except ValueError:
+        return bare.lower().removesuffix(".")
 
 
 def plain(address: str) -> Address:

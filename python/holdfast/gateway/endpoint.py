@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.gateway.device import exception_text
-from holdfast.gateway.fields import HOST, PORT, TRANSPORT, UNIT, Field, Schema, integer
+from holdfast.gateway.fields import HOST, PORT, SERVER_NAME, TRANSPORT, UNIT, Field, Schema, integer
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     Given: TypeAlias = Mapping[str, Any]
     Answer: TypeAlias = dict[str, Any]
 
-TARGET: tuple[Field, ...] = (HOST, PORT, UNIT, TRANSPORT)
+TARGET: tuple[Field, ...] = (HOST, PORT, UNIT, TRANSPORT, SERVER_NAME)
 """The fields that name a device."""
 
 MILLISECONDS: Schema = {"type": "integer", "minimum": 0}
@@ -50,6 +50,8 @@ class Endpoint:
     description: str = ""
     writes: Callable[[Given], bool] = field(default=lambda _: False)
     """Whether a request changes something on the device."""
+    broadcast: bool = False
+    """Whether it may go to all units of a serial line; the answer has a `note` then."""
     timeout: int = 10_000
     optional: tuple[str, ...] = ()
     """Fields of the answer that are there only sometimes."""

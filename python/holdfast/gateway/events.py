@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
 from holdfast.http import SAFE
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
     from holdfast.http import Send
 
+Result = TypeVar("Result")
 KIND = b"text/event-stream"
 
 
@@ -40,6 +43,17 @@ class Stream:
         """A comment, if nothing was sent for a while."""
         if self._loop.time() - self._last >= self._heartbeat:
             await self._write(b":\n\n")
+
+    async def during(self, work: Coroutine[Any, Any, Result]) -> Result:
+        """What work comes to, with signs of life."""
+        task = asyncio.create_task(work)
+        try:
+            while not (await asyncio.wait([task], timeout=self._heartbeat))[0]:
+                await self.beat()
+            return task.result()
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
     async def pause(self, until: float) -> None:
         """Waits until a time of the event loop, with signs of life."""

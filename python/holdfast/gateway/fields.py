@@ -6,8 +6,10 @@ not a field is refused, so that no slip of the pen is taken for a default.
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass, replace
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qsl
 
@@ -40,14 +42,19 @@ class Field:
     default: Any = REQUIRED
     refusal: Callable[[Any], str] | None = None
     """What is said of a wrong value, where the usual words won't do."""
+    allowed: str = ""
+    """What it may be, where the schema has no words for it."""
+    fits: Callable[[Any], bool] = lambda _: True
+    """Whether a value that fits the schema is one."""
 
     def check(self, value: Any) -> Any:
         """The value. Raises `Unfit`."""
         flaw = _flaw(value, self.schema)
-        if flaw is not None:
-            usual = f"{self.name}{flaw}"
-            raise malformed(usual if self.refusal is None else self.refusal(value))
-        return value
+        if flaw is None and self.fits(value):
+            return value
+        if self.allowed:
+            flaw = f" is {told(value)}, allowed is {self.allowed}"
+        raise malformed(f"{self.name}{flaw}" if self.refusal is None else self.refusal(value))
 
     def read(self, text: str) -> Any:
         """A value from a query. Raises `Unfit`."""
@@ -83,18 +90,41 @@ BIT: Schema = {"enum": [False, True, 0, 1]}
 TEXT: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
 ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
 
+
+def is_host(text: str) -> bool:
+    """Whether it is an IP address, or may be a name: what ends in a number is none."""
+    try:
+        ip_address(text.removeprefix("[").removesuffix("]"))
+    except ValueError:
+        last = text.removesuffix(".").rpartition(".")[2]
+        return ":" not in text and re.fullmatch("[0-9]*|0[xX][0-9a-fA-F]*", last) is None
+    return True
+
+
+NAME_OR_ADDRESS = "a name or an IP address; the port is a field of its own"
+
 HOST = Field(
     "host",
     {"type": "string", "maxLength": 253, "pattern": _HOST},
     "Name or IP address of the device; it must be in the egress list",
+    allowed=NAME_OR_ADDRESS,
+    fits=is_host,
 )
-PORT = Field("port", integer(1, LAST), "Port", 502)
+PORT = Field("port", integer(1, LAST), "Port; 502 if left out, 802 with `tls`", None)
 UNIT = Field("unitId", integer(0, 255), "Unit id (slave address)", 1)
 TRANSPORT = Field(
     "transport",
     {"type": "string", "enum": ["tcp", "udp", "rtu+tcp", "tls"]},
-    "How to talk to it; `tls` is not available in this version",
+    "How to talk to it; `tls` is Modbus TCP over TLS",
     "tcp",
+)
+SERVER_NAME = Field(
+    "serverName",
+    {"type": "string", "maxLength": 253, "pattern": _HOST},
+    "With `tls`: the name or IP address that the device's certificate has, if it is not `host`",
+    None,
+    allowed="a name or an IP address",
+    fits=is_host,
 )
 ADDRESS = Field("address", REGISTER, "The first address, from 0")
 DATATYPE = Field(
@@ -103,12 +133,14 @@ DATATYPE = Field(
     "Type of the values: `int16`, `uint32`, `float32`, `bcd16`, `bit:3`, `string:20`, `bytes:4`, "
     "`bool`, or an array as `float32[10]`",
     None,
+    allowed="a type as int16, float32, bcd16, bit:3, string:20 or float32[10]",
 )
 BYTE_ORDER = Field(
     "byteOrder",
     ORDER,
     "Order of bytes: `ABCD`, `CDAB`, `BADC`, `DCBA`, or eight letters for eight bytes",
     "ABCD",
+    allowed="ABCD, CDAB, BADC, DCBA, or eight letters A to H",
 )
 AREA_LIST = Field(
     "areas",
@@ -138,11 +170,21 @@ def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
     """The fields of a JSON object, defaults filled in. Raises `Unfit`."""
     try:
         given = msgspec.json.decode(body)
+        json.loads(body, object_pairs_hook=_without_twins)
     except (msgspec.MsgspecError, RecursionError, UnicodeError, ValueError) as error:
         raise malformed(f"the body is not JSON: {str(error)[:100]}") from None
     if not isinstance(given, dict):
         raise malformed("the body is not a JSON object")
     return _filled(given, fields)
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> None:
+    """Raises `Unfit` for a name that an object has twice."""
+    seen: set[str] = set()
+    for name, _ in pairs:
+        if name in seen:
+            raise malformed(f"{shown(name)} is given more than once")
+        seen.add(name)
 
 
 def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
@@ -199,7 +241,7 @@ def _flaw(value: Any, schema: Schema) -> str | None:
         return None if type(value) is bool else f" is {told(value)}, allowed are true and false"
     if kind != "string":
         return None
-    fits = isinstance(value, str) and re.search(schema.get("pattern", ""), value) is not None
+    fits = isinstance(value, str) and re.fullmatch(schema.get("pattern", ".*"), value) is not None
     long = isinstance(value, str) and not 1 <= len(value) <= schema.get("maxLength", 8)
     return f" is {told(value)}, which it can't be" if long or not fits else None
 

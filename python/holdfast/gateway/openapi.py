@@ -38,8 +38,11 @@ TEXTS = {
         "Neither `application/json` nor what curl says instead, or compressed",
         'Content-Type is "text/plain", allowed is application/json',
     ),
-    "500": ("No connection, or no reply in time", "Connection timeout"),
-    "503": ("Too much at once", "64 requests are under way, which is the limit"),
+    "500": ("No connection, TLS not agreed on, or no reply in time", "Connection timeout"),
+    "503": (
+        "Too much at once, or the gateway stops",
+        "64 requests are under way, which is the limit",
+    ),
 }
 """What a status means, and an example of an error."""
 
@@ -85,7 +88,9 @@ def _endpoint(endpoint: Endpoint, limits: Limits) -> dict[str, Any]:
     longest = round(1000 * limits.timeout)
     fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
     answer = {"success": {"const": True}, **_target(), **endpoint.properties}
-    whole = _object(answer, optional=endpoint.optional)
+    if endpoint.broadcast:
+        answer["note"] = {"type": "string", "description": "Of a broadcast: nobody confirms it"}
+    whole = _object(answer, optional=(*endpoint.optional, "note"))
     example = {"success": True, **endpoint.answer}
     return {
         "operationId": endpoint.name,
@@ -276,9 +281,15 @@ def _schemas_of_maps() -> dict[str, Schema]:
             {
                 "success": {"type": "boolean"},
                 "error": {"type": "string", "description": "Why it ended early"},
+                "reason": {"type": "string", "description": "The same in a word"},
                 "requests": COUNT,
                 "seconds": {"type": "number"},
                 "exact": {"type": "boolean"},
+                "step": {
+                    "type": ["integer", "null"],
+                    "description": "Samples were read at least every so many addresses, and where "
+                    "ranges like to begin; `null` if every address was",
+                },
                 "first": ADDRESS,
                 "last": ADDRESS,
                 "areas": array_of(
@@ -293,7 +304,7 @@ def _schemas_of_maps() -> dict[str, Schema]:
                     )
                 ),
             },
-            optional=("error",),
+            optional=("error", "reason"),
         ),
     }
 

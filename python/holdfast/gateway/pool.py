@@ -9,32 +9,33 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeVar
 
-from holdfast.client import Client
+from holdfast.client import Client, check_files
 from holdfast.errors import ConnectionLost, ModbusException
+from holdfast.target import IN_FLIGHT, NetworkTarget, Tls
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
     from typing import Protocol
 
     from holdfast.gateway.egress import Route
-    from holdfast.target import Transport
 
     class Dial(Protocol):
         """Makes clients, which connect when they are first used."""
 
-        def __call__(
-            self, transport: Transport, address: str, port: int, *, timeout: float, in_flight: int
-        ) -> Client:
-            """The client of an address."""
+        def __call__(self, target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
+            """The client of an address.
+
+            Raises `OSError` and `ValueError` for what TLS can't use.
+            """
             ...
 
-    Key: TypeAlias = tuple[Transport, str, int]
 
 Result = TypeVar("Result")
 
+NO_TLS = Tls()
 LOOK = 0.5
 """Seconds between two looks for connections that nobody uses."""
 
@@ -43,12 +44,14 @@ class Full(Exception):
     """As many devices as there may be are talked to right now."""
 
 
-def dial(
-    transport: Transport, address: str, port: int, *, timeout: float, in_flight: int
-) -> Client:
-    """A client of an address."""
-    host = f"[{address}]" if ":" in address else address
-    return Client(f"{transport}://{host}:{port}", timeout=timeout, max_in_flight=in_flight)
+class Unusable(Exception):
+    """Files of TLS that could be used at the start, and can't now."""
+
+
+def dial(target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
+    """A client of an address. Raises `OSError` and `ValueError` for what TLS can't use."""
+    query = f"?{target.tls.query}" if target.transport == "tls" else ""
+    return Client(f"{target}{query}", timeout=timeout, max_in_flight=in_flight)
 
 
 @dataclass
@@ -70,21 +73,29 @@ class _Entry:
 
 
 class Pool:
-    """Clients by transport, address and port; `most` of them, each idle for `idle` seconds at most.
+    """Clients by their targets; `most` of them, each idle for `idle` seconds at most.
 
-    Over TCP, `in_flight` requests are on their way to a device at once, otherwise one; more wait.
-    `longest` is the most seconds that a request takes.
+    Over TCP and TLS, `in_flight` requests are on their way to a device at once, otherwise one; more
+    wait. `longest` is the most seconds that a request takes.
     """
 
     def __init__(
-        self, *, most: int, in_flight: int, idle: float, longest: float, dial: Dial = dial
+        self,
+        *,
+        most: int,
+        in_flight: int,
+        idle: float,
+        longest: float,
+        tls: Tls = NO_TLS,
+        dial: Dial = dial,
     ) -> None:
         self._most = most
         self._in_flight = in_flight
         self._idle = idle
         self._longest = longest
+        self._tls = tls
         self._dial = dial
-        self._entries: dict[Key, _Entry] = {}
+        self._entries: dict[NetworkTarget, _Entry] = {}
         self._keeper: asyncio.Task[None] | None = None
 
     def __len__(self) -> int:
@@ -102,9 +113,11 @@ class Pool:
 
         `timeout` is the time for it; it is for the caller to end it then. With `repeat` it is
         done again if the connection turns out to have ended since it was last used.
-        Raises `Full`, and what the call raises.
+        Raises `Full`, `Unusable`, `ValueError` for a name that no certificate can have, and what
+        the call raises.
         """
-        keys: list[Key] = [(route.transport, each, route.port) for each in route.addresses]
+        tls = NO_TLS if route.name is None else replace(self._tls, name=route.name)
+        keys = [NetworkTarget(route.transport, each, route.port, tls) for each in route.addresses]
         keys.sort(key=lambda key: key not in self._entries)
         for key in keys[:-1]:
             try:
@@ -116,7 +129,7 @@ class Pool:
 
     async def _run(
         self,
-        key: Key,
+        key: NetworkTarget,
         timeout: float,
         call: Callable[[Client], Awaitable[Result]],
         *,
@@ -154,14 +167,16 @@ class Pool:
         entry.proven, entry.doubtful = True, False
         return result
 
-    async def _entry(self, key: Key, timeout: float) -> _Entry:
+    async def _entry(self, key: NetworkTarget, timeout: float) -> _Entry:
         if self._keeper is None:
             self._keeper = asyncio.create_task(self._keep())
-        entry = self._entries.get(key)
+        if key not in self._entries:
+            made = await self._client(key, timeout)
+        entry = self._entries.get(key)  # Another request may have made it meanwhile.
         if entry is None:
             gone = self._pushed_out() if len(self._entries) >= self._most else None
-            in_flight = self._in_flight if key[0] == "tcp" else 1
-            entry = _Entry(*self._client(key, timeout), asyncio.Semaphore(in_flight))
+            in_flight = self._in_flight if key.transport in IN_FLIGHT else 1
+            entry = _Entry(*made, asyncio.Semaphore(in_flight))
             self._entries[key] = entry
             if gone is not None:
                 entry.users += 1
@@ -171,19 +186,38 @@ class Pool:
                     entry.users -= 1
         return entry
 
-    def _client(self, key: Key, timeout: float) -> tuple[Client, float]:
+    async def _client(self, key: NetworkTarget, timeout: float) -> tuple[Client, float]:
         """A client. What can't be cancelled, which TCP can, has the timeout of the request."""
-        timeout = self._longest if key[0] == "tcp" else timeout
-        return self._dial(*key, timeout=timeout, in_flight=self._in_flight), timeout
+        timeout = self._longest if key.transport in IN_FLIGHT else timeout
+        if key.transport != "tls":
+            return self._dial(key, timeout=timeout, in_flight=self._in_flight), timeout
+        return await asyncio.to_thread(self._dial_tls, key, timeout), timeout
 
-    async def _refresh(self, key: Key, entry: _Entry, timeout: float) -> None:
-        """Makes a client fit for a request that has its turn."""
-        other = key[0] != "tcp" and timeout != entry.timeout
-        if entry.active == 1 and (entry.doubtful or other):
-            entry.proven = entry.doubtful = False
-            await entry.client.close()
-            if other:
-                entry.client, entry.timeout = self._client(key, timeout)
+    def _dial_tls(self, key: NetworkTarget, timeout: float) -> Client:
+        """A client with TLS, whose files are read now, which takes its time."""
+        try:
+            return self._dial(key, timeout=timeout, in_flight=self._in_flight)
+        except (OSError, ValueError):
+            try:
+                check_files(self._tls)
+            except (OSError, ValueError) as error:
+                raise Unusable(str(error)) from None
+            raise
+
+    async def _refresh(self, key: NetworkTarget, entry: _Entry, timeout: float) -> None:
+        """Makes a client fit for a request that has its turn; files may have been renewed."""
+        other = key.transport not in IN_FLIGHT and timeout != entry.timeout
+        if entry.active > 1 or not (entry.doubtful or other):
+            return
+        made = entry.client, entry.timeout
+        if other or key.transport == "tls":
+            made = await self._client(key, timeout)
+        if entry.active > 1:  # Meanwhile another uses it.
+            return
+        old = entry.client
+        entry.proven = entry.doubtful = False
+        entry.client, entry.timeout = made
+        await old.close()
 
     def _pushed_out(self) -> _Entry:
         """Takes out the one that was used longest ago, of those in no use. Raises `Full`."""

@@ -58,6 +58,7 @@ QUANTITY = Field(
     integer(1, 2000),
     "How many, up to 2000 bits or 125 registers; 1 if left out, or what the datatype takes",
     None,
+    allowed="an integer 1 to 125 for registers, 1 to 2000 for bits",
 )
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from ipaddress import ip_network
 from typing import TYPE_CHECKING
 
+from holdfast.target import Tls
+
 if TYPE_CHECKING:
     from holdfast.config.addresses import Network
     from holdfast.config.egress import Allowed
@@ -24,6 +26,8 @@ class Limits:
     """What a request may ask for as its time."""
     requests: int = 64
     """Requests at once; more are answered 503."""
+    requests_of_device: int = 32
+    """Those to one host and port, so that a dead device leaves places for others."""
     streams: int = 16
     """Maps and watches at once; more are answered 503."""
     mapping: float = 900.0
@@ -42,6 +46,8 @@ class Limits:
     """Connections of HTTP clients."""
     request_timeout: float = 10.0
     """For a request to arrive, and for an answer to be taken."""
+    ending: float = 0.7
+    """For requests under way when the gateway ends; then they are answered 503."""
 
     @property
     def open_connections(self) -> int:
@@ -59,3 +65,5 @@ class Settings:
     """Without any, whoever may connect may ask."""
     sources: tuple[Network, ...] = LOOPBACK
     limits: Limits = field(default_factory=Limits)
+    tls: Tls = field(default_factory=Tls)
+    """Whom it trusts among devices with TLS, and what it shows them; callers have no say in it."""

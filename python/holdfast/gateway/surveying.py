@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 from typing import TYPE_CHECKING, Any, cast
 
 from holdfast import mapping
-from holdfast.errors import ModbusError, ModbusException
+from holdfast.errors import ConnectionLost, ModbusError, ModbusException
 from holdfast.gateway.device import Failed
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.fields import AREA_LIST, LAST, Field, integer, malformed, timeout
 from holdfast.http_requests import Unfit
 from holdfast.mapping import Survey
-from holdfast.types import AREAS
+from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
     from holdfast.client import Client
@@ -62,39 +61,58 @@ def planned(given: Given) -> Survey:
     )
 
 
-async def survey(survey: Survey, device: Device, stream: Stream, longest: float) -> None:
+async def survey(
+    survey: Survey, device: Device, stream: Stream, *, step: int, longest: float
+) -> None:
     """Maps a device. What fails before anything was answered, fails as a read does."""
     began = time.monotonic()
-    with contextlib.suppress(ModbusException):  # Which is an answer: the device is there.
-        await device.ask(
-            lambda client: client.read_holding_registers(survey.span.start, 1, unit=device.unit),
-            repeat=True,
-        )
+    await _find(survey, device)
     await stream.begin()
     running = asyncio.create_task(_run(survey, _Reader(device), longest))
     try:
         while not running.done():
             await stream.event("progress", _progress(survey))
             await asyncio.wait([running], timeout=BETWEEN)
-        error = running.result()
+        failure = running.result()
     finally:
         running.cancel()
         await asyncio.wait([running])
-    await stream.event("result", _result(survey, time.monotonic() - began, error))
+    result = {**_result(survey, failure), "seconds": round(time.monotonic() - began, 3)}
+    result["step"] = None if survey.exact else step
+    await stream.event("result", result)
     await stream.end()
 
 
-async def _run(survey: Survey, reader: _Reader, longest: float) -> str | None:
+async def _find(survey: Survey, device: Device) -> None:
+    """Puts the first area that the device answers in to the front. Raises `Failed` and `Unfit`."""
+    for found in list(survey.areas):
+        try:
+            await _Reader(device).look(found.area, survey.span.start)
+        except ModbusException:  # Which is an answer: the device is there.
+            pass
+        except Failed as error:
+            if error.reason != "timeout" or found is survey.areas[-1]:
+                raise
+            continue
+        survey.areas.remove(found)
+        survey.areas.insert(0, found)
+        return
+
+
+async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None:
     """Carries a survey out; why it ended early, if it did."""
     try:
         async with asyncio.timeout(longest):
             await mapping.run(survey, cast("Client", reader))
     except TimeoutError:
-        return f"not done within {longest:g} s"
+        return Failed("unfinished", f"not done within {longest:g} s")
     except ModbusError as error:
-        return str(error)
-    except (Failed, Unfit) as error:
-        return error.detail
+        reason = "connection_lost" if isinstance(error, ConnectionLost) else "timeout"
+        return Failed(reason, str(error))
+    except Unfit as error:
+        return Failed(error.reason, error.detail)
+    except Failed as error:
+        return error
     return None
 
 
@@ -103,6 +121,13 @@ class _Reader:
 
     def __init__(self, device: Device) -> None:
         self._device = device
+
+    async def look(self, area: Area, address: int) -> None:
+        """A first read, which fails as a request does."""
+        kind = "bool" if area in BIT_AREAS else "uint16"
+        await self._device.ask(
+            lambda client: client.read(area, address, kind, unit=self._device.unit), repeat=True
+        )
 
     async def read(self, area: Area, address: int, kind: str) -> Any:
         """A read, each with the time of the request."""
@@ -123,21 +148,24 @@ def _progress(survey: Survey) -> dict[str, Any]:
                 "addresses": found.addresses,
                 **({"ranges": _pairs(found.ranges)} if few else {}),
             }
-            for found in survey.areas
+            for found in _ordered(survey)
         ],
     }
 
 
-def _result(survey: Survey, seconds: float, error: str | None) -> dict[str, Any]:
+def _ordered(survey: Survey) -> list[AreaMap]:
+    return sorted(survey.areas, key=lambda found: AREAS.index(found.area))
+
+
+def _result(survey: Survey, failure: Failed | None) -> dict[str, Any]:
     return {
-        "success": error is None,
-        **({} if error is None else {"error": error}),
+        "success": failure is None,
+        **({} if failure is None else {"error": failure.detail, "reason": failure.reason}),
         "requests": survey.requests,
-        "seconds": round(seconds, 3),
         "exact": survey.exact,
         "first": survey.span.start,
         "last": survey.span.stop - 1,
-        "areas": [_area(found) for found in survey.areas],
+        "areas": [_area(found) for found in _ordered(survey)],
     }
 
 

@@ -69,7 +69,7 @@ async def watch(given: Given, device: Device, stream: Stream) -> None:
         due = max(due + interval, loop.time())
         await stream.pause(due)
         try:
-            event = view.changed(await view.asked.read(device))
+            event = view.changed(await stream.during(view.asked.read(device)))
         except (ModbusException, Failed, Unfit) as error:
             event = view.problem(error)
 

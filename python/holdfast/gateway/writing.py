@@ -166,6 +166,7 @@ ENDPOINTS = (
         {**EXAMPLE, "address": 17, "coilValue": ON, "written": True, "rtt": 12},
         "Function 5. `coilValue` is what is on the wire: 65280 is on.",
         writes=always,
+        broadcast=True,
         timeout=TIMEOUT,
     ),
     Endpoint(
@@ -177,7 +178,7 @@ ENDPOINTS = (
             ADDRESS,
             _values(
                 PLAIN_OR_TYPED,
-                2 * MOST_REGISTERS,
+                MOST_REGISTERS,
                 "Registers 0 to 65535, up to 123; with `datatype` values of that type, bytes in "
                 "hex",
             ),
@@ -199,6 +200,7 @@ ENDPOINTS = (
         {**EXAMPLE, "startAddress": 100, "quantity": 3, "rtt": 14},
         "Function 16. A value that does not fit is refused; nothing is cut or wrapped.",
         writes=always,
+        broadcast=True,
         timeout=TIMEOUT,
     ),
     Endpoint(
@@ -212,6 +214,7 @@ ENDPOINTS = (
         {**EXAMPLE, "address": 5, "value": 1234, "rtt": 12},
         "Function 6.",
         writes=always,
+        broadcast=True,
         timeout=TIMEOUT,
     ),
     Endpoint(
@@ -225,6 +228,7 @@ ENDPOINTS = (
         {**EXAMPLE, "startAddress": 16, "quantity": 3, "rtt": 12},
         "Function 15.",
         writes=always,
+        broadcast=True,
         timeout=TIMEOUT,
     ),
     Endpoint(
@@ -248,6 +252,7 @@ ENDPOINTS = (
         {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8, "rtt": 12},
         "Function 22: the register becomes `(now & andMask) | (orMask & ~andMask)`, as one step.",
         writes=always,
+        broadcast=True,
         timeout=TIMEOUT,
     ),
     Endpoint(
