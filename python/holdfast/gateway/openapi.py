@@ -41,7 +41,7 @@ TEXTS = {
     "500": ("No connection, TLS not agreed on, or no reply in time", "Connection timeout"),
     "503": (
         "Too much at once, or the gateway stops",
-        "64 requests are under way, which is the limit",
+        "128 requests are under way, which is the limit",
     ),
 }
 """What a status means, and an example of an error."""

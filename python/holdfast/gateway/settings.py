@@ -24,9 +24,9 @@ class Limits:
     """Bytes of a request's body."""
     timeout: float = 60.0
     """What a request may ask for as its time."""
-    requests: int = 64
+    requests: int = 128
     """Requests at once; more are answered 503."""
-    requests_of_device: int = 32
+    requests_of_device: int = 64
     """Those to one host and port, so that a dead device leaves places for others."""
     streams: int = 16
     """Maps and watches at once; more are answered 503."""
