@@ -7,6 +7,7 @@ use std::sync::Arc;
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
 use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
+use socket2::SockRef;
 use tokio::io::Interest;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
@@ -151,12 +152,10 @@ impl Datagrams {
             segment_size: None,
             src_ip: to.dst_ip,
         };
-        let sent = self
-            .socket
-            .try_io(Interest::WRITABLE, || self.state.try_send((&self.socket).into(), &transmit));
-        if sent.is_err() {
+        // The system is asked, whatever the runtime knows of the socket: it may know nothing yet.
+        if self.state.try_send((&self.socket).into(), &transmit).is_err() {
             // What was asked need not be an address of this machine: a broadcast is none.
-            let _ = self.socket.try_send_to(reply, to.addr);
+            let _ = SockRef::from(&self.socket).send_to(reply, &to.addr.into());
         }
     }
 }
