@@ -136,6 +136,18 @@ def test_what_was_learned_outlives_a_change_of_what_is_read(poller: Poller) -> N
         assert [(at, fault) for _, at, _, fault in found if fault] == [(50, 2)]
 
 
+def test_what_nobody_wants_any_more_is_not_told_and_not_read(poller: Poller) -> None:
+    with Fake(without([50])) as fake:
+        poller.add(device(fake, interval=3600.0, reads=fields(range(100)), max_gap=10))
+        settled(poller, 0)
+        learned = len(fake.requests)
+        reads = fields([*range(50), *range(51, 100)])
+        poller.replace("a", device(fake, interval=3600.0, reads=reads, max_gap=10))
+        assert not any(fault for *_, fault in settled(poller, 0))
+        assert [asked(request) for request in fake.requests[learned:]] == [(0, 50), (51, 49)]
+        assert poller.counters()["a"]["health"] == "ok"
+
+
 def test_a_device_that_refuses_everything_is_asked_all_the_same(poller: Poller) -> None:
     with Fake(without(range(65536))) as fake:
         poller.add(device(fake, interval=INTERVAL, reads=fields([1, 5, 200])))

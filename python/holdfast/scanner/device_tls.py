@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from holdfast.client import endpoint
+from holdfast.client import check_files, endpoint
 from holdfast.scanner.errors import Refused
-from holdfast.target import TLS_PORT, NetworkTarget, Tls
+from holdfast.target import NetworkTarget, Tls
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,20 +34,20 @@ class DeviceTls:
         if self == DeviceTls():
             return
         try:
-            self._endpoint(NetworkTarget("tls", "localhost", TLS_PORT))
+            check_files(self._files())
         except ValueError as error:
             raise OSError(f"TLS of devices: {error}") from None
 
     def endpoint(self, address: Target) -> Endpoint:
         """Where a device is connected to. Raises `Refused`."""
+        if isinstance(address, NetworkTarget) and address.transport == "tls":
+            address = replace(address, tls=self._files(address.tls.name))
         try:
-            return self._endpoint(address)
+            return endpoint(address)
         except (OSError, ValueError) as error:
             raise Refused(f"{address}: {error}") from None
 
-    def _endpoint(self, address: Target) -> Endpoint:
-        if isinstance(address, NetworkTarget) and address.transport == "tls":
-            files = (self.ca_file, self.cert_file, self.key_file)
-            ca, cert, key = (None if file is None else str(file) for file in files)
-            address = replace(address, tls=Tls(ca, cert, key, address.tls.name))
-        return endpoint(address)
+    def _files(self, name: str | None = None) -> Tls:
+        files = (self.ca_file, self.cert_file, self.key_file)
+        ca, cert, key = (None if file is None else str(file) for file in files)
+        return Tls(ca, cert, key, name)

@@ -423,6 +423,7 @@ impl Device {
         }
         if old.limits == new.limits {
             self.learned.replace(before.learned.take());
+            self.learned().keep(&self.fields);
             self.draw_plan();
         }
     }
@@ -535,7 +536,7 @@ impl Device {
         let only = self.plan.borrow().is_empty();
         let retried = self.learned().retry(Instant::now(), only);
         let mut fault = None;
-        for hole in known.iter().filter(|hole| self.fields.iter().any(|field| hole.holds(field))) {
+        for hole in known {
             let block = hole.block();
             let mut found = hole.fault;
             if retried.as_ref().is_some_and(|retried| retried.is(hole)) {

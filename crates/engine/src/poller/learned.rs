@@ -51,7 +51,7 @@ impl Hole {
     }
 
     /// Whether a field is in it.
-    pub(super) fn holds(&self, field: &Field) -> bool {
+    fn holds(&self, field: &Field) -> bool {
         let end = u32::from(field.address) + u32::from(field.count);
         field.area == self.area && self.address <= field.address && end <= self.end()
     }
@@ -89,6 +89,17 @@ impl Learned {
         let retry_at = Instant::now() + RETRY;
         self.holes.push(Hole { area, address, count, fault, retry_at });
         self.remember();
+    }
+
+    /// Forgets what can't be read of what nobody wants any more; it stays apart from its neighbours.
+    pub(super) fn keep(&mut self, fields: &[Field]) {
+        let wanted = |hole: &Hole| fields.iter().any(|field| hole.holds(field));
+        let (kept, unwanted) = std::mem::take(&mut self.holes).into_iter().partition(wanted);
+        self.holes = kept;
+        let unwanted: Vec<Hole> = unwanted;
+        for hole in unwanted {
+            self.cut(hole.area, hole.address.into());
+        }
     }
 
     pub(super) fn holes(&self) -> &[Hole] {
