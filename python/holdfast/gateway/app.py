@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast import __version__, logs
-from holdfast.adapters.rest import page
+from holdfast import openapi_page as page
 from holdfast.errors import ModbusException
 from holdfast.gateway import assets, identifying, openapi, reading, surveying, watching, writing
 from holdfast.gateway.broadcasting import NOTE

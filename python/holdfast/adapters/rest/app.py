@@ -13,7 +13,8 @@ from urllib.parse import parse_qsl
 import msgspec
 
 from holdfast import __version__
-from holdfast.adapters.rest import openapi, page
+from holdfast import openapi_page as page
+from holdfast.adapters.rest import openapi
 from holdfast.http import SAFE, address_of, headers_of, respond
 from holdfast.http_requests import Gone, Request, Unfit, respond_to_its_end, shown
 from holdfast.ingest import Grant, Refused
