@@ -131,7 +131,7 @@ class Bench:
         """One of the appliance's diagnostics."""
         request = urllib.request.Request(f"http://{self.rest}/api/v1/{what}")
         request.add_header("Authorization", f"Bearer {TOKEN}")
-        with urllib.request.urlopen(request, timeout=common.PATIENCE) as answer:
+        with urllib.request.urlopen(request, timeout=common.TIMEOUT) as answer:
             return json.load(answer)
 
     def _counts(self) -> Any:
@@ -253,7 +253,7 @@ def show(name: str, rounds: list[dict[str, Result]]) -> None:
 
 def _wait(problem: str, done: Callable[[], bool]) -> None:
     """Waits until it is done."""
-    end = time.monotonic() + common.PATIENCE
+    end = time.monotonic() + common.TIMEOUT
     while not done():
         if time.monotonic() > end:
             raise RuntimeError(problem)

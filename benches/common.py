@@ -22,7 +22,7 @@ from typing import IO, TypeAlias
 ROOT = Path(__file__).parent.parent
 TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "release"
 # Seconds: how long a server may take to start, and a load to end after its time.
-PATIENCE = 30
+TIMEOUT = 30
 REQUEST = bytes.fromhex("123400000006010300000000")
 
 Result: TypeAlias = dict[str, float]
@@ -70,7 +70,7 @@ class Server:
             text=True,
             preexec_fn=pinned(core),
         )
-        watchdog = threading.Timer(PATIENCE, self.process.kill)
+        watchdog = threading.Timer(TIMEOUT, self.process.kill)
         watchdog.start()
         self.addresses = dict(self._listening() for _ in range(listeners))
         watchdog.cancel()
@@ -142,7 +142,7 @@ def outcome(command: Sequence[str], seconds: float, core: int) -> Result:
     """What a process prints that runs for some seconds."""
     with running(command, core) as process:
         try:
-            out, error = process.communicate(timeout=seconds + PATIENCE)
+            out, error = process.communicate(timeout=seconds + TIMEOUT)
         except subprocess.TimeoutExpired:
             raise TurnFailed("it did not end") from None
     if process.returncode != 0:

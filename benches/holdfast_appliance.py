@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 
 from holdfast import config
-from holdfast.adapters.supervisor import give_way
 from holdfast.appliance import Appliance
+from holdfast.appliance.supervision import give_way
 
 give_way()
 with Appliance(config.load(sys.argv[1])) as appliance:

@@ -24,7 +24,7 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 memory = holdfast.Memory(holding_registers=1000)
 poller = _core.Poller(
     [
-        _core.Device(
+        _core.PolledDevice(
             f"device-{number}",
             _core.Endpoint.network("tcp", f"127.0.{1 + number // 250}.{1 + number % 250}", port),
             unit=1,

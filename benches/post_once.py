@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import quantiles
 
 WARMUP = 0.3
-PATIENCE = 10
+TIMEOUT = 10
 
 
 class Load:
@@ -37,7 +37,7 @@ class Load:
         expected = await self.ask()
         self.begin = time.perf_counter() + WARMUP
         self.end = self.begin + self.seconds
-        async with asyncio.timeout(WARMUP + self.seconds + PATIENCE):
+        async with asyncio.timeout(WARMUP + self.seconds + TIMEOUT):
             await asyncio.gather(*(self._client(expected) for _ in range(clients)))
 
     async def _client(self, expected: bytes) -> None:

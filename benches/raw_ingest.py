@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 import common
 from common import Result, Server
 
-from holdfast import raw
+from holdfast import raw_ingest
 
 REGISTERS = (3, 125, 5000)
 IN_FLIGHT = (1, 16)
@@ -79,14 +79,14 @@ def main() -> None:
 def encoded(form: str, registers: int) -> bytes:
     values = [(7 * address + registers) % 65536 for address in range(registers)]
     if form == "v1":
-        return raw.encode("holding_registers", 0, values, unit=1)
-    return raw.encode("holding_registers", 0, values, memory_id=1)
+        return raw_ingest.encode("holding_registers", 0, values, unit=1)
+    return raw_ingest.encode("holding_registers", 0, values, memory_id=1)
 
 
 def check(holdfast: Server, form: str, registers: int, packet: bytes) -> None:
     """Sends one packet, and reads over Modbus what became of it."""
     host, _, port = holdfast.addresses[form].rpartition(":")
-    raw.send_packet_sync(host, int(port), packet)
+    raw_ingest.send_packet_sync(host, int(port), packet)
     quantity = min(registers, 125)
     header = 10 if form == "v1" else 12
     written = common.ask(holdfast.addresses["modbus"], quantity)[9:]

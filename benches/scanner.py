@@ -98,7 +98,7 @@ async def subscribe(bench: Bench, devices: int, rate: int) -> None:
             "tags": tags,
         }
         answer = await client.request(
-            "modbus.subscribe", json.dumps(request).encode(), timeout=common.PATIENCE
+            "modbus.subscribe", json.dumps(request).encode(), timeout=common.TIMEOUT
         )
         if not json.loads(answer.data)["success"]:
             raise RuntimeError(answer.data.decode())
@@ -111,7 +111,7 @@ async def browse(bench: Bench) -> tuple[dict[str, int], int]:
     missed, offset = 0, 0
     while True:
         asked = json.dumps({"offset": offset}).encode()
-        answer = await client.request("modbus.browse", asked, timeout=common.PATIENCE)
+        answer = await client.request("modbus.browse", asked, timeout=common.TIMEOUT)
         found = json.loads(answer.data)
         missed += sum(device["missed"] for device in found["devices"])
         if "next" not in found:

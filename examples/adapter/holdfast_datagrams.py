@@ -21,11 +21,11 @@ class Datagrams:
                     text, peer = receiver.recvfrom(65535)
                     address, *values = [int(word) for word in text.split()]
                     command = {"memory": memory, "area": "input_registers", "address": address}
-                    self.context.door.write(
+                    self.context.memory_access.write(
                         [command | {"values": values}], self.context.grant, f"{peer[0]}:{peer[1]}"
                     )
                 except (TimeoutError, ValueError, Refused):
-                    continue  # A refusal has been counted and logged by the door.
+                    continue  # A refusal has been counted and logged by the memory_access.
 
     def status(self) -> dict[str, object]:
         return {"port": self.context.options["port"]}

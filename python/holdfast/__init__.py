@@ -6,7 +6,10 @@ configuration's (`holdfast.config`) or native (`holdfast._core`, which some of t
 
 from __future__ import annotations
 
-from holdfast import raw, values
+import importlib
+from typing import Any
+
+from holdfast import raw_ingest, values
 from holdfast._core import Memory, OutOfRange, Rule, __version__
 from holdfast.client import Client, SyncClient
 from holdfast.errors import (
@@ -31,6 +34,13 @@ __all__ = [
     "Server",
     "SyncClient",
     "__version__",
-    "raw",
+    "raw_ingest",
     "values",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """The former name of `raw_ingest`, which warns."""
+    if name == "raw":
+        return importlib.import_module("holdfast.raw")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

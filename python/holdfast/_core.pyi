@@ -10,12 +10,12 @@ from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFul
 
 __all__ = [
     "BlockingClient",
-    "Device",
     "Endpoint",
     "Engine",
     "Listener",
     "Memory",
     "OutOfRange",
+    "PolledDevice",
     "Poller",
     "RawRule",
     "Request",
@@ -402,7 +402,7 @@ class Session:
         """Replies that came after their requests had been given up."""
 
 @final
-class Device:
+class PolledDevice:
     """A device to be polled: what is read, how often, and where it goes.
 
     `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
@@ -437,7 +437,7 @@ class Device:
         report: bool = False,
         release: bool = False,
         measured: bool = False,
-    ) -> Device: ...
+    ) -> PolledDevice: ...
 
 @final
 class Poller:
@@ -446,11 +446,11 @@ class Poller:
     Raises `ValueError` for a read that no request can carry or a destination that it does not fit.
     """
 
-    def __new__(cls, devices: Sequence[Device]) -> Poller: ...
-    def add(self, device: Device) -> None:
+    def __new__(cls, devices: Sequence[PolledDevice]) -> Poller: ...
+    def add(self, device: PolledDevice) -> None:
         """Polls one more device. Raises `ValueError`, also for a name that is taken."""
 
-    def replace(self, name: str, device: Device, *, at_once: bool = True) -> None:
+    def replace(self, name: str, device: PolledDevice, *, at_once: bool = True) -> None:
         """Polls a device in the place of the one called `name`; it may have the same name.
 
         The poll under way is completed; counters, connection and schedule stay. `at_once` the new

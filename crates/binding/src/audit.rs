@@ -1,6 +1,6 @@
 //! Writes as Python's audit log has them: a dictionary each.
 
-use holdfast_engine::audit::{Record, Written};
+use holdfast_engine::server::audit::{Record, Written};
 use holdfast_memory::Area;
 use holdfast_protocol::pdu::{ExceptionCode, Range, Request};
 use holdfast_protocol::raw_ingest::{Format, Header};

@@ -9,7 +9,7 @@ use holdfast_engine::client::{
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
-use holdfast_engine::{Line, LineMode, LineParity};
+use holdfast_engine::{LineMode, LineParity, SerialLine};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Diagnostics, Range, Request as CoreRequest, Response, ResponseError, SubFunction, limit,
@@ -297,12 +297,12 @@ pub fn line(
     stop_bits: i128,
     data_bits: i128,
     silence: Option<f64>,
-) -> PyResult<Line> {
+) -> PyResult<SerialLine> {
     let silence = silence.map(|silence| seconds("silence", silence)).transpose()?;
     let modes = [("rtu", LineMode::Rtu { silence }), ("ascii", LineMode::Ascii)];
     let parities =
         [("none", LineParity::None), ("even", LineParity::Even), ("odd", LineParity::Odd)];
-    Ok(Line {
+    Ok(SerialLine {
         device,
         baud: within("baud", baud, 50..=4_000_000)? as u32,
         parity: word("parity", parity, &parities)?,

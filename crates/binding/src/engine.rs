@@ -2,8 +2,10 @@
 
 use std::net::SocketAddr;
 
-use holdfast_engine::event::Verbosity;
-use holdfast_engine::{Engine as Core, ListenerCounters, ProtocolCounters, Settings, StartError};
+use holdfast_engine::server::event::Verbosity;
+use holdfast_engine::server::{
+    Engine as Core, ListenerCounters, ProtocolCounters, Settings, StartError,
+};
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

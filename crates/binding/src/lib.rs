@@ -26,7 +26,7 @@ mod _core {
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, write_across};
     #[pymodule_export]
-    use super::poller::{Device, Poller, plan_blocks};
+    use super::poller::{PolledDevice, Poller, plan_blocks};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -4,12 +4,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_engine::policy::{Functions, Rights, Rule as CoreRule};
-use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
-use holdfast_engine::{
-    Limits, ListenerKind, ListenerSettings, RawRule as CoreRawRule, RawSettings, SerialSettings,
-    StreamFraming, StreamSettings, UdpSettings, WhenFull,
+use holdfast_engine::server::policy::{AccessMode, Functions, Rule as CoreRule};
+use holdfast_engine::server::{
+    ConnectionLimits, ListenerKind, ListenerSettings, RawRule as CoreRawRule, RawSettings,
+    SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
 };
+use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
 use holdfast_protocol::raw_ingest::Format;
 use ipnet::IpNet;
@@ -38,8 +38,8 @@ impl Rule {
         deny: Option<Vec<i128>>,
         roles: Option<Vec<String>>,
     ) -> PyResult<Rule> {
-        let allowed = [("read-only", Rights::ReadOnly), ("read-write", Rights::ReadWrite)];
-        let rights = word("access", access, &allowed)?;
+        let allowed = [("read-only", AccessMode::ReadOnly), ("read-write", AccessMode::ReadWrite)];
+        let access = word("access", access, &allowed)?;
         let codes = |codes: Option<Vec<i128>>| {
             let codes =
                 codes.map(|codes| codes.into_iter().map(|code| byte("function code", code)));
@@ -57,7 +57,7 @@ impl Rule {
         let units = units.into_iter().map(|(unit, memory)| Ok((byte("unit id", unit)?, memory)));
         let units = units.collect::<PyResult<_>>()?;
         let sources = networks(&sources)?;
-        Ok(Rule { core: CoreRule { sources, roles, units, rights, functions } })
+        Ok(Rule { core: CoreRule { sources, roles, units, access, functions } })
     }
 }
 
@@ -213,12 +213,12 @@ fn limits(
     max_connections: i128,
     max_connections_per_source: Option<i128>,
     when_full: &str,
-) -> PyResult<Limits> {
+) -> PyResult<ConnectionLimits> {
     let allowed = [("refuse", WhenFull::Refuse), ("evict", WhenFull::Evict)];
     let of_source = max_connections_per_source
         .map(|most| within("max_connections_per_source", most, 1..=65_535))
         .transpose()?;
-    Ok(Limits {
+    Ok(ConnectionLimits {
         max_connections: within("max_connections", max_connections, 1..=65_535)?,
         max_connections_per_source: of_source,
         when_full: word("when_full", when_full, &allowed)?,

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use holdfast_engine::poller::plan::{self, Field, Limits, Strategy, Stretch};
+use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
     Batch, Destination, DeviceSettings, DeviceState, Fault, ForwardSettings, Poll, Poller as Core,
     PollerError, ReadSettings, StatusSettings,
@@ -33,13 +33,13 @@ type Forward = (String, u16, String, String, u16, f64);
 type PlannedBlock = (&'static str, u16, u16, Vec<usize>, u32);
 
 #[pyclass(frozen, module = "holdfast")]
-pub struct Device {
+pub struct PolledDevice {
     core: DeviceSettings,
 }
 
 #[pymethods]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
-impl Device {
+impl PolledDevice {
     #[new]
     #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, report=false, release=false, measured=false))]
     fn new(
@@ -61,7 +61,7 @@ impl Device {
         report: bool,
         release: bool,
         measured: bool,
-    ) -> PyResult<Device> {
+    ) -> PyResult<PolledDevice> {
         let reads = reads.into_iter().map(|(area, address, count, into)| {
             Ok(ReadSettings {
                 area: named(&area)?,
@@ -91,7 +91,7 @@ impl Device {
             release,
             measured,
         };
-        Ok(Device { core })
+        Ok(PolledDevice { core })
     }
 }
 
@@ -103,7 +103,7 @@ pub struct Poller {
 #[pymethods]
 impl Poller {
     #[new]
-    fn new(py: Python<'_>, devices: Vec<PyRef<'_, Device>>) -> PyResult<Poller> {
+    fn new(py: Python<'_>, devices: Vec<PyRef<'_, PolledDevice>>) -> PyResult<Poller> {
         let devices: Vec<DeviceSettings> =
             devices.iter().map(|device| device.core.clone()).collect();
         let core = py.detach(|| Core::start(devices)).map_err(|error| match error {
@@ -113,12 +113,12 @@ impl Poller {
         Ok(Poller { core })
     }
 
-    fn add(&self, device: PyRef<'_, Device>) -> PyResult<()> {
+    fn add(&self, device: PyRef<'_, PolledDevice>) -> PyResult<()> {
         self.core.add(device.core.clone()).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
     #[pyo3(signature = (name, device, *, at_once=true))]
-    fn replace(&self, name: &str, device: PyRef<'_, Device>, at_once: bool) -> PyResult<()> {
+    fn replace(&self, name: &str, device: PyRef<'_, PolledDevice>, at_once: bool) -> PyResult<()> {
         self.core
             .replace(name, device.core.clone(), at_once)
             .map_err(|error| PyValueError::new_err(error.to_string()))
@@ -200,7 +200,7 @@ pub fn plan_blocks(
         .map_err(|error| PyValueError::new_err(error.to_string()))?;
     let blocks = blocks.into_iter();
     Ok(blocks
-        .map(|block| (block.area.name(), block.address, block.count, block.fields, block.holes))
+        .map(|block| (block.area.name(), block.address, block.count, block.fields, block.gaps))
         .collect())
 }
 
@@ -234,14 +234,14 @@ fn limits(
     max_bits: i128,
     readable: Option<Vec<Range>>,
     forbidden: Option<Vec<Range>>,
-) -> PyResult<Limits> {
+) -> PyResult<PlanLimits> {
     let stretches = |ranges: Option<Vec<Range>>| {
         let ranges = ranges.unwrap_or_default().into_iter();
         ranges
             .map(|(area, start, end)| Ok(Stretch { area: named(&area)?, start, end }))
             .collect::<PyResult<Vec<Stretch>>>()
     };
-    Ok(Limits {
+    Ok(PlanLimits {
         max_registers: within("max_registers", max_registers, 1..=125)? as u16,
         max_bits: within("max_bits", max_bits, 1..=2000)? as u16,
         readable: stretches(readable)?,
@@ -253,7 +253,7 @@ fn limits(
 /// Polls, and writes as ticket and fault.
 type Taken<'py> = (Vec<PollResult<'py>>, Vec<(u64, u16)>);
 
-/// Device, seconds of the schedule, and blocks: area, address, count, bytes or fault, and seconds
+/// PolledDevice, seconds of the schedule, and blocks: area, address, count, bytes or fault, and seconds
 /// since 1970.
 type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);
 type ReportedBlock<'py> = (&'static str, u16, u16, Option<Bound<'py, PyBytes>>, u16, f64);

@@ -5,7 +5,7 @@
 //! * A connection's rights are settled once, when it is accepted: its source address picks one rule
 //!   ([`policy`]), and the rule is two tables. A request costs two look-ups.
 //! * All that arrived together is answered together, in order, with one write ([`connection`]). The
-//!   way from request to reply ([`station`]) allocates nothing.
+//!   way from request to reply ([`unit_server`]) allocates nothing.
 //! * One peer can't hold up another: every buffer has a bound, every wait has a deadline, and no
 //!   code on a worker thread waits for anything but its sockets.
 //! * It says what happened in counters and events, and never waits for whoever reads them.
@@ -14,33 +14,11 @@
 
 #![forbid(unsafe_code)]
 
-mod admission;
-pub mod audit;
 pub mod client;
-mod connection;
-pub mod counters;
-mod engine;
-pub mod event;
-mod framing;
-pub mod identity;
-mod listener;
-mod modbus_stream;
-pub mod policy;
+mod counter;
 pub mod poller;
-mod raw_ingest;
-mod serial;
-pub mod station;
-mod stream;
+mod serial_line;
+pub mod server;
 pub mod tls;
-mod tls_stream;
-mod udp;
 
-pub use engine::{
-    Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
-    StartError,
-};
-pub use listener::{Limits, WhenFull};
-pub use modbus_stream::{StreamFraming, StreamSettings};
-pub use raw_ingest::{RawRule, RawSettings};
-pub use serial::{Line, LineMode, LineParity, SerialSettings};
-pub use udp::UdpSettings;
+pub use serial_line::{LineMode, LineParity, SerialLine};

@@ -3,15 +3,15 @@
 use std::net::IpAddr;
 use std::sync::Arc;
 
-use holdfast_engine::policy::{Functions, Policy, Rights, Rule};
+use holdfast_engine::server::policy::{AccessMode, Functions, Policy, Rule};
 use holdfast_memory::{Layout, Memory};
 
-fn rule(sources: &[&str], unit: u8, rights: Rights, functions: Functions) -> Rule {
+fn rule(sources: &[&str], unit: u8, rights: AccessMode, functions: Functions) -> Rule {
     Rule {
         sources: sources.iter().map(|source| source.parse().unwrap()).collect(),
         roles: None,
         units: vec![(unit, Arc::new(Memory::new(Layout::default(), None).unwrap()))],
-        rights,
+        access: rights,
         functions,
     }
 }
@@ -23,16 +23,16 @@ fn peer(text: &str) -> IpAddr {
 #[test]
 fn the_first_rule_that_names_a_peer_holds() {
     let policy = Policy::of(&[
-        rule(&["10.0.0.0/24", "fd00::/64"], 1, Rights::ReadWrite, Functions::All),
-        rule(&["10.0.0.0/8"], 2, Rights::ReadOnly, Functions::All),
+        rule(&["10.0.0.0/24", "fd00::/64"], 1, AccessMode::ReadWrite, Functions::All),
+        rule(&["10.0.0.0/8"], 2, AccessMode::ReadOnly, Functions::All),
     ]);
     for (address, unit) in [("10.0.0.255", 1), ("10.0.1.0", 2), ("fd00::ffff", 1)] {
-        let grant = policy.grant(peer(address)).unwrap();
-        assert!(grant.memory(unit).is_some(), "{address}");
-        assert!(grant.memory(3 - unit).is_none(), "{address}");
+        let rights = policy.rights(peer(address)).unwrap();
+        assert!(rights.memory(unit).is_some(), "{address}");
+        assert!(rights.memory(3 - unit).is_none(), "{address}");
     }
     for stranger in ["11.0.0.1", "fd00:0:0:1::1", "::1", "127.0.0.1"] {
-        assert!(policy.grant(peer(stranger)).is_none(), "{stranger}");
+        assert!(policy.rights(peer(stranger)).is_none(), "{stranger}");
     }
 }
 
@@ -43,9 +43,9 @@ fn the_first_rule_that_names_peer_and_role_holds() {
         ..rule
     };
     let policy = Policy::of(&[
-        of_roles(&["a", "b"], rule(&["10.0.0.0/8"], 1, Rights::ReadWrite, Functions::All)),
-        of_roles(&["b", ""], rule(&["10.0.0.0/24"], 2, Rights::ReadOnly, Functions::All)),
-        rule(&["10.0.1.0/24"], 3, Rights::ReadOnly, Functions::All),
+        of_roles(&["a", "b"], rule(&["10.0.0.0/8"], 1, AccessMode::ReadWrite, Functions::All)),
+        of_roles(&["b", ""], rule(&["10.0.0.0/24"], 2, AccessMode::ReadOnly, Functions::All)),
+        rule(&["10.0.1.0/24"], 3, AccessMode::ReadOnly, Functions::All),
     ]);
     for (address, role, unit) in [
         ("10.0.0.1", "a", Some(1)),
@@ -57,33 +57,33 @@ fn the_first_rule_that_names_peer_and_role_holds() {
         ("10.0.2.1", "x", None),
         ("11.0.0.1", "a", None),
     ] {
-        let grant = policy.grant_of_role(peer(address), role);
-        let units: Option<Vec<u8>> = grant.map(|grant| grant.one_unit_of_each_memory(|_| true));
+        let rights = policy.grant_of_role(peer(address), role);
+        let units: Option<Vec<u8>> = rights.map(|rights| rights.one_unit_of_each_memory(|_| true));
         assert_eq!(units, unit.map(|unit| vec![unit]), "{address} {role:?}");
     }
-    assert!(policy.grant(peer("10.0.2.1")).is_some());
-    assert!(policy.grant(peer("11.0.0.1")).is_none());
+    assert!(policy.rights(peer("10.0.2.1")).is_some());
+    assert!(policy.rights(peer("11.0.0.1")).is_none());
 }
 
 #[test]
 fn a_mapped_address_is_the_ipv4_address_it_maps() {
-    let rules = vec![rule(&["10.0.0.0/24"], 1, Rights::ReadOnly, Functions::All)];
-    assert!(Policy::of(&rules).grant(peer("::ffff:10.0.0.7")).is_some());
-    let rules = vec![rule(&["::/0"], 1, Rights::ReadOnly, Functions::All)];
-    assert!(Policy::of(&rules).grant(peer("::ffff:10.0.0.7")).is_none());
+    let rules = vec![rule(&["10.0.0.0/24"], 1, AccessMode::ReadOnly, Functions::All)];
+    assert!(Policy::of(&rules).rights(peer("::ffff:10.0.0.7")).is_some());
+    let rules = vec![rule(&["::/0"], 1, AccessMode::ReadOnly, Functions::All)];
+    assert!(Policy::of(&rules).rights(peer("::ffff:10.0.0.7")).is_none());
 }
 
 #[test]
 fn functions_are_those_known_allowed_and_fit_for_the_rights() {
     let allowed = |rights, functions| -> Vec<u8> {
         let policy = Policy::of(&[rule(&["::/0"], 1, rights, functions)]);
-        let grant = policy.grant(peer("::1")).unwrap();
-        (0..=255).filter(|code| grant.allows(*code)).collect()
+        let rights = policy.rights(peer("::1")).unwrap();
+        (0..=255).filter(|code| rights.allows(*code)).collect()
     };
     let all = [1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43];
-    assert_eq!(allowed(Rights::ReadWrite, Functions::All), all);
-    assert_eq!(allowed(Rights::ReadOnly, Functions::All), [1, 2, 3, 4, 8, 11, 17, 43]);
-    assert_eq!(allowed(Rights::ReadOnly, Functions::Only(vec![3, 6, 99])), [3]);
-    assert_eq!(allowed(Rights::ReadWrite, Functions::Only(vec![3, 6, 99])), [3, 6]);
-    assert_eq!(allowed(Rights::ReadOnly, Functions::Except(vec![3, 43])), [1, 2, 4, 8, 11, 17]);
+    assert_eq!(allowed(AccessMode::ReadWrite, Functions::All), all);
+    assert_eq!(allowed(AccessMode::ReadOnly, Functions::All), [1, 2, 3, 4, 8, 11, 17, 43]);
+    assert_eq!(allowed(AccessMode::ReadOnly, Functions::Only(vec![3, 6, 99])), [3]);
+    assert_eq!(allowed(AccessMode::ReadWrite, Functions::Only(vec![3, 6, 99])), [3, 6]);
+    assert_eq!(allowed(AccessMode::ReadOnly, Functions::Except(vec![3, 43])), [1, 2, 4, 8, 11, 17]);
 }

@@ -11,15 +11,16 @@ group `holdfast.adapters`, see docs/adapters.md.
 from __future__ import annotations
 
 import threading
+import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from holdfast.ingest import Counts, Door, Grant, Refused, Written
+from holdfast.ingest import Counts, Grant, MemoryAccess, Refused, Written
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-__all__ = ["Adapter", "Context", "Counts", "Door", "Grant", "Refused", "Stop", "Written"]
+__all__ = ["Adapter", "Context", "Counts", "Grant", "MemoryAccess", "Refused", "Stop", "Written"]
 
 ENTRY_POINTS = "holdfast.adapters"
 
@@ -73,9 +74,19 @@ class Context:
 
     name: str
     """Its name in the configuration."""
-    door: Door
+    memory_access: MemoryAccess
     """Its way to memory."""
     grant: Grant
     """What the configuration lets it do."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Its own part of the configuration."""
+
+    @property
+    def door(self) -> MemoryAccess:
+        """The former name of `memory_access`. Deprecated: it goes with the next release."""
+        warnings.warn(
+            "Context.door is now Context.memory_access; the old name goes with the next release",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return self.memory_access

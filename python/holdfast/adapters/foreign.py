@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from importlib.metadata import EntryPoint
 
-    from holdfast.adapters import Adapter, Door
+    from holdfast.adapters import Adapter, MemoryAccess
     from holdfast.config import AdapterConfig
 
 
@@ -33,14 +33,16 @@ def entry_point(name: str, settings: AdapterConfig) -> EntryPoint:
     raise UnknownAdapter(message)
 
 
-def factory(name: str, settings: AdapterConfig, door: Door) -> Callable[[], Adapter]:
+def factory(
+    name: str, settings: AdapterConfig, memory_access: MemoryAccess
+) -> Callable[[], Adapter]:
     """What makes the adapter. Its code is loaded when it is made: a fault of it is its own.
 
     Raises `UnknownAdapter`, as `entry_point`.
     """
     found = entry_point(name, settings)
     grant = Grant(name, settings.memories, settings.areas, settings.access == "read-write")
-    context = Context(name, door, grant, settings.options)
+    context = Context(name, memory_access, grant, settings.options)
 
     def make() -> Adapter:
         adapter: Adapter = found.load()(context)

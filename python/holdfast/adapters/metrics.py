@@ -13,7 +13,7 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from holdfast import __version__
-from holdfast.http import SAFE, Host, rejection, respond
+from holdfast.web.host import SAFE, Host, rejection, respond
 
 if TYPE_CHECKING:
     import socket
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
     from holdfast.adapters import Stop
+    from holdfast.appliance.diagnostics import Diagnostics
     from holdfast.config import MetricsConfig
-    from holdfast.diagnostics import Diagnostics
-    from holdfast.http import Receive, Scope, Send
+    from holdfast.web.host import Receive, Scope, Send
 
 MAX_CONNECTIONS = 32
 REQUEST_TIMEOUT = 10.0

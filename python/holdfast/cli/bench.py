@@ -14,7 +14,7 @@ import click
 from holdfast.cli import device, places, showing
 from holdfast.cli.progress import bar
 from holdfast.errors import ModbusError
-from holdfast.loading import MOST_CONNECTIONS, Load
+from holdfast.tools.load import MAX_CONNECTIONS, Load
 
 if TYPE_CHECKING:
     from holdfast.types import Area
@@ -33,7 +33,7 @@ def _area(text: str) -> Area:
 @device.url_argument
 @click.option(
     "--connections",
-    type=click.IntRange(1, MOST_CONNECTIONS),
+    type=click.IntRange(1, MAX_CONNECTIONS),
     default=1,
     show_default=True,
     metavar="N",

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast import assembly
-from holdfast.client import check_files, endpoint
+from holdfast.appliance import assembly
+from holdfast.client.endpoint import check_files, endpoint
 from holdfast.config import ConfigError, ModbusTlsListener, load, source
 from holdfast.config.problems import Report
 

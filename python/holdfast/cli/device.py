@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
-from holdfast.client import LONGEST_TIMEOUT, SyncClient
+from holdfast.client import SyncClient
+from holdfast.client.base import MAX_TIMEOUT
+from holdfast.client.target import parse
 from holdfast.errors import (
     ConnectionLost,
     InvalidResponse,
@@ -18,7 +20,6 @@ from holdfast.errors import (
     ModbusException,
     RequestTimeout,
 )
-from holdfast.target import parse
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def seconds(text: str) -> float:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not 0 < number <= LONGEST_TIMEOUT:
+    if not 0 < number <= MAX_TIMEOUT:
         raise click.BadParameter(f"{text!r} is no number of seconds, more than 0 to 86400.")
     return number
 

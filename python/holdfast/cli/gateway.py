@@ -14,14 +14,14 @@ import click
 
 from holdfast import logs
 from holdfast.adapters import Stop
-from holdfast.cli.run import PATIENCE, Signals
-from holdfast.client import check_files
+from holdfast.cli.run import JOIN_TIMEOUT, Signals
+from holdfast.client.endpoint import check_files
+from holdfast.client.target import PORT, Tls
 from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.egress import parse_allowed
-from holdfast.gateway import Gateway, Limits, Settings, tokens
+from holdfast.gateway import Gateway, GatewayLimits, Settings, tokens
 from holdfast.gateway.settings import LOOPBACK
-from holdfast.http import listen
-from holdfast.target import PORT, Tls
+from holdfast.web.host import listen
 
 if TYPE_CHECKING:
     import socket
@@ -131,7 +131,7 @@ def gateway(
         writes=writes,
         tokens=() if token_file is None else _tokens(token_file),
         sources=sources,
-        limits=replace(Limits(), in_flight=in_flight),
+        limits=replace(GatewayLimits(), in_flight=in_flight),
         tls=_tls(tls_ca, tls_cert, tls_key),
     )
     if not settings.tokens and any(not each.is_loopback for each in sources):
@@ -155,7 +155,7 @@ def _serve(settings: Settings, listener: socket.socket, signals: Signals) -> Non
         running: Future[None] = threads.submit(served.run, stop)
         click.echo(_greeting(served.address, settings))
         while not signals.received and not running.done():
-            wait_for([running], PATIENCE)
+            wait_for([running], JOIN_TIMEOUT)
         stop.set()
         running.result()
 

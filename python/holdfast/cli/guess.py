@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast import guessing, mapping
 from holdfast.cli import device, pace, places, showing
 from holdfast.errors import ModbusError, ModbusException
+from holdfast.tools import discovery, inference
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from holdfast.cli.places import Place
     from holdfast.client import SyncClient
-    from holdfast.guessing import Guess
+    from holdfast.tools.inference import Guess
 
 REGISTERS = 4
 """What is looked at: enough for the largest number."""
@@ -110,7 +110,7 @@ def guess(
             device.fail(error, url, told if as_json else None)
         except ValueError as error:
             raise click.UsageError(f"{error}.") from error
-    guesses = guessing.guess(found, like=like, anywhere=anywhere)
+    guesses = inference.guess(found, like=like, anywhere=anywhere)
     if as_json:
         answer = {"ok": True, **told, "reads": found, "guesses": [_told(each) for each in guesses]}
         click.echo(json.dumps(answer))
@@ -126,7 +126,7 @@ def _size(client: SyncClient, place: Place) -> int:
         try:
             device.read_raw(client, place.area, place.address, size)
         except ModbusException as error:
-            if error.code != mapping.OUTSIDE or size == 1:
+            if error.code != discovery.OUTSIDE or size == 1:
                 raise
             size -= 1
         else:

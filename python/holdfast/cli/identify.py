@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from holdfast.cli import device, showing
+from holdfast.client.requests import OBJECT_NAMES
 from holdfast.errors import ModbusError
-from holdfast.operations import OBJECT_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from holdfast.operations import Identification, ServerId
+    from holdfast.client.requests import Identification, ServerId
 
 Answer = TypeVar("Answer")
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from holdfast.cli.keys import Wait
-    from holdfast.cli.sources import Block, Source
+    from holdfast.cli.sources import Source, WatchedRange
 
-LOOK = 0.2
+SIZE_CHECK_INTERVAL = 0.2
 """Seconds between two looks at the size of the terminal."""
 
 FADE = 3
@@ -90,7 +90,7 @@ class View:
 
     def _wait(self, wait: Wait, left: float) -> None:
         """Waits a moment, for keys as well."""
-        pressed = wait(min(left, LOOK))
+        pressed = wait(min(left, SIZE_CHECK_INTERVAL))
         for key in [pressed] if pressed.startswith("\x1b") else pressed:
             if key in ("q", "Q", keys.END):
                 raise Quit
@@ -138,7 +138,7 @@ class View:
             lines += self._block(index, block, width)
         return lines
 
-    def _block(self, index: int, block: Block, width: int) -> list[Text]:
+    def _block(self, index: int, block: WatchedRange, width: int) -> list[Text]:
         cell = 2 if block.area in BIT_AREAS else 6
         most = 32 if cell == 2 else 16
         columns = max(1, min(most, 1 << max(0, (max(1, (width - 6) // cell)).bit_length() - 1)))
@@ -179,5 +179,5 @@ def _quit(_number: int, _frame: FrameType | None) -> None:
     raise Quit
 
 
-def _name(block: Block) -> str:
+def _name(block: WatchedRange) -> str:
     return block.area if block.memory is None else f"{block.memory} {block.area}"

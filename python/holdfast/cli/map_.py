@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast import mapping
 from holdfast.cli import device, places, showing
 from holdfast.cli.progress import bar
 from holdfast.errors import ModbusError
-from holdfast.mapping import Survey
+from holdfast.tools import discovery
+from holdfast.tools.discovery import Survey
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.mapping import AreaMap, Failure
+    from holdfast.tools.discovery import AreaMap, Failure
     from holdfast.types import Area
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -57,7 +57,7 @@ def _span(text: str) -> range:
 @click.option(
     "--step",
     type=click.IntRange(1),
-    default=mapping.STEP,
+    default=discovery.STEP,
     show_default=True,
     metavar="N",
     help="Addresses from sample to sample.",
@@ -107,7 +107,7 @@ def map_(
     with device.connect(url, unit, timeout) as client:
         try:
             with bar("Mapping", survey.total, lambda: _requests(survey)) as advance:
-                mapping.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
+                discovery.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
         except ModbusError as error:
             why = str(error)
         except KeyboardInterrupt:

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from holdfast import planning
 from holdfast.cli import device, places, showing
 from holdfast.cli.configuration import load_or_exit
-from holdfast.planning import Preset
+from holdfast.tools import planning
+from holdfast.tools.planning import Preset
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from holdfast.config import DeviceConfig
-    from holdfast.planning import Block, Field, Plan, Rules
+    from holdfast.tools.planning import Block, Field, Plan, Rules
     from holdfast.types import Area
 
 FILL = 50

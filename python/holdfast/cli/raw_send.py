@@ -9,11 +9,11 @@ from typing import IO
 
 import click
 
-from holdfast import raw
+from holdfast import raw_ingest
 from holdfast.cli.places import number
 from holdfast.types import AREAS, Area
 
-MOST = 0xFFFF
+MAX_FIELD = 0xFFFF
 
 # Everything that may stand between two values of a file.
 SEPARATORS = re.compile(r"[\s,;]+")
@@ -28,8 +28,8 @@ def _integer(text: str) -> int:
 
 def _word(text: str) -> int:
     found = _integer(text)
-    if found > MOST:
-        raise click.BadParameter(f"{text} is outside 0 to {MOST}.")
+    if found > MAX_FIELD:
+        raise click.BadParameter(f"{text} is outside 0 to {MAX_FIELD}.")
     return found
 
 
@@ -43,8 +43,8 @@ def _receiver(text: str) -> tuple[str, int]:
     port = number(digits)
     if not host or port is None:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
-    if not 1 <= port <= MOST:
-        raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MOST}.")
+    if not 1 <= port <= MAX_FIELD:
+        raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MAX_FIELD}.")
     return host, port
 
 
@@ -68,7 +68,7 @@ def _receiver(text: str) -> tuple[str, int]:
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
-    default=raw.TIMEOUT,
+    default=raw_ingest.TIMEOUT,
     show_default=True,
     metavar="SECONDS",
     help="For connection, packet and reply together.",
@@ -106,7 +106,7 @@ def raw_send(
     if count is not None and payload is None:
         raise click.UsageError("--count goes with --hex.")
     try:
-        packet = raw.encode(
+        packet = raw_ingest.encode(
             area,
             address,
             None if payload is not None else values if file is None else _values(file),
@@ -124,10 +124,10 @@ def raw_send(
     host, port = receiver
     answer: dict[str, object] = {"area": area, "address": address, "bytes": len(packet)}
     try:
-        raw.send_packet_sync(host, port, packet, timeout=timeout)
+        raw_ingest.send_packet_sync(host, port, packet, timeout=timeout)
     except ValueError as error:
         raise click.UsageError(f"{error}.") from error
-    except raw.RawError as error:
+    except raw_ingest.RawError as error:
         if not as_json:
             click.echo(f"holdfast: {error}", err=True)
             sys.exit(1)
@@ -141,10 +141,10 @@ def raw_send(
         click.echo(f"Written: {area} from address {address}, one packet of {len(packet)} bytes.")
 
 
-def _reason(error: raw.RawError) -> str:
-    if isinstance(error, raw.RawRefused):
+def _reason(error: raw_ingest.RawError) -> str:
+    if isinstance(error, raw_ingest.RawRefused):
         return "refused"
-    return "timeout" if isinstance(error, raw.RawTimeout) else "failed"
+    return "timeout" if isinstance(error, raw_ingest.RawTimeout) else "failed"
 
 
 def _values(file: IO[str]) -> list[int]:
@@ -160,8 +160,8 @@ def _values(file: IO[str]) -> list[int]:
                     found = f"{file.name}:{line}: {item[:40]!r} is not an integer"
                     raise ValueError(f"{found}, decimal or 0x")
                 values.append(value)
-            if len(values) > MOST:
-                raise ValueError(f"{file.name} has more than {MOST} values")
+            if len(values) > MAX_FIELD:
+                raise ValueError(f"{file.name} has more than {MAX_FIELD} values")
     except UnicodeDecodeError:
         raise ValueError(f"{file.name} is not text in UTF-8") from None
     return values

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast import mapping
 from holdfast.cli import device, pace, places, showing
 from holdfast.cli.typed import typed, typed_options
 from holdfast.errors import ModbusError, ModbusException
+from holdfast.tools import discovery
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
 
@@ -299,7 +299,7 @@ class _Lines:
 
 
 def _hint(error: ModbusError, query: _Query) -> str | None:
-    if isinstance(error, ModbusException) and error.code == mapping.OUTSIDE:
+    if isinstance(error, ModbusException) and error.code == discovery.OUTSIDE:
         return places.modicon_hint(query.place)
     return None
 

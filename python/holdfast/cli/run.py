@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast import assembly, logs
+from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
-from holdfast.adapters.supervisor import give_way
-from holdfast.appliance import Appliance
+from holdfast.appliance import Appliance, assembly
+from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
 from holdfast.config import GatewayConfig, ModbusTcpListener
@@ -24,7 +24,7 @@ from holdfast.config import GatewayConfig, ModbusTcpListener
 if TYPE_CHECKING:
     from types import FrameType
 
-    from holdfast.appliance import Endpoint
+    from holdfast.appliance.running import ListenAddress
     from holdfast.config import (
         Config,
         DeviceConfig,
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     )
 
 # How long a signal may wait until it is noticed, in seconds.
-PATIENCE = 0.2
+JOIN_TIMEOUT = 0.2
 
 # Devices that the greeting names.
-MOST_DEVICES = 10
+MAX_DEVICES = 10
 
 # The number that mbpoll gives each area.
 MBPOLL_TYPES = {
@@ -74,7 +74,7 @@ def run(file: Path) -> None:
     try:
         click.echo(_greeting(appliance, file))
         while not signals.received:
-            appliance.log_events(timeout=PATIENCE)
+            appliance.log_events(timeout=JOIN_TIMEOUT)
     finally:
         appliance.stop()
 
@@ -114,7 +114,7 @@ def _explained(error: OSError) -> str:
 def _greeting(appliance: Appliance, file: Path) -> str:
     endpoints = appliance.endpoints()
     devices, nats = list(appliance.config.devices.items()), appliance.config.nats
-    shown = devices[:MOST_DEVICES]
+    shown = devices[:MAX_DEVICES]
     names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
     names += [] if nats is None else ["nats"]
     width = max(map(len, names), default=0)
@@ -136,7 +136,7 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     return "\n".join([*lines, "", "Ctrl-C stops it."])
 
 
-def _address(endpoint: Endpoint) -> str:
+def _address(endpoint: ListenAddress) -> str:
     if endpoint.port is None:
         return f"{endpoint.type}  {endpoint.host}"
     address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
@@ -175,7 +175,7 @@ def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
     return f"{to}; {rights} for {sources or 'the line'}{of}"
 
 
-def _suggestions(appliance: Appliance, endpoints: list[Endpoint], file: Path) -> list[str]:
+def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Path) -> list[str]:
     """Commands that work on this appliance: a read, a write where one is allowed, the check."""
     check = f"{_program()} check {shlex.quote(str(file))}"
     for endpoint in endpoints:

@@ -18,7 +18,7 @@ import click
 from holdfast import logs
 from holdfast.cli.open_files import allow_open_files
 from holdfast.config.scanning import PREFIX, SERVER_PORT, parse_prefix, parse_server
-from holdfast.scanner import DeviceTls, Limits, Scanner, Servers, Settings
+from holdfast.scanner import DeviceTls, Scanner, ScannerLimits, Servers, Settings
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE, Allowed
 from holdfast.scanner.schema import json_schema
@@ -121,14 +121,14 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option(
     "--max-devices",
     type=click.IntRange(1),
-    default=Limits.devices,
+    default=ScannerLimits.devices,
     show_default=True,
     metavar="N",
 )
 @click.option(
     "--max-tags",
     type=click.IntRange(1),
-    default=Limits.tags,
+    default=ScannerLimits.tags,
     show_default=True,
     metavar="N",
     help="Of all devices.",
@@ -164,7 +164,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     if store is not None and not embedded:
         raise click.UsageError("--store goes with --embedded.")
     logs.configure(options["log_level"], options["log_format"])
-    limits = Limits(devices=options["max_devices"], tags=options["max_tags"])
+    limits = ScannerLimits(devices=options["max_devices"], tags=options["max_tags"])
     allow_open_files(limits.connections)
     with ExitStack() as stack:
         check: Callable[[], None] | None = None

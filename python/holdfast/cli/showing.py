@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast import logs
-from holdfast.guessing import shortest
+from holdfast.tools.inference import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

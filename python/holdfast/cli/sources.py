@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from holdfast.config.addresses import Bind
     from holdfast.types import Area
 
-MOST = 8192
+MAX_ADDRESSES = 8192
 """Addresses that are watched at most: more nobody can look at, and reading them takes long."""
 
 READ_FUNCTIONS: dict[Area, int] = dict(zip(AREAS, (1, 2, 3, 4), strict=True))
 
 
 @dataclass(frozen=True)
-class Block:
+class WatchedRange:
     """A range of addresses that is watched."""
 
     memory: str | None
@@ -53,7 +53,7 @@ class Source(Protocol):
     """What is watched. `read` raises `ModbusError`, `Unreadable` or `OSError`."""
 
     where: str
-    blocks: list[Block]
+    blocks: list[WatchedRange]
 
     def read(self) -> list[list[int]]:
         """The values of each block."""
@@ -62,10 +62,10 @@ class Source(Protocol):
         """Ends the connection."""
 
 
-class Device:
+class DeviceSource:
     """Blocks of a device, read over Modbus."""
 
-    def __init__(self, where: str, client: SyncClient, blocks: Sequence[Block]) -> None:
+    def __init__(self, where: str, client: SyncClient, blocks: Sequence[WatchedRange]) -> None:
         self.where = where
         self.blocks = list(blocks)
         self._client = client
@@ -86,7 +86,7 @@ class Rest:
     """Blocks of memories, read over the REST interface of an appliance."""
 
     def __init__(
-        self, bind: Bind, blocks: Sequence[Block], token: str | None, timeout: float
+        self, bind: Bind, blocks: Sequence[WatchedRange], token: str | None, timeout: float
     ) -> None:
         self.where = f"REST at http://{_shown(bind)}"
         self.blocks = list(blocks)
@@ -103,7 +103,7 @@ class Rest:
                 raise
             raise Unreadable(f"not an answer of REST: {error!r}") from error
 
-    def _values(self, block: Block) -> list[int]:
+    def _values(self, block: WatchedRange) -> list[int]:
         query = {
             "memory": block.memory,
             "area": block.area,
@@ -125,7 +125,7 @@ class Rest:
         self._connection.close()
 
 
-def by_rest(config: Config, token: str | None) -> list[Block]:
+def by_rest(config: Config, token: str | None) -> list[WatchedRange]:
     """The memories that a token lets one read. Raises `Unwatchable`."""
     rest = config.rest
     assert rest is not None
@@ -148,7 +148,7 @@ def by_rest(config: Config, token: str | None) -> list[Block]:
     ]
 
 
-def by_modbus(config: Config) -> tuple[str, Bind, list[Block]]:
+def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
     """The first Modbus TCP listener, and the memories that it shows. Raises `Unwatchable`."""
     found = [
         (name, listener)
@@ -164,7 +164,7 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[Block]]:
     if not rules:
         raise Unwatchable(f"no rule of listener {name} lets {host} in")
     rule = rules[0]
-    blocks: list[Block] = []
+    blocks: list[WatchedRange] = []
     seen: set[str] = set()
     for unit, memory in rule.units.items():
         if memory not in seen:
@@ -177,24 +177,28 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[Block]]:
     return name, listener.bind, blocks
 
 
-def within(blocks: Sequence[Block], area: Area, address: int, count: int) -> list[Block]:
+def within(
+    blocks: Sequence[WatchedRange], area: Area, address: int, count: int
+) -> list[WatchedRange]:
     """What of blocks is in a range of an area."""
     found = []
     for block in blocks:
         first = max(block.address, address)
         end = min(block.address + block.count, address + count)
         if block.area == area and first < end:
-            found.append(Block(block.memory, block.unit, area, first, end - first))
+            found.append(WatchedRange(block.memory, block.unit, area, first, end - first))
     return found
 
 
-def cut(blocks: Sequence[Block], most: int = MOST) -> tuple[list[Block], int]:
+def cut(
+    blocks: Sequence[WatchedRange], most: int = MAX_ADDRESSES
+) -> tuple[list[WatchedRange], int]:
     """The first blocks that together have no more than `most` addresses; how many were cut off."""
     left, kept = most, []
     for block in blocks:
         count = min(block.count, left)
         if count:
-            kept.append(Block(block.memory, block.unit, block.area, block.address, count))
+            kept.append(WatchedRange(block.memory, block.unit, block.area, block.address, count))
         left -= count
     total = sum(block.count for block in blocks)
     return kept, total - sum(block.count for block in kept)
@@ -220,9 +224,9 @@ def _check_port(what: str, bind: Bind) -> None:
         raise Unwatchable(f"{what} is bound to port 0, so that its port is not known")
 
 
-def _areas(config: Config, memory: str, unit: int) -> list[Block]:
+def _areas(config: Config, memory: str, unit: int) -> list[WatchedRange]:
     spans = [(area, getattr(config.memories[memory], area)) for area in AREAS]
-    return [Block(memory, unit, area, span.start, span.size) for area, span in spans if span]
+    return [WatchedRange(memory, unit, area, span.start, span.size) for area, span in spans if span]
 
 
 def _may_read(area: Area, functions: Sequence[int] | None, deny: Sequence[int] | None) -> bool:

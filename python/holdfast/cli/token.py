@@ -14,8 +14,8 @@ import click
 
 from holdfast.cli.configuration import WRONG
 from holdfast.config.dump import PLAIN
+from holdfast.config.scalars import NAME_FORM, is_name
 from holdfast.config.source import scalar
-from holdfast.config.values import NAME_FORM, is_name
 
 BYTES = 32
 SHORT = 16

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from holdfast import mapping
 from holdfast.cli import device, pace, places, showing, sources
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.progress import bar
-from holdfast.cli.sources import Block, Unreadable, Unwatchable
+from holdfast.cli.sources import Unreadable, Unwatchable, WatchedRange
 from holdfast.cli.watching import Tracker
 from holdfast.errors import ModbusError
+from holdfast.tools import discovery
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -119,24 +119,26 @@ def _device(
     where = f"{url}, unit {unit}"
     if chosen is not None:
         place, count = chosen
-        return sources.Device(where, client, [Block(None, unit, place.area, place.address, count)])
-    survey = mapping.Survey()
+        return sources.DeviceSource(
+            where, client, [WatchedRange(None, unit, place.area, place.address, count)]
+        )
+    survey = discovery.Survey()
     click.echo(f"{where}: finding out which addresses there are", err=True)
     try:
         with bar("Mapping", survey.total, lambda: f"{survey.requests} requests") as advance:
-            mapping.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
+            discovery.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
     except ModbusError as error:
         client.close()
         _fail(f"{url}: {error}", as_json)
     blocks = [
-        Block(None, unit, found.area, each.start, len(each))
+        WatchedRange(None, unit, found.area, each.start, len(each))
         for found in survey.areas
         for each in found.ranges
     ]
     if not blocks:
         client.close()
         _fail(f"{url}: no address was found", as_json)
-    return sources.Device(where, client, blocks)
+    return sources.DeviceSource(where, client, blocks)
 
 
 def _appliance(
@@ -169,7 +171,7 @@ def _appliance(
         return sources.Rest(config.rest.bind, blocks, needed, timeout)
     url = sources.url_of(bind)
     client = device.connect(url, blocks[0].unit, timeout)
-    return sources.Device(f"listener {name} at {url}", client, blocks)
+    return sources.DeviceSource(f"listener {name} at {url}", client, blocks)
 
 
 def _lines(

@@ -11,12 +11,12 @@ from holdfast.types import BIT_AREAS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.cli.sources import Block
+    from holdfast.cli.sources import WatchedRange
 
 WINDOW = 10.0
 """Seconds that a rate is taken over."""
 
-LONGEST = 64
+MAX_CHANGES = 64
 """Changes of an address that a rate is taken from."""
 
 
@@ -29,7 +29,7 @@ class History:
     """When it changed last."""
     reading: int = 0
     """In which reading that was."""
-    steps: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LONGEST))
+    steps: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=MAX_CHANGES))
     """When it changed, and by how much."""
     since: float = 0.0
     """When the first of these steps began."""
@@ -45,7 +45,7 @@ class History:
 class Change:
     """An address that has another value than before."""
 
-    block: Block
+    block: WatchedRange
     address: int
     was: int
     now: int
@@ -54,7 +54,7 @@ class Change:
 class Tracker:
     """Compares readings of blocks."""
 
-    def __init__(self, blocks: Sequence[Block]) -> None:
+    def __init__(self, blocks: Sequence[WatchedRange]) -> None:
         self.blocks = blocks
         self.values: list[list[int]] = []
         """The last reading of each block."""
@@ -85,8 +85,8 @@ class Tracker:
         history = self.histories.get((index, address))
         return None if history is None else self.readings - history.reading
 
-    def latest(self, most: int) -> list[tuple[Block, int, int, History]]:
-        """Block, address, value and history of what changed last, in order of addresses."""
+    def latest(self, most: int) -> list[tuple[WatchedRange, int, int, History]]:
+        """WatchedRange, address, value and history of what changed last, in order of addresses."""
         places = sorted(self.histories, key=lambda place: -self.histories[place].reading)
         found = []
         for index, address in sorted(places[:most]):
@@ -100,7 +100,7 @@ class Tracker:
         if not history.steps or moment - history.last > WINDOW:
             history.steps.clear()
             history.since = self.at
-        elif len(history.steps) == LONGEST:
+        elif len(history.steps) == MAX_CHANGES:
             history.since = history.steps[0][0]
         while history.steps and moment - history.steps[0][0] > WINDOW:
             history.since, _ = history.steps.popleft()
@@ -110,7 +110,7 @@ class Tracker:
         history.reading = self.readings
 
 
-def _step(block: Block, was: int, now: int) -> int:
+def _step(block: WatchedRange, was: int, now: int) -> int:
     """By how much a register changed, round the corner if that is nearer; 1 for a bit."""
     if block.area in BIT_AREAS:
         return 1

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast import operations, values
+from holdfast import values
 from holdfast.cli import device, places, showing
 from holdfast.cli.typed import typed, typed_options
+from holdfast.client import requests
 from holdfast.errors import ModbusError, ModbusException
 from holdfast.types import BIT_AREAS
 
@@ -81,7 +82,7 @@ def write(
     for word in left:
         if word.startswith("--") or (word.startswith("-") and not NEGATIVE.match(word)):
             raise click.NoSuchOption(word)
-    if place.area not in operations.WRITE_LIMITS:
+    if place.area not in requests.WRITE_LIMITS:
         raise click.UsageError(f"{place.area} can't be written, only read.")
     if not left:
         raise click.UsageError("Missing argument 'VALUE...'.")
@@ -140,7 +141,7 @@ def _job(
             raise ValueError(f"{asked.element} takes one value, found {len(found)}")
         value = found[0] if asked.count == 1 else found
         name = asked.element if asked.count == 1 else f"{asked.element}[{asked.count}]"
-        steps = operations.write_typed(
+        steps = requests.write_typed(
             place.area, place.address, value, name, order, encoding, split=split
         )
         return _Job(place, asked, value, split, list(steps))

@@ -36,7 +36,7 @@ from holdfast.config.listeners import (
     ServerTlsConfig,
     TlsRuleConfig,
 )
-from holdfast.config.loading import load
+from holdfast.config.load import load
 from holdfast.config.memories import MemoryConfig, Seal, Span
 from holdfast.config.model import Config, IdentityConfig, LogConfig
 from holdfast.config.problems import ConfigError, Problem

@@ -9,7 +9,7 @@ from holdfast.config.remote import parse_remote
 from holdfast.config.words import show
 
 URL_FORM = "mqtt://host:port or mqtts://host:port"
-LONGEST_TEXT = 65535
+MAX_TEXT = 65535
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
@@ -30,11 +30,11 @@ def parse_broker(text: object) -> Broker:
 
 def parse_topic_filter(text: object) -> str:
     """Raises `ValueError` for what MQTT 5, 4.7, does not allow."""
-    allowed = f"allowed: a topic filter of 1 to {LONGEST_TEXT} bytes"
+    allowed = f"allowed: a topic filter of 1 to {MAX_TEXT} bytes"
     if not isinstance(text, str):
         raise ValueError(f"found {show(text)}, {allowed}")
     size = len(text.encode(errors="surrogatepass"))
-    if not 1 <= size <= LONGEST_TEXT:
+    if not 1 <= size <= MAX_TEXT:
         raise ValueError(f"found text of {size} bytes, {allowed}")
     if re.search("[\0\ud800-\udfff]", text):
         raise ValueError(f"found {show(text)}, allowed: a topic filter without NUL and surrogates")

@@ -8,14 +8,13 @@ import os
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from holdfast.client.target import SerialTarget, parse
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
 from holdfast.config.files import unreadable
 from holdfast.config.initial import extent
 from holdfast.config.listeners import SERIAL_TYPES
 from holdfast.config.memory_checks import addresses
-from holdfast.config.scanning import parse_pollable
-from holdfast.config.tolerance import entries, integer, mapping, parsed
-from holdfast.config.values import (
+from holdfast.config.scalars import (
     AREAS,
     BIT_AREAS,
     NOT_ON_A_LINE,
@@ -23,19 +22,20 @@ from holdfast.config.values import (
     Area,
     parse_url,
 )
+from holdfast.config.scanning import parse_pollable
+from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.words import choice, listing, show
-from holdfast.target import SerialTarget, parse
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from holdfast.client.target import Target
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
-    from holdfast.target import Target
 
 LAST = 65535
-MOST_OF_A_PACKET = 65535
+MAX_OF_A_PACKET = 65535
 """The most values of one raw ingest packet."""
 
 _NAMING = {"v1": "unit", "crc": "memory_id"}
@@ -210,7 +210,7 @@ class DeviceChecks:
                 line = f"in line {self.report.line(where)}"
                 self.report.add(path, f"{message} {line}, allowed: other addresses", of_key=True)
         if forwarded and count == LAST + 1:
-            allowed = f"allowed beside forward: up to {MOST_OF_A_PACKET}, which one packet holds"
+            allowed = f"allowed beside forward: up to {MAX_OF_A_PACKET}, which one packet holds"
             self.report.add((*path, "count"), f"found {count}, {allowed}")
         if isinstance(read.get("into"), dict):
             into = (*path, "into")

@@ -6,11 +6,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
+from holdfast.client.target import Target, parse
 from holdfast.config.base import Model
 from holdfast.config.memories import Register, Size
 from holdfast.config.receiver import Receiver, parse_receiver
-from holdfast.config.values import (
-    LONGEST_TIME,
+from holdfast.config.scalars import (
+    MAX_TIME,
     Area,
     DeviceUrl,
     Duration,
@@ -22,9 +23,8 @@ from holdfast.config.values import (
     UnitId,
     whole_number,
 )
-from holdfast.target import Target, parse
 
-SHORTEST_INTERVAL = 0.01
+MIN_INTERVAL = 0.01
 STATUS_BLOCK = 30
 """Registers of a status block."""
 LAST_SLOT = 65536 // STATUS_BLOCK - 1
@@ -147,7 +147,7 @@ class DeviceConfig(Model):
     """Whether it is polled."""
     interval: Annotated[
         float,
-        Field(ge=SHORTEST_INTERVAL, le=LONGEST_TIME, allow_inf_nan=False),
+        Field(ge=MIN_INTERVAL, le=MAX_TIME, allow_inf_nan=False),
         whole_number,
     ]
     """Seconds from the start of a poll to the start of the next."""

@@ -6,12 +6,12 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from holdfast.client.target import PORT, TLS_PORT
 from holdfast.config.addresses import Address, Network, parse_source
 from holdfast.config.words import show
-from holdfast.target import PORT, TLS_PORT
 
 if TYPE_CHECKING:
-    from holdfast.target import Transport
+    from holdfast.client.target import Transport
 
 FORM = (
     "NETWORK[:PORTS] as 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from holdfast.config.scalars import is_name
 from holdfast.config.tolerance import entries, mapping
 from holdfast.config.unique import refuse_repeats
-from holdfast.config.values import is_name
 from holdfast.config.words import guess, listing, show
 
 if TYPE_CHECKING:
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from holdfast.config.memories import Seal
     from holdfast.config.model import Config
     from holdfast.config.problems import Report
+    from holdfast.config.scalars import Area
     from holdfast.config.source import KeyPath
-    from holdfast.config.values import Area
 
 
 @dataclass
@@ -55,7 +55,7 @@ class GrantChecks:
             self.report.add(path, f"found {show(name)}, {allowed}")
 
 
-class Grant(NamedTuple):
+class WriterGrant(NamedTuple):
     """Where one writer may go; `path` is its place in the file."""
 
     path: KeyPath
@@ -64,25 +64,27 @@ class Grant(NamedTuple):
     writes: bool
 
 
-def grants(config: Config) -> Iterator[Grant]:
+def grants(config: Config) -> Iterator[WriterGrant]:
     """All grants to others than Modbus clients."""
     for name, listener in config.listeners.items():
         if listener.type != "raw-ingest":
             continue
         for index, rule in enumerate(listener.rules):
             memories = (*rule.units.values(), *rule.memories)
-            yield Grant(("listeners", name, "rules", index), memories, rule.areas, writes=True)
+            yield WriterGrant(
+                ("listeners", name, "rules", index), memories, rule.areas, writes=True
+            )
     if config.rest is not None and config.rest.tokens != "none":
         for index, token in enumerate(config.rest.tokens):
             writes = token.access == "read-write"
-            yield Grant(("rest", "tokens", index), token.memories, token.areas, writes)
+            yield WriterGrant(("rest", "tokens", index), token.memories, token.areas, writes)
     if config.mqtt is not None:
         for index, topic in enumerate(config.mqtt.subscriptions):
             path: KeyPath = ("mqtt", "subscriptions", index)
-            yield Grant(path, topic.memories, topic.areas, writes=True)
+            yield WriterGrant(path, topic.memories, topic.areas, writes=True)
     for name, adapter in config.adapters.items():
         writes = adapter.access == "read-write"
-        yield Grant(("adapters", name), adapter.memories, adapter.areas, writes)
+        yield WriterGrant(("adapters", name), adapter.memories, adapter.areas, writes)
 
 
 def doubt_grants(config: Config, report: Report) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from holdfast.config import source
 from holdfast.config.problems import ConfigError, Problem
-from holdfast.config.values import AREAS, BIT_AREAS, Area
+from holdfast.config.scalars import AREAS, BIT_AREAS, Area
 from holdfast.config.words import guess, listing, show
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from holdfast.config.addresses import Network, covers, parse_source
 from holdfast.config.allowed import allowed
 from holdfast.config.files import unreadable
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
+from holdfast.config.scalars import WRITES
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.unique import refuse_repeats
-from holdfast.config.values import WRITES
 from holdfast.config.words import show
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
 
-_MOST = ModbusTcpListener.model_fields["max_connections"].default
+_MAX_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default
 _OTHER = {"v1": "crc", "crc": "v1"}
 _NAMING = {"v1": "units", "crc": "memories"}
 """How a raw ingest rule names memories, by the format of the packets."""
@@ -86,7 +86,7 @@ class ListenerChecks:
         ]
 
     def _limits(self, path: KeyPath, listener: dict[Any, Any]) -> None:
-        most = integer(listener.get("max_connections", _MOST), 1, 65535)
+        most = integer(listener.get("max_connections", _MAX_CONNECTIONS), 1, 65535)
         of_source = integer(listener.get("max_connections_per_source"), 1, 65535)
         if most is not None and of_source is not None and of_source > most:
             message = f"{of_source} has no effect: max_connections is {most}"

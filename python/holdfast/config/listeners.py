@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import Field, Strict
 
 from holdfast.config.base import Model
-from holdfast.config.values import (
+from holdfast.config.scalars import (
     RAW_UNIT_KEYS,
     SERIAL_UNIT_KEYS,
     UNIT_KEYS,

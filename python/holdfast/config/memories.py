@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, PrivateAttr
 
 from holdfast.config.base import Model
 from holdfast.config.initial import InitialRun
-from holdfast.config.values import AREAS, Area, BitArea, FilePath, NotNull
+from holdfast.config.scalars import AREAS, Area, BitArea, FilePath, NotNull
 
 Size = Annotated[int, Field(ge=1, le=65536)]
 Register = Annotated[int, Field(ge=0, le=65535)]

@@ -11,9 +11,9 @@ from pydantic import TypeAdapter
 from holdfast.config import initial, source
 from holdfast.config.memories import Extent, Span
 from holdfast.config.problems import ConfigError
+from holdfast.config.scalars import AREAS, BIT_AREAS, Area
 from holdfast.config.tolerance import fitting, integer, mapping
 from holdfast.config.unique import Owners
-from holdfast.config.values import AREAS, BIT_AREAS, Area
 from holdfast.config.words import listing, show
 
 if TYPE_CHECKING:

@@ -17,16 +17,7 @@ from holdfast.config.base import Model
 from holdfast.config.devices import DeviceConfig
 from holdfast.config.listeners import Listener
 from holdfast.config.memories import MemoryConfig
-from holdfast.config.services import (
-    AdapterConfig,
-    AuditConfig,
-    GatewayConfig,
-    MetricsConfig,
-    MqttConfig,
-    NatsConfig,
-    RestConfig,
-)
-from holdfast.config.values import (
+from holdfast.config.scalars import (
     ADAPTER_KEYS,
     NAME_KEYS,
     OBJECT_KEYS,
@@ -37,6 +28,15 @@ from holdfast.config.values import (
     ObjectId,
     Text,
     UnitId,
+)
+from holdfast.config.services import (
+    AdapterConfig,
+    AuditConfig,
+    GatewayConfig,
+    MetricsConfig,
+    MqttConfig,
+    NatsConfig,
+    RestConfig,
 )
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ PREFIX = "modbus"
 PREFIX_FORM = "the first part of subjects: letters, digits, '_' and '-', with dots between"
 POLLABLE_FORM = f"{SOURCE_FORM}, or a serial device, as in /dev/ttyUSB0 or COM3"
 
-MOST_DEVICES = 5000
-MOST_TAGS = 500_000
+MAX_DEVICES = 5000
+MAX_TAGS = 500_000
 """What subscribers may ask for where nothing else is said; tags are those of all devices."""
 
 _PORTS = {"nats": SERVER_PORT, "tls": SERVER_PORT}

@@ -11,8 +11,7 @@ from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.config.base import Model
 from holdfast.config.broker import Broker, parse_broker
-from holdfast.config.scanning import MOST_DEVICES, MOST_TAGS, PREFIX
-from holdfast.config.values import (
+from holdfast.config.scalars import (
     Access,
     Areas,
     BindAddress,
@@ -35,6 +34,7 @@ from holdfast.config.values import (
     SubjectPrefix,
     TopicFilter,
 )
+from holdfast.config.scanning import MAX_DEVICES, MAX_TAGS, PREFIX
 
 
 class GatewayTokenConfig(Model):
@@ -165,9 +165,9 @@ class MqttConfig(Model):
 class NatsLimitsConfig(Model):
     """What subscribers of the scanner may ask for at most."""
 
-    devices: Annotated[int, Field(ge=1)] = MOST_DEVICES
+    devices: Annotated[int, Field(ge=1)] = MAX_DEVICES
     """Devices that are polled at once."""
-    tags: Annotated[int, Field(ge=1)] = MOST_TAGS
+    tags: Annotated[int, Field(ge=1)] = MAX_TAGS
     """Tags of all devices."""
 
 

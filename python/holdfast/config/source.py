@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
 
-MOST_VALUES = 1_000_000
+MAX_VALUES = 1_000_000
 """Values of one file, counted as often as an alias repeats them."""
 
 _TAG = "tag:yaml.org,2002:"
@@ -132,8 +132,8 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
     except RecursionError:
         message = "not a configuration: values inside values without end"
         raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
-    if spot.values > MOST_VALUES:
-        message = f"found {spot.values} values, aliases repeated, allowed: {MOST_VALUES}"
+    if spot.values > MAX_VALUES:
+        message = f"found {spot.values} values, aliases repeated, allowed: {MAX_VALUES}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
     document = Document(file, data, spot)
     return document, [

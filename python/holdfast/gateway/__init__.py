@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from holdfast.config.egress import Allowed
 from holdfast.gateway.app import App, rejection
 from holdfast.gateway.pool import dial
-from holdfast.gateway.settings import Limits, Settings
-from holdfast.http import Host, address_of
+from holdfast.gateway.settings import GatewayLimits, Settings
+from holdfast.web.host import Host, address_of
 
 if TYPE_CHECKING:
     import socket
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from holdfast.gateway.egress import Resolve
     from holdfast.gateway.pool import Dial
 
-__all__ = ["Allowed", "Gateway", "Limits", "Settings"]
+__all__ = ["Allowed", "Gateway", "GatewayLimits", "Settings"]
 
 
 class Gateway:

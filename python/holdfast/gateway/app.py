@@ -14,30 +14,30 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast import __version__, logs
-from holdfast import openapi_page as page
 from holdfast.errors import ModbusException
 from holdfast.gateway import assets, identifying, openapi, reading, surveying, watching, writing
 from holdfast.gateway.broadcasting import NOTE
-from holdfast.gateway.device import Device, Failed
+from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
 from holdfast.gateway.events import Stream
 from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
-from holdfast.http import SAFE, headers_of, respond
-from holdfast.http_requests import Gone, Request, Unfit, respond_to_its_end, shown
+from holdfast.web import openapi_page as page
+from holdfast.web.host import SAFE, headers_of, respond
+from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterator
 
     from holdfast.gateway.egress import Resolve
-    from holdfast.gateway.endpoint import Endpoint
+    from holdfast.gateway.endpoint import Operation
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
-    from holdfast.http import Headers, Receive, Scope, Send
+    from holdfast.web.host import Headers, Receive, Scope, Send
 
     Handler: TypeAlias = Callable[[Request, Send], Awaitable[None]]
 
-ENDPOINTS: tuple[Endpoint, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
+ENDPOINTS: tuple[Operation, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *identifying.ENDPOINTS)
 
 JSON = b"application/json"
 REASON = b"holdfast-reason"
@@ -134,13 +134,13 @@ class App:
         self._requests += 1
         try:
             await self._answer(request, send)
-        except Unfit as unfit:
+        except BadRequest as unfit:
             await self._refuse(request, send, unfit)
         except Failed as failed:
             self._failed += 1
             body = _error(failed.detail)
             await self._reply(request, send, body, status=500, reason=failed.reason)
-        except Gone:
+        except ClientDisconnected:
             pass
         except Exception:
             logs.problem("request_failed", listener="gateway", peer=request.peer)
@@ -154,7 +154,7 @@ class App:
             raise malformed(f"{hosts} headers Host, HTTP/1.1 has one")
         route = self.routes.get(request.path)
         if route is None:
-            raise Unfit("not_found", f"there is nothing at {shown(request.path)}")
+            raise BadRequest("not_found", f"there is nothing at {shown(request.path)}")
         allowed, handler = route
         head = request.method == "HEAD" and allowed == "GET" and request.path != watching.PATH
         if request.method == allowed or head:
@@ -165,10 +165,10 @@ class App:
             methods = "GET, HEAD, OPTIONS"
         request.more_headers.append((b"allow", methods.encode()))
         if request.method != "OPTIONS":
-            raise Unfit("method_not_allowed", f"Method not allowed: allowed are {methods}")
+            raise BadRequest("method_not_allowed", f"Method not allowed: allowed are {methods}")
         await respond(send, 204, [*SAFE, *request.more_headers])
 
-    async def _refuse(self, request: Request, send: Send, unfit: Unfit) -> None:
+    async def _refuse(self, request: Request, send: Send, unfit: BadRequest) -> None:
         status = STATUSES[unfit.reason]
         self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
         logs.refused(
@@ -211,20 +211,20 @@ class App:
     # Who asks, and how much at once.
 
     def _admit(self, request: Request) -> None:
-        """Raises `Unfit` for a request of nobody who may ask."""
+        """Raises `BadRequest` for a request of nobody who may ask."""
         if request.is_foreign:
-            raise Unfit("foreign_page", "a page of another site asks for this")
+            raise BadRequest("foreign_page", "a page of another site asks for this")
         if self._settings.tokens:
             request.who = request.owner(self._settings.tokens)
         elif not request.is_direct:
             detail = "Host is a name, without tokens allowed are IP addresses and localhost"
-            raise Unfit("foreign_page", detail)
+            raise BadRequest("foreign_page", detail)
 
     @contextlib.contextmanager
     def _place(self, kind: str, most: int) -> Iterator[None]:
-        """One of the places for what runs at once. Raises `Unfit`."""
+        """One of the places for what runs at once. Raises `BadRequest`."""
         if self._running[kind] >= most:
-            raise Unfit("busy", f"{most} {kind} are under way, which is the limit")
+            raise BadRequest("busy", f"{most} {kind} are under way, which is the limit")
         self._running[kind] += 1
         try:
             yield
@@ -232,12 +232,14 @@ class App:
             self._running[kind] -= 1
 
     @contextlib.contextmanager
-    def _share(self, device: Device) -> Iterator[None]:
-        """One of the places that requests of one device have. Raises `Unfit`."""
+    def _share(self, device: RequestedDevice) -> Iterator[None]:
+        """One of the places that requests of one device have. Raises `BadRequest`."""
         key, most = (device.host.lower(), device.port), self._limits.requests_of_device
         if self._shares.get(key, 0) >= most:
             where = f"{device.host}:{device.port}"
-            raise Unfit("busy", f"{most} requests to {where} are under way, which is the limit")
+            raise BadRequest(
+                "busy", f"{most} requests to {where} are under way, which is the limit"
+            )
         self._shares[key] = self._shares.get(key, 0) + 1
         try:
             yield
@@ -263,7 +265,7 @@ class App:
         try:
             await asyncio.wait([task, *others], return_when=asyncio.FIRST_COMPLETED)
             if not task.done():
-                raise Gone
+                raise ClientDisconnected
             task.result()
         finally:
             for each in (task, *others):
@@ -272,7 +274,7 @@ class App:
 
     # Requests of devices.
 
-    def _handler(self, endpoint: Endpoint) -> Handler:
+    def _handler(self, endpoint: Operation) -> Handler:
         longest = round(1000 * self._limits.timeout)
         fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
 
@@ -283,8 +285,10 @@ class App:
                 given = from_json(await request.body(self._limits.body), fields)
                 changes = endpoint.writes(given)
                 if changes and not self._settings.writes:
-                    raise Unfit("writes_off", f"writes are off: {WRITES_ON}")
-                device = Device(self._egress, self._pool, given, broadcast=endpoint.broadcast)
+                    raise BadRequest("writes_off", f"writes are off: {WRITES_ON}")
+                device = RequestedDevice(
+                    self._egress, self._pool, given, broadcast=endpoint.broadcast
+                )
                 with self._share(device):
                     work = self._carry_out(request, send, endpoint, given, device, changes)
                     await self._while_there_or_told(request, work)
@@ -295,18 +299,18 @@ class App:
         """The same for a request that is answered when the gateway ends."""
         try:
             await self._while_there(request, work, grace=self._limits.ending)
-        except Gone:
+        except ClientDisconnected:
             if self._ending.is_set():
-                raise Unfit("stopping", STOPPING) from None
+                raise BadRequest("stopping", STOPPING) from None
             raise
 
     async def _carry_out(
         self,
         request: Request,
         send: Send,
-        endpoint: Endpoint,
+        endpoint: Operation,
         given: dict[str, Any],
-        device: Device,
+        device: RequestedDevice,
         changes: bool,
     ) -> None:
         outcome = "failed"
@@ -318,7 +322,7 @@ class App:
         except ModbusException as error:
             outcome = f"exception {error.code:02X}"
             answer = endpoint.on_exception(given, device, error)
-        except Unfit:
+        except BadRequest:
             outcome = "refused"
             raise
         finally:
@@ -329,7 +333,13 @@ class App:
         await self._reply(request, send, msgspec.json.encode(answer))
 
     def _note_write(
-        self, request: Request, given: dict[str, Any], device: Device, outcome: str, *, sent: bool
+        self,
+        request: Request,
+        given: dict[str, Any],
+        device: RequestedDevice,
+        outcome: str,
+        *,
+        sent: bool,
     ) -> None:
         """Counts a write that was sent, and tells who wrote where, without the values."""
         self._writes += sent
@@ -351,7 +361,7 @@ class App:
         with self._place("streams", self._limits.streams):
             body = await request.body(self._limits.body)
             given = from_json(body, surveying.fields(self._limits))
-            device = Device(self._egress, self._pool, given)
+            device = RequestedDevice(self._egress, self._pool, given)
             survey = surveying.planned(given)
             stream = Stream(send, self._limits.heartbeat)
             work = surveying.survey(
@@ -363,7 +373,7 @@ class App:
         self._admit(request)
         with self._place("streams", self._limits.streams):
             given = from_query(request.scope["query_string"], watching.fields(self._limits))
-            device = Device(self._egress, self._pool, given)
+            device = RequestedDevice(self._egress, self._pool, given)
             stream = Stream(send, self._limits.heartbeat)
             await self._while_streaming(request, stream, watching.watch(given, device, stream))
 
@@ -372,9 +382,9 @@ class App:
     ) -> None:
         try:
             await self._while_there(request, work, grace=0)
-        except Gone:
+        except ClientDisconnected:
             if self._ending.is_set() and not stream.began:
-                raise Unfit("stopping", STOPPING) from None
+                raise BadRequest("stopping", STOPPING) from None
             if self._ending.is_set():
                 await stream.end()
 

@@ -7,8 +7,8 @@ import contextlib
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast.client import Client
+from holdfast.client.target import NetworkTarget
 from holdfast.errors import ConnectionLost, InvalidResponse
-from holdfast.target import NetworkTarget
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -8,22 +8,23 @@ import ssl
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast import logs, tls
+from holdfast import logs
+from holdfast.client import tls
+from holdfast.client.target import PORT, TLS_PORT
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusException, RequestTimeout
 from holdfast.gateway.broadcasting import broadcast
 from holdfast.gateway.egress import NoSuchName, Refused
 from holdfast.gateway.fields import malformed
 from holdfast.gateway.pool import Full, Unusable, could_not_connect
-from holdfast.http_requests import Unfit
-from holdfast.target import PORT, TLS_PORT
+from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from holdfast.client import Client
+    from holdfast.client.target import Transport
     from holdfast.gateway.egress import Egress
     from holdfast.gateway.pool import Pool
-    from holdfast.target import Transport
 
 Result = TypeVar("Result")
 
@@ -49,7 +50,7 @@ class Failed(Exception):
         super().__init__(f"{reason}: {detail}")
 
 
-class Device:
+class RequestedDevice:
     """The device that a request names, for as long as the request takes."""
 
     def __init__(
@@ -86,7 +87,7 @@ class Device:
     ) -> Result:
         """What a call comes to, within the time of the request; only reads are to be repeated.
 
-        Raises `Failed`, `Unfit`, and `ModbusException` for what the device answers.
+        Raises `Failed`, `BadRequest`, and `ModbusException` for what the device answers.
         """
         if self.is_broadcast:
             call = broadcast(call)
@@ -120,11 +121,11 @@ class Device:
                 self._waits = True
                 return await self._pool.run(route, self.timeout, turn, repeat=repeat)
         except Refused as error:
-            raise Unfit("refused_target", str(error)) from None
+            raise BadRequest("refused_target", str(error)) from None
         except NoSuchName as error:
             raise Failed("no_such_name", str(error)) from None
         except Full:
-            raise Unfit("busy", "too many devices are talked to right now") from None
+            raise BadRequest("busy", "too many devices are talked to right now") from None
         except Unusable as error:
             logs.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))
             detail = "its certificates can't be used now, see the log of the gateway"

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from holdfast.client.target import Transport
     from holdfast.config.addresses import Address
     from holdfast.config.egress import Allowed
-    from holdfast.target import Transport
 
     Resolve: TypeAlias = Callable[[str], Awaitable[list[str]]]
 
-MOST_LOOKUPS = 32
+MAX_LOOKUPS = 32
 """Names that are looked up at once; more wait."""
 
 
@@ -103,7 +103,7 @@ class Lookups:
     """The system's resolver, in threads that nobody has to wait for."""
 
     def __init__(self) -> None:
-        self._turns = asyncio.Semaphore(MOST_LOOKUPS)
+        self._turns = asyncio.Semaphore(MAX_LOOKUPS)
 
     async def __call__(self, host: str) -> list[str]:
         """The addresses of a name. Raises `NoSuchName`."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from holdfast.errors import ModbusException
-    from holdfast.gateway.device import Device
+    from holdfast.gateway.device import RequestedDevice
 
     Given: TypeAlias = Mapping[str, Any]
     Answer: TypeAlias = dict[str, Any]
@@ -26,21 +26,21 @@ EXAMPLE: dict[str, Any] = {"host": "plc.factory.local", "port": 502, "unitId": 1
 """The device of examples."""
 
 
-def exception_answer(given: Given, device: Device, error: ModbusException) -> Answer:
+def exception_answer(given: Given, device: RequestedDevice, error: ModbusException) -> Answer:
     """What a Modbus exception is answered with."""
     about = {"address": given["address"]} if "address" in given else {}
     return {"success": False, "error": exception_text(error), **device.told, **about}
 
 
 @dataclass(frozen=True)
-class Endpoint:
+class Operation:
     """One thing that can be asked of a device."""
 
     path: str
     name: str
     summary: str
     fields: tuple[Field, ...]
-    carry_out: Callable[[Given, Device], Awaitable[Answer]]
+    carry_out: Callable[[Given, RequestedDevice], Awaitable[Answer]]
     properties: dict[str, Schema]
     """The schemas of the answer's fields, but for those that all answers have."""
     examples: dict[str, dict[str, Any]]
@@ -55,7 +55,7 @@ class Endpoint:
     timeout: int = 10_000
     optional: tuple[str, ...] = ()
     """Fields of the answer that are there only sometimes."""
-    on_exception: Callable[[Given, Device, ModbusException], Answer] = exception_answer
+    on_exception: Callable[[Given, RequestedDevice, ModbusException], Answer] = exception_answer
 
 
 def always(_: Given) -> bool:

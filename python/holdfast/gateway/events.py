@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from holdfast.http import SAFE
+from holdfast.web.host import SAFE
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from holdfast.http import Send
+    from holdfast.web.host import Send
 
 Result = TypeVar("Result")
 KIND = b"text/event-stream"

@@ -15,8 +15,8 @@ from urllib.parse import parse_qsl
 
 import msgspec
 
-from holdfast.http_requests import Unfit, shown
 from holdfast.types import AREAS
+from holdfast.web.requests import BadRequest, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ LAST = 65535
 REQUIRED: Any = object()
 """In place of a default: there is none."""
 
-MOST_PARAMETERS = 32
+MAX_PARAMETERS = 32
 
 _HOST = r"^(\[[0-9A-Fa-f:.]{2,45}\]|[0-9A-Fa-f:.]{2,45}|[A-Za-z0-9_]([A-Za-z0-9._-]{0,252}))$"
 
@@ -48,7 +48,7 @@ class Field:
     """Whether a value that fits the schema is one."""
 
     def check(self, value: Any) -> Any:
-        """The value. Raises `Unfit`."""
+        """The value. Raises `BadRequest`."""
         flaw = _flaw(value, self.schema)
         if flaw is None and self.fits(value):
             return value
@@ -57,7 +57,7 @@ class Field:
         raise malformed(f"{self.name}{flaw}" if self.refusal is None else self.refusal(value))
 
     def read(self, text: str) -> Any:
-        """A value from a query. Raises `Unfit`."""
+        """A value from a query. Raises `BadRequest`."""
         kind = self.schema["type"]
         if kind == "integer" and re.fullmatch("(0|[1-9][0-9]{0,9})", text):
             return self.check(int(text))
@@ -167,7 +167,7 @@ def with_default(field: Field, default: Any) -> Field:
 
 
 def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
-    """The fields of a JSON object, defaults filled in. Raises `Unfit`."""
+    """The fields of a JSON object, defaults filled in. Raises `BadRequest`."""
     try:
         given = msgspec.json.decode(body)
         json.loads(body, object_pairs_hook=_without_twins)
@@ -179,7 +179,7 @@ def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> None:
-    """Raises `Unfit` for a name that an object has twice."""
+    """Raises `BadRequest` for a name that an object has twice."""
     seen: set[str] = set()
     for name, _ in pairs:
         if name in seen:
@@ -188,13 +188,13 @@ def _without_twins(pairs: list[tuple[str, Any]]) -> None:
 
 
 def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
-    """The fields of a query, defaults filled in. Raises `Unfit`."""
+    """The fields of a query, defaults filled in. Raises `BadRequest`."""
     try:
         pairs = parse_qsl(
-            query.decode("latin-1"), keep_blank_values=True, max_num_fields=MOST_PARAMETERS
+            query.decode("latin-1"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS
         )
     except ValueError:
-        raise malformed(f"there are more than {MOST_PARAMETERS} parameters") from None
+        raise malformed(f"there are more than {MAX_PARAMETERS} parameters") from None
     known = {field.name: field for field in fields}
     given: dict[str, Any] = {}
     for name, text in pairs:
@@ -204,9 +204,9 @@ def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
     return _filled(given, fields)
 
 
-def malformed(detail: str) -> Unfit:
+def malformed(detail: str) -> BadRequest:
     """A wrong request."""
-    return Unfit("malformed", detail)
+    return BadRequest("malformed", detail)
 
 
 def _filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]:

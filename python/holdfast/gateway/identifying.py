@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.gateway.endpoint import EXAMPLE, MILLISECONDS, REGISTERS, TARGET, Endpoint
+from holdfast.client.requests import OBJECT_NAMES
+from holdfast.gateway.endpoint import EXAMPLE, MILLISECONDS, REGISTERS, TARGET, Operation
 from holdfast.gateway.fields import REGISTER, Field, array, integer
-from holdfast.operations import OBJECT_NAMES
 
 if TYPE_CHECKING:
-    from holdfast.gateway.device import Device
+    from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Answer, Given
 
 HARMLESS = {0, 2, *range(11, 19)}
 """Sub-functions that change nothing: the echo, the diagnostic register, the counters."""
 
-MOST_WORDS = 125
+MAX_WORDS = 125
 
 _NAMES = {
     name: "".join(word if at == 0 else word.title() for at, word in enumerate(name.split("_")))
@@ -25,7 +25,7 @@ _TEXT_OR_NULL = {"type": ["string", "null"]}
 _HEX = {"type": "string", "pattern": "^([0-9a-f]{2})*$"}
 
 
-async def _diagnostics(given: Given, device: Device) -> Answer:
+async def _diagnostics(given: Given, device: RequestedDevice) -> Answer:
     number, words = given["subFunction"], given["data"]
     found = await device.ask(
         lambda client: client.diagnostics(number, words, unit=device.unit),
@@ -40,7 +40,7 @@ async def _diagnostics(given: Given, device: Device) -> Answer:
     }
 
 
-async def _server_id(_: Given, device: Device) -> Answer:
+async def _server_id(_: Given, device: RequestedDevice) -> Answer:
     found = await device.ask(lambda client: client.report_server_id(unit=device.unit), repeat=True)
     return {
         "success": True,
@@ -53,7 +53,7 @@ async def _server_id(_: Given, device: Device) -> Answer:
     }
 
 
-async def _identify(_: Given, device: Device) -> Answer:
+async def _identify(_: Given, device: RequestedDevice) -> Answer:
     found = await device.ask(lambda client: client.identify(unit=device.unit), repeat=True)
     names = {told: getattr(found, name) for name, told in _NAMES.items()}
     objects = {str(number): data.hex() for number, data in sorted(found.objects.items())}
@@ -68,7 +68,7 @@ async def _identify(_: Given, device: Device) -> Answer:
 
 
 ENDPOINTS = (
-    Endpoint(
+    Operation(
         "/api/modbus/diagnostics",
         "diagnostics",
         "Diagnostics of a device on a serial line",
@@ -77,7 +77,7 @@ ENDPOINTS = (
             Field(
                 "subFunction", REGISTER, "0 echo, 2 diagnostic register, 11 to 18 counters, …", 0
             ),
-            Field("data", array(REGISTER, MOST_WORDS), "Words that go with it", [0]),
+            Field("data", array(REGISTER, MAX_WORDS), "Words that go with it", [0]),
         ),
         _diagnostics,
         {"subFunction": integer(0, 65535), "data": REGISTERS, "rtt": MILLISECONDS},
@@ -87,7 +87,7 @@ ENDPOINTS = (
         "as writes are. 4, Force Listen Only Mode, has no reply.",
         writes=lambda given: given["subFunction"] not in HARMLESS,
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/server-id",
         "serverId",
         "What a device calls itself",
@@ -111,7 +111,7 @@ ENDPOINTS = (
         },
         "Function 17. The layout is the device's own: `data` is all of it, in hex.",
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/identify",
         "identify",
         "Vendor, product and revision of a device",

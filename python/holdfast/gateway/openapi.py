@@ -13,8 +13,8 @@ from holdfast.types import AREAS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.gateway.endpoint import Endpoint
-    from holdfast.gateway.settings import Limits, Settings
+    from holdfast.gateway.endpoint import Operation
+    from holdfast.gateway.settings import GatewayLimits, Settings
 
 STATUS = "/api/gateway"
 
@@ -50,7 +50,7 @@ POSTED = ("400", "403", "405", "408", "413", "415", "500", "503")
 STREAMED = ("400", "403", "405", "500", "503")
 
 
-def document(version: str, endpoints: Iterable[Endpoint], settings: Settings) -> dict[str, Any]:
+def document(version: str, endpoints: Iterable[Operation], settings: Settings) -> dict[str, Any]:
     """The document of a gateway with these settings."""
     secured = bool(settings.tokens)
     limits = settings.limits
@@ -84,7 +84,7 @@ def document(version: str, endpoints: Iterable[Endpoint], settings: Settings) ->
     }
 
 
-def _endpoint(endpoint: Endpoint, limits: Limits) -> dict[str, Any]:
+def _endpoint(endpoint: Operation, limits: GatewayLimits) -> dict[str, Any]:
     longest = round(1000 * limits.timeout)
     fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
     answer = {"success": {"const": True}, **_target(), **endpoint.properties}
@@ -106,7 +106,7 @@ def _endpoint(endpoint: Endpoint, limits: Limits) -> dict[str, Any]:
     }
 
 
-def _streams(limits: Limits) -> dict[str, Any]:
+def _streams(limits: GatewayLimits) -> dict[str, Any]:
     return {
         surveying.PATH: {
             "post": {

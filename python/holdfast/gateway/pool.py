@@ -12,9 +12,10 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeVar
 
-from holdfast.client import Client, check_files
+from holdfast.client import Client
+from holdfast.client.endpoint import check_files
+from holdfast.client.target import IN_FLIGHT, NetworkTarget, Tls
 from holdfast.errors import ConnectionLost, ModbusException
-from holdfast.target import IN_FLIGHT, NetworkTarget, Tls
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 NO_TLS = Tls()
-LOOK = 0.5
+CHECK_INTERVAL = 0.5
 """Seconds between two looks for connections that nobody uses."""
 
 
@@ -230,7 +231,7 @@ class Pool:
         """Closes what nobody uses, and everything at the end."""
         try:
             while True:
-                await asyncio.sleep(LOOK)
+                await asyncio.sleep(CHECK_INTERVAL)
                 await self._close_unused()
         finally:
             for entry in self._entries.values():

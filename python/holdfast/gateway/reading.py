@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.client.requests import ADDRESSES, READ_LIMITS
 from holdfast.errors import ModbusException
 from holdfast.gateway.device import exception_name, exception_text
-from holdfast.gateway.endpoint import EXAMPLE, TARGET, Endpoint, array_of
+from holdfast.gateway.endpoint import EXAMPLE, TARGET, Operation, array_of
 from holdfast.gateway.fields import (
     ADDRESS,
     BYTE_ORDER,
@@ -18,14 +19,13 @@ from holdfast.gateway.fields import (
     told,
 )
 from holdfast.gateway.typed import quantity_of, typed
-from holdfast.operations import ADDRESSES, READ_LIMITS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from holdfast.client import Client
-    from holdfast.gateway.device import Device
+    from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Answer, Given
     from holdfast.gateway.typed import Typed
     from holdfast.types import Area
@@ -63,7 +63,7 @@ QUANTITY = Field(
 
 
 class Range:
-    """What a request reads. Raises `Unfit` for what can't be read at once."""
+    """What a request reads. Raises `BadRequest` for what can't be read at once."""
 
     def __init__(self, given: Given) -> None:
         self.function: int = given["functionCode"]
@@ -82,7 +82,7 @@ class Range:
         """What its values are."""
         return "coils" if self.area in BIT_AREAS else "registers"
 
-    async def read(self, device: Device) -> list[Any]:
+    async def read(self, device: RequestedDevice) -> list[Any]:
         """The values of now: booleans, or integers 0 to 65535."""
         return await device.ask(self._call(device.unit), repeat=True)
 
@@ -99,7 +99,7 @@ class Range:
         return call
 
 
-async def _connect(_: Given, device: Device) -> Answer:
+async def _connect(_: Given, device: RequestedDevice) -> Answer:
     answer = {"success": True, "message": "Modbus server reachable", **device.told}
     try:
         [register] = await device.ask(
@@ -111,7 +111,7 @@ async def _connect(_: Given, device: Device) -> Answer:
     return {**answer, "testRegister": register}
 
 
-async def _read(given: Given, device: Device) -> Answer:
+async def _read(given: Given, device: RequestedDevice) -> Answer:
     asked = Range(given)
     found = await asked.read(device)
     return {
@@ -127,7 +127,7 @@ async def _read(given: Given, device: Device) -> Answer:
     }
 
 
-def _read_exception(given: Given, _: Device, error: ModbusException) -> Answer:
+def _read_exception(given: Given, _: RequestedDevice, error: ModbusException) -> Answer:
     return {
         "success": False,
         "error": exception_text(error),
@@ -152,7 +152,7 @@ TYPED: dict[str, Schema] = {
 }
 
 ENDPOINTS = (
-    Endpoint(
+    Operation(
         "/api/modbus/connect",
         "connect",
         "Whether a device answers",
@@ -168,7 +168,7 @@ ENDPOINTS = (
         "Reads holding register 0. A Modbus exception is an answer too: the device is there.",
         optional=("testRegister", "exception"),
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/read",
         "read",
         "Read coils, discrete inputs, holding or input registers",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_network
 from typing import TYPE_CHECKING
 
-from holdfast.target import Tls
+from holdfast.client.target import Tls
 
 if TYPE_CHECKING:
     from holdfast.config.addresses import Network
@@ -17,7 +17,7 @@ LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"
 
 
 @dataclass(frozen=True)
-class Limits:
+class GatewayLimits:
     """What a gateway takes and does at most. Times are in seconds."""
 
     body: int = 65536
@@ -64,6 +64,6 @@ class Settings:
     tokens: tuple[Token, ...] = ()
     """Without any, whoever may connect may ask."""
     sources: tuple[Network, ...] = LOOPBACK
-    limits: Limits = field(default_factory=Limits)
+    limits: GatewayLimits = field(default_factory=GatewayLimits)
     tls: Tls = field(default_factory=Tls)
     """Whom it trusts among devices with TLS, and what it shows them; callers have no say in it."""

@@ -6,22 +6,22 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any, cast
 
-from holdfast import mapping
 from holdfast.errors import ConnectionLost, ModbusError, ModbusException
 from holdfast.gateway.device import Failed
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.fields import AREA_LIST, LAST, Field, integer, malformed, timeout
-from holdfast.http_requests import Unfit
-from holdfast.mapping import Survey
+from holdfast.tools import discovery
+from holdfast.tools.discovery import Survey
 from holdfast.types import AREAS, BIT_AREAS
+from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
     from holdfast.client import Client
-    from holdfast.gateway.device import Device
+    from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
     from holdfast.gateway.events import Stream
-    from holdfast.gateway.settings import Limits
-    from holdfast.mapping import AreaMap
+    from holdfast.gateway.settings import GatewayLimits
+    from holdfast.tools.discovery import AreaMap
     from holdfast.types import Area
 
 PATH = "/api/modbus/map"
@@ -30,11 +30,11 @@ TIMEOUT = 2_000
 BETWEEN = 0.2
 """Seconds between two events of progress."""
 
-MOST_SHOWN = 500
+MAX_SHOWN = 500
 """Ranges that an event of progress tells; the result tells all."""
 
 
-def fields(limits: Limits) -> tuple[Field, ...]:
+def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """What a map is asked with."""
     return (
         *TARGET,
@@ -42,14 +42,14 @@ def fields(limits: Limits) -> tuple[Field, ...]:
         Field("first", integer(0, LAST), "The first address to look at", 0),
         Field("last", integer(0, LAST), "The last address to look at", LAST),
         Field("exact", {"type": "boolean"}, "Read every address, not samples", False),
-        Field("step", integer(1, LAST + 1), "Addresses between two samples", mapping.STEP),
+        Field("step", integer(1, LAST + 1), "Addresses between two samples", discovery.STEP),
         Field("maxQuantity", integer(1, 2000), "The most that a read asks for", None),
         timeout(TIMEOUT, round(1000 * limits.timeout), "Milliseconds for each read"),
     )
 
 
 def planned(given: Given) -> Survey:
-    """What a request asks for. Raises `Unfit`."""
+    """What a request asks for. Raises `BadRequest`."""
     if given["first"] > given["last"]:
         raise malformed(f"first is {given['first']}, behind last, which is {given['last']}")
     return Survey(
@@ -62,7 +62,7 @@ def planned(given: Given) -> Survey:
 
 
 async def survey(
-    survey: Survey, device: Device, stream: Stream, *, step: int, longest: float
+    survey: Survey, device: RequestedDevice, stream: Stream, *, step: int, longest: float
 ) -> None:
     """Maps a device. What fails before anything was answered, fails as a read does."""
     began = time.monotonic()
@@ -83,8 +83,11 @@ async def survey(
     await stream.end()
 
 
-async def _find(survey: Survey, device: Device) -> None:
-    """Puts the first area that the device answers in to the front. Raises `Failed` and `Unfit`."""
+async def _find(survey: Survey, device: RequestedDevice) -> None:
+    """Puts the first area that the device answers in to the front.
+
+    Raises `Failed` and `BadRequest`.
+    """
     for found in list(survey.areas):
         try:
             await _Reader(device).look(found.area, survey.span.start)
@@ -103,13 +106,13 @@ async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None
     """Carries a survey out; why it ended early, if it did."""
     try:
         async with asyncio.timeout(longest):
-            await mapping.run(survey, cast("Client", reader))
+            await discovery.run(survey, cast("Client", reader))
     except TimeoutError:
         return Failed("unfinished", f"not done within {longest:g} s")
     except ModbusError as error:
         reason = "connection_lost" if isinstance(error, ConnectionLost) else "timeout"
         return Failed(reason, str(error))
-    except Unfit as error:
+    except BadRequest as error:
         return Failed(error.reason, error.detail)
     except Failed as error:
         return error
@@ -119,7 +122,7 @@ async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None
 class _Reader:
     """A client as far as a survey needs one."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: RequestedDevice) -> None:
         self._device = device
 
     async def look(self, area: Area, address: int) -> None:
@@ -137,7 +140,7 @@ class _Reader:
 
 
 def _progress(survey: Survey) -> dict[str, Any]:
-    few = sum(len(found.ranges) for found in survey.areas) <= MOST_SHOWN
+    few = sum(len(found.ranges) for found in survey.areas) <= MAX_SHOWN
     return {
         "at": survey.at,
         "total": survey.total,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.config.values import NAME_FORM, is_name
+from holdfast.config.scalars import NAME_FORM, is_name
 
 if TYPE_CHECKING:
     from pathlib import Path

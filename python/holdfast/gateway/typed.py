@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast.gateway.fields import malformed
-from holdfast.guessing import shortest
+from holdfast.tools.inference import shortest
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
 
@@ -45,7 +45,7 @@ class Typed:
         }
 
     def encode(self, given: Sequence[Any]) -> list[int]:
-        """The registers of values. Raises `Unfit`."""
+        """The registers of values. Raises `BadRequest`."""
         if self.element.startswith("bit:"):
             raise malformed("a bit of a register is written by /api/modbus/write/mask")
         if self.count is not None and self.count != len(given):
@@ -84,7 +84,7 @@ class Typed:
 
 
 def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
-    """What a request asks for; `None` if it names no type. Raises `Unfit`."""
+    """What a request asks for; `None` if it names no type. Raises `BadRequest`."""
     if datatype is None:
         if order != "ABCD":
             raise malformed("byteOrder goes with datatype")

@@ -11,26 +11,26 @@ from holdfast.gateway.device import Failed, exception_text
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.fields import ADDRESS, BYTE_ORDER, DATATYPE, Field, integer, timeout
 from holdfast.gateway.reading import FUNCTION, QUANTITY, Range
-from holdfast.http_requests import Unfit
+from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import TypeAlias
 
-    from holdfast.gateway.device import Device
+    from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
     from holdfast.gateway.events import Stream
-    from holdfast.gateway.settings import Limits
+    from holdfast.gateway.settings import GatewayLimits
 
     Event: TypeAlias = tuple[str, Any]
 
 PATH = "/api/modbus/watch"
 TIMEOUT = 5_000
 INTERVAL = 1_000
-LONGEST_INTERVAL = 3_600_000
+MAX_INTERVAL = 3_600_000
 
 
-def fields(limits: Limits) -> tuple[Field, ...]:
+def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """What a watch is asked with."""
     least = round(1000 * limits.interval)
     return (
@@ -42,7 +42,7 @@ def fields(limits: Limits) -> tuple[Field, ...]:
         BYTE_ORDER,
         Field(
             "interval",
-            integer(least, LONGEST_INTERVAL),
+            integer(least, MAX_INTERVAL),
             "Milliseconds from poll to poll",
             max(least, INTERVAL),
         ),
@@ -50,7 +50,7 @@ def fields(limits: Limits) -> tuple[Field, ...]:
     )
 
 
-async def watch(given: Given, device: Device, stream: Stream) -> None:
+async def watch(given: Given, device: RequestedDevice, stream: Stream) -> None:
     """Polls until it is cancelled. What fails before the first event, fails as a read does."""
     view = _View(Range(given), device)
     interval = given["interval"] / 1000
@@ -70,14 +70,14 @@ async def watch(given: Given, device: Device, stream: Stream) -> None:
         await stream.pause(due)
         try:
             event = view.changed(await stream.during(view.asked.read(device)))
-        except (ModbusException, Failed, Unfit) as error:
+        except (ModbusException, Failed, BadRequest) as error:
             event = view.problem(error)
 
 
 class _View:
     """What the client knows, and the events that make it know what is."""
 
-    def __init__(self, asked: Range, device: Device) -> None:
+    def __init__(self, asked: Range, device: RequestedDevice) -> None:
         self.asked = asked
         self._device = device
         self._values: list[Any] | None = None
@@ -133,8 +133,8 @@ class _View:
 
 
 def _detail(error: Exception) -> str:
-    return error.detail if isinstance(error, Failed | Unfit) else str(error)
+    return error.detail if isinstance(error, Failed | BadRequest) else str(error)
 
 
 def _reason(error: Exception) -> str:
-    return error.reason if isinstance(error, Failed | Unfit) else "exception"
+    return error.reason if isinstance(error, Failed | BadRequest) else "exception"

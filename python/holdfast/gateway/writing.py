@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.client.requests import ADDRESSES, WRITE_LIMITS
 from holdfast.gateway.endpoint import (
     EXAMPLE,
     MILLISECONDS,
     REGISTERS,
     TARGET,
-    Endpoint,
+    Operation,
     always,
 )
 from holdfast.gateway.fields import (
@@ -24,26 +25,25 @@ from holdfast.gateway.fields import (
     malformed,
 )
 from holdfast.gateway.typed import typed
-from holdfast.operations import ADDRESSES, WRITE_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.gateway.device import Device
+    from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Answer, Given
 
 ON = 0xFF00
-MOST_REGISTERS = WRITE_LIMITS["holding_registers"]
-MOST_COILS = WRITE_LIMITS["coils"]
-MOST_WITH_READ = 121
-MOST_READ = 125
+MAX_REGISTERS = WRITE_LIMITS["holding_registers"]
+MAX_COILS = WRITE_LIMITS["coils"]
+MAX_WITH_READ = 121
+MAX_READ = 125
 TIMEOUT = 5_000
 
 PLAIN_OR_TYPED = {"type": ["integer", "number", "string", "boolean"]}
 """Values of any type; which, the datatype says."""
 
 
-async def _write_coil(given: Given, device: Device) -> Answer:
+async def _write_coil(given: Given, device: RequestedDevice) -> Answer:
     address, value = given["address"], bool(given["value"])
     await device.ask(lambda client: client.write_coil(address, value, unit=device.unit))
     return {
@@ -56,14 +56,14 @@ async def _write_coil(given: Given, device: Device) -> Answer:
     }
 
 
-async def _write_coils(given: Given, device: Device) -> Answer:
+async def _write_coils(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], [bool(each) for each in given["values"]]
     _check_end(address, len(values))
     await device.ask(lambda client: client.write_coils(address, values, unit=device.unit))
     return _written(device, address, len(values))
 
 
-async def _write_register(given: Given, device: Device) -> Answer:
+async def _write_register(given: Given, device: RequestedDevice) -> Answer:
     address, value = given["address"], given["value"]
     await device.ask(lambda client: client.write_register(address, value, unit=device.unit))
     return {
@@ -75,16 +75,16 @@ async def _write_register(given: Given, device: Device) -> Answer:
     }
 
 
-async def _write_registers(given: Given, device: Device) -> Answer:
+async def _write_registers(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], _registers(given)
-    if len(values) > MOST_REGISTERS:
-        raise malformed(f"{len(values)} registers, allowed are {MOST_REGISTERS} in a request")
+    if len(values) > MAX_REGISTERS:
+        raise malformed(f"{len(values)} registers, allowed are {MAX_REGISTERS} in a request")
     _check_end(address, len(values))
     await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
     return _written(device, address, len(values))
 
 
-async def _mask(given: Given, device: Device) -> Answer:
+async def _mask(given: Given, device: RequestedDevice) -> Answer:
     address, and_mask, or_mask = given["address"], given["andMask"], given["orMask"]
     await device.ask(
         lambda client: client.mask_write(
@@ -95,7 +95,7 @@ async def _mask(given: Given, device: Device) -> Answer:
     return {"success": True, **device.told, "address": address, **masks, "rtt": device.rtt}
 
 
-async def _read_write(given: Given, device: Device) -> Answer:
+async def _read_write(given: Given, device: RequestedDevice) -> Answer:
     first, quantity = given["readAddress"], given["readQuantity"]
     address, values = given["writeAddress"], given["values"]
     _check_end(first, quantity)
@@ -116,7 +116,7 @@ async def _read_write(given: Given, device: Device) -> Answer:
     }
 
 
-def _written(device: Device, address: int, quantity: int) -> Answer:
+def _written(device: RequestedDevice, address: int, quantity: int) -> Answer:
     return {
         "success": True,
         **device.told,
@@ -127,7 +127,7 @@ def _written(device: Device, address: int, quantity: int) -> Answer:
 
 
 def _registers(given: Given) -> Sequence[int]:
-    """The registers to write. Raises `Unfit`."""
+    """The registers to write. Raises `BadRequest`."""
     kind = typed(given["datatype"], given["byteOrder"], "holding_registers")
     if kind is not None:
         return kind.encode(given["values"])
@@ -145,12 +145,12 @@ def _values(items: dict[str, Any], most: int, text: str) -> Field:
 
 _WRITTEN = {
     "startAddress": integer(0, 65535),
-    "quantity": integer(1, MOST_COILS),
+    "quantity": integer(1, MAX_COILS),
     "rtt": MILLISECONDS,
 }
 
 ENDPOINTS = (
-    Endpoint(
+    Operation(
         "/api/modbus/write/coil",
         "writeCoil",
         "Write one coil",
@@ -169,7 +169,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/write/registers",
         "writeRegisters",
         "Write holding registers",
@@ -178,7 +178,7 @@ ENDPOINTS = (
             ADDRESS,
             _values(
                 PLAIN_OR_TYPED,
-                MOST_REGISTERS,
+                MAX_REGISTERS,
                 "Registers 0 to 65535, up to 123; with `datatype` values of that type, bytes in "
                 "hex",
             ),
@@ -203,7 +203,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/write/register",
         "writeRegister",
         "Write one holding register",
@@ -217,11 +217,11 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/write/coils",
         "writeCoils",
         "Write coils",
-        (*TARGET, ADDRESS, _values(BIT, MOST_COILS, "Up to 1968 of `true`, `false`, 1, 0")),
+        (*TARGET, ADDRESS, _values(BIT, MAX_COILS, "Up to 1968 of `true`, `false`, 1, 0")),
         _write_coils,
         _WRITTEN,
         {"Three coils": {**EXAMPLE, "address": 16, "values": [True, False, True]}},
@@ -231,7 +231,7 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/write/mask",
         "writeMask",
         "Change bits of a holding register",
@@ -255,23 +255,23 @@ ENDPOINTS = (
         broadcast=True,
         timeout=TIMEOUT,
     ),
-    Endpoint(
+    Operation(
         "/api/modbus/readwrite",
         "readWrite",
         "Write holding registers, then read some, as one step",
         (
             *TARGET,
             Field("readAddress", REGISTER, "The first address to read"),
-            Field("readQuantity", integer(1, MOST_READ), "How many registers to read"),
+            Field("readQuantity", integer(1, MAX_READ), "How many registers to read"),
             Field("writeAddress", REGISTER, "The first address to write"),
-            _values(REGISTER, MOST_WITH_READ, "Registers to write, up to 121"),
+            _values(REGISTER, MAX_WITH_READ, "Registers to write, up to 121"),
         ),
         _read_write,
         {
             "writeAddress": integer(0, 65535),
-            "written": integer(1, MOST_WITH_READ),
+            "written": integer(1, MAX_WITH_READ),
             "readAddress": integer(0, 65535),
-            "quantity": integer(1, MOST_READ),
+            "quantity": integer(1, MAX_READ),
             "format": {"const": "registers"},
             "values": REGISTERS,
             "rtt": MILLISECONDS,

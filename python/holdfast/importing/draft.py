@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from holdfast.config.values import AREAS
+from holdfast.config.scalars import AREAS
 
 
 @dataclass

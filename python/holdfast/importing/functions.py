@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.values import FUNCTIONS, WRITES
+from holdfast.config.scalars import FUNCTIONS, WRITES
 from holdfast.config.words import listing, show
 
 if TYPE_CHECKING:

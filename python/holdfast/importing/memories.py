@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.values import AREAS
+from holdfast.config.scalars import AREAS
 from holdfast.config.words import listing
 
 if TYPE_CHECKING:

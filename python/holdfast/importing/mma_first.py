@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.values import WRITES
+from holdfast.config.scalars import WRITES
 from holdfast.config.words import guess, listing, show
 from holdfast.importing import functions
 from holdfast.importing.filters import ALL, read_filter

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from holdfast.config.values import NAME_FORM
+from holdfast.config.scalars import NAME_FORM
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
     from holdfast.importing.notes import Desk
 
-MOST = 64
+MAX_LENGTH = 64
 
 
 def unique_names(desk: Desk, wanted: Sequence[tuple[KeyPath, str]]) -> list[str]:
@@ -33,7 +33,7 @@ def unique_names(desk: Desk, wanted: Sequence[tuple[KeyPath, str]]) -> list[str]
 
 
 def _allowed(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", text)[:MOST] or "_"
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", text)[:MAX_LENGTH] or "_"
 
 
 def free_name(name: str, taken: set[str]) -> str:
@@ -41,5 +41,5 @@ def free_name(name: str, taken: set[str]) -> str:
     number, free = 1, name
     while free in taken:
         number += 1
-        free = f"{name[: MOST - len(str(number)) - 1]}-{number}"
+        free = f"{name[: MAX_LENGTH - len(str(number)) - 1]}-{number}"
     return free

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
     from holdfast.importing.notes import Desk
 
-MOST_SHOWN = 4
+MAX_SHOWN = 4
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ Profile: TypeAlias = tuple[tuple[Policy, frozenset[int]], ...]
 
 
 @dataclass(frozen=True)
-class Grant:
+class RuleGrant:
     """What a rule of ours says of those it matches."""
 
     units: tuple[int, ...]
@@ -85,7 +85,7 @@ class Merger:
                 rules.append({"sources": peers.written(), "units": units, **rights})
         return rules
 
-    def _grants(self) -> dict[Network, Grant]:
+    def _grants(self) -> dict[Network, RuleGrant]:
         """The grant of each network that some peer is in without being in a narrower one."""
         networks = dict.fromkeys(
             network for policy in self.policies for rule in policy.rules for network in rule[0]
@@ -102,7 +102,7 @@ class Merger:
         found = ((policy, policy.functions(network)) for policy in self.policies)
         return tuple((policy, allowed) for policy, allowed in found if allowed & policy.touching)
 
-    def _grant(self, profile: Profile, network: Network) -> Grant:
+    def _grant(self, profile: Profile, network: Network) -> RuleGrant:
         grant = _common(profile)
         if len(grant.units) < len(profile) or any(
             (allowed & policy.touching & functions.SOURCE) - grant.functions
@@ -111,10 +111,10 @@ class Merger:
             self._conflicts.setdefault(profile, []).append(network)
         return grant
 
-    def _pruned(self, grants: dict[Network, Grant]) -> dict[Network, Grant]:
+    def _pruned(self, grants: dict[Network, RuleGrant]) -> dict[Network, RuleGrant]:
         """Without networks that are granted what the next wider one is granted."""
-        nothing = Grant((), frozenset())
-        kept: dict[Network, Grant] = {}
+        nothing = RuleGrant((), frozenset())
+        kept: dict[Network, RuleGrant] = {}
         for network in sorted(grants, key=lambda network: network.prefixlen):
             wider = [other for other in kept if _within(network, other)]
             around = max(wider, key=lambda other: other.prefixlen, default=None)
@@ -123,9 +123,9 @@ class Merger:
         return {network: kept[network] for network in grants if network in kept}
 
     def _tell(self, profile: Profile, networks: list[Network]) -> None:
-        shown = [written(network) for network in networks[:MOST_SHOWN]]
-        if len(networks) > MOST_SHOWN:
-            shown.append(f"{len(networks) - MOST_SHOWN} more")
+        shown = [written(network) for network in networks[:MAX_SHOWN]]
+        if len(networks) > MAX_SHOWN:
+            shown.append(f"{len(networks) - MAX_SHOWN} more")
         had = "; ".join(
             f"unit {policy.unit}: {functions.spelled(allowed & policy.touching)}"
             for policy, allowed in profile
@@ -143,7 +143,7 @@ class Merger:
         self.desk.note("changed", self.path, message)
 
 
-def _common(profile: Profile) -> Grant:
+def _common(profile: Profile) -> RuleGrant:
     """One set of functions for all units: it gives no unit a function that it did not have.
 
     A unit that could do nothing then, or leave nothing to those before it, is left out.
@@ -156,7 +156,7 @@ def _common(profile: Profile) -> Grant:
     by_all = functions.ALL.intersection(*(allowed for _, allowed in served))
     by_one = frozenset[int]().union(*(allowed & policy.touching for policy, allowed in served))
     had = by_all | by_one if served else by_one
-    return Grant(tuple(policy.unit for policy, _ in served), had & _shared(served))
+    return RuleGrant(tuple(policy.unit for policy, _ in served), had & _shared(served))
 
 
 def _shared(profile: Profile) -> frozenset[int]:
@@ -165,7 +165,7 @@ def _shared(profile: Profile) -> frozenset[int]:
     return functions.ALL.difference(*refused)
 
 
-def _next(waiting: dict[Network, Grant]) -> tuple[Grant, list[Network]]:
+def _next(waiting: dict[Network, RuleGrant]) -> tuple[RuleGrant, list[Network]]:
     """The grant whose rule can come next, with networks that wait for no narrower one.
 
     Best is a grant of which nothing is left for a later rule. If there is none, only those

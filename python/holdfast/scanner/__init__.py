@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from holdfast.scanner.broker import Servers
 from holdfast.scanner.device_tls import DeviceTls
-from holdfast.scanner.limits import Limits
+from holdfast.scanner.limits import ScannerLimits
 from holdfast.scanner.service import Scanner, Settings
 
-__all__ = ["DeviceTls", "Limits", "Scanner", "Servers", "Settings"]
+__all__ = ["DeviceTls", "Scanner", "ScannerLimits", "Servers", "Settings"]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
 
 FIRST_PAUSE = 0.25
-LONGEST_PAUSE = 2.0
+MAX_PAUSE = 2.0
 """Seconds between attempts to connect: doubled with each failure, up to the longest."""
 
 SILENCE = 600.0
@@ -41,7 +41,7 @@ PING = 10
 PENDING = 64 * 1024 * 1024
 """Bytes that nats-py may hold; the outbox sees to it that there are never so many."""
 
-LOOK = 1.0
+CHECK_INTERVAL = 1.0
 """Seconds between looks whether nats-py has given a connection up without telling."""
 
 CLOSING = 1.5
@@ -217,7 +217,7 @@ class Broker:
             logs.refused("nats_error", kind="nats", reason=reason)
             return
         self._failures += 1
-        pause = min(FIRST_PAUSE * 2 ** min(self._failures, 10), LONGEST_PAUSE)
+        pause = min(FIRST_PAUSE * 2 ** min(self._failures, 10), MAX_PAUSE)
         client.options["reconnect_time_wait"] = pause
         now = time.monotonic()
         if reason == self._told[0] and now - self._told[1] < SILENCE:
@@ -230,7 +230,7 @@ async def _given_up(client: Client, ended: asyncio.Event) -> None:
     """Returns when nats-py has given a client up, which it does not say when that fails."""
     while not (ended.is_set() or client.is_closed):
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(LOOK):
+            async with asyncio.timeout(CHECK_INTERVAL):
                 await ended.wait()
     ended.set()
 

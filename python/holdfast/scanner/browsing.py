@@ -21,7 +21,7 @@ from holdfast.scanner.tags import FUNCTION_CODES, Places
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence, Set
 
-    from holdfast.scanner.devices import Device
+    from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import BrowseRequest, ServiceReport
     from holdfast.scanner.tags import Tag
 
@@ -39,7 +39,7 @@ SMALLEST_ID = 4
 
 def browsed(
     request: BrowseRequest,
-    devices: Mapping[str, tuple[Device, Mapping[str, str]]],
+    devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
     counters: Mapping[str, Mapping[str, Any]],
     service: ServiceReport,
     most: int,
@@ -75,7 +75,7 @@ class _Report:
     """What there is to tell of one device."""
 
     def __init__(
-        self, device: Device, undecoded: Mapping[str, str], counters: Mapping[str, Any]
+        self, device: ScannedDevice, undecoded: Mapping[str, str], counters: Mapping[str, Any]
     ) -> None:
         self._device = device
         self._undecoded = undecoded

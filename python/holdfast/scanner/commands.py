@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast import logs
-from holdfast.operations import write_typed
+from holdfast.client.requests import write_typed
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import described, is_unwritten
 from holdfast.scanner.tags import FLOATS, WRITABLE
@@ -21,7 +21,7 @@ from holdfast.values import ConversionError, encode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from holdfast.scanner.devices import Device
+    from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.polling import Polling
     from holdfast.scanner.tags import Tag
 
@@ -101,7 +101,7 @@ def _shown(text: str) -> str:
     return repr(text if len(text) <= 40 else f"{text[:40]}…")
 
 
-async def write(polling: Polling, device: Device, tag: Tag, text: str) -> None:
+async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) -> None:
     """Writes a value that is given as text; returns when the device has confirmed it.
 
     Raises `Refused`.

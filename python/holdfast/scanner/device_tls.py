@@ -9,15 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from holdfast.client import check_files, endpoint
+from holdfast.client.endpoint import check_files, endpoint
+from holdfast.client.target import NetworkTarget, Tls
 from holdfast.scanner.errors import Refused
-from holdfast.target import NetworkTarget, Tls
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast._core import Endpoint
-    from holdfast.target import Target
+    from holdfast.client.target import Target
 
 
 @dataclass(frozen=True)

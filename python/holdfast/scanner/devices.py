@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
     from holdfast._core import Endpoint
+    from holdfast.client.target import Target
     from holdfast.scanner.health import Health
     from holdfast.scanner.messages import PlanRequest, Publish, Range
-    from holdfast.target import Target
     from holdfast.types import Area
 
 MAX_GAP = 10
@@ -120,7 +120,7 @@ class Wanted:
     description: str | None
 
 
-class Device:
+class ScannedDevice:
     """A device that somebody wants tags of."""
 
     def __init__(self, id: str, source: Source, address: Target, health: Health) -> None:

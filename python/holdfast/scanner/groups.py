@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from holdfast.scanner.devices import Device
+    from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.tags import Tag
 
 
@@ -30,7 +30,7 @@ class Group:
     deadbands: tuple[float, ...]
 
 
-def grouped(device: Device) -> list[Group]:
+def grouped(device: ScannedDevice) -> list[Group]:
     """The groups of a device: those that are always published first, then by rate."""
     demands: dict[tuple[bool, int, float], set[str]] = {}
     for subscriber in device.subscribers.values():

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from holdfast.scanner.messages import State
-    from holdfast.scanner.polling import Block
+    from holdfast.scanner.polling import PolledBlock
 
 Found = TypeVar("Found", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""
@@ -71,10 +71,10 @@ class Health:
     """What went wrong last, though it may be well again."""
     last_error_at: float | None = None
     scans: int = 0
-    blocks: list[Block] = field(default_factory=list)
+    blocks: list[PolledBlock] = field(default_factory=list)
     """Each as the last scan left it that came to it."""
 
-    def judge(self, blocks: list[Block]) -> bool:
+    def judge(self, blocks: list[PolledBlock]) -> bool:
         """Takes note of a poll; whether that is worth telling.
 
         It is when the state changes, and when a device that answers refuses something new. One
@@ -104,7 +104,7 @@ class Health:
         return before != (self.state, self.error if self.state == "online" else None)
 
 
-def beside(blocks: Iterable[Found], others: Iterable[Block]) -> list[Found]:
+def beside(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> list[Found]:
     """The blocks that share nothing with others, which don't overlap each other."""
     places = sorted(block[:3] for block in others)
 

@@ -26,7 +26,7 @@ EVERY = 10.0
 KEPT = 60.0
 """Seconds after which a sign that is not renewed is gone."""
 
-PATIENCE = 2.0
+JETSTREAM_TIMEOUT = 2.0
 """Seconds that JetStream has to answer."""
 
 
@@ -74,7 +74,7 @@ class Heart:
         if client is None or not self._works:
             return
         with contextlib.suppress(Exception):
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(JETSTREAM_TIMEOUT):
                 await (await _bucket(client)).delete(self._key)
 
     def _told(self, works: bool, reason: str) -> None:
@@ -93,13 +93,13 @@ def _reason(error: Exception) -> str:
     if isinstance(error, ServiceUnavailableError | NoRespondersError):
         return "the server has no JetStream, or none for this account"
     if isinstance(error, TimeoutError):
-        return f"JetStream did not answer within {PATIENCE:g} s"
+        return f"JetStream did not answer within {JETSTREAM_TIMEOUT:g} s"
     return str(error) or type(error).__name__
 
 
 async def _bucket(client: Client) -> KeyValue:
     """The bucket; it is made if it is not there."""
-    jetstream = client.jetstream(timeout=PATIENCE)
+    jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
     try:
         return await jetstream.key_value(BUCKET)
     except NotFoundError:

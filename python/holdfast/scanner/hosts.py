@@ -15,20 +15,20 @@ from dataclasses import replace
 from ipaddress import IPv6Address, ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
+from holdfast.client.target import NetworkTarget, SerialTarget, Tls
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner.errors import Refused
-from holdfast.target import NetworkTarget, SerialTarget, Tls
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from ipaddress import IPv4Address
 
-    from holdfast.target import Target
+    from holdfast.client.target import Target
 
-PATIENCE = 5.0
+LOOKUP_TIMEOUT = 5.0
 """Seconds that a name has to be looked up."""
 
-MOST_LOOKING = 64
+MAX_LOOKING = 64
 """Names that are looked up at once."""
 
 PRIVATE = tuple(
@@ -85,16 +85,16 @@ class Allowed:
         """The addresses of a host, IPv4 first: few devices have another."""
         with contextlib.suppress(ValueError):
             return [str(ip_address(target.host))]
-        if self._looking >= MOST_LOOKING:
-            raise Refused(f"{MOST_LOOKING} names are being looked up, no more at once")
+        if self._looking >= MAX_LOOKING:
+            raise Refused(f"{MAX_LOOKING} names are being looked up, no more at once")
         self._looking += 1
         future = _looked_up(target)
         future.add_done_callback(self._looked)
         try:
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(LOOKUP_TIMEOUT):
                 found = await asyncio.shield(future)
         except TimeoutError:
-            raise Refused(f"host {target.host} was not found within {PATIENCE:g} s") from None
+            raise Refused(f"host {target.host} was not found within {LOOKUP_TIMEOUT:g} s") from None
         except (OSError, UnicodeError) as error:
             raise Refused(f"host {target.host}: {error}") from None
         ordered = sorted(found, key=lambda entry: entry[0] != socket.AF_INET)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from holdfast.config.scanning import MOST_DEVICES, MOST_TAGS
+from holdfast.config.scanning import MAX_DEVICES, MAX_TAGS
 
 
 @dataclass(frozen=True)
-class Limits:
+class ScannerLimits:
     """The limits of one scanner; times are in milliseconds."""
 
-    devices: int = MOST_DEVICES
-    tags: int = MOST_TAGS
+    devices: int = MAX_DEVICES
+    tags: int = MAX_TAGS
     """Of all devices."""
     device_tags: int = 10_000
     """Of one device."""

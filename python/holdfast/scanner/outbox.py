@@ -31,7 +31,7 @@ PIECE = 512 * 1024
 KEPT = 200_000
 """Messages that are kept while there is no connection."""
 
-LOOK = 0.005
+CHECK_INTERVAL = 0.005
 """Seconds between looks whether a slow connection takes more."""
 
 
@@ -83,14 +83,14 @@ class Outbox:
             self._news.clear()
             while (self._flowing or self._kept) and self._client is not None:
                 if not self._takes():
-                    await asyncio.sleep(LOOK)
+                    await asyncio.sleep(CHECK_INTERVAL)
                     continue
                 await self._send(self._client)
 
     async def flush(self) -> None:
         """Waits until the server has what was put in, or is gone."""
         while (self._flowing or self._kept) and self._client is not None:
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(CHECK_INTERVAL)
         if self._client is not None:
             with contextlib.suppress(Error):
                 await self._client.flush()

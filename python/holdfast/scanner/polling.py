@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from holdfast import _core
 
 if TYPE_CHECKING:
-    from holdfast.scanner.devices import Device
+    from holdfast.scanner.devices import ScannedDevice
     from holdfast.types import Area
 
-Block: TypeAlias = "tuple[Area, int, int, bytes | None, int, float]"
+PolledBlock: TypeAlias = "tuple[Area, int, int, bytes | None, int, float]"
 """Area, address, count, the bytes if there are any, the fault, and the seconds since 1970 when that
 was known."""
 
-Poll: TypeAlias = tuple[str, float, list[Block]]
+Poll: TypeAlias = tuple[str, float, list[PolledBlock]]
 """What the device is polled as, when the schedule wanted the poll, in seconds, and its blocks."""
 
-PATIENCE = 60.0
+RESULTS_TIMEOUT = 60.0
 """Seconds that the thread waits for polls at once; it ends with the poller."""
 
 GATHERED = 0.005
@@ -44,13 +44,13 @@ class Polling:
     schedule wanted it, in seconds, and the blocks.
     """
 
-    def __init__(self, take: Callable[[Device, float, list[Block]], None]) -> None:
+    def __init__(self, take: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
         self._take = take
-        self._devices: dict[str, Device] = {}
+        self._devices: dict[str, ScannedDevice] = {}
         """By what they are polled as."""
-        self._renewed: dict[Device, float] = {}
-        self._waiting: dict[Device, asyncio.TimerHandle] = {}
-        self._urgent: set[Device] = set()
+        self._renewed: dict[ScannedDevice, float] = {}
+        self._waiting: dict[ScannedDevice, asyncio.TimerHandle] = {}
+        self._urgent: set[ScannedDevice] = set()
         """Those of which somebody waits for values that nobody has yet."""
         self._writes: dict[int, asyncio.Future[int]] = {}
         """By the number that the poller gave them: what will have the fault."""
@@ -62,7 +62,7 @@ class Polling:
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
         self._thread.start()
 
-    def renew(self, device: Device, *, at_once: bool = True) -> None:
+    def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
         """Polls a device as it is now wanted: at once, or soon if that has just changed; without
         `at_once` when it is its turn.
         """
@@ -76,7 +76,7 @@ class Polling:
         else:
             self._renew(device)
 
-    def _renew(self, device: Device) -> None:
+    def _renew(self, device: ScannedDevice) -> None:
         """The name is another one with every change: what was still read for the old one is not
         taken for the new one's.
         """
@@ -93,7 +93,7 @@ class Polling:
         self._devices[name] = device
         self._renewed[device] = self._loop.time()
 
-    def drop(self, device: Device) -> None:
+    def drop(self, device: ScannedDevice) -> None:
         """Polls a device no more; its connection is closed."""
         waiting = self._waiting.pop(device, None)
         if waiting is not None:
@@ -103,7 +103,7 @@ class Polling:
         del self._devices[device.polled_as]
         del self._renewed[device]
 
-    async def write(self, device: Device, request: _core.Request) -> int:
+    async def write(self, device: ScannedDevice, request: _core.Request) -> int:
         """Sends a write to a device between two reads; the fault, 0 when it was confirmed."""
         number = self._poller.write(device.polled_as, request)
         done: asyncio.Future[int] = self._loop.create_future()
@@ -135,7 +135,7 @@ class Polling:
         self._thread.join()
 
     def _run(self) -> None:
-        while (taken := self._poller.results(PATIENCE)) is not None:
+        while (taken := self._poller.results(RESULTS_TIMEOUT)) is not None:
             self._taken.acquire()
             if self._stopping.is_set():
                 return
@@ -156,12 +156,12 @@ class Polling:
             self._taken.release()
 
 
-def _made(device: Device, name: str) -> _core.Device:
+def _made(device: ScannedDevice, name: str) -> _core.PolledDevice:
     source, plan = device.source, device.source.plan
     assert device.endpoint is not None
     interval = device.rate / 1000
     reads = dict.fromkeys((tag.area, tag.address, tag.count, None) for tag in device.tags.values())
-    return _core.Device(
+    return _core.PolledDevice(
         name,
         device.endpoint,
         unit=source.unit,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
     from holdfast.scanner.decoding import Decoder
-    from holdfast.scanner.polling import Block
+    from holdfast.scanner.polling import PolledBlock
     from holdfast.scanner.tags import Tag
     from holdfast.types import Area
 
@@ -104,7 +104,7 @@ class Publisher:
         self.regroup(groups, newcomers)
         self._wanted, self._newcomers, self._anew = None, set(), False
 
-    def messages(self, due: float, blocks: Sequence[Block]) -> list[Message]:
+    def messages(self, due: float, blocks: Sequence[PolledBlock]) -> list[Message]:
         """What is to be published after a poll that the schedule wanted at this time in seconds."""
         self._settle()
         shape = tuple(block[:3] for block in blocks if block[3] is not None)

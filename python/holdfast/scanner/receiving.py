@@ -17,7 +17,7 @@ from nats.protocol.parser import AWAITING_CONTROL_LINE, AWAITING_MSG_PAYLOAD, Pa
 from holdfast import logs
 
 END = b"\r\n"
-LONGEST_LINE = 1024 * 1024
+MAX_LINE = 1024 * 1024
 """Bytes of a line of the protocol; the longest are those that tell of the server."""
 
 
@@ -73,7 +73,7 @@ class _Parser(Parser):
             if self.state == AWAITING_CONTROL_LINE:
                 end = self.buf.find(END)
                 if end < 0:
-                    if len(self.buf) > LONGEST_LINE:
+                    if len(self.buf) > MAX_LINE:
                         raise ProtocolError("nats: a line without an end")
                     return
                 line = bytes(self.buf[:end])

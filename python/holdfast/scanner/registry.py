@@ -11,20 +11,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlsplit
 
-from holdfast import target as targets
-from holdfast.scanner.devices import Device, Plan, Source, Subscriber, Wanted
+from holdfast.client import target as targets
+from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
 from holdfast.scanner.tags import tag
-from holdfast.target import NetworkTarget, SerialTarget
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.scanner.limits import Limits
+    from holdfast.client.target import Target
+    from holdfast.scanner.limits import ScannerLimits
     from holdfast.scanner.messages import SubscribeRequest, UnsubscribeRequest
     from holdfast.scanner.tags import Tag
-    from holdfast.target import Target
 
 SCAN_RATE = 1000
 TIMEOUT = 1000
@@ -49,7 +49,7 @@ class Subscription:
     deadband: float
 
 
-def understood(request: SubscribeRequest, limits: Limits) -> Subscription:
+def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription:
     """What a request asks for. Raises `Refused`."""
     _check_id(request.device_id)
     if request.deadband and request.publish != "change":
@@ -138,14 +138,14 @@ def _within(key: str, value: int | None, default: int, least: int, most: int) ->
 class Registry:
     """Devices by id, and who wants what of them."""
 
-    def __init__(self, limits: Limits) -> None:
-        self.devices: dict[str, Device] = {}
+    def __init__(self, limits: ScannerLimits) -> None:
+        self.devices: dict[str, ScannedDevice] = {}
         self._limits = limits
         self._tags = 0
         self._holders: dict[str, set[str]] = {}
         """The devices that have a tag of an id."""
 
-    def subscribe(self, asked: Subscription, address: Target) -> tuple[Device | None, bool]:
+    def subscribe(self, asked: Subscription, address: Target) -> tuple[ScannedDevice | None, bool]:
         """Adds a subscription; the device, and whether what it is to be polled for changed.
 
         Who wants no tags is no subscriber; there is no device if nobody wants tags of it. Raises
@@ -162,7 +162,7 @@ class Registry:
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
             return device, False
         if device is None:
-            device = Device(asked.device, asked.source, address, Health())
+            device = ScannedDevice(asked.device, asked.source, address, Health())
             self.devices[device.id] = device
         before = device.rate if device.subscribers else None
         subscriber = device.subscribers.setdefault(
@@ -178,7 +178,7 @@ class Registry:
         self._tags += len(new)
         return device, bool(new) or device.rate != before
 
-    def unsubscribe(self, request: UnsubscribeRequest) -> tuple[Device | None, bool]:
+    def unsubscribe(self, request: UnsubscribeRequest) -> tuple[ScannedDevice | None, bool]:
         """Takes tags from a subscriber; the device, and whether what it is polled for changed.
 
         The device is gone with its last subscriber. What is not known is not wanted: all is well.
@@ -204,7 +204,7 @@ class Registry:
             return device, True
         return device, bool(unwanted) or device.rate != before
 
-    def commanded(self, name: str) -> tuple[Device, Tag]:
+    def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
         """The tag that a command names: by its id, or by device and id. Raises `Refused`."""
         found = {(device, name) for device in self._holders.get(name, ())}
         parts = name.split(".")
@@ -237,7 +237,7 @@ class Registry:
                         f"not {_shown(said)}; devices on one serial line have the same settings"
                     )
 
-    def _check_limits(self, device: Device | None, asked: Subscription, new: int) -> None:
+    def _check_limits(self, device: ScannedDevice | None, asked: Subscription, new: int) -> None:
         limits = self._limits
         if device is None and len(self.devices) >= limits.devices:
             raise Refused(f"there are {limits.devices} devices, more are not allowed")
@@ -255,7 +255,7 @@ class Registry:
             raise Refused(f"there would be {self._tags + new} tags, allowed are {limits.tags}")
 
 
-def _check_known(device: Device, asked: Subscription) -> None:
+def _check_known(device: ScannedDevice, asked: Subscription) -> None:
     """That a request does not say otherwise of a device than those before it."""
     check_address(device, asked)
     for key in ("timeout", "release", "plan"):
@@ -271,7 +271,7 @@ def _check_known(device: Device, asked: Subscription) -> None:
             )
 
 
-def check_address(device: Device, asked: Subscription) -> None:
+def check_address(device: ScannedDevice, asked: Subscription) -> None:
     """That a device is where a request says it is. Raises `Refused`."""
     known, said = device.source, asked.source
     if (known.target, known.unit) != (said.target, said.unit):

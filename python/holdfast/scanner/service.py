@@ -24,7 +24,7 @@ from holdfast.scanner.errors import Refused
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
 from holdfast.scanner.hosts import Allowed
-from holdfast.scanner.limits import Limits
+from holdfast.scanner.limits import ScannerLimits
 from holdfast.scanner.messages import (
     Answer,
     BrowseRequest,
@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast._core import Endpoint
-    from holdfast.scanner.devices import Device
+    from holdfast.client.target import Target
+    from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import BrowseAnswer
-    from holdfast.scanner.polling import Block
+    from holdfast.scanner.polling import PolledBlock
     from holdfast.scanner.registry import Subscription
-    from holdfast.target import Target
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer]]"
 
@@ -71,7 +71,7 @@ class Settings:
     """The first part of all subjects, and the id of the module in messages."""
     allow: tuple[str, ...] = ()
     """Networks and serial devices, see `Allowed`."""
-    limits: Limits = field(default_factory=Limits)
+    limits: ScannerLimits = field(default_factory=ScannerLimits)
     device_tls: DeviceTls = field(default_factory=DeviceTls)
     """Whom it trusts among devices, and what it shows them."""
 
@@ -205,7 +205,7 @@ class Scanner:
         )
         return Answer(success=True, count=len(asked.tags))
 
-    def _begin_publishing(self, device: Device, asked: Subscription) -> None:
+    def _begin_publishing(self, device: ScannedDevice, asked: Subscription) -> None:
         publisher = self._publishers.get(device.id)
         if publisher is None:
             publisher = Publisher(self._settings.prefix, device.id)
@@ -250,7 +250,7 @@ class Scanner:
                 await asyncio.sleep(0)
             yield
 
-    def _drop(self, device: Device) -> None:
+    def _drop(self, device: ScannedDevice) -> None:
         """Forgets a device that nobody wants."""
         del self._publishers[device.id]
         self._polling.drop(device)
@@ -296,14 +296,14 @@ class Scanner:
         )
         return browsed(request, devices, self._polling.counters(), service, most)
 
-    def _take(self, device: Device, due: float, blocks: list[Block]) -> None:
+    def _take(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         """Publishes what was read."""
         try:
             self._publish(device, due, blocks)
         except Exception:  # What is wrong with one device must not cost the others.
             logs.problem("scan_failed", device=device.id)
 
-    def _publish(self, device: Device, due: float, blocks: list[Block]) -> None:
+    def _publish(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         if device.health.judge(blocks):
             self._tell(device)
         if device.may_have_moved():
@@ -312,7 +312,7 @@ class Scanner:
         messages = self._publishers[id].messages(due, blocks)
         self.outbox.put([((id, tag), text) for tag, text in messages])
 
-    async def _look_up(self, device: Device) -> None:
+    async def _look_up(self, device: ScannedDevice) -> None:
         """Looks where a device is that does not answer: its name may mean another address now."""
         async with self._turn(device.id):
             if self._registry.devices.get(device.id) is not device:
@@ -328,7 +328,7 @@ class Scanner:
                 self._polling.renew(device)
                 logs.write(logging.INFO, "moved", device=device.id, address=str(address))
 
-    def _tell(self, device: Device) -> None:
+    def _tell(self, device: ScannedDevice) -> None:
         """Publishes and logs how a device does."""
         self._publish_state(device)
         health = device.health
@@ -336,7 +336,7 @@ class Scanner:
         told = {} if health.error is None else {"error": health.error}
         logs.write(level, f"device_{health.state}", device=device.id, **told)
 
-    def _publish_state(self, device: Device) -> None:
+    def _publish_state(self, device: ScannedDevice) -> None:
         health = device.health
         status = Status(
             device_id=device.id,

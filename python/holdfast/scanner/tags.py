@@ -7,7 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from holdfast.operations import WRITE_LIMITS
+from holdfast.client.requests import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
 from holdfast.values import ConversionError, decode, encode
 from holdfast.values.codec import codec_of

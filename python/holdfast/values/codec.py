@@ -11,7 +11,7 @@ from holdfast.values.bits import Bit, Bool
 from holdfast.values.errors import DoesNotFit, UnknownEncoding, WrongLength, counted, shown
 from holdfast.values.numeric import INTEGERS, Float, Integer
 from holdfast.values.orders import FOUR, order_of, swap_registers
-from holdfast.values.registers import Block
+from holdfast.values.registers import RegisterBlock
 from holdfast.values.text import Bytes, Text
 from holdfast.values.types import parsed
 
@@ -70,7 +70,9 @@ class Codec:
         self.type = type
         self.kind = kind
         self.swapped = order.swapped
-        block = Block(type.registers, type.name, swapped=order.swapped, bits=type.base == "bool")
+        block = RegisterBlock(
+            type.registers, type.name, swapped=order.swapped, bits=type.base == "bool"
+        )
         self.to_bytes = block.pack
         """The bytes of registers in any form, those of each register swapped if `swapped`."""
         self._to_registers = block.unpack

@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 from typing import TypeVar
 
-LONGEST_SHOWN = 40
+MAX_SHOWN = 40
 LARGEST_SHOWN = 1 << 128
 
 
@@ -66,8 +66,8 @@ def shown(value: object) -> str:
     if isinstance(value, int) and not -LARGEST_SHOWN < value < LARGEST_SHOWN:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, str | bytes):
-        cut = len(value) > LONGEST_SHOWN
-        return f"{value[:LONGEST_SHOWN]!r}{'…' if cut else ''}"
+        cut = len(value) > MAX_SHOWN
+        return f"{value[:MAX_SHOWN]!r}{'…' if cut else ''}"
     if value is None or isinstance(value, int | float):
         return repr(value)
     return f"a {type(value).__name__}"

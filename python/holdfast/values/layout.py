@@ -10,8 +10,8 @@ from holdfast.values.bits import Bit, merge
 from holdfast.values.codec import Codec, codec_of
 from holdfast.values.errors import ConversionError, DoesNotFit, InvalidLayout, at, shown
 from holdfast.values.reading import Reading
-from holdfast.values.registers import Block
-from holdfast.values.types import MOST_REGISTERS
+from holdfast.values.registers import RegisterBlock
+from holdfast.values.types import MAX_REGISTERS
 
 if TYPE_CHECKING:
     from holdfast.values.registers import Registers
@@ -51,7 +51,7 @@ class Layout:
         self.size = _size(self.fields, self._codecs, size)
         """The registers of the block."""
         bits = all(codec.type.base == "bool" for codec in self._codecs)
-        self._block = Block(self.size, "the layout", bits=bits)
+        self._block = RegisterBlock(self.size, "the layout", bits=bits)
         offsets = [entry.offset for entry in self.fields]
         self._values = Reading(self.names, self._codecs, offsets, self.size).values
         self._overlap = _overlap(self.fields, self._codecs)
@@ -112,8 +112,8 @@ def _field(entry: Field | tuple[Any, ...]) -> Field:
         raise InvalidLayout(f"a field is {shown(entry)}, allowed is {allowed}")
     if not isinstance(made.name, str) or not made.name:
         raise InvalidLayout(f"the name of a field is {shown(made.name)}, not a text")
-    if type(made.offset) is not int or not 0 <= made.offset < MOST_REGISTERS:
-        allowed = f"allowed are 0 to {MOST_REGISTERS - 1}"
+    if type(made.offset) is not int or not 0 <= made.offset < MAX_REGISTERS:
+        allowed = f"allowed are 0 to {MAX_REGISTERS - 1}"
         raise at(made.name, InvalidLayout(f"offset {shown(made.offset)}, {allowed}"), made.name)
     return made
 
@@ -132,14 +132,14 @@ def _size(fields: tuple[Field, ...], codecs: list[Codec], size: int | None) -> i
         entry.offset + codec.type.registers for entry, codec in zip(fields, codecs, strict=True)
     ]
     last = max(ends)
-    if last > MOST_REGISTERS:
+    if last > MAX_REGISTERS:
         name = fields[ends.index(last)].name
-        found = f"ends after {last} registers, allowed are {MOST_REGISTERS}"
+        found = f"ends after {last} registers, allowed are {MAX_REGISTERS}"
         raise at(name, InvalidLayout(found), name)
     if size is None:
         return last
-    if type(size) is not int or not last <= size <= MOST_REGISTERS:
-        raise InvalidLayout(f"size {shown(size)}, allowed are {last} to {MOST_REGISTERS}")
+    if type(size) is not int or not last <= size <= MAX_REGISTERS:
+        raise InvalidLayout(f"size {shown(size)}, allowed are {last} to {MAX_REGISTERS}")
     return size
 
 

@@ -21,7 +21,7 @@ array of `uint16`. For `bool` also bits: a sequence of 0, 1, `False`, `True`, or
 ALLOWED = "a sequence of integers, bytes, or a buffer of bytes or of unsigned 16-bit integers"
 
 
-class Block:
+class RegisterBlock:
     """A number of registers as bytes: big-endian, or `swapped`. `bits` lets bools in."""
 
     def __init__(self, count: int, name: str, *, swapped: bool = False, bits: bool = False) -> None:

@@ -25,7 +25,7 @@ FIXED = {
 """Types whose name says all: the bytes that an element takes in registers."""
 
 ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays as float32[10]"
-MOST_REGISTERS = 65536
+MAX_REGISTERS = 65536
 
 _NUMBER = r"(0|[1-9][0-9]{0,5})"
 _NAME = re.compile(rf"(([a-z]+[0-9]*)(?::{_NUMBER})?)(?:\[{_NUMBER}\])?")
@@ -65,8 +65,8 @@ def parsed(name: str) -> Type:
     if width is None:
         raise _unknown(name)
     made = Type(name, element, base, int(parameter or 0), width, int(count) if count else None)
-    if not 1 <= made.registers <= MOST_REGISTERS:
-        allowed = f"allowed are 1 to {MOST_REGISTERS}"
+    if not 1 <= made.registers <= MAX_REGISTERS:
+        allowed = f"allowed are 1 to {MAX_REGISTERS}"
         raise UnknownType(f"type {shown(name)} would take {made.registers} registers, {allowed}")
     return made
 

@@ -15,12 +15,12 @@ use std::time::{Duration, Instant};
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, Request, Response, ResponseError};
 
-use super::line::{self, Line, Stream};
-use super::secure::Secure;
+use super::byte_stream::{self, ByteStream, TcpByteStream};
 use super::session::Session;
+use super::tls_stream::TlsStream;
 use super::turns::Turns;
 use super::{Broken, ClientError};
-use crate::serial::{Line as SerialLine, LineMode};
+use crate::serial_line::{LineMode, SerialLine};
 use crate::tls::client::ClientTls;
 
 /// Bytes taken from a socket at once.
@@ -31,7 +31,7 @@ const IDLE: Duration = Duration::from_millis(50);
 
 /// Timeouts one after the other, without a byte between them, after which a connection is given up:
 /// the other side may have gone without a word.
-const SILENT: u32 = 3;
+const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
 
 /// How often a read is sent over UDP within its deadline.
 const UDP_ATTEMPTS: u32 = 3;
@@ -79,11 +79,11 @@ struct Connection {
 
 enum Kind {
     Tcp {
-        stream: Stream,
+        stream: TcpByteStream,
         session: Session,
     },
     Tls {
-        stream: Box<Secure>,
+        stream: Box<TlsStream>,
         session: Session,
     },
     Udp {
@@ -92,12 +92,12 @@ enum Kind {
     },
     /// `silence` is that of a serial line.
     Rtu {
-        line: Box<dyn Line>,
+        line: Box<dyn ByteStream>,
         silence: Option<Duration>,
         echo: bool,
     },
     Ascii {
-        line: Box<dyn Line>,
+        line: Box<dyn ByteStream>,
         silence: Duration,
         echo: bool,
     },
@@ -172,7 +172,7 @@ impl BlockingClient {
             Err(Failure { error, usable }) => {
                 let silent = matches!(error, ClientError::Timeout(_)) && late == self.late();
                 connection.timeouts = if silent { connection.timeouts + 1 } else { 0 };
-                if !usable || connection.timeouts == SILENT {
+                if !usable || connection.timeouts == MAX_CONSECUTIVE_TIMEOUTS {
                     *held = None;
                 }
                 Err(error)
@@ -201,22 +201,24 @@ impl BlockingClient {
         let at = |host: &str, port: u16| failed(format!("{host}:{port}"));
         let kind = match &self.endpoint {
             Endpoint::Tcp { host, port, tls } => {
-                let stream = Stream::connect(host, *port, deadline).map_err(at(host, *port))?;
+                let stream =
+                    TcpByteStream::connect(host, *port, deadline).map_err(at(host, *port))?;
                 let session = Session::default();
                 match tls {
                     None => Kind::Tcp { stream, session },
                     Some(tls) => {
-                        let secure = Secure::agree(stream, tls, deadline);
+                        let secure = TlsStream::agree(stream, tls, deadline);
                         Kind::Tls { stream: secure.map_err(at(host, *port))?.into(), session }
                     }
                 }
             }
             Endpoint::RtuOverTcp { host, port } => {
-                let stream = Stream::connect(host, *port, deadline).map_err(at(host, *port))?;
+                let stream =
+                    TcpByteStream::connect(host, *port, deadline).map_err(at(host, *port))?;
                 Kind::Rtu { line: Box::new(stream), silence: None, echo: false }
             }
             Endpoint::Udp { host, port } => {
-                let socket = line::first(host, *port, |address| {
+                let socket = byte_stream::first(host, *port, |address| {
                     let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
                     let socket = UdpSocket::bind(any)?;
                     socket.connect(address)?;
@@ -318,7 +320,7 @@ fn invalid(text: impl Into<String>) -> Failure {
 }
 
 fn over_tcp(
-    stream: &mut impl Line,
+    stream: &mut impl ByteStream,
     session: &mut Session,
     call: &Call<'_>,
     give: &mut dyn FnMut(Response<'_>),
@@ -406,7 +408,7 @@ fn over_udp(
 }
 
 fn over_rtu(
-    line: &mut dyn Line,
+    line: &mut dyn ByteStream,
     silence: Option<Duration>,
     used: Instant,
     echo: &mut bool,
@@ -473,7 +475,7 @@ fn rtu_reply(bytes: &[u8], request_len: usize) -> Result<Option<(u8, &[u8])>, Fr
 /// Waits until a serial line is silent, and throws away what has come till then: nobody asked for
 /// it, or nobody waits for it any more.
 fn settle(
-    line: &mut dyn Line,
+    line: &mut dyn ByteStream,
     silence: Duration,
     used: Instant,
     deadline: Instant,
@@ -504,7 +506,7 @@ fn strip(received: &mut [u8], len: &mut usize, frame: &[u8]) -> bool {
 }
 
 fn over_ascii(
-    line: &mut dyn Line,
+    line: &mut dyn ByteStream,
     silence: Duration,
     used: Instant,
     echo: &mut bool,

@@ -5,10 +5,10 @@
 //! * [`exchange`] is one request and its reply on transports that carry one at a time, by blocking
 //!   calls with a deadline: RTU, ASCII, UDP, and TCP for callers that wait anyway.
 
+mod byte_stream;
 mod exchange;
-mod line;
-mod secure;
 pub mod session;
+mod tls_stream;
 mod turns;
 
 pub use exchange::{BlockingClient, Endpoint};

@@ -6,7 +6,7 @@ use std::time::Duration;
 const FIRST: Duration = Duration::from_secs(1);
 
 /// The longest pause of those who are asked.
-pub(super) const LONGEST: Duration = Duration::from_secs(60);
+pub(super) const MAX_PAUSE: Duration = Duration::from_secs(60);
 
 /// The pause after `failures` failures in a row, at least one: up to a quarter shorter by chance, so
 /// that those who failed together don't come back together.
@@ -25,7 +25,7 @@ mod tests {
     fn pauses_double_up_to_a_limit() {
         for (failures, most) in [(1, 1), (2, 2), (3, 4), (6, 32), (7, 60), (8, 60), (4000, 60)] {
             let most = Duration::from_secs(most);
-            let found = pause(failures, LONGEST);
+            let found = pause(failures, MAX_PAUSE);
             assert!(found <= most && found >= most.mul_f64(0.75), "{failures}: {found:?}");
         }
     }

@@ -25,17 +25,17 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::backoff;
+use super::cost::Samples;
 use super::forward::{Forward, ForwardSettings};
-use super::learned::{Hole, Learned};
-use super::link::{Link, Weight};
-use super::plan::{self, Block, Field, Limits, Strategy};
-use super::price::Samples;
+use super::learned::{Learned, Unreadable};
+use super::link::{Link, Priority};
+use super::plan::{self, Block, Field, PlanLimits, Strategy};
 use super::results::{BlockResult, Poll, Results};
 use super::search;
 use super::sink::Destination;
 use super::status::{Fault, Health, Status, StatusSettings};
 use crate::client::Endpoint;
-use crate::counters::Counter;
+use crate::counter::Counter;
 
 /// How often a status block is written at least.
 const TELLING: Duration = Duration::from_secs(1);
@@ -44,7 +44,7 @@ const TELLING: Duration = Duration::from_secs(1);
 const DEAD_AFTER: u32 = 3;
 
 /// Polls beside the schedule are at least so far apart, or an interval if that is shorter.
-const BESIDE: Duration = Duration::from_secs(1);
+const OFF_SCHEDULE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A device and what is to become of what it answers.
 #[derive(Debug, Clone)]
@@ -56,9 +56,9 @@ pub struct DeviceSettings {
     pub interval: Duration,
     pub timeout: Duration,
     pub reads: Vec<ReadSettings>,
-    pub limits: Limits,
+    pub limits: PlanLimits,
     pub strategy: Strategy,
-    /// Whether the prices of [`Strategy::Cost`] are only what it begins with: those that the device's
+    /// Whether the costs of [`Strategy::Cost`] are only what it begins with: those that the device's
     /// own answers show take their place.
     pub measured: bool,
     pub forward: Vec<ForwardSettings>,
@@ -120,7 +120,7 @@ pub struct DeviceCounters {
 
 impl DeviceState {
     /// An answer is out of date after three intervals and the time that a reply may take.
-    pub(super) fn expect(&self, interval: Duration, timeout: Duration) {
+    pub(super) fn set_stale_after(&self, interval: Duration, timeout: Duration) {
         let after = interval.saturating_mul(3).saturating_add(timeout).as_millis();
         self.stale_after.store(u64::try_from(after).unwrap_or(u64::MAX), Ordering::Relaxed);
     }
@@ -233,10 +233,10 @@ pub(super) struct Device {
     /// When the next poll is to begin.
     due: Cell<Instant>,
     /// Whether that is so late because nothing would answer before.
-    resting: Cell<bool>,
+    backing_off: Cell<bool>,
     /// When one is to begin beside the schedule, and when the last did.
-    beside: Cell<Option<Instant>>,
-    last_beside: Cell<Option<Instant>>,
+    off_schedule: Cell<Option<Instant>>,
+    last_off_schedule: Cell<Option<Instant>>,
 }
 
 /// Held while a request is under way: a device gets one at a time, whoever sends it.
@@ -282,7 +282,7 @@ impl Inbox {
 }
 
 /// The fields of reads, each no longer than a request.
-pub(super) fn fields(reads: &[ReadSettings], limits: &Limits) -> Vec<(Field, usize, u32)> {
+pub(super) fn fields(reads: &[ReadSettings], limits: &PlanLimits) -> Vec<(Field, usize, u32)> {
     let mut fields = Vec::new();
     for (index, read) in reads.iter().enumerate() {
         let most =
@@ -319,9 +319,9 @@ impl Device {
             samples: Cell::default(),
             silent: Cell::new(0),
             due: Cell::new(Instant::now()),
-            resting: Cell::new(false),
-            beside: Cell::new(None),
-            last_beside: Cell::new(None),
+            backing_off: Cell::new(false),
+            off_schedule: Cell::new(None),
+            last_off_schedule: Cell::new(None),
             settings,
             state,
             link,
@@ -349,8 +349,8 @@ impl Device {
     async fn poll_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
         let interval = self.settings.interval;
         loop {
-            let (mut due, beside) = (self.due.get(), self.beside.get());
-            let at = beside.map_or(due, |beside| beside.min(due));
+            let (mut due, off_schedule) = (self.due.get(), self.off_schedule.get());
+            let at = off_schedule.map_or(due, |off_schedule| off_schedule.min(due));
             tokio::select! {
                 biased;
                 told = inbox.next() => match told {
@@ -362,11 +362,11 @@ impl Device {
                 },
                 () = sleep_until(at) => {}
             }
-            self.beside.set(None);
+            self.off_schedule.set(None);
             let mut began = due;
             if at < due {
                 began = Instant::now();
-                self.last_beside.set(Some(began));
+                self.last_off_schedule.set(Some(began));
             } else {
                 due += interval;
             }
@@ -379,7 +379,7 @@ impl Device {
                 // What is left out on purpose is not missed.
                 (due, _) = first_from(until, due, interval);
             }
-            self.resting.set(rest.is_some());
+            self.backing_off.set(rest.is_some());
             self.due.set(due);
             if interval.is_zero() {
                 tokio::task::yield_now().await;
@@ -389,7 +389,7 @@ impl Device {
 
     /// Ends a rest.
     fn wake(&self) {
-        if self.resting.take() {
+        if self.backing_off.take() {
             self.silent.set(0);
             self.due.set(Instant::now());
         }
@@ -397,7 +397,7 @@ impl Device {
 
     /// That a poll is wanted soon, beside the schedule.
     pub(super) fn want_soon(&self) {
-        self.beside.set(Some(Instant::now()));
+        self.off_schedule.set(Some(Instant::now()));
     }
 
     /// Goes on where the device before it ended.
@@ -405,18 +405,19 @@ impl Device {
         let now = Instant::now();
         let (old, new) = (&before.settings, &self.settings);
         if !Rc::ptr_eq(&before.link, &self.link) || old.unit_id != new.unit_id {
-            self.beside.set(None);
+            self.off_schedule.set(None);
             return self.due.set(now);
         }
-        let apart = new.interval.min(BESIDE);
-        self.last_beside.set(before.last_beside.get());
-        let not_before = before.last_beside.get().map(|last| last + apart);
-        let wanted = self.beside.get().or(before.beside.get());
-        self.beside.set(wanted.map(|wanted| not_before.map_or(wanted, |time| time.max(wanted))));
+        let apart = new.interval.min(OFF_SCHEDULE_INTERVAL);
+        self.last_off_schedule.set(before.last_off_schedule.get());
+        let not_before = before.last_off_schedule.get().map(|last| last + apart);
+        let wanted = self.off_schedule.get().or(before.off_schedule.get());
+        self.off_schedule
+            .set(wanted.map(|wanted| not_before.map_or(wanted, |time| time.max(wanted))));
         self.silent.set(before.silent.get());
-        self.resting.set(before.resting.get());
-        if before.resting.get() {
-            self.beside.set(None);
+        self.backing_off.set(before.backing_off.get());
+        if before.backing_off.get() {
+            self.off_schedule.set(None);
             self.due.set(before.due.get());
         } else {
             self.due.set(before.due.get().min(now + new.interval));
@@ -442,8 +443,9 @@ impl Device {
     fn rest(&self) -> Option<Instant> {
         let silent = self.silent.get();
         self.link.retry_at().or_else(|| {
-            (silent >= DEAD_AFTER)
-                .then(|| Instant::now() + backoff::pause(silent - DEAD_AFTER + 1, backoff::LONGEST))
+            (silent >= DEAD_AFTER).then(|| {
+                Instant::now() + backoff::pause(silent - DEAD_AFTER + 1, backoff::MAX_PAUSE)
+            })
         })
     }
 
@@ -477,7 +479,7 @@ impl Device {
         if !self.settings.measured {
             return;
         }
-        if let Some((request, item)) = self.samples.get().price(item) {
+        if let Some((request, item)) = self.samples.get().cost(item) {
             self.strategy.set(Strategy::Cost { request, item });
             self.samples.take();
             self.draw_plan();
@@ -494,7 +496,7 @@ impl Device {
         let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
         let (mut fault, mut answered) = (None, false);
         let plan = Rc::clone(&self.plan.borrow());
-        let known = self.learned().holes().to_vec();
+        let known = self.learned().unreadable().to_vec();
         let first = self.first.take();
         for index in (0..plan.len()).map(|offset| (first + offset) % plan.len()) {
             match self.read(&plan[index], &mut gathered).await {
@@ -512,7 +514,7 @@ impl Device {
             }
         }
         if answered || plan.is_empty() {
-            fault = fault.or(self.look_at_holes(&known, &mut gathered).await);
+            fault = fault.or(self.look_at_unreadable(&known, &mut gathered).await);
             answered |= fault.is_some_and(Fault::is_answer);
         }
         if let Some(results) = &self.report {
@@ -532,14 +534,18 @@ impl Device {
 
     /// Tells of the ranges that can't be read, and tries one again from time to time; a fault of
     /// one of them.
-    async fn look_at_holes(&self, known: &[Hole], gathered: &mut Gathered) -> Option<Fault> {
+    async fn look_at_unreadable(
+        &self,
+        known: &[Unreadable],
+        gathered: &mut Gathered,
+    ) -> Option<Fault> {
         let only = self.plan.borrow().is_empty();
         let retried = self.learned().retry(Instant::now(), only);
         let mut fault = None;
-        for hole in known {
-            let block = hole.block();
-            let mut found = hole.fault;
-            if retried.as_ref().is_some_and(|retried| retried.is(hole)) {
+        for range in known {
+            let block = range.block();
+            let mut found = range.fault;
+            if retried.as_ref().is_some_and(|retried| retried.is(range)) {
                 match self.ask(&block).await {
                     Err(fault) => found = fault,
                     Ok(_) => {
@@ -590,9 +596,9 @@ impl Device {
         let counters = &self.state.counters;
         counters.requests.add();
         let began = Instant::now();
-        let weight = if self.silent.get() > 0 { Weight::Doubtful } else { Weight::Usual };
+        let priority = if self.silent.get() > 0 { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
-        let answer = self.link.call(*unit_id, &buffer[..len], *timeout, weight).await;
+        let answer = self.link.call(*unit_id, &buffer[..len], *timeout, priority).await;
         match &answer {
             Ok(_) => {
                 let took = began.elapsed();
@@ -731,14 +737,14 @@ mod tests {
 
     #[test]
     fn reads_are_parted_into_what_one_request_can_carry() {
-        let of = |area, count, limits: &Limits| {
+        let of = |area, count, limits: &PlanLimits| {
             let read = ReadSettings { area, address: 5, count, into: None };
             let parts = fields(&[read], limits).into_iter();
             parts.map(|(field, _, at)| (field.address, field.count, at)).collect::<Vec<_>>()
         };
-        let limits = Limits { max_bits: 3, max_registers: 100, ..Limits::default() };
+        let limits = PlanLimits { max_bits: 3, max_registers: 100, ..PlanLimits::default() };
         assert_eq!(of(Area::Coils, 7, &limits), [(5, 3, 0), (8, 3, 3), (11, 1, 6)]);
         assert_eq!(of(Area::HoldingRegisters, 100, &limits), [(5, 100, 0)]);
-        assert_eq!(of(Area::InputRegisters, 65_531, &Limits::default()).len(), 525);
+        assert_eq!(of(Area::InputRegisters, 65_531, &PlanLimits::default()).len(), 525);
     }
 }

@@ -15,10 +15,10 @@ use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
 
 use super::backoff;
-use crate::counters::Counter;
+use crate::counter::Counter;
 
 /// The longest pause before a target that is down is tried again.
-const LONGEST: Duration = Duration::from_secs(10);
+const MAX_PAUSE: Duration = Duration::from_secs(10);
 
 /// A receiver of Raw Ingest packets.
 #[derive(Debug, Clone)]
@@ -127,7 +127,7 @@ impl Forward {
                         self.counters.replaced.add();
                     }
                     self.failures.set(self.failures.get().saturating_add(1));
-                    sleep(backoff::pause(self.failures.get(), LONGEST)).await;
+                    sleep(backoff::pause(self.failures.get(), MAX_PAUSE)).await;
                 }
             }
         }

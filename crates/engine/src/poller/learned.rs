@@ -6,7 +6,7 @@ use std::time::Duration;
 use holdfast_memory::Area;
 use tokio::time::Instant;
 
-use super::plan::{Block, Cut, Field, Limits};
+use super::plan::{Block, Cut, Field, PlanLimits};
 use super::status::Fault;
 
 /// How long it is remembered.
@@ -20,14 +20,14 @@ pub(super) struct Learned {
     max_registers: Option<u16>,
     max_bits: Option<u16>,
     cuts: Vec<Cut>,
-    holes: Vec<Hole>,
+    unreadable: Vec<Unreadable>,
     /// When all of it is forgotten.
     until: Option<Instant>,
 }
 
 /// A range that the device refuses to read.
 #[derive(Debug, Clone)]
-pub(super) struct Hole {
+pub(super) struct Unreadable {
     pub(super) area: Area,
     pub(super) address: u16,
     pub(super) count: u16,
@@ -35,18 +35,18 @@ pub(super) struct Hole {
     retry_at: Instant,
 }
 
-impl Hole {
+impl Unreadable {
     fn end(&self) -> u32 {
         u32::from(self.address) + u32::from(self.count)
     }
 
     /// It as a request.
     pub(super) fn block(&self) -> Block {
-        let Hole { area, address, count, .. } = *self;
-        Block { area, address, count, fields: Vec::new(), holes: 0 }
+        let Unreadable { area, address, count, .. } = *self;
+        Block { area, address, count, fields: Vec::new(), gaps: 0 }
     }
 
-    pub(super) fn is(&self, other: &Hole) -> bool {
+    pub(super) fn is(&self, other: &Unreadable) -> bool {
         (self.area, self.address, self.count) == (other.area, other.address, other.count)
     }
 
@@ -87,42 +87,42 @@ impl Learned {
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
         let Block { area, address, count, .. } = *block;
         let retry_at = Instant::now() + RETRY;
-        self.holes.push(Hole { area, address, count, fault, retry_at });
+        self.unreadable.push(Unreadable { area, address, count, fault, retry_at });
         self.remember();
     }
 
     /// Forgets what can't be read of what nobody wants any more; it stays apart from its neighbours.
     pub(super) fn keep(&mut self, fields: &[Field]) {
-        let wanted = |hole: &Hole| fields.iter().any(|field| hole.holds(field));
-        let (kept, unwanted) = std::mem::take(&mut self.holes).into_iter().partition(wanted);
-        self.holes = kept;
-        let unwanted: Vec<Hole> = unwanted;
-        for hole in unwanted {
-            self.cut(hole.area, hole.address.into());
+        let wanted = |range: &Unreadable| fields.iter().any(|field| range.holds(field));
+        let (kept, unwanted) = std::mem::take(&mut self.unreadable).into_iter().partition(wanted);
+        self.unreadable = kept;
+        let unwanted: Vec<Unreadable> = unwanted;
+        for range in unwanted {
+            self.cut(range.area, range.address.into());
         }
     }
 
-    pub(super) fn holes(&self) -> &[Hole] {
-        &self.holes
+    pub(super) fn unreadable(&self) -> &[Unreadable] {
+        &self.unreadable
     }
 
-    /// The hole that is to be tried again, if its time has come, or in any case: each in its turn.
-    pub(super) fn retry(&mut self, now: Instant, in_any_case: bool) -> Option<Hole> {
-        let hole = self.holes.iter_mut().min_by_key(|hole| hole.retry_at)?;
-        if hole.retry_at > now && !in_any_case {
+    /// The range that is to be tried again, if its time has come, or in any case: each in its turn.
+    pub(super) fn retry(&mut self, now: Instant, in_any_case: bool) -> Option<Unreadable> {
+        let range = self.unreadable.iter_mut().min_by_key(|range| range.retry_at)?;
+        if range.retry_at > now && !in_any_case {
             return None;
         }
-        hole.retry_at = now + RETRY;
-        Some(hole.clone())
+        range.retry_at = now + RETRY;
+        Some(range.clone())
     }
 
     /// Whether a field is known not to be readable.
     pub(super) fn is_refused(&self, field: &Field) -> bool {
-        self.holes.iter().any(|hole| hole.holds(field))
+        self.unreadable.iter().any(|range| range.holds(field))
     }
 
     /// The limits of a device with these fields, none of which is made unreadable by them.
-    pub(super) fn limits(&self, of: &Limits, fields: &[Field]) -> Limits {
+    pub(super) fn limits(&self, of: &PlanLimits, fields: &[Field]) -> PlanLimits {
         let longest = |bits: bool| {
             let alike = fields.iter().filter(|field| field.area.is_bits() == bits);
             alike.map(|field| field.count).max().unwrap_or(1)
@@ -134,9 +134,9 @@ impl Learned {
         limits.max_registers = within(self.max_registers, of.max_registers, false);
         limits.max_bits = within(self.max_bits, of.max_bits, true);
         limits.cuts.extend(&self.cuts);
-        for hole in &self.holes {
-            let of_hole = [hole.address.into(), hole.end()];
-            limits.cuts.extend(of_hole.map(|address| Cut { area: hole.area, address }));
+        for range in &self.unreadable {
+            let ends = [range.address.into(), range.end()];
+            limits.cuts.extend(ends.map(|address| Cut { area: range.area, address }));
         }
         limits
     }

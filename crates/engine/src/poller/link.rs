@@ -33,7 +33,7 @@ const IN_FLIGHT: usize = 8;
 const DOUBTFUL: usize = 4;
 
 /// Timeouts one after the other, without a byte between them, after which a connection is given up.
-const SILENT: u32 = 3;
+const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
 
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 16 * 1024;
@@ -43,7 +43,7 @@ pub(super) type Answer = Result<Vec<u8>, Fault>;
 
 /// How much a request matters beside others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Weight {
+pub(super) enum Priority {
     Usual,
     /// To a unit that was silent the last time: it leaves room for the others.
     Doubtful,
@@ -72,11 +72,11 @@ impl Link {
         unit_id: u8,
         pdu: &[u8],
         timeout: Duration,
-        weight: Weight,
+        priority: Priority,
     ) -> Answer {
         match self {
-            Link::Tcp(link) => link.call(unit_id, pdu, timeout, weight).await,
-            Link::Blocking(link) => link.call(unit_id, pdu, timeout, weight).await,
+            Link::Tcp(link) => link.call(unit_id, pdu, timeout, priority).await,
+            Link::Blocking(link) => link.call(unit_id, pdu, timeout, priority).await,
         }
     }
 }
@@ -149,13 +149,13 @@ impl TcpLink {
         }
     }
 
-    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, weight: Weight) -> Answer {
-        let doubtful = weight == Weight::Doubtful;
+    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, priority: Priority) -> Answer {
+        let doubtful = priority == Priority::Doubtful;
         let _doubtful = if doubtful { self.doubtful.acquire().await.ok() } else { None };
         let Ok(_place) = self.places.acquire().await else { return Err(Fault::Reset) };
         let deadline = Instant::now() + timeout;
         if self.open.borrow().is_none() {
-            self.connect(deadline, weight).await?;
+            self.connect(deadline, priority).await?;
         }
         let (id, answer) = self.send(unit_id, pdu)?;
         let sent = Instant::now();
@@ -173,14 +173,14 @@ impl TcpLink {
     }
 
     /// Makes the connection, once for all who wait for it.
-    async fn connect(&self, deadline: Instant, weight: Weight) -> Result<(), Fault> {
+    async fn connect(&self, deadline: Instant, priority: Priority) -> Result<(), Fault> {
         let _alone = timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
         if self.open.borrow().is_some() {
             return Ok(());
         }
         if let Some((until, fault)) = self.failed.get()
             && Instant::now() < until
-            && weight != Weight::Urgent
+            && priority != Priority::Urgent
         {
             return Err(fault);
         }
@@ -204,7 +204,7 @@ impl TcpLink {
             Err(_) => Fault::Timeout,
         };
         self.failures.set(self.failures.get().saturating_add(1));
-        let pause = backoff::pause(self.failures.get(), backoff::LONGEST);
+        let pause = backoff::pause(self.failures.get(), backoff::MAX_PAUSE);
         self.failed.set(Some((Instant::now() + pause, fault)));
         Err(fault)
     }
@@ -267,7 +267,7 @@ impl Open {
             self.timeouts += 1;
             self.timed_out = Instant::now();
         }
-        let doubtful = self.timeouts >= SILENT || self.session.is_amid_reply();
+        let doubtful = self.timeouts >= MAX_CONSECUTIVE_TIMEOUTS || self.session.is_amid_reply();
         !(doubtful && self.waiting.is_empty())
     }
 
@@ -415,9 +415,9 @@ impl BlockingLink {
         BlockingLink { jobs, urgent, retry_at: Cell::new(None) }
     }
 
-    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, weight: Weight) -> Answer {
+    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, priority: Priority) -> Answer {
         let (answer, answered) = oneshot::channel();
-        let urgent = weight == Weight::Urgent;
+        let urgent = priority == Priority::Urgent;
         let call = Call { unit_id, pdu: pdu.to_vec(), timeout, urgent, answer };
         let job = if urgent {
             self.urgent.send(call).or(Err(Fault::Reset))?;
@@ -446,7 +446,7 @@ fn carried_out(
     match answer {
         Err(ClientError::Connect { .. }) => {
             *failures = failures.saturating_add(1);
-            *retry_at = Some(Instant::now() + backoff::pause(*failures, backoff::LONGEST));
+            *retry_at = Some(Instant::now() + backoff::pause(*failures, backoff::MAX_PAUSE));
             Err(Fault::Refused)
         }
         other => {

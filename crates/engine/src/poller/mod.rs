@@ -8,13 +8,13 @@
 //! All tasks of a poller live on one thread, so that they share without locks.
 
 mod backoff;
+mod cost;
 mod device;
 mod forward;
 mod handshake;
 mod learned;
 mod link;
 pub mod plan;
-mod price;
 mod results;
 mod search;
 mod sink;

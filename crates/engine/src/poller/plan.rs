@@ -1,9 +1,9 @@
 //! Which requests read a set of fields: a pure function, and how a plan changes when a device refuses.
 //!
-//! The rules this file keeps: a field is never split; a block is within the device's limits; a hole is
+//! The rules this file keeps: a field is never split; a block is within the device's limits; a gap is
 //! read only where that is allowed. Two ways to choose are built in. [`Strategy::Gap`] crosses every
-//! hole up to a size. [`Strategy::Cost`] finds the cheapest plan for what a request and a register
-//! cost: at a high price of requests it crosses all holes that it may, at price 0 none.
+//! gap up to a size. [`Strategy::Cost`] finds the cheapest plan for what a request and a register
+//! cost: at a high cost of requests it crosses all gaps that it may, at cost 0 none.
 
 use holdfast_memory::Area;
 use thiserror::Error;
@@ -29,7 +29,7 @@ pub struct Block {
     /// Indexes of the fields, by address.
     pub fields: Vec<usize>,
     /// Items that are read though no field wants them.
-    pub holes: u32,
+    pub gaps: u32,
 }
 
 /// A range of one area: `start` to `end`, `end` not included.
@@ -51,19 +51,19 @@ pub struct Cut {
 pub enum Strategy {
     /// Holes of up to `max_gap` items are read.
     Gap { max_gap: u16 },
-    /// Any hole is read if that is cheaper: `request` for each request and `item` for each register
+    /// Any gap is read if that is cheaper: `request` for each request and `item` for each register
     /// or 16 bits.
     Cost { request: f64, item: f64 },
 }
 
 /// What a device bears.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Limits {
+pub struct PlanLimits {
     pub max_registers: u16,
     pub max_bits: u16,
     /// Holes are read only inside these, if there are any for the area.
     pub readable: Vec<Stretch>,
-    /// Never read, not even as a hole.
+    /// Never read, not even as a gap.
     pub forbidden: Vec<Stretch>,
     pub cuts: Vec<Cut>,
 }
@@ -80,9 +80,9 @@ pub enum PlanError {
     Forbidden { index: usize },
 }
 
-impl Default for Limits {
-    fn default() -> Limits {
-        Limits {
+impl Default for PlanLimits {
+    fn default() -> PlanLimits {
+        PlanLimits {
             max_registers: 125,
             max_bits: 2000,
             readable: Vec::new(),
@@ -92,7 +92,7 @@ impl Default for Limits {
     }
 }
 
-impl Limits {
+impl PlanLimits {
     fn most(&self, area: Area) -> u16 {
         if area.is_bits() { self.max_bits } else { self.max_registers }
     }
@@ -105,7 +105,7 @@ impl Limits {
             || (!self.cuts.iter().any(between) && (start == end || self.bears(area, end, start)))
     }
 
-    /// Whether a hole may be read.
+    /// Whether a gap may be read.
     fn bears(&self, area: Area, start: u32, end: u32) -> bool {
         let of_area = |stretches: &[Stretch]| {
             stretches.iter().filter(|each| each.area == area).copied().collect::<Vec<_>>()
@@ -130,7 +130,7 @@ impl Field {
 /// [`PlanError`] for a field that no request may read.
 pub fn plan(
     fields: &[Field],
-    limits: &Limits,
+    limits: &PlanLimits,
     strategy: Strategy,
 ) -> Result<Vec<Block>, PlanError> {
     for (index, field) in fields.iter().enumerate() {
@@ -142,7 +142,7 @@ pub fn plan(
         } else if field.end() > 65_536 {
             return Err(PlanError::Beyond { index });
         }
-        let open = Limits { readable: Vec::new(), ..limits.clone() };
+        let open = PlanLimits { readable: Vec::new(), ..limits.clone() };
         if !open.bears(field.area, field.address.into(), field.end()) {
             return Err(PlanError::Forbidden { index });
         }
@@ -163,11 +163,11 @@ pub fn plan(
     Ok(blocks)
 }
 
-/// Greedy from the left: a block ends where the hole is too large, or the block would be.
+/// Greedy from the left: a block ends where the gap is too large, or the block would be.
 fn by_gap(
     fields: &[Field],
     order: &[usize],
-    limits: &Limits,
+    limits: &PlanLimits,
     max_gap: u16,
     blocks: &mut Vec<Block>,
 ) {
@@ -198,11 +198,11 @@ fn by_gap(
 fn by_cost(
     fields: &[Field],
     order: &[usize],
-    limits: &Limits,
+    limits: &PlanLimits,
     (request, item): (f64, f64),
     blocks: &mut Vec<Block>,
 ) {
-    // Where all fields up to each one end: what a later field leaves between is a hole.
+    // Where all fields up to each one end: what a later field leaves between is a gap.
     let ends = order.iter().scan(0, |end, index| {
         *end = fields[*index].end().max(*end);
         Some(*end)
@@ -252,14 +252,14 @@ fn reach(fields: &[Field], order: &[usize]) -> u32 {
 fn block(fields: &[Field], order: &[usize]) -> Block {
     let first = fields[order[0]];
     let start = u32::from(first.address);
-    let (mut end, mut holes) = (start, 0);
+    let (mut end, mut gaps) = (start, 0);
     for index in order {
         let field = fields[*index];
-        holes += u32::from(field.address).saturating_sub(end);
+        gaps += u32::from(field.address).saturating_sub(end);
         end = end.max(field.end());
     }
     let count = (end - start) as u16;
-    Block { area: first.area, address: first.address, count, fields: order.to_vec(), holes }
+    Block { area: first.area, address: first.address, count, fields: order.to_vec(), gaps }
 }
 
 /// The two blocks to try in place of one that the device refused; `None` for a block of one field.
@@ -296,18 +296,18 @@ mod tests {
     fn holes_up_to_the_gap_are_read_and_larger_ones_are_not() {
         let fields = [field(20, 2), field(0, 4), field(6, 2), field(11, 1)];
         let strategy = Strategy::Gap { max_gap: 3 };
-        let blocks = plan(&fields, &Limits::default(), strategy).unwrap();
+        let blocks = plan(&fields, &PlanLimits::default(), strategy).unwrap();
         assert_eq!(spans(&blocks), [(0, 12), (20, 2)]);
-        assert_eq!((blocks[0].fields.clone(), blocks[0].holes), (vec![1, 2, 3], 5));
+        assert_eq!((blocks[0].fields.clone(), blocks[0].gaps), (vec![1, 2, 3], 5));
     }
 
     #[test]
     fn limits_and_forbidden_ranges_cut() {
         let area = Area::HoldingRegisters;
-        let limits = Limits {
+        let limits = PlanLimits {
             max_registers: 10,
             forbidden: vec![Stretch { area, start: 13, end: 14 }],
-            ..Limits::default()
+            ..PlanLimits::default()
         };
         let fields = [field(0, 6), field(6, 5), field(12, 1), field(14, 1), field(15, 1)];
         let blocks = plan(&fields, &limits, Strategy::Gap { max_gap: 9 }).unwrap();
@@ -321,7 +321,7 @@ mod tests {
     fn holes_outside_readable_ranges_are_not_read() {
         let area = Area::HoldingRegisters;
         let readable = vec![Stretch { area, start: 0, end: 10 }];
-        let limits = Limits { readable, ..Limits::default() };
+        let limits = PlanLimits { readable, ..PlanLimits::default() };
         let fields = [field(0, 1), field(5, 1), field(9, 1), field(12, 1)];
         for strategy in [Strategy::Gap { max_gap: 50 }, Strategy::Cost { request: 1e6, item: 1.0 }]
         {
@@ -334,7 +334,7 @@ mod tests {
         let fields = [field(0, 1), field(11, 1), field(100, 1)];
         let of = |request: f64| {
             let strategy = Strategy::Cost { request, item: 1.0 };
-            spans(&plan(&fields, &Limits::default(), strategy).unwrap())
+            spans(&plan(&fields, &PlanLimits::default(), strategy).unwrap())
         };
         assert_eq!(of(0.0), [(0, 1), (11, 1), (100, 1)]);
         assert_eq!(of(11.0), [(0, 12), (100, 1)]);
@@ -344,7 +344,7 @@ mod tests {
     #[test]
     fn a_refused_block_is_halved_until_one_field_is_alone() {
         let fields = [field(0, 1), field(1, 1), field(2, 2), field(9, 1)];
-        let all = plan(&fields, &Limits::default(), Strategy::Gap { max_gap: 9 }).unwrap();
+        let all = plan(&fields, &PlanLimits::default(), Strategy::Gap { max_gap: 9 }).unwrap();
         assert_eq!(spans(&all), [(0, 10)]);
         let [left, right] = halves(&fields, &all[0]).unwrap();
         assert_eq!(spans(&[left.clone(), right.clone()]), [(0, 2), (2, 8)]);
@@ -358,7 +358,7 @@ mod tests {
     fn nothing_is_read_across_a_cut() {
         let area = Area::HoldingRegisters;
         let cuts = [4, 10, 30].map(|address| Cut { area, address }).to_vec();
-        let limits = Limits { cuts, ..Limits::default() };
+        let limits = PlanLimits { cuts, ..PlanLimits::default() };
         let fields = [field(0, 4), field(4, 2), field(8, 4), field(11, 5), field(20, 1)];
         for strategy in [Strategy::Gap { max_gap: 50 }, Strategy::Cost { request: 1e6, item: 1.0 }]
         {
@@ -375,7 +375,7 @@ mod tests {
             (field(0, 0), PlanError::Empty { index: 0 }),
             (field(65_535, 2), PlanError::Beyond { index: 0 }),
         ] {
-            assert_eq!(plan(&[bad], &Limits::default(), strategy), Err(error));
+            assert_eq!(plan(&[bad], &PlanLimits::default(), strategy), Err(error));
         }
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use holdfast_memory::{Access, Area, Memory, Write};
 
 /// Registers of one block.
-pub const BLOCK: u16 = 30;
+pub const STATUS_BLOCK_LEN: u16 = 30;
 
 /// Bytes of the name in it.
 const NAME: usize = 16;
@@ -97,8 +97,8 @@ pub struct Status {
 }
 
 impl Status {
-    fn registers(&self, name: &str) -> [u16; BLOCK as usize] {
-        let mut block = [0; BLOCK as usize];
+    fn registers(&self, name: &str) -> [u16; STATUS_BLOCK_LEN as usize] {
+        let mut block = [0; STATUS_BLOCK_LEN as usize];
         block[0] = self.health.code();
         block[1] = self.last_error;
         block[2] = self.seconds_in_error;
@@ -124,8 +124,8 @@ impl Status {
             self.registers(name).iter().flat_map(|register| register.to_be_bytes()).collect();
         let write = Write {
             area: to.area,
-            address: to.slot.saturating_mul(BLOCK),
-            count: usize::from(BLOCK),
+            address: to.slot.saturating_mul(STATUS_BLOCK_LEN),
+            count: usize::from(STATUS_BLOCK_LEN),
             bytes: &bytes,
         };
         // That it fits was checked when the poller was made.

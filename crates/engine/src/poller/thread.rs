@@ -16,10 +16,10 @@ use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::device::{Device, DeviceSettings, DeviceState, Inbox, Turn, fields};
 use super::forward::{Forward, ForwardCounters};
-use super::link::{Link, Weight};
+use super::link::{Link, Priority};
 use super::plan::{self, PlanError};
 use super::results::{Results, Written};
-use super::status::{BLOCK, Fault};
+use super::status::{Fault, STATUS_BLOCK_LEN};
 use crate::client::Endpoint;
 use crate::tls::client::Identity;
 
@@ -53,7 +53,7 @@ pub struct Polled {
 
 impl Polled {
     fn new(device: &DeviceSettings, state: Arc<DeviceState>) -> Polled {
-        state.expect(device.interval, device.timeout);
+        state.set_stale_after(device.interval, device.timeout);
         let forwards = device.forward.iter().map(|_| Arc::default()).collect();
         Polled { name: device.name.clone(), state, forwards }
     }
@@ -328,7 +328,7 @@ impl Running {
         let Running { unit_id, timeout, release, .. } = *self;
         spawn_local(async move {
             let turn = turn.lock().await;
-            let answer = link.call(unit_id, &pdu, timeout, Weight::Urgent).await;
+            let answer = link.call(unit_id, &pdu, timeout, Priority::Urgent).await;
             drop(turn);
             if release {
                 link.release();
@@ -414,8 +414,8 @@ fn check(device: &DeviceSettings) -> Result<(), PollerError> {
     if let Some(status) = &device.status {
         let span = status.memory.span(status.area);
         let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
-        let first = u32::from(status.slot) * u32::from(BLOCK);
-        if status.area.is_bits() || first < start || first + u32::from(BLOCK) > end {
+        let first = u32::from(status.slot) * u32::from(STATUS_BLOCK_LEN);
+        if status.area.is_bits() || first < start || first + u32::from(STATUS_BLOCK_LEN) > end {
             return Err(PollerError::Status { device: name() });
         }
     }

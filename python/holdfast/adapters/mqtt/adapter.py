@@ -13,7 +13,7 @@ from holdfast.adapters.mqtt.backoff import Backoff
 from holdfast.adapters.mqtt.dialing import dial, tls_context
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
-from holdfast.adapters.mqtt.link import MOST_UNSENT, Link
+from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
 from holdfast.adapters.mqtt.waiting import Ended, Waiter
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.adapters import Door, Stop
+    from holdfast.adapters import MemoryAccess, Stop
     from holdfast.config import MqttConfig, SubscriptionConfig
 
 WELCOME = 10.0
@@ -33,21 +33,21 @@ WELCOME = 10.0
 SILENCE = 600.0
 """Seconds for which a failure to connect is not logged again when its reason is the same."""
 
-LONGEST_PASSWORD = 65535
+MAX_PASSWORD = 65535
 
 _TICK = 1.0
 """Seconds between looks at the keep-alive."""
 
 
 class Mqtt:
-    """Takes messages from a broker, and hands them to the door."""
+    """Takes messages from a broker, and hands them to the memory_access."""
 
-    def __init__(self, settings: MqttConfig, door: Door) -> None:
+    def __init__(self, settings: MqttConfig, memory_access: MemoryAccess) -> None:
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         self._settings = settings
         self._broker = f"{host}:{settings.port}"
         filters = Filters(settings.subscriptions)
-        self._inbox = Inbox(door, filters, self._broker)
+        self._inbox = Inbox(memory_access, filters, self._broker)
         self._answers = Answers(filters)
         self._topics = [_Topic(entry) for entry in settings.subscriptions]
         self._asked: dict[int, _Topic] = {}
@@ -85,7 +85,7 @@ class Mqtt:
     def _connection(self, waiter: Waiter) -> float:
         """One connection, from dialing to its end; the seconds that it held."""
         self._ending = None
-        link: Link | None = None
+        link: BrokerConnection | None = None
         try:
             link = self._link(waiter)
             link.open(self._settings)
@@ -106,7 +106,7 @@ class Mqtt:
             held = self._ended()
         return held
 
-    def _link(self, waiter: Waiter) -> Link:
+    def _link(self, waiter: Waiter) -> BrokerConnection:
         settings = self._settings
         context = tls_context(settings.tls) if settings.secure else None
 
@@ -114,13 +114,15 @@ class Mqtt:
             return dial(settings.host, settings.port, context, waiter)
 
         password = _password(settings.password_file)
-        link = Link(settings, password, open_socket, self._unreleased, self._inbox, self._answers)
+        link = BrokerConnection(
+            settings, password, open_socket, self._unreleased, self._inbox, self._answers
+        )
         link.on_connect = self._on_connect
         link.on_subscribe = self._on_subscribe
         link.on_disconnect = self._on_disconnect
         return link
 
-    def _serve(self, link: Link, waiter: Waiter) -> None:
+    def _serve(self, link: BrokerConnection, waiter: Waiter) -> None:
         """Reads and writes until the connection ends."""
         welcome = time.monotonic() + WELCOME
         tick = min(_TICK, self._settings.keep_alive / 2)
@@ -128,7 +130,7 @@ class Mqtt:
             if self._connected_at is None and time.monotonic() > welcome:
                 raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
             pending = getattr(connection, "pending", int)() > 0
-            read = link.unsent < MOST_UNSENT
+            read = link.unsent < MAX_UNSENT
             readable, writable = waiter.wait(
                 connection,  # type: ignore[arg-type]
                 read=read,
@@ -166,7 +168,7 @@ class Mqtt:
         reason: ReasonCode,
         properties: Properties | None,
     ) -> None:
-        assert isinstance(link, Link)
+        assert isinstance(link, BrokerConnection)
         if reason.is_failure:
             self._ending = f"the broker refused the connection: {reason}"
             return
@@ -190,7 +192,7 @@ class Mqtt:
         self._connects += 1
         self._connected_at = time.monotonic()
 
-    def _subscribe(self, link: Link, topic: _Topic, *, resumed: bool) -> None:
+    def _subscribe(self, link: BrokerConnection, topic: _Topic, *, resumed: bool) -> None:
         """Asks for a topic. With MQTT 3.1.1 to ask again is to get retained messages again, so what
         this process was granted in a session that still exists is not asked for.
         """
@@ -290,9 +292,9 @@ def _password(file: Path | None) -> bytes | None:
     if file is None:
         return None
     with file.open("rb") as opened:
-        content = opened.read(LONGEST_PASSWORD + 3)
+        content = opened.read(MAX_PASSWORD + 3)
     newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
     password = content.removesuffix(newline)
-    if len(password) > LONGEST_PASSWORD:
-        raise ValueError(f"{file} holds more than {LONGEST_PASSWORD} bytes")
+    if len(password) > MAX_PASSWORD:
+        raise ValueError(f"{file} holds more than {MAX_PASSWORD} bytes")
     return password

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.adapters.mqtt.filters import Filters
-    from holdfast.adapters.mqtt.link import Link
+    from holdfast.adapters.mqtt.link import BrokerConnection
     from holdfast.adapters.mqtt.packets import Publish
 
-MOST_WAITING = 100
+MAX_WAITING = 100
 """Answers that the broker has not taken yet."""
 
 
@@ -33,7 +33,7 @@ class Answers:
         self.sent = 0
         self.dropped = 0
 
-    def send(self, link: Link, message: Publish, answer: Mapping[str, object]) -> None:
+    def send(self, link: BrokerConnection, message: Publish, answer: Mapping[str, object]) -> None:
         """Answers a message, if it asks for that."""
         if message.response_topic is None:
             return
@@ -43,7 +43,11 @@ class Answers:
             self.dropped += 1
 
     def _sent(
-        self, link: Link, message: Publish, response_topic: bytes, answer: Mapping[str, object]
+        self,
+        link: BrokerConnection,
+        message: Publish,
+        response_topic: bytes,
+        answer: Mapping[str, object],
     ) -> bool:
         try:
             topic = response_topic.decode()
@@ -53,7 +57,7 @@ class Answers:
             return False
         payload = msgspec.json.encode(answer)
         size = len(payload) + len(response_topic) + len(message.correlation or b"")
-        if link.unsent >= MOST_WAITING or not link.takes(size):
+        if link.unsent >= MAX_WAITING or not link.takes(size):
             return False
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         properties.ContentType = "application/json"

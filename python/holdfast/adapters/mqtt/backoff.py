@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 FIRST_PAUSE = 1.0
-LONGEST_PAUSE = 60.0
+MAX_PAUSE = 60.0
 """Seconds: doubled with each failure, up to the longest."""
 
 JITTER = 0.25
@@ -25,5 +25,5 @@ class Backoff:
         """Seconds to wait, after a connection that held so long, 0 when there was none."""
         if held >= PROVEN:
             self._next = FIRST_PAUSE
-        pause, self._next = self._next, min(2 * self._next, LONGEST_PAUSE)
+        pause, self._next = self._next, min(2 * self._next, MAX_PAUSE)
         return pause * random.uniform(1 - JITTER, 1 + JITTER)

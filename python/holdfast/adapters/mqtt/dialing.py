@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.mqtt.waiting import Waiter
     from holdfast.config import BrokerTlsConfig
 
-PATIENCE = 10.0
+CONNECT_TIMEOUT = 10.0
 """Seconds that one address of the broker has to accept the connection, and TLS to be agreed on."""
 
 _UNDER_WAY = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
@@ -77,7 +77,7 @@ def _addresses(host: str, port: int, waiter: Waiter) -> list[tuple[int, Any]]:
 def _open(
     family: int, address: Any, host: str, context: ssl.SSLContext | None, waiter: Waiter
 ) -> socket.socket:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + CONNECT_TIMEOUT
     connection = socket.socket(family, socket.SOCK_STREAM)
     try:
         connection.setblocking(False)
@@ -119,4 +119,4 @@ def _wait(
 ) -> None:
     seconds = deadline - time.monotonic()
     if seconds <= 0 or not any(waiter.wait(connection, read=read, write=write, seconds=seconds)):
-        raise TimeoutError(f"no answer within {PATIENCE:g} s")
+        raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s")

@@ -1,4 +1,4 @@
-"""What becomes of a message: written by the door, or refused."""
+"""What becomes of a message: written by the memory_access, or refused."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from holdfast.ingest import Grant, Refused
 if TYPE_CHECKING:
     from holdfast.adapters.mqtt.filters import Filters
     from holdfast.adapters.mqtt.packets import Publish
-    from holdfast.ingest import Door
+    from holdfast.ingest import MemoryAccess
 
-MOST_BYTES = 8 * 2**20
+MAX_BYTES = 8 * 2**20
 """The largest payload that is looked at."""
 
-LONGEST_TOPIC = 200
+MAX_TOPIC = 200
 """How much of a topic is logged."""
 
 _NOBODY = Grant("no subscription", (), (), writes=False)
@@ -24,8 +24,8 @@ _NOBODY = Grant("no subscription", (), (), writes=False)
 class Inbox:
     """Takes messages, one after the other; none of them can stop the next."""
 
-    def __init__(self, door: Door, filters: Filters, broker: str) -> None:
-        self._door = door
+    def __init__(self, memory_access: MemoryAccess, filters: Filters, broker: str) -> None:
+        self._memory_access = memory_access
         self._filters = filters
         self._broker = broker
         self.received = 0
@@ -34,28 +34,28 @@ class Inbox:
         """Carries out a message; what its sender is told."""
         self.received += 1
         topic = message.topic
-        shown = topic if len(topic) <= LONGEST_TOPIC else f"{topic[:LONGEST_TOPIC]}…"
+        shown = topic if len(topic) <= MAX_TOPIC else f"{topic[:MAX_TOPIC]}…"
         peer = f"{self._broker} {shown}"
         grant = self._filters.grant(topic) or _NOBODY
         try:
             refused = _refused_unread(message, grant)
             if refused is None:
-                return self._door.ingest(message.payload, grant, peer).answer()
-            self._door.refuse(refused, grant.name, peer)
+                return self._memory_access.ingest(message.payload, grant, peer).answer()
+            self._memory_access.refuse(refused, grant.name, peer)
         except Refused as error:
             refused = error
         except Exception:  # A fault in here must not become that of the next message.
             logs.problem("mqtt_message_failed", broker=self._broker, topic=shown)
             refused = Refused("internal_error", "the message could not be carried out")
-            self._door.refuse(refused, grant.name, peer)
+            self._memory_access.refuse(refused, grant.name, peer)
         return refused.answer()
 
 
 def _refused_unread(message: Publish, grant: Grant) -> Refused | None:
     if grant is _NOBODY:
         return Refused("not_granted", "no subscription of the configuration has this topic")
-    if message.size > MOST_BYTES:
-        return Refused("too_large", f"{message.size} bytes, allowed are {MOST_BYTES}")
+    if message.size > MAX_BYTES:
+        return Refused("too_large", f"{message.size} bytes, allowed are {MAX_BYTES}")
     if message.problem is not None:
         return Refused("malformed", message.problem)
     return None

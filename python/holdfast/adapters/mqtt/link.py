@@ -20,9 +20,9 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from holdfast.adapters.mqtt.answers import MOST_WAITING
-from holdfast.adapters.mqtt.inbox import MOST_BYTES
-from holdfast.adapters.mqtt.packets import MOST_PROPERTIES, parse_publish
+from holdfast.adapters.mqtt.answers import MAX_WAITING
+from holdfast.adapters.mqtt.inbox import MAX_BYTES
+from holdfast.adapters.mqtt.packets import MAX_PROPERTIES, parse_publish
 
 if TYPE_CHECKING:
     import socket
@@ -36,19 +36,19 @@ SESSION_EXPIRY = 3600
 """Seconds that the broker keeps subscriptions and undelivered messages while this client is away.
 It can be told so with MQTT 5 only."""
 
-MOST_UNSENT = 1000
+MAX_UNSENT = 1000
 """Packets waiting to be sent, mostly acknowledgements, above which nothing more is read."""
 
-_MOST_ON_THE_WAY = 20
+_MAX_ON_THE_WAY = 20
 """Answers sent and not acknowledged; the others wait."""
 
-_KEPT = MOST_PROPERTIES + 2**17
+_KEPT = MAX_PROPERTIES + 2**17
 """Bytes of a packet too large: enough for what stands before the payload."""
 
-_LARGEST = MOST_BYTES + _KEPT
+_LARGEST = MAX_BYTES + _KEPT
 
 
-class Link(Client):
+class BrokerConnection(Client):
     """One connection, from dialing to its end; the next one is another object."""
 
     def __init__(
@@ -79,7 +79,7 @@ class Link(Client):
         self.trouble: str | None = None
         """What paho last found wrong."""
         self.on_log = self._note
-        self.max_queued_messages = MOST_WAITING
+        self.max_queued_messages = MAX_WAITING
         self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
 
     def open(self, settings: MqttConfig) -> None:
@@ -100,8 +100,8 @@ class Link(Client):
     def accepted(self, properties: Properties | None) -> None:
         """The broker took the connection, and told its limits."""
         self.on_log = None
-        most: int = getattr(properties, "ReceiveMaximum", _MOST_ON_THE_WAY)
-        self._max_inflight_messages = min(most, _MOST_ON_THE_WAY)
+        most: int = getattr(properties, "ReceiveMaximum", _MAX_ON_THE_WAY)
+        self._max_inflight_messages = min(most, _MAX_ON_THE_WAY)
         self._largest_sent = getattr(properties, "MaximumPacketSize", None)
         self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
 

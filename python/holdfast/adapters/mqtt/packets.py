@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-MOST_PROPERTIES = 2**18
+MAX_PROPERTIES = 2**18
 """Bytes: response topic, correlation data and content type at their longest, and some more."""
 
 _FIXED = {1: 1, 2: 4, 35: 2}
@@ -75,8 +75,8 @@ def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: boo
 
 def _properties(view: memoryview, size: int) -> dict[int, bytes]:
     """The value of each property with a length; of two the last."""
-    if size > MOST_PROPERTIES:
-        raise ValueError(f"{size} bytes, allowed are {MOST_PROPERTIES}")
+    if size > MAX_PROPERTIES:
+        raise ValueError(f"{size} bytes, allowed are {MAX_PROPERTIES}")
     if len(view) < size:
         raise ValueError("cut off")
     found = {}

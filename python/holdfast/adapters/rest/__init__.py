@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.rest.app import App
-from holdfast.http import Host
+from holdfast.web.host import Host
 
 if TYPE_CHECKING:
     import socket
 
     from holdfast.adapters import Stop
+    from holdfast.appliance.diagnostics import Diagnostics
     from holdfast.config import RestConfig
-    from holdfast.diagnostics import Diagnostics
-    from holdfast.ingest import Door
+    from holdfast.ingest import MemoryAccess
 
 __all__ = ["Rest"]
 
@@ -22,11 +22,15 @@ class Rest:
     """The REST adapter, on a socket that listens already."""
 
     def __init__(
-        self, settings: RestConfig, door: Door, diagnostics: Diagnostics, listener: socket.socket
+        self,
+        settings: RestConfig,
+        memory_access: MemoryAccess,
+        diagnostics: Diagnostics,
+        listener: socket.socket,
     ) -> None:
         self._host = Host(
             "rest",
-            App(settings, door, diagnostics, listener),
+            App(settings, memory_access, diagnostics, listener),
             listener,
             sources=settings.sources,
             max_connections=settings.max_connections,

@@ -1,7 +1,7 @@
 """The routes: what a request asks for, who asks, and how it is answered.
 
 A plain ASGI application. All that bears on memory is the door's work; what is refused here was
-refused before it came to the door.
+refused before it came to the memory_access.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from urllib.parse import parse_qsl
 import msgspec
 
 from holdfast import __version__
-from holdfast import openapi_page as page
 from holdfast.adapters.rest import openapi
-from holdfast.http import SAFE, address_of, headers_of, respond
-from holdfast.http_requests import Gone, Request, Unfit, respond_to_its_end, shown
 from holdfast.ingest import Grant, Refused
 from holdfast.types import AREAS
+from holdfast.web import openapi_page as page
+from holdfast.web.host import SAFE, address_of, headers_of, respond
+from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Awaitable, Callable
 
+    from holdfast.appliance.diagnostics import Diagnostics
     from holdfast.config import RestConfig
-    from holdfast.diagnostics import Diagnostics
-    from holdfast.http import Receive, Scope, Send
-    from holdfast.ingest import Door
+    from holdfast.ingest import MemoryAccess
+    from holdfast.web.host import Receive, Scope, Send
 
     Answer: TypeAlias = tuple[bytes, bytes]
     Handler: TypeAlias = Callable[[Request], Answer | Awaitable[Answer]]
@@ -43,21 +43,25 @@ PARAMETERS = ("memory", "area", "address", "count")
 ANYONE = "anyone"
 """Who asks, where there are no tokens."""
 
-LINGER = 2.0
+LINGER_TIMEOUT = 2.0
 """Seconds that a client has to end a body that is too large, so that it gets the answer."""
 
 
 class Declined(Refused):
-    """Refused before it came to the door, which does not know of it yet."""
+    """Refused before it came to the memory_access, which does not know of it yet."""
 
 
 class App:
     """The ASGI application."""
 
     def __init__(
-        self, settings: RestConfig, door: Door, diagnostics: Diagnostics, listener: socket.socket
+        self,
+        settings: RestConfig,
+        memory_access: MemoryAccess,
+        diagnostics: Diagnostics,
+        listener: socket.socket,
     ) -> None:
-        self._door = door
+        self._memory_access = memory_access
         self._diagnostics = diagnostics
         self._max_body = settings.max_body
         tokens = () if settings.tokens == "none" else settings.tokens
@@ -72,7 +76,7 @@ class App:
             for token in tokens
         }
         self._anyone = (
-            Grant(ANYONE, frozenset(door.memories), frozenset(AREAS))
+            Grant(ANYONE, frozenset(memory_access.memories), frozenset(AREAS))
             if settings.tokens == "none"
             else None
         )
@@ -96,11 +100,11 @@ class App:
         request = Request(scope, receive)
         try:
             kind, body = await self._answer(request)
-        except Unfit as unfit:
+        except BadRequest as unfit:
             await self._refuse(request, Declined(unfit.reason, unfit.detail), send)
         except Refused as refused:
             await self._refuse(request, refused, send)
-        except Gone:
+        except ClientDisconnected:
             pass
         else:
             headers = headers_of(kind, body) if body else list(SAFE)
@@ -125,7 +129,7 @@ class App:
         """Counts what the door does not know of, and answers."""
         if isinstance(refused, Declined):
             write = request.scope["path"] == INGEST and request.scope["method"] == "POST"
-            note = self._door.refuse if write else self._door.note
+            note = self._memory_access.refuse if write else self._memory_access.note
             note(refused, request.who, request.peer)
         status = STATUSES[refused.reason]
         body = msgspec.json.encode(refused.answer())
@@ -141,14 +145,16 @@ class App:
         grant = self._authorize(request)
         request.check_json()
         body = await request.body(self._max_body)
-        return JSON, msgspec.json.encode(self._door.ingest(body, grant, request.peer).answer())
+        return JSON, msgspec.json.encode(
+            self._memory_access.ingest(body, grant, request.peer).answer()
+        )
 
     def _read(self, request: Request) -> Answer:
         grant = self._authorize(request)
         memory, area, address, count = _parameters(request.scope["query_string"])
         start = _number("address", address, 0, 65535)
         amount = _number("count", count, 1, 65536)
-        values = self._door.read(memory, area, start, amount, grant, request.peer)
+        values = self._memory_access.read(memory, area, start, amount, grant, request.peer)
         return JSON, msgspec.json.encode({"values": values})
 
     def _health(self, _: Request) -> Answer:

@@ -1,0 +1,75 @@
+//! What a request and a register cost a device, learned from the times of its answers.
+
+/// Answers that a cost is learned from, before it is told.
+const ENOUGH: u32 = 100;
+
+/// A line through round trips by size: what a request takes, and what each 16 bits take beside it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Samples {
+    count: u32,
+    sum_size: f64,
+    sum_time: f64,
+    sum_size_squared: f64,
+    sum_product: f64,
+}
+
+impl Samples {
+    /// An answer of so many registers, or sixteens of bits, that took so many milliseconds.
+    pub(super) fn add(&mut self, size: f64, time: f64) {
+        self.count += 1;
+        self.sum_size += size;
+        self.sum_time += time;
+        self.sum_size_squared += size * size;
+        self.sum_product += size * time;
+    }
+
+    /// Milliseconds of a request and of a register, once that is known. Of answers that were all of
+    /// one size nothing is learned about registers: `before` stands for it.
+    pub(super) fn cost(&self, before: f64) -> Option<(f64, f64)> {
+        if self.count < ENOUGH {
+            return None;
+        }
+        let count = f64::from(self.count);
+        let spread = self.sum_size_squared - self.sum_size * self.sum_size / count;
+        let together = self.sum_product - self.sum_size * self.sum_time / count;
+        let item = if spread > count / 100.0 { (together / spread).max(0.0) } else { before };
+        let request = (self.sum_time - item * self.sum_size) / count;
+        Some((request.max(0.0), item))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_price_is_that_of_the_answers() {
+        let mut samples = Samples::default();
+        for index in 0..ENOUGH {
+            assert_eq!(samples.cost(9.0), None);
+            let size = f64::from(index % 10 + 1);
+            samples.add(size, 5.0 + 0.25 * size);
+        }
+        let (request, item) = samples.cost(9.0).unwrap();
+        assert!((request - 5.0).abs() < 1e-9 && (item - 0.25).abs() < 1e-9, "{request} {item}");
+    }
+
+    #[test]
+    fn answers_of_one_size_tell_nothing_of_registers() {
+        let mut samples = Samples::default();
+        for _ in 0..ENOUGH {
+            samples.add(10.0, 7.0);
+        }
+        assert_eq!(samples.cost(0.2), Some((5.0, 0.2)));
+    }
+
+    #[test]
+    fn a_price_is_never_below_nothing() {
+        let mut samples = Samples::default();
+        for index in 0..ENOUGH {
+            let size = f64::from(index % 2 * 100 + 1);
+            samples.add(size, 10.0 - size / 20.0);
+        }
+        assert!(samples.cost(0.0).is_some_and(|(request, item)| request >= 0.0 && item == 0.0));
+    }
+}

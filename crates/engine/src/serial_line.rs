@@ -1,0 +1,85 @@
+//! A serial device and how it is set: what a client opens and what a listener opens.
+
+use std::io;
+use std::time::Duration;
+
+use serial2_tokio::{CharSize, FlowControl, Parity, SerialPort, Settings, StopBits};
+
+/// Above 19,200 baud the silence between RTU frames does not get shorter (2.5.1.1).
+const FAST: (u32, Duration) = (19_200, Duration::from_micros(1_750));
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LineParity {
+    None,
+    Even,
+    Odd,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LineMode {
+    /// A silence ends a frame; `None` for that of the standard.
+    Rtu {
+        silence: Option<Duration>,
+    },
+    Ascii,
+}
+
+/// A serial device and how it is set.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SerialLine {
+    pub device: String,
+    pub baud: u32,
+    pub parity: LineParity,
+    pub stop_bits: u8,
+    pub data_bits: u8,
+    pub mode: LineMode,
+}
+
+impl SerialLine {
+    /// Opens the device, in the context of a runtime.
+    pub(crate) fn open(&self) -> io::Result<SerialPort> {
+        SerialPort::open(&self.device, |settings: Settings| self.set(settings))
+    }
+
+    /// Opens the device for blocking calls.
+    pub(crate) fn open_blocking(&self) -> io::Result<serial2::SerialPort> {
+        serial2::SerialPort::open(&self.device, |settings: Settings| self.set(settings))
+    }
+
+    fn set(&self, mut settings: Settings) -> io::Result<Settings> {
+        settings.set_raw();
+        settings.set_baud_rate(self.baud)?;
+        settings.set_stop_bits(if self.stop_bits == 2 { StopBits::Two } else { StopBits::One });
+        settings.set_flow_control(FlowControl::None);
+        if !self.is_pseudo_terminal() {
+            let seven = self.data_bits == 7;
+            settings.set_char_size(if seven { CharSize::Bits7 } else { CharSize::Bits8 });
+            settings.set_parity(match self.parity {
+                LineParity::None => Parity::None,
+                LineParity::Even => Parity::Even,
+                LineParity::Odd => Parity::Odd,
+            });
+        }
+        Ok(settings)
+    }
+
+    /// A pseudo terminal carries bytes: Linux refuses to give its characters another form.
+    fn is_pseudo_terminal(&self) -> bool {
+        let device = std::fs::canonicalize(&self.device);
+        device.is_ok_and(|device| device.starts_with("/dev/pts"))
+    }
+
+    /// The silence that ends an RTU frame: 3.5 characters.
+    pub(crate) fn silence(&self) -> Duration {
+        let (fast, shortest) = FAST;
+        match self.mode {
+            LineMode::Rtu { silence: Some(silence) } => silence,
+            _ if self.baud > fast => shortest,
+            _ => {
+                let parity = u32::from(self.parity != LineParity::None);
+                let bits = 1 + u32::from(self.data_bits) + parity + u32::from(self.stop_bits);
+                Duration::from_secs_f64(3.5 * f64::from(bits) / f64::from(self.baud))
+            }
+        }
+    }
+}

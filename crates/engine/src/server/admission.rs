@@ -1,0 +1,234 @@
+//! Which connections a listener holds, and whether there is room for one more.
+
+use std::collections::HashMap;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use tokio::task::AbortHandle;
+
+use super::listener::{ConnectionLimits, WhenFull};
+
+#[derive(Debug)]
+pub(crate) struct Admission {
+    max_connections: usize,
+    max_per_source: usize,
+    when_full: WhenFull,
+    epoch: Instant,
+    table: Mutex<Table>,
+}
+
+#[derive(Debug, Default)]
+struct Table {
+    next_id: u64,
+    held: HashMap<u64, Held>,
+    per_source: HashMap<IpAddr, usize>,
+}
+
+#[derive(Debug)]
+struct Held {
+    peer: SocketAddr,
+    last_request: Arc<AtomicU64>,
+    /// Known once the task of the connection runs.
+    task: Option<AbortHandle>,
+}
+
+/// No room, and nobody to close instead.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Full;
+
+/// The place of one connection; it is free again when this is dropped.
+#[derive(Debug)]
+pub(crate) struct Ticket {
+    id: u64,
+    last_request: Arc<AtomicU64>,
+    admission: Arc<Admission>,
+}
+
+impl Admission {
+    pub(crate) fn new(limits: ConnectionLimits) -> Admission {
+        let ConnectionLimits { max_connections, max_connections_per_source, when_full } = limits;
+        Admission {
+            max_connections,
+            max_per_source: max_connections_per_source.unwrap_or(max_connections),
+            when_full,
+            epoch: Instant::now(),
+            table: Mutex::default(),
+        }
+    }
+
+    /// A place for a connection from `peer`, and the peer that was closed for it.
+    pub(crate) fn admit(
+        self: &Arc<Self>,
+        peer: SocketAddr,
+    ) -> Result<(Ticket, Option<SocketAddr>), Full> {
+        let source = peer.ip().to_canonical();
+        let mut table = self.table();
+        let from_source = table.per_source.get(&source).copied().unwrap_or_default();
+        let evicted = if from_source >= self.max_per_source {
+            Some(self.evict(&mut table, Some(source))?)
+        } else if table.held.len() >= self.max_connections {
+            Some(self.evict(&mut table, None)?)
+        } else {
+            None
+        };
+        let id = table.next_id;
+        table.next_id += 1;
+        let last_request = Arc::new(AtomicU64::new(self.now()));
+        let held = Held { peer, last_request: Arc::clone(&last_request), task: None };
+        table.held.insert(id, held);
+        *table.per_source.entry(source).or_default() += 1;
+        Ok((Ticket { id, last_request, admission: Arc::clone(self) }, evicted))
+    }
+
+    /// Closes the connection that is idle longest, of one source or of all.
+    fn evict(&self, table: &mut Table, source: Option<IpAddr>) -> Result<SocketAddr, Full> {
+        if self.when_full == WhenFull::Refuse {
+            return Err(Full);
+        }
+        let of_source = |held: &Held| source.is_none_or(|ip| held.peer.ip().to_canonical() == ip);
+        let candidates =
+            table.held.iter().filter(|(_, held)| held.task.is_some() && of_source(held));
+        let id = candidates
+            .min_by_key(|(id, held)| (held.last_request.load(Ordering::Relaxed), **id))
+            .map(|(id, _)| *id)
+            .ok_or(Full)?;
+        let held = table.remove(id).ok_or(Full)?;
+        if let Some(task) = held.task {
+            task.abort();
+        }
+        Ok(held.peer)
+    }
+
+    pub(crate) fn open(&self) -> usize {
+        self.table().held.len()
+    }
+
+    fn table(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn now(&self) -> u64 {
+        self.epoch.elapsed().as_micros() as u64
+    }
+}
+
+impl Table {
+    fn remove(&mut self, id: u64) -> Option<Held> {
+        let held = self.held.remove(&id)?;
+        let source = held.peer.ip().to_canonical();
+        if let Some(count) = self.per_source.get_mut(&source) {
+            *count -= 1;
+            if *count == 0 {
+                self.per_source.remove(&source);
+            }
+        }
+        Some(held)
+    }
+}
+
+impl Ticket {
+    pub(crate) fn id(&self) -> u64 {
+        self.id
+    }
+
+    /// Notes that the connection had a request just now.
+    #[inline]
+    pub(crate) fn touch(&self, now: Instant) {
+        let since = now.saturating_duration_since(self.admission.epoch);
+        self.last_request.store(since.as_micros() as u64, Ordering::Relaxed);
+    }
+}
+
+/// Says which task serves the connection, so that it can be closed from outside.
+pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
+    if let Some(held) = admission.table().held.get_mut(&id) {
+        held.task = Some(task);
+    }
+}
+
+impl Drop for Ticket {
+    fn drop(&mut self) {
+        self.admission.table().remove(self.id);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn peer(last: u8, port: u16) -> SocketAddr {
+        SocketAddr::from(([127, 0, 0, last], port))
+    }
+
+    fn admission(
+        max_connections: usize,
+        max_connections_per_source: Option<usize>,
+        when_full: WhenFull,
+    ) -> Arc<Admission> {
+        Arc::new(Admission::new(ConnectionLimits {
+            max_connections,
+            max_connections_per_source,
+            when_full,
+        }))
+    }
+
+    fn task(runtime: &tokio::runtime::Runtime) -> AbortHandle {
+        runtime.spawn(std::future::pending::<()>()).abort_handle()
+    }
+
+    #[test]
+    fn a_place_is_free_again_when_its_ticket_is_dropped() {
+        let admission = admission(1, None, WhenFull::Refuse);
+        let (ticket, _) = admission.admit(peer(1, 1)).unwrap();
+        assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
+        drop(ticket);
+        assert!(admission.admit(peer(1, 2)).is_ok());
+    }
+
+    #[test]
+    fn the_limit_of_a_source_counts_mapped_addresses_as_the_same() {
+        let admission = admission(9, Some(1), WhenFull::Refuse);
+        let mapped: SocketAddr = "[::ffff:127.0.0.1]:2".parse().unwrap();
+        let held = admission.admit(peer(1, 1)).unwrap();
+        assert_eq!(admission.admit(mapped).unwrap_err(), Full);
+        assert!(admission.admit(peer(2, 1)).is_ok());
+        drop(held);
+        assert!(admission.admit(mapped).is_ok());
+    }
+
+    #[test]
+    fn the_connection_that_is_idle_longest_is_evicted() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(3, None, WhenFull::Evict);
+        let tickets = [1, 2, 3].map(|port| {
+            let (ticket, evicted) = admission.admit(peer(1, port)).unwrap();
+            assert_eq!(evicted, None);
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket
+        });
+        let later = Instant::now() + Duration::from_secs(1);
+        for (seconds, index) in [(3, 0), (1, 1), (2, 2)] {
+            tickets[index].touch(later + Duration::from_secs(seconds));
+        }
+        let (_fourth, evicted) = admission.admit(peer(1, 4)).unwrap();
+        assert_eq!(evicted, Some(peer(1, 2)));
+        assert_eq!(admission.open(), 3);
+    }
+
+    #[test]
+    fn a_source_at_its_limit_evicts_only_its_own() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(9, Some(1), WhenFull::Evict);
+        let _held = [(1, 1), (2, 2)].map(|(last, port)| {
+            let (ticket, _) = admission.admit(peer(last, port)).unwrap();
+            attach(&admission, ticket.id(), task(&runtime));
+            ticket
+        });
+        let (_third, evicted) = admission.admit(peer(2, 3)).unwrap();
+        assert_eq!(evicted, Some(peer(2, 2)));
+    }
+}

@@ -1,0 +1,462 @@
+//! One Modbus connection over a stream: bytes in, all complete requests answered in order, bytes out.
+//!
+//! A worker thread has one pair of buffers for all of its connections ([`Scratch`]): between a read
+//! and the write that answers it nothing is awaited. What is left over is kept by the connection
+//! itself, and is small: the beginning of a request, or replies that a slow peer does not take.
+//! While replies wait, no more requests are read.
+
+use std::cell::RefCell;
+use std::future::poll_fn;
+use std::io;
+use std::marker::PhantomData;
+use std::net::SocketAddr;
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use holdfast_protocol::frame::mbap;
+use holdfast_protocol::pdu;
+use tokio::sync::watch;
+use tokio::task::yield_now;
+use tokio::time::{Instant, Sleep, sleep_until};
+
+use super::admission::Ticket;
+use super::event::Kind;
+use super::framing::{Framing, Mbap, Next, Rtu};
+use super::listener::ListenerContext;
+use super::policy::PeerRights;
+use super::stream::{self, Stream};
+use super::unit_server::UnitServer;
+
+/// Bytes taken from a socket at once.
+const INPUT: usize = 4096;
+
+/// The longest frame of any framing.
+const MAX_REQUEST_LEN: usize = mbap::MAX_LEN;
+
+/// Room for the replies to all the requests that one input can hold.
+const OUTPUT: usize = output::<Mbap>(output::<Rtu>(0));
+
+const fn output<F: Framing>(least: usize) -> usize {
+    assert!(F::MAX_LEN <= MAX_REQUEST_LEN);
+    let len = (INPUT / F::SHORTEST + 1) * F::MAX_LEN;
+    if len > least { len } else { least }
+}
+
+/// How often a connection is read before the others, and the sockets of all, have their turn.
+const TURNS: u32 = 4;
+
+/// How often the rest of the input is read before a connection ends.
+const LAST_READS: usize = 64;
+
+/// What "no deadline" means to a timer.
+const FAR: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
+
+struct Scratch {
+    input: Box<[u8]>,
+    output: Box<[u8]>,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::new(Scratch {
+        input: vec![0; INPUT].into_boxed_slice(),
+        output: vec![0; OUTPUT].into_boxed_slice(),
+    });
+}
+
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Timeouts {
+    /// Without a request; `None` keeps the connection.
+    pub(crate) idle: Option<Duration>,
+    /// From the first byte of a request to its last, and for a peer to take its replies.
+    pub(crate) request: Duration,
+}
+
+pub(crate) struct Connection<F, S> {
+    stream: S,
+    answering: Answering<F>,
+    timeouts: Timeouts,
+    ticket: Ticket,
+    /// What the peer is to get and did not take yet.
+    unsent: Vec<u8>,
+    last_request: Instant,
+    /// When the request that is not complete yet began.
+    begun: Option<Instant>,
+    /// Reads without a pause.
+    turns: u32,
+}
+
+/// What the answers of a connection depend on.
+struct Answering<F> {
+    context: Arc<ListenerContext>,
+    peer: SocketAddr,
+    unit_server: Arc<UnitServer>,
+    rights: Arc<PeerRights>,
+    /// The beginning of a request.
+    partial: [u8; MAX_REQUEST_LEN],
+    partial_len: usize,
+    framing: PhantomData<F>,
+}
+
+/// What became of some input.
+struct Answered {
+    /// Bytes of output.
+    len: usize,
+    requests: usize,
+    /// Bytes of whole frames.
+    consumed: usize,
+    /// A frame could not be trusted: nothing behind it was looked at.
+    broken: bool,
+}
+
+impl<F: Framing, S: Stream> Connection<F, S> {
+    pub(crate) fn new(
+        context: Arc<ListenerContext>,
+        unit_server: Arc<UnitServer>,
+        (stream, peer): (S, SocketAddr),
+        rights: Arc<PeerRights>,
+        timeouts: Timeouts,
+        ticket: Ticket,
+    ) -> Connection<F, S> {
+        let answering = Answering::new(context, peer, unit_server, rights);
+        let last_request = Instant::now();
+        Connection {
+            stream,
+            answering,
+            timeouts,
+            ticket,
+            unsent: Vec::new(),
+            last_request,
+            begun: None,
+            turns: 0,
+        }
+    }
+
+    /// Serves until the connection ends. What ended it is counted before the peer can see it.
+    pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
+        let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer);
+        match self.serve(stop).await {
+            Some(end) => {
+                context.ended(end, peer);
+                // Behind replies that were cut off, nothing can be said.
+                if self.unsent.is_empty() {
+                    self.stream.end(&mut self.unsent);
+                    let _ = stream::write(self.stream.socket(), &mut self.unsent);
+                }
+            }
+            None => {
+                self.finish();
+                context.ended(Kind::Closed, peer);
+            }
+        }
+    }
+
+    /// Serves until the connection ends; `None` when all are to stop.
+    async fn serve(&mut self, mut stop: watch::Receiver<bool>) -> Option<Kind> {
+        // A peer that never pauses never lets the wait for a stop have its turn.
+        let flooded = stop.clone();
+        let mut stopping = pin!(stop.wait_for(|stop| *stop));
+        let mut alarm = pin!(sleep_until(self.last_request + FAR));
+        loop {
+            if let Err(end) = self.send_unsent().await {
+                return Some(end);
+            }
+            if flooded.has_changed().unwrap_or(true) {
+                return None;
+            }
+            self.set(alarm.as_mut());
+            let step = tokio::select! {
+                biased;
+                step = poll_fn(|context| self.poll(context)) => step,
+                () = &mut alarm => self.overdue(),
+                _ = &mut stopping => return None,
+            };
+            if let Err(end) = step {
+                return Some(end);
+            }
+            if self.turns == TURNS {
+                self.turns = 0;
+                yield_now().await;
+            }
+        }
+    }
+
+    /// Reads once, answers all that is complete, and writes once.
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            let kept = self.answering.restore(input);
+            let read = self.stream.poll_read(context, &mut input[kept..], &mut self.unsent);
+            let Poll::Ready(read) = read else {
+                self.turns = 0;
+                return Poll::Pending;
+            };
+            self.turns += 1;
+            let answered = self.answering.answer(&input[..kept + read?], output);
+            self.note(&answered);
+            let output = &output[..answered.len];
+            if !output.is_empty() {
+                self.stream.send(output, &mut self.unsent)?;
+            }
+            Poll::Ready(if answered.broken { Err(Kind::BrokenFrame) } else { Ok(()) })
+        })
+    }
+
+    /// Keeps the times that the deadlines hang on.
+    fn note(&mut self, answered: &Answered) {
+        let now = Instant::now();
+        if answered.requests > 0 {
+            self.last_request = now;
+            self.ticket.touch(now.into_std());
+        }
+        if self.answering.partial_len == 0 && !self.stream.is_amid_record() {
+            self.begun = None;
+        } else if answered.consumed > 0 || self.begun.is_none() {
+            self.begun = Some(now);
+        }
+    }
+
+    /// Waits for the peer to take the replies it is owed.
+    async fn send_unsent(&mut self) -> Result<(), Kind> {
+        if !self.unsent.is_empty() {
+            let patience = self.timeouts.request;
+            stream::send_all(self.stream.socket(), &self.unsent, patience).await?;
+            // A slow peer's buffer is given back: most connections never need one.
+            self.unsent = Vec::new();
+        }
+        Ok(())
+    }
+
+    fn deadline(&self) -> (Instant, Kind) {
+        match (self.begun, self.timeouts.idle) {
+            (Some(begun), _) => (begun + self.timeouts.request, Kind::RequestTimeout),
+            (None, Some(idle)) => (self.last_request + idle, Kind::Idle),
+            (None, None) => (self.last_request + FAR, Kind::Idle),
+        }
+    }
+
+    /// Sets the alarm to an earlier time. A later one waits until it rings: requests come much more
+    /// often than alarms.
+    fn set(&self, alarm: Pin<&mut Sleep>) {
+        let (deadline, _) = self.deadline();
+        if deadline < alarm.deadline() || alarm.is_elapsed() {
+            alarm.reset(deadline);
+        }
+    }
+
+    fn overdue(&self) -> Result<(), Kind> {
+        let (deadline, kind) = self.deadline();
+        if Instant::now() < deadline { Ok(()) } else { Err(kind) }
+    }
+
+    /// Answers what the system has received already, then ends.
+    fn finish(mut self) {
+        // A peer whose buffers are full, or who is gone, loses what it does not take.
+        if self.answering.drain(&mut self.stream, &mut self.unsent).is_ok() {
+            self.stream.end(&mut self.unsent);
+            let _ = stream::write(self.stream.socket(), &mut self.unsent);
+        }
+    }
+}
+
+impl<F: Framing> Answering<F> {
+    fn new(
+        context: Arc<ListenerContext>,
+        peer: SocketAddr,
+        unit_server: Arc<UnitServer>,
+        rights: Arc<PeerRights>,
+    ) -> Answering<F> {
+        let partial = [0; MAX_REQUEST_LEN];
+        Answering {
+            context,
+            peer,
+            unit_server,
+            rights,
+            partial,
+            partial_len: 0,
+            framing: PhantomData,
+        }
+    }
+
+    /// Puts the beginning of a request in context of what will be read; its length.
+    fn restore(&self, input: &mut [u8]) -> usize {
+        input[..self.partial_len].copy_from_slice(&self.partial[..self.partial_len]);
+        self.partial_len
+    }
+
+    /// Answers the complete requests of `input` and keeps the incomplete one behind them.
+    fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
+        let mut answered = Answered { len: 0, requests: 0, consumed: 0, broken: false };
+        let mut rest = input;
+        loop {
+            match F::next(rest) {
+                Next::Request { tag, unit_id, pdu, len } => {
+                    rest = &rest[len..];
+                    answered.requests += 1;
+                    answered.len += self.reply(tag, unit_id, pdu, &mut output[answered.len..]);
+                }
+                Next::Foreign { len } => {
+                    rest = &rest[len..];
+                    self.unit_server.counters.frames.foreign.add();
+                }
+                Next::Damaged { len } => {
+                    rest = &rest[len..];
+                    self.unit_server.counters.frames.damaged.add();
+                }
+                Next::Broken => {
+                    self.unit_server.counters.frames.broken.add();
+                    answered.broken = true;
+                    break;
+                }
+                Next::Incomplete => break,
+            }
+        }
+        answered.consumed = input.len() - rest.len();
+        // An incomplete frame is shorter than the longest one.
+        let kept = rest.len().min(self.partial.len());
+        self.partial[..kept].copy_from_slice(&rest[..kept]);
+        self.partial_len = kept;
+        answered
+    }
+
+    /// Writes one framed reply at the start of `output`; its length, 0 when none is due.
+    #[inline]
+    fn reply(&self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
+        let room = output.get_mut(F::HEADER_LEN..);
+        let Some(buffer) = room.and_then(<[u8]>::first_chunk_mut::<{ pdu::MAX_LEN }>) else {
+            return 0;
+        };
+        let len = self.unit_server.answer(&self.rights, unit_id, request, buffer);
+        if let Some(auditor) = &self.context.auditor {
+            let reply = &buffer[..len.unwrap_or_default()];
+            auditor.note(&self.context.name, Some(self.peer), unit_id, request, reply);
+        }
+        len.map_or(0, |len| F::complete(output, tag, unit_id, len))
+    }
+
+    /// Sends `unsent`, then reads, answers and sends until nothing more is there, without waiting.
+    fn drain(&mut self, stream: &mut impl Stream, unsent: &mut Vec<u8>) -> io::Result<()> {
+        stream::write(stream.socket(), unsent)?;
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            for _ in 0..LAST_READS {
+                let kept = self.restore(input);
+                let Some(len) = stream.read_now(&mut input[kept..], unsent) else { break };
+                let answered = self.answer(&input[..kept + len], output);
+                let output = &output[..answered.len];
+                if !output.is_empty() && stream.send(output, unsent).is_err() {
+                    break;
+                }
+                stream::write(stream.socket(), unsent)?;
+                if answered.broken {
+                    break;
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holdfast_memory::{Area, Layout, Memory, Span};
+
+    use super::*;
+    use crate::server::identity::Identity;
+    use crate::server::policy::{AccessMode, Functions, Rule};
+
+    fn answering() -> Answering<Mbap> {
+        let span = Span::new(0, 2000).unwrap();
+        let layout =
+            Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
+        let rule = Rule {
+            sources: Vec::new(),
+            roles: None,
+            units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
+            access: AccessMode::ReadWrite,
+            functions: Functions::All,
+        };
+        let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+        Answering::new(
+            Arc::new(ListenerContext::for_tests()),
+            SocketAddr::from(([127, 0, 0, 1], 1)),
+            Arc::new(UnitServer::new(Identity::new(&objects, &[]).unwrap())),
+            Arc::new(PeerRights::new(&rule)),
+        )
+    }
+
+    fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        [&mbap::header(7, unit_id, pdu.len())[..], pdu].concat()
+    }
+
+    /// One request of each function, and some that are refused.
+    fn requests() -> Vec<u8> {
+        let write = [&[16, 0, 0, 0, 123, 246][..], &[0; 246]].concat();
+        let pdus: [&[u8]; 17] = [
+            &[1, 0, 3, 7, 0xD0 - 3],
+            &[2, 0, 0, 0, 9],
+            &[3, 0, 0, 0, 125],
+            &[4, 0, 1, 0, 2],
+            &[5, 0, 9, 0xFF, 0],
+            &[6, 0, 9, 1, 2],
+            &[8, 0, 0, 1, 2],
+            &[8, 0, 0x0B, 0, 0],
+            &[11],
+            &[15, 0, 3, 0, 9, 2, 0xFF, 1],
+            &write,
+            &[17],
+            &[22, 0, 4, 0, 0xF2, 0, 0x25],
+            &[23, 0, 0, 0, 2, 0, 1, 0, 1, 2, 0xBE, 0xEF],
+            &[43, 14, 3, 0],
+            &[3, 0xFF, 0xFF, 0, 2],
+            &[99],
+        ];
+        pdus.iter().flat_map(|pdu| frame(1, pdu)).collect()
+    }
+
+    #[test]
+    fn the_way_from_request_to_reply_allocates_nothing() {
+        let (mut answering, input, mut output) = (answering(), requests(), vec![0; OUTPUT]);
+        answering.answer(&input, &mut output);
+        let mut requests = 0;
+        let allocations = allocation_counter::measure(|| {
+            requests = answering.answer(&input, &mut output).requests;
+        });
+        assert_eq!(requests, 17);
+        assert_eq!(allocations.count_total, 0);
+    }
+
+    #[test]
+    fn requests_cut_anywhere_get_the_replies_they_get_whole() {
+        let input = requests();
+        let mut whole = vec![0; OUTPUT];
+        let len = answering().answer(&input, &mut whole).len;
+        for cut in 0..input.len() {
+            let (mut answering, mut buffer, mut output) =
+                (answering(), vec![0; INPUT], vec![0; OUTPUT]);
+            let mut replies = Vec::new();
+            for part in [&input[..cut], &input[cut..]] {
+                let kept = answering.restore(&mut buffer);
+                buffer[kept..kept + part.len()].copy_from_slice(part);
+                let answered = answering.answer(&buffer[..kept + part.len()], &mut output);
+                replies.extend_from_slice(&output[..answered.len]);
+            }
+            assert!(replies == whole[..len], "cut at {cut}");
+        }
+    }
+
+    #[test]
+    fn the_output_has_room_for_the_replies_to_any_input() {
+        let shortest = frame(1, &[17]);
+        let input = shortest.repeat(INPUT / shortest.len());
+        let answered = answering().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!(answered.requests, INPUT / Mbap::SHORTEST);
+        assert!(answered.requests * mbap::MAX_LEN <= OUTPUT);
+    }
+
+    #[test]
+    fn what_is_in_front_of_a_broken_frame_is_answered_and_nothing_behind_it() {
+        let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
+        let answered = answering().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!((answered.requests, answered.broken), (1, true));
+    }
+}

@@ -1,0 +1,160 @@
+//! What happened to connections, for a log: sent without waiting, dropped and counted when nobody
+//! takes them.
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use holdfast_protocol::raw_ingest::Refusal;
+
+/// Events that wait to be taken.
+const CAPACITY: usize = 1024;
+
+/// Characters of a role that an event tells.
+const MAX_ROLE_LEN: usize = 64;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    Opened,
+    /// The peer ended the connection, or it broke.
+    Closed,
+    /// Closed after `idle_timeout`.
+    Idle,
+    /// A request did not arrive within `request_timeout`.
+    RequestTimeout,
+    /// The peer did not take its replies.
+    SlowReader,
+    /// A length that no frame has.
+    BrokenFrame,
+    /// Closed in favour of a new connection.
+    Evicted,
+    RefusedSource,
+    /// No rule names the role of the peer, which the event tells.
+    RefusedRole,
+    RefusedFull,
+    /// TLS failed, most often in its handshake; why, in a word.
+    TlsFailed(&'static str),
+    AcceptError,
+    /// A Raw Ingest packet was not written.
+    PacketRefused(Refusal),
+    /// A serial device was lost; it is opened again.
+    LineLost,
+    /// A serial device is there again.
+    LineBack,
+}
+
+impl Kind {
+    /// Whether this is the ordinary course of a connection.
+    const fn is_ordinary(self) -> bool {
+        matches!(self, Kind::Opened | Kind::Closed | Kind::Idle)
+    }
+
+    pub const fn name(self) -> &'static str {
+        match self {
+            Kind::Opened => "opened",
+            Kind::Closed => "closed",
+            Kind::Idle => "idle",
+            Kind::RequestTimeout => "request_timeout",
+            Kind::SlowReader => "slow_reader",
+            Kind::BrokenFrame => "broken_frame",
+            Kind::Evicted => "evicted",
+            Kind::RefusedSource => "refused_source",
+            Kind::RefusedRole => "refused_role",
+            Kind::RefusedFull => "refused_full",
+            Kind::TlsFailed(_) => "tls_failed",
+            Kind::AcceptError => "accept_error",
+            Kind::PacketRefused(_) => "packet_refused",
+            Kind::LineLost => "line_lost",
+            Kind::LineBack => "line_back",
+        }
+    }
+
+    /// Why, where the name does not say it.
+    pub const fn reason(self) -> Option<&'static str> {
+        match self {
+            Kind::PacketRefused(refusal) => Some(refusal.name()),
+            Kind::TlsFailed(reason) => Some(reason),
+            _ => None,
+        }
+    }
+}
+
+/// Something that happened on a listener.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Event {
+    pub listener: Arc<str>,
+    pub kind: Kind,
+    pub peer: Option<SocketAddr>,
+    /// Of a peer that was refused for it; its first 64 characters.
+    pub role: Option<Box<str>>,
+}
+
+/// Which events are sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verbosity {
+    Nothing,
+    /// Refusals and faults.
+    Refusals,
+    /// Every connection too.
+    All,
+}
+
+/// The sending side.
+#[derive(Debug, Clone)]
+pub(crate) struct Reporter {
+    verbosity: Verbosity,
+    sender: SyncSender<Event>,
+    lost: Arc<AtomicU64>,
+}
+
+/// The receiving side.
+#[derive(Debug)]
+pub(crate) struct Events {
+    receiver: Mutex<Receiver<Event>>,
+    lost: Arc<AtomicU64>,
+}
+
+pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
+    let (sender, receiver) = sync_channel(CAPACITY);
+    let lost = Arc::new(AtomicU64::new(0));
+    let reporter = Reporter { verbosity, sender, lost: Arc::clone(&lost) };
+    (reporter, Events { receiver: Mutex::new(receiver), lost })
+}
+
+impl Reporter {
+    pub(crate) fn report(
+        &self,
+        listener: &Arc<str>,
+        kind: Kind,
+        peer: Option<SocketAddr>,
+        role: Option<&str>,
+    ) {
+        let wanted = match self.verbosity {
+            Verbosity::Nothing => false,
+            Verbosity::Refusals => !kind.is_ordinary(),
+            Verbosity::All => true,
+        };
+        if !wanted {
+            return;
+        }
+        let role = role.map(|role| role.chars().take(MAX_ROLE_LEN).collect());
+        let event = Event { listener: Arc::clone(listener), kind, peer, role };
+        if self.sender.try_send(event).is_err() {
+            self.lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Events {
+    /// The next event; `None` when there is none for `timeout`, or no more will come.
+    pub(crate) fn next(&self, timeout: Duration) -> Option<Event> {
+        self.receiver.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout).ok()
+    }
+
+    /// How many events found no place.
+    pub(crate) fn lost(&self) -> u64 {
+        self.lost.load(Ordering::Relaxed)
+    }
+}

@@ -1,0 +1,296 @@
+//! What every listener has: a name, a socket, connections that are admitted, counted and reported.
+
+use std::io;
+use std::net::{IpAddr, Shutdown, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
+use tokio::net::TcpStream;
+use tokio::runtime::Handle;
+use tokio::sync::watch;
+use tokio::time::{Instant, timeout_at};
+
+use super::admission::{Admission, Full, Ticket, attach};
+use super::audit::Auditor;
+use super::counters::ConnectionCounters;
+use super::event::{Kind, Reporter};
+
+/// Connections that the system holds until they are accepted.
+const BACKLOG: i32 = 1024;
+
+/// When a silent peer is asked whether it is still there, how often, and how long apart.
+const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Duration::from_secs(15));
+
+/// A pause after the system could not accept, most often for want of file descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// How long a refused peer is read, at most, and how many bytes at once.
+const DRAIN: Duration = Duration::from_secs(5);
+const DRAIN_CHUNK: usize = 16 * 1024;
+
+/// What becomes of a new connection when there is no room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WhenFull {
+    /// It is closed.
+    Refuse,
+    /// The connection that is idle longest is closed instead.
+    Evict,
+}
+
+/// How many connections there may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConnectionLimits {
+    pub max_connections: usize,
+    pub max_connections_per_source: Option<usize>,
+    pub when_full: WhenFull,
+}
+
+impl ConnectionLimits {
+    /// Of a listener that has no connections.
+    const NONE: ConnectionLimits = ConnectionLimits {
+        max_connections: 0,
+        max_connections_per_source: None,
+        when_full: WhenFull::Refuse,
+    };
+}
+
+/// The outer side of a listener: all that does not depend on its protocol.
+#[derive(Debug)]
+pub(crate) struct ListenerContext {
+    pub(crate) name: Arc<str>,
+    pub(crate) admission: Arc<Admission>,
+    pub(crate) connections: ConnectionCounters,
+    pub(crate) auditor: Option<Auditor>,
+    reporter: Reporter,
+}
+
+impl ListenerContext {
+    pub(crate) fn new(
+        name: &str,
+        limits: Option<ConnectionLimits>,
+        reporter: Reporter,
+        auditor: Option<Auditor>,
+    ) -> ListenerContext {
+        ListenerContext {
+            name: name.into(),
+            admission: Arc::new(Admission::new(limits.unwrap_or(ConnectionLimits::NONE))),
+            connections: ConnectionCounters::default(),
+            auditor,
+            reporter,
+        }
+    }
+
+    #[cfg(test)]
+    pub(crate) fn for_tests() -> ListenerContext {
+        let (reporter, _) = super::event::channel(super::event::Verbosity::Nothing);
+        ListenerContext::new("test", None, reporter, None)
+    }
+
+    pub(crate) fn report(&self, kind: Kind, peer: Option<SocketAddr>) {
+        self.reporter.report(&self.name, kind, peer, None);
+    }
+
+    /// Counts and reports the end of a connection.
+    pub(crate) fn ended(&self, kind: Kind, peer: SocketAddr) {
+        match kind {
+            Kind::Idle => self.connections.idle.add(),
+            Kind::RequestTimeout => self.connections.request_timeout.add(),
+            Kind::SlowReader => self.connections.slow_reader.add(),
+            Kind::TlsFailed(_) => self.connections.tls_failed.add(),
+            _ => {}
+        }
+        self.report(kind, Some(peer));
+    }
+
+    pub(crate) fn refuse_source(&self, peer: SocketAddr) {
+        self.connections.refused_source.add();
+        self.report(Kind::RefusedSource, Some(peer));
+    }
+
+    pub(crate) fn refuse_role(&self, peer: SocketAddr, role: &str) {
+        self.connections.refused_role.add();
+        self.reporter.report(&self.name, Kind::RefusedRole, Some(peer), Some(role));
+    }
+}
+
+/// A connection that was admitted.
+pub(crate) struct Admitted<G> {
+    pub(crate) stream: TcpStream,
+    pub(crate) peer: SocketAddr,
+    pub(crate) rights: Arc<G>,
+    /// Bytes that have been read already.
+    pub(crate) received: Vec<u8>,
+    pub(crate) ticket: Ticket,
+}
+
+/// What a listener does with its connections.
+pub(crate) trait Service: Send + Sync + Sized + 'static {
+    type PeerRights: Send + Sync + 'static;
+
+    fn rights(&self, peer: IpAddr) -> Option<&Arc<Self::PeerRights>>;
+
+    /// Serves a connection to its end if that can be done without waiting; else gives it back.
+    fn serve_at_once(
+        &self,
+        _front: &ListenerContext,
+        connection: Admitted<Self::PeerRights>,
+    ) -> Option<Admitted<Self::PeerRights>> {
+        Some(connection)
+    }
+
+    /// Serves a connection to its end.
+    fn serve(
+        self: Arc<Self>,
+        context: Arc<ListenerContext>,
+        connection: Admitted<Self::PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) -> impl Future<Output = ()> + Send;
+}
+
+/// Accepts until `stop`, and gives the connections to the workers in turn.
+pub(crate) async fn accept<S: Service>(
+    context: Arc<ListenerContext>,
+    service: Arc<S>,
+    socket: std::net::TcpListener,
+    workers: Vec<Handle>,
+    mut stop: watch::Receiver<bool>,
+) {
+    let Ok(socket) = tokio::net::TcpListener::from_std(socket) else {
+        return;
+    };
+    loop {
+        let accepted = tokio::select! {
+            biased;
+            _ = stop.wait_for(|stop| *stop) => return,
+            accepted = socket.accept() => accepted,
+        };
+        match accepted {
+            Ok((stream, peer)) => admit(&context, &service, stream, peer, &workers, &stop),
+            Err(error) if is_of_one_peer(&error) => {}
+            Err(_) => {
+                context.connections.accept_errors.add();
+                context.report(Kind::AcceptError, None);
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+/// Settles what a new connection may do, and starts to serve it.
+fn admit<S: Service>(
+    context: &Arc<ListenerContext>,
+    service: &Arc<S>,
+    stream: TcpStream,
+    peer: SocketAddr,
+    workers: &[Handle],
+    stop: &watch::Receiver<bool>,
+) {
+    let Some(rights) = service.rights(peer.ip()) else {
+        return context.refuse_source(peer);
+    };
+    let (ticket, evicted) = match context.admission.admit(peer) {
+        Ok(admitted) => admitted,
+        Err(Full) => {
+            context.connections.refused_full.add();
+            return context.report(Kind::RefusedFull, Some(peer));
+        }
+    };
+    if evicted.is_some() {
+        context.connections.evicted.add();
+        context.report(Kind::Evicted, evicted);
+    }
+    context.connections.accepted.add();
+    context.report(Kind::Opened, Some(peer));
+    let id = ticket.id();
+    let rights = Arc::clone(rights);
+    let connection = Admitted { stream, peer, rights, received: Vec::new(), ticket };
+    let Some(connection) = service.serve_at_once(context, connection) else {
+        return;
+    };
+    let (context, service, stop) = (Arc::clone(context), Arc::clone(service), stop.clone());
+    let admission = Arc::clone(&context.admission);
+    let task = if let [worker] = workers {
+        worker.spawn(service.serve(context, connection, stop))
+    } else {
+        let Admitted { stream, peer, rights, received, ticket } = connection;
+        let Ok(stream) = stream.into_std() else { return };
+        let worker = &workers[id as usize % workers.len()];
+        worker.spawn(async move {
+            // The socket belongs to the worker that serves it: it is registered there.
+            let Ok(stream) = TcpStream::from_std(stream) else { return };
+            let connection = Admitted { stream, peer, rights, received, ticket };
+            service.serve(context, connection, stop).await;
+        })
+    };
+    attach(&admission, id, task.abort_handle());
+}
+
+/// A socket that listens, not yet known to any runtime.
+pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+    let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
+    // Elsewhere the option lets two programs take the same port.
+    #[cfg(unix)]
+    socket.set_reuse_address(true)?;
+    bind(&socket, address)?;
+    socket.listen(BACKLOG)?;
+    Ok(socket.into())
+}
+
+/// A socket that receives datagrams, not yet known to any runtime.
+pub(crate) fn bind_udp(address: SocketAddr) -> io::Result<std::net::UdpSocket> {
+    let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+    bind(&socket, address)?;
+    Ok(socket.into())
+}
+
+fn bind(socket: &Socket, address: SocketAddr) -> io::Result<()> {
+    if address.is_ipv6() {
+        socket.set_only_v6(false)?;
+    }
+    socket.bind(&address.into())?;
+    socket.set_nonblocking(true)
+}
+
+/// Replies leave at once, and a peer that is gone is noticed. Where the system refuses an option,
+/// the connection works without it.
+pub(crate) fn set_options(stream: &TcpStream) {
+    let (time, retries, interval) = KEEPALIVE;
+    let keepalive = TcpKeepalive::new().with_time(time).with_interval(interval);
+    #[cfg(not(target_os = "windows"))]
+    let keepalive = keepalive.with_retries(retries);
+    #[cfg(target_os = "windows")]
+    let _ = retries;
+    let _ = stream.set_nodelay(true);
+    let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
+}
+
+/// Ends the sending side, and reads until the peer has ended its own: a socket that is closed with
+/// unread bytes resets the connection, and the peer may lose what it was told.
+pub(crate) async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
+    if SockRef::from(stream).shutdown(Shutdown::Write).is_err() {
+        return;
+    }
+    let deadline = Instant::now() + DRAIN;
+    let mut chunk = vec![0; DRAIN_CHUNK];
+    loop {
+        let readable = tokio::select! {
+            readable = timeout_at(deadline, stream.readable()) => readable,
+            _ = stop.wait_for(|stop| *stop) => return,
+        };
+        let Ok(Ok(())) = readable else { return };
+        match stream.try_read(&mut chunk) {
+            Ok(0) => return,
+            Ok(_) if Instant::now() >= deadline => return,
+            Ok(_) => {}
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(_) => return,
+        }
+    }
+}
+
+/// Errors of `accept` that say something of one peer, not of the listener.
+fn is_of_one_peer(error: &io::Error) -> bool {
+    use io::ErrorKind::{ConnectionAborted, ConnectionReset, Interrupted, WouldBlock};
+    matches!(error.kind(), ConnectionAborted | ConnectionReset | Interrupted | WouldBlock)
+}

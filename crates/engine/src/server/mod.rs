@@ -1,0 +1,29 @@
+//! Listeners: Modbus and Raw Ingest over memories, one file a transport.
+
+mod admission;
+pub mod audit;
+mod connection;
+pub mod counters;
+mod engine;
+pub mod event;
+mod framing;
+pub mod identity;
+mod listener;
+pub mod policy;
+mod raw_ingest;
+mod serial;
+mod stream;
+mod tcp;
+mod tls;
+mod udp;
+pub mod unit_server;
+
+pub use engine::{
+    Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
+    StartError,
+};
+pub use listener::{ConnectionLimits, WhenFull};
+pub use raw_ingest::{RawRule, RawSettings};
+pub use serial::SerialSettings;
+pub use tcp::{StreamFraming, StreamSettings};
+pub use udp::UdpSettings;

@@ -1,0 +1,151 @@
+//! Who may do what: rules, compiled into tables.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use holdfast_memory::Memory;
+use holdfast_protocol::pdu::Function;
+use ipnet::IpNet;
+
+/// What a rule lets its peers do with the memories it names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AccessMode {
+    ReadOnly,
+    ReadWrite,
+}
+
+/// The function codes of a rule.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Functions {
+    All,
+    Only(Vec<u8>),
+    Except(Vec<u8>),
+}
+
+/// What peers from some networks are granted.
+#[derive(Debug, Clone)]
+pub struct Rule {
+    pub sources: Vec<IpNet>,
+    /// The roles that certificates of these peers may name, empty text the null role; `None` for any
+    /// role. Only TLS has roles.
+    pub roles: Option<Vec<String>>,
+    pub units: Vec<(u8, Arc<Memory>)>,
+    pub access: AccessMode,
+    pub functions: Functions,
+}
+
+/// The rules of a listener: the first that holds a peer settles what it may do.
+#[derive(Debug)]
+pub struct Policy<G> {
+    rules: Vec<Entry<G>>,
+}
+
+#[derive(Debug)]
+struct Entry<G> {
+    sources: Vec<IpNet>,
+    roles: Option<Vec<String>>,
+    rights: Arc<G>,
+}
+
+impl<G> Policy<G> {
+    /// Rules as the sources that each holds, and what it grants them.
+    pub fn new(rules: impl IntoIterator<Item = (Vec<IpNet>, G)>) -> Policy<G> {
+        let rules = rules.into_iter().map(|(sources, rights)| {
+            let rights = Arc::new(rights);
+            Entry { sources, roles: None, rights }
+        });
+        Policy { rules: rules.collect() }
+    }
+
+    /// What a peer is granted, whatever its role; `None` for one that no rule names. An IPv4 address
+    /// mapped into IPv6 is that IPv4 address.
+    pub fn rights(&self, peer: IpAddr) -> Option<&Arc<G>> {
+        self.find(peer, |_| true)
+    }
+
+    /// What a peer of that role is granted.
+    pub fn grant_of_role(&self, peer: IpAddr, role: &str) -> Option<&Arc<G>> {
+        self.find(peer, |roles| roles.iter().any(|allowed| allowed == role))
+    }
+
+    fn find(&self, peer: IpAddr, allows: impl Fn(&[String]) -> bool) -> Option<&Arc<G>> {
+        let peer = peer.to_canonical();
+        let mut rules = self.rules.iter();
+        let found = rules.find(|rule| {
+            rule.sources.iter().any(|network| network.contains(&peer))
+                && rule.roles.as_deref().is_none_or(&allows)
+        });
+        found.map(|rule| &rule.rights)
+    }
+}
+
+impl Policy<PeerRights> {
+    pub fn of(rules: &[Rule]) -> Policy<PeerRights> {
+        let rules = rules.iter().map(|rule| Entry {
+            sources: rule.sources.clone(),
+            roles: rule.roles.clone(),
+            rights: Arc::new(PeerRights::new(rule)),
+        });
+        Policy { rules: rules.collect() }
+    }
+}
+
+/// One rule as tables.
+#[derive(Debug)]
+pub struct PeerRights {
+    units: [Option<Arc<Memory>>; 256],
+    functions: [bool; 256],
+    access: AccessMode,
+}
+
+impl PeerRights {
+    pub fn new(rule: &Rule) -> PeerRights {
+        let mut units = [const { None }; 256];
+        for (unit, memory) in &rule.units {
+            units[usize::from(*unit)] = Some(Arc::clone(memory));
+        }
+        let functions = std::array::from_fn(|code| {
+            let code = code as u8;
+            let known = Function::from_code(code);
+            let named = match &rule.functions {
+                Functions::All => true,
+                Functions::Only(codes) => codes.contains(&code),
+                Functions::Except(codes) => !codes.contains(&code),
+            };
+            known.is_some_and(|function| {
+                named && (rule.access == AccessMode::ReadWrite || !function.is_write())
+            })
+        });
+        PeerRights { units, functions, access: rule.access }
+    }
+
+    /// The memory behind a unit id.
+    #[inline]
+    pub fn memory(&self, unit_id: u8) -> Option<&Memory> {
+        self.units[usize::from(unit_id)].as_deref()
+    }
+
+    /// Unit ids that map every memory behind those that are `wanted`, each memory once.
+    pub fn one_unit_of_each_memory(&self, wanted: impl Fn(u8) -> bool) -> Vec<u8> {
+        let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
+        for (unit_id, memory) in (0..=u8::MAX).zip(&self.units) {
+            if let Some(memory) = memory
+                && wanted(unit_id)
+                && !found.iter().any(|(_, known)| Arc::ptr_eq(known, memory))
+            {
+                found.push((unit_id, memory));
+            }
+        }
+        found.into_iter().map(|(unit_id, _)| unit_id).collect()
+    }
+
+    /// Whether a function code is known and allowed.
+    #[inline]
+    pub fn allows(&self, function_code: u8) -> bool {
+        self.functions[usize::from(function_code)]
+    }
+
+    pub fn read_only(&self) -> bool {
+        self.access == AccessMode::ReadOnly
+    }
+}

@@ -1,0 +1,280 @@
+//! A Raw Ingest listener: one connection is one packet, one write, one byte of reply.
+//!
+//! What is wrong with a packet is known from its header, before its payload is read, or from its
+//! whole; memory is touched only then. A refused peer is read until it is done: a socket that is
+//! closed with unread bytes resets the connection, and the reply could be lost.
+
+use std::collections::HashMap;
+use std::io::{ErrorKind, Read, Write as _};
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use holdfast_memory::{Access, Area, Memory, Write};
+use holdfast_protocol::raw_ingest::{DONE, Format, Header, REFUSED, Refusal};
+use ipnet::IpNet;
+use socket2::SockRef;
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::time::{Instant, timeout_at};
+
+use super::audit::{Record, Written};
+use super::counters::PacketCounters;
+use super::event::Kind;
+use super::listener::{Admitted, ConnectionLimits, ListenerContext, Service, drain};
+use super::policy::Policy;
+
+/// Bytes that are read at once.
+const CHUNK: usize = 16 * 1024;
+
+/// What peers from some networks may write.
+#[derive(Debug, Clone)]
+pub struct RawRule {
+    pub sources: Vec<IpNet>,
+    /// The memory behind each unit id (v1) or memory id (crc).
+    pub targets: Vec<(u16, Arc<Memory>)>,
+    pub areas: Vec<Area>,
+}
+
+/// A listener for Raw Ingest packets.
+#[derive(Debug, Clone)]
+pub struct RawSettings {
+    /// Port 0 lets the system pick one. `[::]` takes IPv4 connections too.
+    pub bind: SocketAddr,
+    pub format: Format,
+    pub rules: Vec<RawRule>,
+    pub limits: ConnectionLimits,
+    /// From the start of a connection to the last byte of its packet.
+    pub request_timeout: Duration,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawGrant {
+    targets: HashMap<u16, Arc<Memory>>,
+    areas: Vec<Area>,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawIngest {
+    pub(crate) packets: PacketCounters,
+    policy: Policy<RawGrant>,
+    format: Format,
+    request_timeout: Duration,
+}
+
+/// A packet as far as it has come.
+enum Packet<'p> {
+    /// This many bytes are missing, at least.
+    Incomplete {
+        missing: usize,
+    },
+    Whole {
+        header: Header,
+        memory: &'p Memory,
+        payload: &'p [u8],
+    },
+}
+
+/// Why there is no packet to answer.
+enum Gone {
+    Closed,
+    Timeout,
+    Stopped,
+}
+
+impl RawIngest {
+    pub(crate) fn new(settings: &RawSettings) -> RawIngest {
+        let rules = settings.rules.iter().map(|rule| {
+            let targets = rule.targets.iter().cloned().collect();
+            (rule.sources.clone(), RawGrant { targets, areas: rule.areas.clone() })
+        });
+        RawIngest {
+            packets: PacketCounters::default(),
+            policy: Policy::new(rules),
+            format: settings.format,
+            request_timeout: settings.request_timeout,
+        }
+    }
+
+    /// Judges what has come so far.
+    fn judge<'p>(&self, rights: &'p RawGrant, bytes: &'p [u8]) -> Result<Packet<'p>, Refusal> {
+        let Some(header) = self.format.header(bytes)? else {
+            let missing = self.format.header_len().saturating_sub(bytes.len()).max(1);
+            return Ok(Packet::Incomplete { missing });
+        };
+        let unmapped = match self.format {
+            Format::V1 => Refusal::Unit,
+            Format::Crc { .. } => Refusal::Memory,
+        };
+        let memory = rights.targets.get(&header.target).ok_or(unmapped)?;
+        let area = area(&header);
+        if !rights.areas.contains(&area) {
+            return Err(Refusal::NotGranted);
+        }
+        let span = memory.span(area);
+        let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
+        let address = u32::from(header.address);
+        if address < start || address + u32::from(header.count) > end {
+            return Err(Refusal::Range);
+        }
+        match self.format.packet_len(&header).checked_sub(bytes.len()) {
+            Some(missing) if missing > 0 => Ok(Packet::Incomplete { missing }),
+            _ => {
+                let payload = self.format.payload(&header, bytes)?;
+                Ok(Packet::Whole { header, memory, payload })
+            }
+        }
+    }
+
+    /// Writes a whole packet, as one step.
+    fn write(
+        &self,
+        context: &ListenerContext,
+        peer: SocketAddr,
+        (header, memory, payload): (Header, &Memory, &[u8]),
+    ) -> Result<(), Refusal> {
+        let Header { address, count, .. } = header;
+        let write =
+            Write { area: area(&header), address, count: usize::from(count), bytes: payload };
+        memory.write(Access::Ingest, write).map_err(|_| Refusal::Range)?;
+        self.packets.accepted.add();
+        self.packets.values.add_many(u64::from(count));
+        self.audit(context, peer, Some(header), payload, None);
+        Ok(())
+    }
+
+    /// Receives a packet; an error is a refusal, or the reason why nobody waits for a reply.
+    async fn receive(
+        &self,
+        stream: &TcpStream,
+        rights: &RawGrant,
+        packet: &mut Vec<u8>,
+        mut stop: watch::Receiver<bool>,
+    ) -> Result<Result<(), Refusal>, Gone> {
+        let deadline = Instant::now() + self.request_timeout;
+        loop {
+            let missing = match self.judge(rights, packet) {
+                Ok(Packet::Incomplete { missing }) => missing,
+                Ok(Packet::Whole { .. }) if more_is_there(stream) => {
+                    return Ok(Err(Refusal::Extra));
+                }
+                Ok(Packet::Whole { .. }) => return Ok(Ok(())),
+                Err(refusal) => return Ok(Err(refusal)),
+            };
+            let readable = tokio::select! {
+                readable = timeout_at(deadline, stream.readable()) => readable,
+                _ = stop.wait_for(|stop| *stop) => return Err(Gone::Stopped),
+            };
+            match readable {
+                Err(_) if packet.is_empty() => return Err(Gone::Timeout),
+                Err(_) => return Ok(Err(Refusal::Late)),
+                Ok(Err(_)) => return Err(Gone::Closed),
+                Ok(Ok(())) => {}
+            }
+            // One byte more than the packet has, so that bytes behind it come with it.
+            packet.reserve(missing + 1);
+            match stream.try_read_buf(packet) {
+                Ok(0) if packet.is_empty() => return Err(Gone::Closed),
+                Ok(0) => return Ok(Err(Refusal::Short)),
+                Ok(_) => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+                Err(_) => return Err(Gone::Closed),
+            }
+        }
+    }
+
+    fn refuse(&self, context: &ListenerContext, peer: SocketAddr, packet: &[u8], refusal: Refusal) {
+        self.packets.refuse(refusal);
+        context.report(Kind::PacketRefused(refusal), Some(peer));
+        let header = self.format.header(packet).ok().flatten();
+        self.audit(context, peer, header, &[], Some(refusal));
+    }
+
+    fn audit(
+        &self,
+        context: &ListenerContext,
+        peer: SocketAddr,
+        header: Option<Header>,
+        payload: &[u8],
+        refused: Option<Refusal>,
+    ) {
+        if let Some(auditor) = &context.auditor {
+            let (format, payload) = (self.format, payload.to_vec());
+            let write = Written::Packet { format, header, payload, refused };
+            auditor.send(Record { listener: Arc::clone(&context.name), peer: Some(peer), write });
+        }
+    }
+}
+
+impl Service for RawIngest {
+    type PeerRights = RawGrant;
+
+    fn rights(&self, peer: IpAddr) -> Option<&Arc<RawGrant>> {
+        self.policy.rights(peer)
+    }
+
+    /// Most packets are there when their connection is accepted, and need no task.
+    fn serve_at_once(
+        &self,
+        context: &ListenerContext,
+        mut connection: Admitted<RawGrant>,
+    ) -> Option<Admitted<RawGrant>> {
+        let mut chunk = [0; CHUNK];
+        let socket = SockRef::from(&connection.stream);
+        let Ok(len) = (&*socket).read(&mut chunk) else {
+            return Some(connection);
+        };
+        let bytes = &chunk[..len];
+        let peer = connection.peer;
+        if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
+            && len < CHUNK
+            && self.write(context, peer, (header, memory, payload)).is_ok()
+        {
+            let _ = (&*socket).write(&[DONE]);
+            context.ended(Kind::Closed, peer);
+            return None;
+        }
+        connection.received = bytes.to_vec();
+        Some(connection)
+    }
+
+    async fn serve(
+        self: Arc<Self>,
+        context: Arc<ListenerContext>,
+        connection: Admitted<RawGrant>,
+        stop: watch::Receiver<bool>,
+    ) {
+        let Admitted { stream, peer, rights, received: mut packet, ticket } = connection;
+        let judged = match self.receive(&stream, &rights, &mut packet, stop.clone()).await {
+            Err(Gone::Timeout) => return context.ended(Kind::RequestTimeout, peer),
+            Err(Gone::Closed | Gone::Stopped) => return context.ended(Kind::Closed, peer),
+            Ok(judged) => judged,
+        };
+        let written = judged.and_then(|()| match self.judge(&rights, &packet)? {
+            Packet::Whole { header, memory, payload } => {
+                self.write(&context, peer, (header, memory, payload))
+            }
+            Packet::Incomplete { .. } => Err(Refusal::Short),
+        });
+        if let Err(refusal) = written {
+            self.refuse(&context, peer, &packet, refusal);
+        }
+        drop(packet);
+        let reply = if written.is_ok() { DONE } else { REFUSED };
+        let _ = (&*SockRef::from(&stream)).write(&[reply]);
+        if written.is_err() {
+            drain(&stream, stop).await;
+        }
+        context.ended(Kind::Closed, peer);
+        drop(ticket);
+    }
+}
+
+/// Whether bytes behind the packet have arrived.
+fn more_is_there(stream: &TcpStream) -> bool {
+    matches!((&*SockRef::from(stream)).read(&mut [0]), Ok(len) if len > 0)
+}
+
+fn area(header: &Header) -> Area {
+    Area::ALL[usize::from(header.area) - 1]
+}

@@ -1,0 +1,261 @@
+//! Modbus on a serial line: one device, RTU or ASCII frames, one request at a time.
+//!
+//! Only frames for a unit that is served here are answered; all others, and damaged ones, are passed
+//! over in silence. Unit id 0 is the broadcast: every memory takes the write, nobody replies.
+//! A device that is lost is opened again until it is back.
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use holdfast_protocol::frame::{ascii, rtu};
+use holdfast_protocol::pdu::{self, Function};
+use serial2_tokio::SerialPort;
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep, sleep_until, timeout};
+
+use super::event::Kind;
+use super::framing::{Framing, Rtu};
+use super::listener::ListenerContext;
+use super::policy::{PeerRights, Rule};
+use super::unit_server::UnitServer;
+use crate::serial_line::{LineMode, SerialLine};
+
+/// The unit id that addresses all (Modbus over Serial SerialLine V1.02, 2.2).
+const BROADCAST: u8 = 0;
+
+/// The longest pause between two characters of an ASCII frame (2.5.2.1).
+const CHARACTER_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// How often a lost device is tried.
+const REOPEN: Duration = Duration::from_secs(1);
+
+/// How long the line may take for a reply before it is held to be stuck.
+const STUCK: Duration = Duration::from_secs(10);
+
+/// A listener on a serial line.
+#[derive(Debug, Clone)]
+pub struct SerialSettings {
+    pub line: SerialLine,
+    /// A line has no sources: those of the rule are not looked at.
+    pub rule: Rule,
+}
+
+pub(crate) struct ModbusSerial {
+    unit_server: Arc<UnitServer>,
+    rights: PeerRights,
+    line: SerialLine,
+}
+
+impl ModbusSerial {
+    pub(crate) fn new(settings: SerialSettings, unit_server: Arc<UnitServer>) -> ModbusSerial {
+        ModbusSerial { unit_server, rights: PeerRights::new(&settings.rule), line: settings.line }
+    }
+
+    /// Serves the line until `stop`.
+    pub(crate) async fn serve(
+        self,
+        context: Arc<ListenerContext>,
+        mut port: SerialPort,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let mut stopping = std::pin::pin!(stop.wait_for(|stop| *stop));
+        loop {
+            let lost = async {
+                match self.line.mode {
+                    LineMode::Rtu { .. } => self.serve_rtu(&context, &port).await,
+                    LineMode::Ascii => self.serve_ascii(&context, &port).await,
+                }
+            };
+            tokio::select! {
+                _ = &mut stopping => return,
+                _ = lost => context.report(Kind::LineLost, None),
+            }
+            port = loop {
+                tokio::select! {
+                    _ = &mut stopping => return,
+                    () = sleep(REOPEN) => {}
+                }
+                if let Ok(port) = self.line.open() {
+                    break port;
+                }
+            };
+            context.report(Kind::LineBack, None);
+        }
+    }
+
+    /// Serves RTU frames until the device is lost.
+    async fn serve_rtu(&self, context: &ListenerContext, port: &SerialPort) -> io::Error {
+        let silence = self.line.silence();
+        // One byte more than the longest frame: a longer one shows.
+        let mut frame = [0; rtu::MAX_LEN + 1];
+        let mut len = 0;
+        let mut quiet = std::pin::pin!(sleep_until(Instant::now()));
+        loop {
+            let at = len.min(frame.len() - 1);
+            // Characters that are there already end no silence, however late they are looked at.
+            let read = tokio::select! {
+                biased;
+                read = port.read(&mut frame[at..]) => read,
+                () = &mut quiet, if len > 0 => {
+                    if let Err(error) = self.answer_rtu(context, port, &frame[..len]).await {
+                        return error;
+                    }
+                    len = 0;
+                    continue;
+                }
+            };
+            match read {
+                Ok(0) => return io::ErrorKind::UnexpectedEof.into(),
+                Ok(more) => len = at + more,
+                Err(error) => return error,
+            }
+            quiet.as_mut().reset(Instant::now() + silence);
+        }
+    }
+
+    async fn answer_rtu(
+        &self,
+        context: &ListenerContext,
+        port: &SerialPort,
+        frame: &[u8],
+    ) -> io::Result<()> {
+        let Ok((unit_id, request)) = rtu::decode(frame) else {
+            self.unit_server.counters.frames.damaged.add();
+            return Ok(());
+        };
+        let mut reply = [0; rtu::MAX_LEN];
+        let Some(buffer) = reply[Rtu::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
+            return Ok(());
+        };
+        match self.answer(context, unit_id, request, buffer) {
+            None => Ok(()),
+            Some(len) => {
+                let len = Rtu::complete(&mut reply, 0, unit_id, len);
+                send(port, &reply[..len]).await
+            }
+        }
+    }
+
+    /// Serves ASCII frames until the device is lost.
+    async fn serve_ascii(&self, context: &ListenerContext, port: &SerialPort) -> io::Error {
+        let damaged = &self.unit_server.counters.frames.damaged;
+        let mut input = [0; 256];
+        let mut frame: Vec<u8> = Vec::with_capacity(ascii::MAX_LEN);
+        loop {
+            let read = if frame.is_empty() {
+                port.read(&mut input).await
+            } else {
+                match timeout(CHARACTER_TIMEOUT, port.read(&mut input)).await {
+                    Ok(read) => read,
+                    Err(_) => {
+                        damaged.add();
+                        frame.clear();
+                        continue;
+                    }
+                }
+            };
+            let len = match read {
+                Ok(0) => return io::ErrorKind::UnexpectedEof.into(),
+                Ok(len) => len,
+                Err(error) => return error,
+            };
+            for &character in &input[..len] {
+                let ends =
+                    character == self.unit_server.ascii_delimiter() && frame.last() == Some(&b'\r');
+                if character == b':' && !ends {
+                    if !frame.is_empty() {
+                        damaged.add();
+                    }
+                    frame.clear();
+                } else if frame.is_empty() {
+                    // Between frames: nothing that is for anybody.
+                    continue;
+                } else if frame.len() == ascii::MAX_LEN {
+                    damaged.add();
+                    frame.clear();
+                    continue;
+                }
+                frame.push(character);
+                if ends {
+                    if let Err(error) = self.answer_ascii(context, port, &mut frame).await {
+                        return error;
+                    }
+                    frame.clear();
+                }
+            }
+        }
+    }
+
+    async fn answer_ascii(
+        &self,
+        context: &ListenerContext,
+        port: &SerialPort,
+        frame: &mut [u8],
+    ) -> io::Result<()> {
+        if let Some(delimiter) = frame.last_mut() {
+            *delimiter = b'\n';
+        }
+        let mut body = [0; pdu::MAX_LEN + 2];
+        let Ok((unit_id, request)) = ascii::decode(frame, &mut body) else {
+            self.unit_server.counters.frames.damaged.add();
+            return Ok(());
+        };
+        let mut buffer = [0; pdu::MAX_LEN];
+        let Some(len) = self.answer(context, unit_id, request, &mut buffer) else {
+            return Ok(());
+        };
+        let mut reply = [0; ascii::MAX_LEN];
+        match ascii::encode(unit_id, &buffer[..len], &mut reply) {
+            None => Ok(()),
+            Some(len) => send(port, &reply[..len]).await,
+        }
+    }
+
+    /// The length of the reply, if one is due.
+    fn answer(
+        &self,
+        context: &ListenerContext,
+        unit_id: u8,
+        request: &[u8],
+        reply: &mut pdu::Buffer,
+    ) -> Option<usize> {
+        if unit_id == BROADCAST {
+            self.broadcast(context, request);
+            return None;
+        }
+        if self.rights.memory(unit_id).is_none() {
+            self.unit_server.counters.frames.other_unit.add();
+            return None;
+        }
+        let len = self.unit_server.answer(&self.rights, unit_id, request, reply);
+        if let Some(auditor) = &context.auditor {
+            let reply = &reply[..len.unwrap_or_default()];
+            auditor.note(&context.name, None, unit_id, request, reply);
+        }
+        len
+    }
+
+    /// A write for all: every memory takes it, nobody replies.
+    fn broadcast(&self, context: &ListenerContext, request: &[u8]) {
+        let function = request.first().copied().and_then(Function::from_code);
+        let wanted = function
+            .is_some_and(|code| code.is_write() && code != Function::ReadWriteMultipleRegisters);
+        if !wanted {
+            self.unit_server.counters.frames.other_unit.add();
+            return;
+        }
+        self.unit_server.broadcast(&self.rights, request, |reply| {
+            if let Some(auditor) = &context.auditor {
+                auditor.note(&context.name, None, BROADCAST, request, reply);
+            }
+        });
+    }
+}
+
+/// Sends a reply; a line that does not take it is held to be lost.
+async fn send(port: &SerialPort, reply: &[u8]) -> io::Result<()> {
+    timeout(STUCK, port.write_all(reply))
+        .await
+        .map_err(|_| io::Error::from(io::ErrorKind::TimedOut))?
+}

@@ -1,0 +1,158 @@
+//! Modbus over TCP connections: what a listener for Modbus TCP, with or without TLS, or RTU over TCP,
+//! serves.
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use super::admission::Ticket;
+use super::connection::{Connection, Timeouts};
+use super::event::Kind;
+use super::framing::{Framing, Mbap, Rtu};
+use super::listener::{Admitted, ConnectionLimits, ListenerContext, Service, drain, set_options};
+use super::policy::{PeerRights, Policy, Rule};
+use super::stream::Stream;
+use super::tls::ServerTlsStream;
+use super::unit_server::UnitServer;
+use crate::tls::server::ServerTls;
+
+/// How a TCP stream carries Modbus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StreamFraming {
+    /// Modbus TCP: an MBAP header before each PDU.
+    Mbap,
+    /// RTU over TCP: frames of a serial line, one behind the other.
+    Rtu,
+}
+
+/// A listener for Modbus over TCP connections.
+#[derive(Debug, Clone)]
+pub struct StreamSettings {
+    /// Port 0 lets the system pick one. `[::]` takes IPv4 connections too.
+    pub bind: SocketAddr,
+    pub framing: StreamFraming,
+    pub rules: Vec<Rule>,
+    pub limits: ConnectionLimits,
+    /// How long a connection may be without a request; `None` keeps it.
+    pub idle_timeout: Option<Duration>,
+    /// From the first byte of a request to its last, and for a peer to take its replies.
+    /// With TLS also for its handshake.
+    pub request_timeout: Duration,
+    /// `None` is plain TCP.
+    pub tls: Option<Arc<ServerTls>>,
+}
+
+pub(crate) struct ModbusStream {
+    unit_server: Arc<UnitServer>,
+    policy: Policy<PeerRights>,
+    timeouts: Timeouts,
+    framing: StreamFraming,
+    tls: Option<Arc<ServerTls>>,
+}
+
+impl ModbusStream {
+    pub(crate) fn new(settings: &StreamSettings, unit_server: Arc<UnitServer>) -> ModbusStream {
+        ModbusStream {
+            unit_server,
+            policy: Policy::of(&settings.rules),
+            timeouts: Timeouts { idle: settings.idle_timeout, request: settings.request_timeout },
+            framing: settings.framing,
+            tls: settings.tls.clone(),
+        }
+    }
+
+    async fn connection<F: Framing>(
+        &self,
+        context: Arc<ListenerContext>,
+        admitted: Admitted<PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) {
+        match &self.tls {
+            None => {
+                let Admitted { stream, peer, rights, ticket, .. } = admitted;
+                self.modbus::<F, _>(context, (stream, peer), rights, ticket, stop).await;
+            }
+            // Apart, so that a plain connection takes no room for it.
+            Some(tls) => Box::pin(self.secure::<F>(tls, context, admitted, stop)).await,
+        }
+    }
+
+    /// Settles by the peer's certificate what it may do, and serves it.
+    async fn secure<F: Framing>(
+        &self,
+        tls: &ServerTls,
+        context: Arc<ListenerContext>,
+        admitted: Admitted<PeerRights>,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let Admitted { stream, peer, ticket, .. } = admitted;
+        let mut stream = match ServerTlsStream::new(stream, tls) {
+            Ok(stream) => stream,
+            Err(end) => return context.ended(end, peer),
+        };
+        let patience = self.timeouts.request;
+        let shaken = tokio::select! {
+            biased;
+            _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
+            shaken = timeout(patience, stream.handshake(patience)) => shaken,
+        };
+        let role = match shaken {
+            Ok(Ok(())) => stream.role(),
+            Ok(Err(Kind::Closed)) => return context.ended(Kind::TlsFailed("closed"), peer),
+            Ok(Err(end)) => Err(end),
+            Err(_) => return context.ended(Kind::TlsFailed("timeout"), peer),
+        };
+        match role {
+            Ok(role) => {
+                if let Some(rights) = self.policy.grant_of_role(peer.ip(), &role) {
+                    let rights = Arc::clone(rights);
+                    return self
+                        .modbus::<F, _>(context, (stream, peer), rights, ticket, stop)
+                        .await;
+                }
+                context.refuse_role(peer, &role);
+                stream.say_end();
+            }
+            Err(end) => context.ended(end, peer),
+        }
+        drain(&stream.into_socket(), stop).await;
+    }
+
+    async fn modbus<F: Framing, S: Stream>(
+        &self,
+        context: Arc<ListenerContext>,
+        stream: (S, SocketAddr),
+        rights: Arc<PeerRights>,
+        ticket: Ticket,
+        stop: watch::Receiver<bool>,
+    ) {
+        let unit_server = Arc::clone(&self.unit_server);
+        let connection =
+            Connection::<F, S>::new(context, unit_server, stream, rights, self.timeouts, ticket);
+        connection.run(stop).await;
+    }
+}
+
+impl Service for ModbusStream {
+    type PeerRights = PeerRights;
+
+    fn rights(&self, peer: IpAddr) -> Option<&Arc<PeerRights>> {
+        self.policy.rights(peer)
+    }
+
+    async fn serve(
+        self: Arc<Self>,
+        context: Arc<ListenerContext>,
+        connection: Admitted<PeerRights>,
+        stop: watch::Receiver<bool>,
+    ) {
+        set_options(&connection.stream);
+        match self.framing {
+            StreamFraming::Mbap => self.connection::<Mbap>(context, connection, stop).await,
+            StreamFraming::Rtu => self.connection::<Rtu>(context, connection, stop).await,
+        }
+    }
+}

@@ -1,0 +1,161 @@
+//! Modbus over UDP: one request a datagram, one reply, from the address that was asked.
+
+use std::io::{self, ErrorKind, IoSliceMut};
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use holdfast_protocol::frame::mbap;
+use holdfast_protocol::pdu;
+use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
+use socket2::SockRef;
+use tokio::io::Interest;
+use tokio::net::UdpSocket;
+use tokio::sync::watch;
+
+use super::framing::{Framing, Mbap, Next};
+use super::listener::ListenerContext;
+use super::policy::{PeerRights, Policy, Rule};
+use super::unit_server::UnitServer;
+
+/// Bytes taken from a socket at once: the system may hand over several datagrams of one peer.
+const INPUT: usize = 64 * 1024;
+
+/// How often the rest of the input is taken before all stops.
+const LAST_READS: usize = 1024;
+
+/// A listener for Modbus datagrams.
+#[derive(Debug, Clone)]
+pub struct UdpSettings {
+    /// Port 0 lets the system pick one. `[::]` takes IPv4 datagrams too.
+    pub bind: SocketAddr,
+    pub rules: Vec<Rule>,
+}
+
+pub(crate) struct ModbusUdp {
+    unit_server: Arc<UnitServer>,
+    policy: Policy<PeerRights>,
+}
+
+impl ModbusUdp {
+    pub(crate) fn new(settings: &UdpSettings, unit_server: Arc<UnitServer>) -> ModbusUdp {
+        ModbusUdp { unit_server, policy: Policy::of(&settings.rules) }
+    }
+
+    /// Answers datagrams until `stop`, then those that the system has received already.
+    pub(crate) async fn serve(
+        self,
+        context: Arc<ListenerContext>,
+        socket: std::net::UdpSocket,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let Ok(state) = UdpSocketState::new((&socket).into()) else { return };
+        let Ok(socket) = UdpSocket::from_std(socket) else { return };
+        let socket = Datagrams { socket, state };
+        let mut input = vec![0; INPUT].into_boxed_slice();
+        loop {
+            let ready = tokio::select! {
+                biased;
+                _ = stop.wait_for(|stop| *stop) => break,
+                ready = socket.socket.readable() => ready,
+            };
+            // An error tells of an earlier reply that could not be delivered.
+            let received = ready.and_then(|()| {
+                socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
+            });
+            if let Ok(meta) = received {
+                self.take(&context, &socket, &meta, &input);
+            }
+        }
+        for _ in 0..LAST_READS {
+            match socket.receive(&mut input) {
+                Ok(meta) => self.take(&context, &socket, &meta, &input),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(_) => {}
+            }
+        }
+    }
+
+    /// Answers all datagrams that came at once, which have one length but for the last.
+    fn take(&self, context: &ListenerContext, socket: &Datagrams, meta: &RecvMeta, input: &[u8]) {
+        let mut output = [0; mbap::MAX_LEN];
+        let mut rest = &input[..meta.len];
+        loop {
+            let (datagram, more) = rest.split_at(meta.stride.min(rest.len()));
+            let len = self.answer(context, meta.addr, datagram, &mut output);
+            if len > 0 {
+                socket.send(&output[..len], meta);
+            }
+            if more.is_empty() || datagram.is_empty() {
+                return;
+            }
+            rest = more;
+        }
+    }
+
+    /// The length of the reply, 0 when none is due.
+    fn answer(
+        &self,
+        context: &ListenerContext,
+        peer: SocketAddr,
+        datagram: &[u8],
+        output: &mut [u8; mbap::MAX_LEN],
+    ) -> usize {
+        let Some(rights) = self.policy.rights(peer.ip()) else {
+            context.refuse_source(peer);
+            return 0;
+        };
+        let frames = &self.unit_server.counters.frames;
+        let (tag, unit_id, request) = match Mbap::next(datagram) {
+            Next::Request { tag, unit_id, pdu, len } if len == datagram.len() => {
+                (tag, unit_id, pdu)
+            }
+            Next::Foreign { .. } => {
+                frames.foreign.add();
+                return 0;
+            }
+            _ => {
+                frames.broken.add();
+                return 0;
+            }
+        };
+        let Some(buffer) = output[Mbap::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
+            return 0;
+        };
+        let len = self.unit_server.answer(rights, unit_id, request, buffer);
+        if let Some(auditor) = &context.auditor {
+            let reply = &buffer[..len.unwrap_or_default()];
+            auditor.note(&context.name, Some(peer), unit_id, request, reply);
+        }
+        len.map_or(0, |len| Mbap::complete(output, tag, unit_id, len))
+    }
+}
+
+/// A socket that tells which of its addresses was asked.
+struct Datagrams {
+    socket: UdpSocket,
+    state: UdpSocketState,
+}
+
+impl Datagrams {
+    fn receive(&self, input: &mut [u8]) -> io::Result<RecvMeta> {
+        let mut meta = [RecvMeta::default()];
+        self.state.recv((&self.socket).into(), &mut [IoSliceMut::new(input)], &mut meta)?;
+        Ok(meta[0])
+    }
+
+    /// A reply that the system has no room for is lost, as any datagram can be.
+    fn send(&self, reply: &[u8], to: &RecvMeta) {
+        let transmit = Transmit {
+            destination: to.addr,
+            ecn: None,
+            contents: reply,
+            segment_size: None,
+            src_ip: to.dst_ip,
+        };
+        // The system is asked, whatever the runtime knows of the socket: it may know nothing yet.
+        if self.state.try_send((&self.socket).into(), &transmit).is_err() {
+            // What was asked need not be an address of this machine: a broadcast is none.
+            let _ = SockRef::from(&self.socket).send_to(reply, &to.addr.into());
+        }
+    }
+}

@@ -1,0 +1,296 @@
+//! From a request PDU to its reply: what the units of one listener do, whatever the transport.
+//!
+//! The order of checks: the function is known and allowed (exception 01), the unit is mapped (0B),
+//! form, quantity and value are right (03), the memory is open (06), the range is inside its area
+//! (02). A denied function is answered before the unit is looked up, so that a stranger can't learn
+//! which units there are. A unit in listen only mode answers nothing at all.
+
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+
+use holdfast_memory::{Access, Area, Memory, Read, Refusal, Write};
+use holdfast_protocol::pdu::{
+    self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
+};
+
+use super::counters::{Bus, Counters};
+use super::identity::Identity;
+use super::policy::PeerRights;
+
+/// Run indicator "on" of Report Server ID (V1.1b3, 6.13).
+const RUNNING: u8 = 0xFF;
+
+/// The units of one listener.
+#[derive(Debug)]
+pub struct UnitServer {
+    pub counters: Counters,
+    identity: Identity,
+    /// Units in listen only mode (V1.1b3, 6.8.1, sub-function 04).
+    silent: [AtomicBool; 256],
+    /// The last character of an ASCII frame (V1.1b3, 6.8.1, sub-function 03).
+    ascii_delimiter: AtomicU8,
+}
+
+impl UnitServer {
+    pub fn new(identity: Identity) -> UnitServer {
+        let silent = [const { AtomicBool::new(false) }; 256];
+        let ascii_delimiter = AtomicU8::new(b'\n');
+        UnitServer { counters: Counters::default(), identity, silent, ascii_delimiter }
+    }
+
+    /// The character that ends an ASCII frame, behind a carriage return.
+    pub fn ascii_delimiter(&self) -> u8 {
+        self.ascii_delimiter.load(Ordering::Relaxed)
+    }
+
+    /// Carries out a request and writes the reply; its length, or `None` when no reply is due.
+    #[inline]
+    pub fn answer(
+        &self,
+        rights: &PeerRights,
+        unit_id: u8,
+        request: &[u8],
+        reply: &mut Buffer,
+    ) -> Option<usize> {
+        let function_code = request.first().copied().unwrap_or_default();
+        self.counters.request(function_code);
+        match self.serve(rights, unit_id, function_code, request, reply) {
+            Ok(Some(len)) => {
+                if function_code != Function::GetCommEventCounter.code() {
+                    self.counters.events.add();
+                }
+                Some(len)
+            }
+            Ok(None) => {
+                self.counters.unanswered.add();
+                None
+            }
+            Err(code) => {
+                self.counters.exception(code);
+                Some(reply::exception(function_code, code, reply))
+            }
+        }
+    }
+
+    /// Carries out a write that is addressed to all (Serial Line V1.02, 2.1): one message without a
+    /// reply, however many memories take it. `note` gets what each would have answered.
+    pub fn broadcast(&self, rights: &PeerRights, request: &[u8], mut note: impl FnMut(&[u8])) {
+        let function_code = request.first().copied().unwrap_or_default();
+        self.counters.request(function_code);
+        self.counters.unanswered.add();
+        let (mut carried_out, mut refused) = (false, None);
+        for unit_id in rights.one_unit_of_each_memory(|unit_id| !self.is_silent(unit_id)) {
+            let mut reply = [0; pdu::MAX_LEN];
+            let len = match self.serve(rights, unit_id, function_code, request, &mut reply) {
+                Ok(len) => {
+                    carried_out = true;
+                    len.unwrap_or_default()
+                }
+                Err(code) => {
+                    refused = refused.or(Some(code));
+                    reply::exception(function_code, code, &mut reply)
+                }
+            };
+            note(&reply[..len]);
+        }
+        match refused {
+            Some(code) => self.counters.exception(code),
+            None if carried_out => self.counters.events.add(),
+            None => {}
+        }
+    }
+
+    #[inline]
+    fn is_silent(&self, unit_id: u8) -> bool {
+        self.silent[usize::from(unit_id)].load(Ordering::Relaxed)
+    }
+
+    #[inline]
+    fn serve(
+        &self,
+        rights: &PeerRights,
+        unit_id: u8,
+        function_code: u8,
+        pdu: &[u8],
+        reply: &mut Buffer,
+    ) -> Result<Option<usize>, ExceptionCode> {
+        let request = Request::parse(pdu);
+        let denied = !rights.allows(function_code) || denied(rights, pdu, &request);
+        let memory = rights.memory(unit_id);
+        if memory.is_some() && self.is_silent(unit_id) {
+            if !denied {
+                self.listen(unit_id, &request);
+            }
+            return Ok(None);
+        }
+        if denied {
+            return Err(ExceptionCode::IllegalFunction);
+        }
+        let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
+        match request? {
+            Request::ReadCoils(range) => {
+                read(memory, Area::Coils, Function::ReadCoils, range, reply)
+            }
+            Request::ReadDiscreteInputs(range) => {
+                read(memory, Area::DiscreteInputs, Function::ReadDiscreteInputs, range, reply)
+            }
+            Request::ReadHoldingRegisters(range) => {
+                read(memory, Area::HoldingRegisters, Function::ReadHoldingRegisters, range, reply)
+            }
+            Request::ReadInputRegisters(range) => {
+                read(memory, Area::InputRegisters, Function::ReadInputRegisters, range, reply)
+            }
+            Request::WriteSingleCoil { address, value } => {
+                let bytes = [u8::from(value)];
+                write(memory, Area::Coils, Range { address, quantity: 1 }, &bytes)?;
+                Ok(reply::echo(pdu, reply))
+            }
+            Request::WriteSingleRegister { address, value } => {
+                let bytes = value.to_be_bytes();
+                write(memory, Area::HoldingRegisters, Range { address, quantity: 1 }, &bytes)?;
+                Ok(reply::echo(pdu, reply))
+            }
+            Request::WriteMultipleCoils { range, bits } => {
+                write(memory, Area::Coils, range, bits)?;
+                Ok(reply::echo(&pdu[..5], reply))
+            }
+            Request::WriteMultipleRegisters { range, registers } => {
+                write(memory, Area::HoldingRegisters, range, registers)?;
+                Ok(reply::echo(&pdu[..5], reply))
+            }
+            Request::MaskWriteRegister { address, and_mask, or_mask } => {
+                let area = Area::HoldingRegisters;
+                let done = memory.mask_write(Access::Client, area, address, and_mask, or_mask);
+                done.map_err(exception).map(|()| reply::echo(pdu, reply))
+            }
+            Request::ReadWriteMultipleRegisters { read, write, registers } => {
+                let area = Area::HoldingRegisters;
+                let function = Function::ReadWriteMultipleRegisters;
+                let (out, len) = reply::counted(function, byte_len(area, read), reply);
+                let done = memory.write_then_read(
+                    Access::Client,
+                    writing(area, write, registers),
+                    reading(area, read, out),
+                );
+                done.map_err(exception).map(|()| len)
+            }
+            _ if memory.sealed() => Err(ExceptionCode::ServerDeviceBusy),
+            Request::Diagnostics(asked) => {
+                return Ok(self.diagnose(unit_id, asked, pdu, reply));
+            }
+            Request::GetCommEventCounter => {
+                Ok(reply::event_counter(self.counters.bus().events as u16, reply))
+            }
+            Request::ReportServerId => {
+                let text = &self.identity.card(unit_id).text;
+                let (out, len) =
+                    reply::counted(Function::ReportServerId, text.len() as u8 + 2, reply);
+                out[0] = unit_id;
+                out[1] = RUNNING;
+                out[2..].copy_from_slice(text);
+                Ok(len)
+            }
+            Request::ReadDeviceIdentification { code, object_id } => {
+                self.identity.card(unit_id).objects.reply(code, object_id, reply)
+            }
+        }
+        .map(Some)
+    }
+
+    /// A unit in listen only mode does one thing: it ends that mode, without a reply.
+    fn listen(&self, unit_id: u8, request: &Result<Request<'_>, ExceptionCode>) {
+        if let Ok(Request::Diagnostics(Diagnostics { sub_function, .. })) = request
+            && *sub_function == SubFunction::RestartCommunications
+        {
+            self.silent[usize::from(unit_id)].store(false, Ordering::Relaxed);
+            self.counters.clear_bus(Bus { no_response: 1, ..Bus::default() });
+        }
+    }
+
+    /// Function 8. The counters are the listener's, their low 16 bits are sent.
+    fn diagnose(
+        &self,
+        unit_id: u8,
+        asked: Diagnostics<'_>,
+        pdu: &[u8],
+        reply: &mut Buffer,
+    ) -> Option<usize> {
+        let bus = self.counters.bus();
+        let count = match asked.sub_function {
+            SubFunction::ReturnQueryData => return Some(reply::echo(pdu, reply)),
+            SubFunction::ChangeAsciiInputDelimiter => {
+                let delimiter = asked.data.first().copied().unwrap_or(b'\n');
+                self.ascii_delimiter.store(delimiter, Ordering::Relaxed);
+                return Some(reply::echo(pdu, reply));
+            }
+            SubFunction::RestartCommunications | SubFunction::ClearCounters => {
+                self.counters.clear_bus(Bus { events: 1, ..Bus::default() });
+                return Some(reply::echo(pdu, reply));
+            }
+            SubFunction::ForceListenOnlyMode => {
+                self.silent[usize::from(unit_id)].store(true, Ordering::Relaxed);
+                return None;
+            }
+            // Nothing here overruns or refuses with a negative acknowledge.
+            SubFunction::ClearOverrunCounter => return Some(reply::echo(pdu, reply)),
+            SubFunction::ReturnServerNakCount
+            | SubFunction::ReturnBusCharacterOverrunCount
+            | SubFunction::ReturnDiagnosticRegister => 0,
+            SubFunction::ReturnBusMessageCount => bus.messages,
+            SubFunction::ReturnBusCommunicationErrorCount => bus.communication_errors,
+            SubFunction::ReturnBusExceptionErrorCount => bus.exceptions,
+            SubFunction::ReturnServerMessageCount => bus.server_messages,
+            SubFunction::ReturnServerNoResponseCount => bus.no_response,
+            SubFunction::ReturnServerBusyCount => bus.busy,
+        };
+        Some(reply::diagnostics(asked.sub_function, count as u16, reply))
+    }
+}
+
+/// Whether a sub-function is unknown, or one that a read-only peer may not use: judged, like the
+/// function, before anything else of the request.
+fn denied(rights: &PeerRights, pdu: &[u8], request: &Result<Request<'_>, ExceptionCode>) -> bool {
+    if *request == Err(ExceptionCode::IllegalFunction) {
+        return true;
+    }
+    let diagnostics = pdu.first() == Some(&Function::Diagnostics.code());
+    diagnostics
+        && rights.read_only()
+        && Diagnostics::sub_function(pdu).is_some_and(SubFunction::changes_state)
+}
+
+fn byte_len(area: Area, range: Range) -> u8 {
+    area.byte_len(usize::from(range.quantity)) as u8
+}
+
+fn reading(area: Area, range: Range, out: &mut [u8]) -> Read<'_> {
+    Read { area, address: range.address, count: usize::from(range.quantity), out }
+}
+
+fn writing(area: Area, range: Range, bytes: &[u8]) -> Write<'_> {
+    Write { area, address: range.address, count: usize::from(range.quantity), bytes }
+}
+
+#[inline]
+fn read(
+    memory: &Memory,
+    area: Area,
+    function: Function,
+    range: Range,
+    reply: &mut Buffer,
+) -> Result<usize, ExceptionCode> {
+    let (out, len) = reply::counted(function, byte_len(area, range), reply);
+    memory.read(Access::Client, reading(area, range, out)).map_err(exception).map(|()| len)
+}
+
+#[inline]
+fn write(memory: &Memory, area: Area, range: Range, bytes: &[u8]) -> Result<(), ExceptionCode> {
+    memory.write(Access::Client, writing(area, range, bytes)).map_err(exception)
+}
+
+fn exception(refusal: Refusal) -> ExceptionCode {
+    match refusal {
+        Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
+        Refusal::OutOfRange | Refusal::GateBit => ExceptionCode::IllegalDataAddress,
+        Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
+    }
+}

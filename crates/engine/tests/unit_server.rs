@@ -1,0 +1,120 @@
+//! Broadcasts and listen only mode, and what is counted of them.
+
+use std::sync::Arc;
+
+use holdfast_engine::server::counters::Bus;
+use holdfast_engine::server::identity::Identity;
+use holdfast_engine::server::policy::{AccessMode, Functions, PeerRights, Rule};
+use holdfast_engine::server::unit_server::UnitServer;
+use holdfast_memory::{Area, Layout, Memory, Span};
+use holdfast_protocol::pdu;
+
+const READ: &[u8] = &[3, 0, 0, 0, 1];
+const WRITE: &[u8] = &[6, 0, 0, 0x12, 0x34];
+const LISTEN_ONLY: &[u8] = &[8, 0, 4, 0, 0];
+const RESTART: &[u8] = &[8, 0, 1, 0, 0];
+
+fn memory(registers: u32) -> Arc<Memory> {
+    let span = Span::new(0, registers).unwrap();
+    Arc::new(Memory::new(Layout::default().with(Area::HoldingRegisters, span), None).unwrap())
+}
+
+fn rights(units: &[(u8, &Arc<Memory>)], rights: AccessMode) -> PeerRights {
+    let units = units.iter().map(|(unit_id, memory)| (*unit_id, Arc::clone(memory))).collect();
+    PeerRights::new(&Rule {
+        sources: Vec::new(),
+        roles: None,
+        units,
+        access: rights,
+        functions: Functions::All,
+    })
+}
+
+fn unit_server() -> UnitServer {
+    let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
+    UnitServer::new(Identity::new(&objects, &[]).unwrap())
+}
+
+fn ask(
+    unit_server: &UnitServer,
+    rights: &PeerRights,
+    unit_id: u8,
+    request: &[u8],
+) -> Option<Vec<u8>> {
+    let mut reply = [0; pdu::MAX_LEN];
+    let len = unit_server.answer(rights, unit_id, request, &mut reply)?;
+    Some(reply[..len].to_vec())
+}
+
+fn broadcast(unit_server: &UnitServer, rights: &PeerRights, request: &[u8]) -> Vec<Vec<u8>> {
+    let mut replies = Vec::new();
+    unit_server.broadcast(rights, request, |reply| replies.push(reply.to_vec()));
+    replies
+}
+
+#[test]
+fn a_broadcast_is_one_message_however_many_memories_take_it() {
+    let (one, other, unit_server) = (memory(1), memory(1), unit_server());
+    let rights = rights(&[(7, &one), (8, &other), (9, &one)], AccessMode::ReadWrite);
+    assert_eq!(broadcast(&unit_server, &rights, WRITE), [WRITE, WRITE]);
+    assert_eq!(
+        unit_server.counters.bus(),
+        Bus { messages: 1, server_messages: 1, no_response: 1, events: 1, ..Bus::default() }
+    );
+    for unit_id in [7, 8] {
+        assert_eq!(ask(&unit_server, &rights, unit_id, READ).unwrap(), [3, 2, 0x12, 0x34]);
+    }
+}
+
+#[test]
+fn a_broadcast_that_one_memory_refuses_is_one_exception_and_no_event() {
+    let (one, other, small) = (memory(9), memory(1), memory(2));
+    let unit_server = unit_server();
+    let rights = rights(&[(7, &one), (8, &other), (9, &small)], AccessMode::ReadWrite);
+    let replies = broadcast(&unit_server, &rights, &[6, 0, 5, 0, 1]);
+    assert_eq!(replies, [vec![6, 0, 5, 0, 1], vec![0x86, 2], vec![0x86, 2]]);
+    let bus = unit_server.counters.bus();
+    assert_eq!((bus.exceptions, bus.events, bus.no_response), (1, 0, 1));
+}
+
+#[test]
+fn a_broadcast_passes_over_units_in_listen_only_mode() {
+    let (one, other, unit_server) = (memory(1), memory(1), unit_server());
+    let rights = rights(&[(7, &one), (8, &other), (9, &other)], AccessMode::ReadWrite);
+    for unit_id in [7, 8] {
+        assert_eq!(ask(&unit_server, &rights, unit_id, LISTEN_ONLY), None);
+    }
+    assert_eq!(broadcast(&unit_server, &rights, WRITE), [WRITE]);
+    assert_eq!(ask(&unit_server, &rights, 9, READ).unwrap(), [3, 2, 0x12, 0x34]);
+    assert_eq!(ask(&unit_server, &rights, 7, RESTART), None);
+    assert_eq!(ask(&unit_server, &rights, 7, READ).unwrap(), [3, 2, 0, 0]);
+}
+
+#[test]
+fn a_unit_in_listen_only_mode_does_not_even_answer_what_it_denies() {
+    let (memory, unit_server) = (memory(1), unit_server());
+    let all = rights(&[(7, &memory)], AccessMode::ReadWrite);
+    let read_only = rights(&[(7, &memory)], AccessMode::ReadOnly);
+    let elsewhere = rights(&[(8, &memory)], AccessMode::ReadWrite);
+    assert_eq!(ask(&unit_server, &all, 7, LISTEN_ONLY), None);
+    assert_eq!(ask(&unit_server, &all, 7, &[99]), None);
+    for request in [WRITE, RESTART, &[43, 13, 0, 0]] {
+        assert_eq!(ask(&unit_server, &read_only, 7, request), None);
+    }
+    assert_eq!(ask(&unit_server, &all, 7, READ), None);
+    assert_eq!(ask(&unit_server, &elsewhere, 7, READ).unwrap(), [0x83, 0x0B]);
+    assert_eq!(ask(&unit_server, &elsewhere, 7, &[99]).unwrap(), [0xE3, 1]);
+    assert_eq!(ask(&unit_server, &all, 7, RESTART), None);
+    assert_eq!(ask(&unit_server, &all, 7, READ).unwrap(), [3, 2, 0, 0]);
+}
+
+#[test]
+fn damaged_frames_are_errors_and_no_messages() {
+    let unit_server = unit_server();
+    unit_server.counters.frames.damaged.add_many(3);
+    unit_server.counters.frames.other_unit.add_many(2);
+    assert_eq!(
+        unit_server.counters.bus(),
+        Bus { messages: 2, communication_errors: 3, ..Bus::default() }
+    );
+}

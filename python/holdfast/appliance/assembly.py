@@ -1,0 +1,251 @@
+"""From a configuration to the native parts: memories, rules, listeners, devices, identity; and to
+what gateway and scanner are told.
+
+It converts, and starts nothing. Gateway and scanner are imported only where they are wanted.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, assert_never
+
+from holdfast import _core
+from holdfast.client.endpoint import endpoint
+from holdfast.client.target import Tls
+from holdfast.config import (
+    BrokerTlsConfig,
+    ModbusAsciiListener,
+    ModbusRtuListener,
+    ModbusRtuOverTcpListener,
+    ModbusTcpListener,
+    ModbusTlsListener,
+    ModbusUdpListener,
+    RawIngestListener,
+)
+from holdfast.server import Identity
+from holdfast.tools import planning
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast._core import Memory
+    from holdfast.config import (
+        Config,
+        DestinationConfig,
+        GatewayConfig,
+        IdentityConfig,
+        Listener,
+        MemoryConfig,
+        NatsConfig,
+        RawRuleConfig,
+        RuleConfig,
+        SerialRuleConfig,
+        ServerTlsConfig,
+    )
+    from holdfast.gateway import Settings as GatewaySettings
+    from holdfast.scanner import Settings as ScannerSettings
+    from holdfast.types import Area
+
+SPREAD = 10.0
+"""Seconds over which the first polls of devices are spread, unless their interval is shorter."""
+
+DISABLED = 4
+"""The health of a device that is not polled, in its status block."""
+
+STATUS_NAME = 16
+"""Bytes of the name in a status block."""
+
+STATUS_BLOCK = 30
+"""Registers of a status block."""
+
+
+def memory(settings: MemoryConfig) -> Memory:
+    """The memory that a configuration describes, with its initial values."""
+    seal = settings.seal
+    made = _core.Memory(
+        **{area: (span.start, span.size) for area, span in settings.areas().items()},
+        seal=None if seal is None else (seal.area, seal.address, seal.mode),
+    )
+    writes = [(run.area, run.address, run.values) for run in settings.initial_values]
+    if writes:
+        made.write_many(writes)
+    return made
+
+
+def identity(settings: IdentityConfig) -> Identity:
+    """What the appliance says of itself."""
+    return Identity(
+        vendor_name=settings.vendor_name,
+        product_code=settings.product_code,
+        revision=settings.revision,
+        vendor_url=settings.vendor_url or "",
+        product_name=settings.product_name or "",
+        model_name=settings.model_name or "",
+        user_application_name=settings.user_application_name or "",
+        unit_names=settings.unit_names,
+        private_objects=settings.objects,
+    )
+
+
+def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.Listener:
+    """The native listener of that name."""
+    settings: Listener = config.listeners[name]
+    match settings:
+        case ModbusTcpListener() | ModbusTlsListener() | ModbusRtuOverTcpListener():
+            return _core.Listener(
+                name,
+                str(settings.bind),
+                [_rule(rule, memories) for rule in settings.rules],
+                framing="rtu" if settings.type == "modbus-rtu-over-tcp" else "mbap",
+                max_connections=settings.max_connections,
+                max_connections_per_source=settings.max_connections_per_source,
+                when_full=settings.when_full,
+                idle_timeout=settings.idle_timeout,
+                request_timeout=settings.request_timeout,
+                tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
+            )
+        case ModbusUdpListener():
+            rules = [_rule(rule, memories) for rule in settings.rules]
+            return _core.Listener.udp(name, str(settings.bind), rules)
+        case ModbusRtuListener() | ModbusAsciiListener():
+            line = settings.serial
+            return _core.Listener.serial(
+                name,
+                line.device,
+                _rule(settings.rules[0], memories),
+                mode="rtu" if settings.type == "modbus-rtu" else "ascii",
+                baud=line.baud,
+                parity=line.parity,
+                stop_bits=line.stop_bits,
+                data_bits=line.data_bits,
+                silence=settings.serial.silence if settings.type == "modbus-rtu" else None,
+            )
+        case RawIngestListener():
+            return _core.Listener.raw_ingest(
+                name,
+                str(settings.bind),
+                [_raw_rule(rule, config, memories) for rule in settings.rules],
+                format=settings.format,
+                crc=settings.crc or "required",
+                max_connections=settings.max_connections,
+                max_connections_per_source=settings.max_connections_per_source,
+                request_timeout=settings.request_timeout,
+            )
+        case _:
+            assert_never(settings)
+
+
+def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
+    """The certificates of a listener. Raises `ValueError` for a file that can't be used."""
+    return _core.ServerTls(
+        cert_file=settings.cert_file,
+        key_file=settings.key_file,
+        ca_file=settings.ca_file,
+        crl_file=settings.crl_file,
+    )
+
+
+def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.PolledDevice:
+    """The native poller's device of that name. Raises `OSError` for files it can't use."""
+    settings = config.devices[name]
+    status = settings.status
+    try:
+        made = endpoint(settings.target)
+    except (OSError, ValueError) as error:
+        raise OSError(f"devices.{name}.url: {error}") from error
+    return _core.PolledDevice(
+        name,
+        made,
+        unit=settings.unit,
+        interval=settings.interval,
+        timeout=settings.timeout,
+        reads=[
+            (read.area, read.address, read.count, _place(read.into, memories))
+            for read in settings.reads
+        ],
+        forward=[
+            (*each.receiver, each.format, each.crc or "required", each.target, each.timeout)
+            for each in settings.forward
+        ],
+        status=None if status is None else (memories[status.memory], status.area, status.slot),
+        start_within=min(settings.interval, SPREAD),
+        measured=settings.cost is not None and settings.cost.measured,
+        **planning.rules(settings),
+    )
+
+
+def disabled_status(name: str) -> list[int]:
+    """The status block of a device that is not polled."""
+    text = name.encode("ascii", "replace")[:STATUS_NAME].ljust(STATUS_NAME, b"\0")
+    told = [DISABLED, 0, 0, *struct.unpack(f">{STATUS_NAME // 2}H", text)]
+    return told + [0] * (STATUS_BLOCK - len(told))
+
+
+def gateway(settings: GatewayConfig) -> GatewaySettings:
+    """What the gateway is told."""
+    from holdfast.gateway import GatewayLimits, Settings
+
+    tokens = () if settings.tokens == "none" else settings.tokens
+    return Settings(
+        settings.allow,
+        writes=settings.access == "read-write",
+        tokens=tuple((token.name, bytes.fromhex(token.sha256)) for token in tokens),
+        sources=settings.sources,
+        limits=GatewayLimits(in_flight=settings.in_flight),
+        tls=gateway_tls(settings),
+    )
+
+
+def gateway_tls(settings: GatewayConfig) -> Tls:
+    """Whom the gateway trusts among devices, and what it shows them."""
+    given = settings.tls
+    files = () if given is None else (given.ca_file, given.cert_file, given.key_file)
+    return Tls(*(None if file is None else str(file) for file in files))
+
+
+def scanner(settings: NatsConfig) -> ScannerSettings:
+    """What the scanner is told."""
+    from holdfast.scanner import DeviceTls, ScannerLimits, Servers, Settings
+
+    tls = settings.tls or BrokerTlsConfig()
+    servers = Servers(
+        settings.servers,
+        settings.username,
+        settings.password_file,
+        settings.token_file,
+        settings.credentials_file,
+        tls.ca_file,
+        tls.cert_file,
+        tls.key_file,
+    )
+    devices = tuple(str(entry) for entry in settings.devices)
+    limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
+    of = settings.device_tls
+    trust = DeviceTls() if of is None else DeviceTls(of.ca_file, of.cert_file, of.key_file)
+    return Settings(servers, settings.prefix, devices, limits, trust)
+
+
+def _place(
+    into: DestinationConfig | None, memories: Mapping[str, Memory]
+) -> tuple[Memory, Area, int] | None:
+    return None if into is None else (memories[into.memory], into.area, into.address)
+
+
+def _rule(rule: RuleConfig | SerialRuleConfig, memories: Mapping[str, Memory]) -> _core.Rule:
+    return _core.Rule(
+        {unit: memories[name] for unit, name in rule.units.items()},
+        sources=[str(source) for source in getattr(rule, "sources", ())],
+        access=rule.access,
+        functions=rule.functions,
+        deny=rule.deny,
+        roles=getattr(rule, "roles", None),
+    )
+
+
+def _raw_rule(rule: RawRuleConfig, config: Config, memories: Mapping[str, Memory]) -> _core.RawRule:
+    ids = ((config.memories[name].id, name) for name in rule.memories)
+    named = {memory_id: memories[name] for memory_id, name in ids if memory_id is not None}
+    units = {unit: memories[name] for unit, name in rule.units.items()}
+    return _core.RawRule(
+        units or named, sources=[str(source) for source in rule.sources], areas=list(rule.areas)
+    )

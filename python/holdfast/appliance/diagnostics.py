@@ -1,0 +1,76 @@
+"""What an appliance says of itself while it runs: one snapshot for REST, metrics and logs."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from holdfast._core import Engine, Memory, Poller
+    from holdfast.appliance.supervision import Supervisor
+    from holdfast.ingest import MemoryAccess
+    from holdfast.ingest.audit import Audit
+
+
+FAULTS = {0x8001: "timeout", 0x8002: "refused", 0x8003: "reset", 0x8004: "invalid reply"}
+"""Why a device did not answer, by the last error of its status block."""
+
+
+def fault(code: int) -> str:
+    """The last error of a device in words."""
+    return FAULTS.get(code, f"exception {code:02X}") if code else "none"
+
+
+class Diagnostics:
+    """Looks at the parts of a running appliance, from any thread, and changes nothing."""
+
+    def __init__(self, memories: Mapping[str, Memory], engine: Engine) -> None:
+        self._memories = memories
+        self._engine = engine
+        self._began = time.monotonic()
+        self.adapters: dict[str, tuple[Supervisor, MemoryAccess | None]] = {}
+        self.audit: Audit | None = None
+        self.poller: Poller | None = None
+        self.disabled: Sequence[str] = ()
+        """Devices that are not polled."""
+
+    def memories(self) -> dict[str, Any]:
+        """Each memory: its areas with start and size, sealed or not, how often it opened."""
+        return {
+            name: {
+                "areas": {
+                    area: {"start": addresses.start, "size": len(addresses)}
+                    for area, addresses in memory.areas.items()
+                },
+                "sealed": memory.sealed,
+                "opened": memory.seal_changes[0],
+                "closed": memory.seal_changes[1],
+            }
+            for name, memory in self._memories.items()
+        }
+
+    def stats(self) -> dict[str, Any]:
+        """Every counter, since the start: of listeners, devices, adapters, the log, the audit."""
+        return {
+            "uptime": round(time.monotonic() - self._began, 3),
+            "listeners": self._engine.counters(),
+            "devices": self.devices(),
+            "adapters": {name: self.adapter(name) for name in self.adapters},
+            "events_lost": self._engine.lost_events,
+            "audit": None if self.audit is None else self.audit.counts(),
+        }
+
+    def devices(self) -> dict[str, dict[str, Any]]:
+        """How each device does, and what was counted of it."""
+        polled = {} if self.poller is None else self.poller.counters()
+        return {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
+
+    def adapter(self, name: str) -> dict[str, Any] | None:
+        """How one adapter does, and what came in by its door; `None` when there is none."""
+        if name not in self.adapters:
+            return None
+        supervisor, memory_access = self.adapters[name]
+        counts = {} if memory_access is None else memory_access.counts()
+        return {**supervisor.status(), **counts}

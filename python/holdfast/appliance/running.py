@@ -1,0 +1,378 @@
+"""The appliance: memories, listeners, devices and adapters of a configuration, started, logged and
+stopped.
+
+It wires parts that know their work. It parses no protocol, and once started it takes no part in
+answering a request.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from holdfast import _core, logs
+from holdfast.adapters import foreign
+from holdfast.appliance import assembly
+from holdfast.appliance.diagnostics import Diagnostics, fault
+from holdfast.appliance.supervision import Supervisor
+from holdfast.client.endpoint import check_files
+from holdfast.config import ModbusAsciiListener, ModbusRtuListener
+from holdfast.ingest import MemoryAccess
+from holdfast.ingest.audit import Audit
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from holdfast.adapters import Adapter
+    from holdfast.client.target import Tls
+    from holdfast.config import (
+        Bind,
+        Config,
+        GatewayConfig,
+        Listener,
+        MetricsConfig,
+        RestConfig,
+    )
+
+# Everything else that a listener reports is a refusal or a fault.
+LEVELS = {
+    "opened": logging.DEBUG,
+    "closed": logging.DEBUG,
+    "idle": logging.DEBUG,
+    "line_back": logging.INFO,
+}
+
+# How many writes the audit log takes at once.
+AUDIT_BATCH = 1000
+
+# How often it is looked whether the health of a device has changed, in seconds.
+HEALTH_CHECK_INTERVAL = 1.0
+
+# How long a thread waits for the next event or write before it looks around, in seconds.
+WAIT_TIMEOUT = 0.2
+
+
+@dataclass(frozen=True)
+class ListenAddress:
+    """Where a part of the configuration is served: a socket, or a serial device."""
+
+    name: str
+    type: str
+    host: str
+    port: int | None
+    """`None` on a serial line, whose device is `host`."""
+    settings: Listener | RestConfig | GatewayConfig | MetricsConfig
+
+
+class Appliance:
+    """One configuration, running from `start` (or `with`) to `stop`.
+
+    Raises `OSError` from `start` when something can't be bound or opened, `UnknownAdapter` for an
+    adapter that is not installed; nothing is left running then.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.memories = {
+            name: assembly.memory(settings) for name, settings in config.memories.items()
+        }
+        self._running: _Running | None = None
+
+    def start(self) -> Self:
+        """Binds everything and serves. Raises `RuntimeError` when it runs already."""
+        if self._running is not None:
+            raise RuntimeError("the appliance runs already")
+        self._running = _Running(self.config, self.memories)
+        for endpoint in self.endpoints():
+            address = endpoint.host if endpoint.port is None else _joined(endpoint)
+            logs.write(logging.INFO, "listening", listener=endpoint.name, address=address)
+        return self
+
+    def stop(self) -> None:
+        """Answers what was received and ends."""
+        running, self._running = self._running, None
+        if running is not None:
+            running.stop()
+            logs.write(logging.INFO, "stopped")
+
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """What it says of itself. Raises `RuntimeError` when it does not run."""
+        return self._parts().diagnostics
+
+    def endpoints(self) -> list[ListenAddress]:
+        """Where everything is served, in the order of the configuration."""
+        return self._parts().endpoints
+
+    def log_events(self, timeout: float) -> None:
+        """Waits up to `timeout` seconds for an event, and logs it; also seals and devices."""
+        self._parts().log_events(timeout)
+
+    def _parts(self) -> _Running:
+        if self._running is None:
+            raise RuntimeError("the appliance does not run")
+        return self._running
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+class _Running:
+    """The parts of a running appliance; making it starts them all, or none."""
+
+    def __init__(self, config: Config, memories: dict[str, _core.Memory]) -> None:
+        self._config = config
+        self._memories = memories
+        self._supervisors: list[Supervisor] = []
+        self._lost_events = 0
+        self._seals = {name: memory.seal_changes for name, memory in memories.items()}
+        self._health = dict.fromkeys(config.devices, "unknown")
+        self._looked = time.monotonic()
+        # An adapter that is not installed, and a file that TLS of devices can't use, are told
+        # before any socket is opened.
+        for name, settings in config.adapters.items():
+            foreign.entry_point(name, settings)
+        if config.gateway is not None and config.gateway.tls is not None:
+            _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
+        devices = [
+            assembly.device(name, config, memories)
+            for name, device in config.devices.items()
+            if device.enabled
+        ]
+        disabled = self._tell_disabled()
+        with ExitStack() as undo:
+            self._audit = self._opened_audit(undo)
+            self._sockets = sockets = self._bound_sockets(undo)
+            self._engine = self._started_engine()
+            undo.callback(self._engine.stop)
+            self._poller = _core.Poller(devices) if devices else None
+            if self._poller is not None:
+                undo.callback(self._poller.stop)
+            self.endpoints = self._listed(sockets)
+            self.diagnostics = Diagnostics(memories, self._engine)
+            self.diagnostics.audit = self._audit
+            self.diagnostics.poller = self._poller
+            self.diagnostics.disabled = disabled
+            self._add_adapters(sockets)
+            undo.pop_all()
+        self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
+        self._stopped = threading.Event()
+        if self._audit is not None:
+            self._auditing.start()
+        for supervisor in self._supervisors:
+            supervisor.start()
+
+    def stop(self) -> None:
+        """Tells all parts to end, then waits for each."""
+        if self._poller is not None:
+            self._poller.stop()
+        for supervisor in self._supervisors:
+            supervisor.stop()
+        self._engine.stop()
+        self._stopped.set()
+        for supervisor in self._supervisors:
+            supervisor.join()
+        for bound in self._sockets.values():
+            bound.close()
+        if self._audit is not None:
+            self._auditing.join()
+            self._audit.close()
+
+    def log_events(self, timeout: float) -> None:
+        event = self._engine.next_event(timeout)
+        if event is not None:
+            self._log_event(*event)
+        lost = self._engine.lost_events
+        if lost > self._lost_events:
+            logs.write(logging.WARNING, "events_lost", count=lost - self._lost_events)
+            self._lost_events = lost
+        for name, memory in self._memories.items():
+            before, now = self._seals[name], memory.seal_changes
+            if now != before:
+                self._seals[name] = now
+                opened, closed = now[0] - before[0], now[1] - before[1]
+                state = "sealed" if memory.sealed else "open"
+                logs.write(
+                    logging.INFO, "seal", memory=name, state=state, opened=opened, closed=closed
+                )
+        if self._poller is not None and time.monotonic() - self._looked >= HEALTH_CHECK_INTERVAL:
+            self._looked = time.monotonic()
+            self._log_health(self._poller)
+
+    def _log_health(self, poller: _core.Poller) -> None:
+        """Logs which devices do better or worse than when it was looked last."""
+        for name, told in poller.counters().items():
+            health = told["health"]
+            if health == self._health[name]:
+                continue
+            self._health[name] = health
+            fields: dict[str, object] = {"device": name, "health": health}
+            if health == "error":
+                fields |= {"error": fault(told["last_error"]), "failures": told["failures"]}
+            logs.write(
+                logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields
+            )
+
+    def _log_event(self, listener: str, event: str, peer: str | None, reason: str | None) -> None:
+        fields = {"listener": listener, "peer": peer or "-"}
+        if reason is not None:
+            fields["role" if event == "refused_role" else "reason"] = reason
+        if event in LEVELS:
+            logs.write(LEVELS[event], event, **fields)
+        else:
+            logs.refused(event, kind=(listener, reason), **fields)
+
+    def _opened_audit(self, undo: ExitStack) -> Audit | None:
+        settings = self._config.audit
+        if settings is None:
+            return None
+        audit = Audit(settings.file, max_bytes=settings.max_bytes, keep=settings.keep)
+        undo.callback(audit.close)
+        return audit
+
+    def _bound_sockets(self, undo: ExitStack) -> dict[str, socket.socket]:
+        """The sockets of what is served over HTTP."""
+        sockets: dict[str, socket.socket] = {}
+        config = self._config
+        services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
+        for name, settings in services.items():
+            if settings is not None:
+                sockets[name] = _listening(name, settings.bind)
+                undo.callback(sockets[name].close)
+        return sockets
+
+    def _started_engine(self) -> _core.Engine:
+        config = self._config
+        identity = assembly.identity(config.identity)
+        return _core.Engine(
+            [assembly.listener(name, config, self._memories) for name in config.listeners],
+            identity=identity.objects(),
+            unit_names=identity.names(),
+            workers=config.workers,
+            events="all" if config.log.level == "debug" else "refusals",
+            audit=self._audit is not None,
+        )
+
+    def _tell_disabled(self) -> list[str]:
+        """Writes the status blocks of the devices that are not polled; their names."""
+        devices = self._config.devices
+        disabled = [name for name, settings in devices.items() if not settings.enabled]
+        for name in disabled:
+            status = devices[name].status
+            if status is not None:
+                told = assembly.disabled_status(name)
+                self._memories[status.memory].write(status.area, status.addresses.start, told)
+        return disabled
+
+    def _listed(self, sockets: dict[str, socket.socket]) -> list[ListenAddress]:
+        listeners = self._config.listeners.items()
+        endpoints: list[ListenAddress] = []
+        for (name, settings), address in zip(listeners, self._engine.addresses, strict=True):
+            if isinstance(settings, ModbusRtuListener | ModbusAsciiListener):
+                device = settings.serial.device
+                endpoints.append(ListenAddress(name, settings.type, device, None, settings))
+            elif address is not None:
+                endpoints.append(ListenAddress(name, settings.type, *address, settings))
+        for name, bound in sockets.items():
+            host, port = bound.getsockname()[:2]
+            service = getattr(self._config, name)
+            endpoints.append(ListenAddress(name, "http", host, port, service))
+        return endpoints
+
+    def _add_adapters(self, sockets: dict[str, socket.socket]) -> None:
+        config = self._config
+        if config.rest is not None:
+            from holdfast.adapters.rest import Rest
+
+            rest, memory_access = config.rest, self._memory_access("rest")
+            at = sockets["rest"]
+            self._add(
+                "rest", memory_access, lambda: Rest(rest, memory_access, self.diagnostics, at)
+            )
+        if config.mqtt is not None:
+            from holdfast.adapters.mqtt import Mqtt
+
+            mqtt, to_mqtt = config.mqtt, self._memory_access("mqtt")
+            self._add("mqtt", to_mqtt, lambda: Mqtt(mqtt, to_mqtt))
+        if config.nats is not None:
+            from holdfast.scanner.adapter import ScannerAdapter
+
+            scanner = assembly.scanner(config.nats)
+            self._add("nats", None, lambda: ScannerAdapter(scanner), may_end=True)
+        if config.gateway is not None:
+            from holdfast.gateway import Gateway
+
+            gateway, gateway_at = assembly.gateway(config.gateway), sockets["gateway"]
+            self._add("gateway", None, lambda: Gateway(gateway, gateway_at))
+        if config.metrics is not None:
+            from holdfast.adapters.metrics import Metrics
+
+            metrics, metrics_at = config.metrics, sockets["metrics"]
+            self._add("metrics", None, lambda: Metrics(metrics, self.diagnostics, metrics_at))
+        for name, settings in config.adapters.items():
+            own_door = self._memory_access(name)
+            self._add(name, own_door, foreign.factory(name, settings, own_door))
+
+    def _memory_access(self, name: str) -> MemoryAccess:
+        return MemoryAccess(name, self._memories, self._audit)
+
+    def _add(
+        self,
+        name: str,
+        memory_access: MemoryAccess | None,
+        factory: Callable[[], Adapter],
+        *,
+        may_end: bool = False,
+    ) -> None:
+        supervisor = Supervisor(name, factory, may_end=may_end)
+        self._supervisors.append(supervisor)
+        self.diagnostics.adapters[name] = (supervisor, memory_access)
+
+    def _take_writes(self) -> None:
+        """Brings the writes of listeners into the audit log, until all have stopped."""
+        audit, lost = self._audit, 0
+        assert audit is not None
+        while True:
+            ended = self._stopped.is_set()
+            writes = self._engine.next_writes(0 if ended else WAIT_TIMEOUT, AUDIT_BATCH)
+            for write in writes:
+                audit.write(**write)
+            missed = self._engine.lost_writes
+            if missed > lost:
+                audit.write(lost=missed - lost)
+                logs.write(logging.ERROR, "audit_lost", count=missed - lost)
+                lost = missed
+            if ended and not writes:
+                return
+
+
+def _listening(name: str, bind: Bind) -> socket.socket:
+    """The socket of a service. Raises `OSError`, which names both."""
+    from holdfast.web import host
+
+    try:
+        return host.listen(bind.host, bind.port)
+    except OSError as error:
+        message = f"{name}: can't listen on {bind}: {error.strerror or error}"
+        raise OSError(error.errno, message) from error
+
+
+def _check_files(name: str, tls: Tls) -> None:
+    """Raises `OSError`, which names them, for files that can't be used."""
+    try:
+        check_files(tls)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{name}: {error}") from error
+
+
+def _joined(endpoint: ListenAddress) -> str:
+    host = f"[{endpoint.host}]" if ":" in endpoint.host else endpoint.host
+    return f"{host}:{endpoint.port}"

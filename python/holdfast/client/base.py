@@ -1,0 +1,43 @@
+"""What both clients are made of: the device, the unit id and the timeout of a call."""
+
+from __future__ import annotations
+
+from holdfast._core import Request
+from holdfast.client.target import SerialTarget, parse
+
+MAX_TIMEOUT = 86_400.0
+
+BROADCASTS = (5, 6, 15, 16, 22)
+"""The functions that may be sent to all units of a serial line (V1.02, 2.1)."""
+
+
+class BaseClient:
+    """What both clients are made of."""
+
+    def __init__(self, url: str, unit: int, timeout: float) -> None:
+        self.target = parse(url)
+        self.unit = _unit(unit)
+        self.timeout = _timeout(timeout)
+
+    def unit_for(self, request: Request, unit: int | None) -> int:
+        """The unit id of a call. Raises `ValueError` for a broadcast that can't be one."""
+        unit = self.unit if unit is None else _unit(unit)
+        if unit == 0 and isinstance(self.target, SerialTarget):
+            code = request.pdu[0]
+            if code not in BROADCASTS:
+                raise ValueError(
+                    f"unit 0 of a serial line is the broadcast, not for function {code}"
+                )
+        return unit
+
+
+def _unit(unit: int) -> int:
+    if type(unit) is not int or not 0 <= unit <= 255:
+        raise ValueError(f"unit is {unit!r}, allowed are 0 to 255")
+    return unit
+
+
+def _timeout(seconds: float) -> float:
+    if not 0 < seconds <= MAX_TIMEOUT:
+        raise ValueError(f"timeout is {seconds!r}, allowed are more than 0 to 86400 seconds")
+    return float(seconds)

@@ -1,0 +1,219 @@
+"""`SyncClient`: a client that waits for each reply."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Self
+
+from holdfast._core import Request
+from holdfast.client import requests
+from holdfast.client.base import BaseClient
+from holdfast.client.endpoint import blocking
+from holdfast.errors import ModbusException
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.client.requests import Identification, Plan, Result, ServerId
+    from holdfast.types import Area
+
+
+class SyncClient(BaseClient):
+    """A client that waits: every method returns when the device has answered.
+
+    `url` names the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
+    `rtu+tcp://host:502`, `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`.
+    `unit` is the unit id, 0 to 255, that a call can replace. `timeout` in seconds covers
+    connecting, sending and receiving.
+
+    The files of a `tls` URL are read now: `OSError` and `ValueError` say what is wrong with them.
+
+    Threads may share a client; their calls take turns, for which `timeout` does not count.
+
+    Methods raise `ValueError` or `TypeError` before anything is sent, and `ModbusException`,
+    `ConnectionLost`, `RequestTimeout` or `InvalidResponse` after; all four are `ModbusError`.
+
+    >>> with holdfast.SyncClient("tcp://plc") as plc:
+    ...     plc.read_holding_registers(0, 3)
+    [11, 22, 33]
+    """
+
+    def __init__(self, url: str, *, unit: int = 1, timeout: float = 1.0) -> None:
+        super().__init__(url, unit, timeout)
+        self._core = blocking(self.target)
+
+    def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:
+        """`count` coils (function 1); more than 2000 take several requests."""
+        return self._run(requests.read_range("coils", address, count), unit)
+
+    def read_discrete_inputs(
+        self, address: int, count: int, *, unit: int | None = None
+    ) -> list[bool]:
+        """`count` discrete inputs (function 2); more than 2000 take several requests."""
+        return self._run(requests.read_range("discrete_inputs", address, count), unit)
+
+    def read_holding_registers(
+        self, address: int, count: int, *, unit: int | None = None
+    ) -> list[int]:
+        """`count` holding registers (function 3), 0 to 65535 each; more than 125 take several
+        requests.
+        """
+        return self._run(requests.read_range("holding_registers", address, count), unit)
+
+    def read_input_registers(
+        self, address: int, count: int, *, unit: int | None = None
+    ) -> list[int]:
+        """`count` input registers (function 4), 0 to 65535 each; more than 125 take several
+        requests.
+        """
+        return self._run(requests.read_range("input_registers", address, count), unit)
+
+    def read(
+        self,
+        area: Area,
+        address: int,
+        type: str,
+        order: str = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> Any:
+        """A typed value, as `holdfast.values.decode` makes it: `"float32"`, `"int16[10]"`.
+
+        `order` is the order of bytes, `encoding` that of a `string:N`.
+        """
+        steps = requests.read_typed(area, address, type, order, encoding)
+        return self._run(steps, unit)
+
+    def write(
+        self,
+        area: Area,
+        address: int,
+        value: Any,
+        type: str,
+        order: str = "ABCD",
+        *,
+        encoding: str | None = None,
+        split: bool = False,
+        unit: int | None = None,
+    ) -> None:
+        """A typed value, as `holdfast.values.encode` makes it, into coils or holding registers.
+
+        One bit or register is written by function 5 or 6, more by 15 or 16, one bit of a register
+        (`bit:3`) by 22. What does not fit into one request needs `split`, and is not one step on
+        the device then.
+        """
+        steps = requests.write_typed(area, address, value, type, order, encoding, split=split)
+        self._run(steps, unit)
+
+    def write_coil(self, address: int, value: bool, *, unit: int | None = None) -> None:
+        """One coil (function 5)."""
+        self._call(Request.write_coil(address, value), unit)
+
+    def write_coils(
+        self,
+        address: int,
+        values: Sequence[bool],
+        *,
+        split: bool = False,
+        unit: int | None = None,
+    ) -> None:
+        """Coils (function 15): up to 1968, or with `split` any number by several requests, which
+        the device does not carry out as one step.
+        """
+        self._run(requests.write_range("coils", address, values, split=split), unit)
+
+    def write_register(self, address: int, value: int, *, unit: int | None = None) -> None:
+        """One holding register (function 6), 0 to 65535."""
+        self._call(Request.write_register(address, value), unit)
+
+    def write_registers(
+        self,
+        address: int,
+        values: Sequence[int],
+        *,
+        split: bool = False,
+        unit: int | None = None,
+    ) -> None:
+        """Holding registers (function 16): up to 123, or with `split` any number by several
+        requests, which the device does not carry out as one step.
+        """
+        steps = requests.write_range("holding_registers", address, values, split=split)
+        self._run(steps, unit)
+
+    def mask_write(
+        self, address: int, *, and_mask: int, or_mask: int, unit: int | None = None
+    ) -> None:
+        """Sets a holding register to `(now & and_mask) | (or_mask & ~and_mask)` (function 22)."""
+        self._call(Request.mask_write(address, and_mask, or_mask), unit)
+
+    def read_write(
+        self,
+        read_address: int,
+        count: int,
+        write_address: int,
+        values: Sequence[int],
+        *,
+        unit: int | None = None,
+    ) -> list[int]:
+        """Writes up to 121 holding registers, then reads up to 125, as one step (function 23)."""
+        request = Request.read_write(read_address, count, write_address, values)
+        result: list[int] = self._call(request, unit)
+        return result
+
+    def identify(self, *, unit: int | None = None) -> Identification:
+        """What the device says of itself (function 43/14): all objects that it has."""
+        return self._run(requests.identify(), unit)
+
+    def report_server_id(self, *, unit: int | None = None) -> ServerId:
+        """What the device says of itself by function 17."""
+        return requests.ServerId(self._call(Request.report_server_id(), unit))
+
+    def diagnostics(
+        self, sub_function: int, data: Sequence[int] = (0,), *, unit: int | None = None
+    ) -> list[int]:
+        """Diagnostics (function 8): sends data words to a sub-function, returns those that come.
+
+        Sub-function 4, Force Listen Only Mode, has no reply: it ends in a `RequestTimeout`.
+        """
+        return self._run(requests.diagnostics(sub_function, data), unit)
+
+    def event_counter(self, *, unit: int | None = None) -> tuple[bool, int]:
+        """Whether the device is busy, and how many requests it carried out (function 11)."""
+        result: tuple[bool, int] = self._call(Request.event_counter(), unit)
+        return result
+
+    @property
+    def late(self) -> int:
+        """Replies that came after their requests had timed out, and were dropped."""
+        return self._core.late
+
+    def close(self) -> None:
+        """Ends the connection after the calls that came before. A later call makes a new one."""
+        self._core.close()
+
+    def _run(self, plan: Plan[Result], unit: int | None) -> Result:
+        """Carries out a plan."""
+        if isinstance(plan, Request):
+            result: Result = self._call(plan, unit)
+            return result
+        try:
+            request = next(plan)
+            while True:
+                try:
+                    reply = self._call(request, unit)
+                except ModbusException as error:
+                    request = plan.throw(error)
+                else:
+                    request = plan.send(reply)
+        except StopIteration as end:
+            value: Result = end.value
+            return value
+
+    def _call(self, request: Request, unit: int | None) -> Any:
+        return self._core.call(request, self.unit_for(request, unit), self.timeout)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,386 @@
+"""The kinds of single values that a configuration holds, each with what is allowed.
+
+Every kind is strict: text is not a number, a boolean is not an integer. A kind whose rule a JSON
+Schema can't say in full raises `ValueError` with a message of its own.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias, TypeGuard, get_args
+from urllib.parse import unquote
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    PlainSerializer,
+    PlainValidator,
+    Strict,
+    ValidationInfo,
+)
+from pydantic.config import JsonDict
+from pydantic.json_schema import JsonSchemaValue, WithJsonSchema
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from holdfast.client.target import FORMS, in_folder, parse
+from holdfast.config.addresses import Bind, Network, parse_bind, parse_source
+from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
+from holdfast.config.egress import Allowed, parse_allowed
+from holdfast.config.receiver import parse_receiver
+from holdfast.config.scanning import PREFIX, Pollable, parse_pollable, parse_prefix, parse_server
+from holdfast.config.words import choice, shape, show
+
+MAX_BYTES = 244
+MAX_DEVICE = 4095
+MAX_ROLE = 255
+MAX_TIME = 31_622_400
+MIN_TIME = 0.001
+
+NOT_ON_A_LINE = "; 0 is the broadcast, 248 to 255 are reserved"
+NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
+_NAME = r"[A-Za-z0-9_.-]{1,64}"
+_BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
+_HIGH_BYTE = r"(12[89]|1[3-9][0-9]|2[0-4][0-9]|25[0-5])"
+_SERIAL = r"([1-9]|[1-9][0-9]|1[0-9][0-9]|2[0-3][0-9]|24[0-7])"
+_WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5]))))"
+
+Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
+BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
+RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
+Access: TypeAlias = Literal["read-only", "read-write"]
+
+AREAS: tuple[Area, ...] = get_args(Area)
+BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
+REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
+FUNCTIONS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43)
+WRITES = (5, 6, 15, 16, 22, 23)
+RESERVED = ("rest", "mqtt", "nats", "gateway", "metrics")
+"""Names that adapters can't have, because the appliance's own parts have them."""
+
+
+def is_name(value: object) -> TypeGuard[str]:
+    """Whether it can be the name of a memory."""
+    return isinstance(value, str) and re.fullmatch(_NAME, value) is not None
+
+
+def _name(value: object) -> str:
+    if is_name(value):
+        return value
+    quote = f"; write '{value}' to make it text" if type(value) is int else ""
+    raise ValueError(f"found {show(value)}, allowed: {NAME_FORM}{quote}")
+
+
+def _id_of(what: str, least: int, most: int, note: str = "") -> Callable[[object], int]:
+    """Takes integers of that range."""
+
+    def number(value: object) -> int:
+        if type(value) is int and least <= value <= most:
+            return value
+        raise ValueError(f"found {show(value)}, allowed: {what} from {least} to {most}{note}")
+
+    return number
+
+
+def _adapter_name(value: object) -> str:
+    if value in RESERVED:
+        raise ValueError(f"found {show(value)}, allowed: a name other than {choice(RESERVED)}")
+    return _name(value)
+
+
+def _option_name(value: object) -> str:
+    if isinstance(value, str):
+        return value
+    raise ValueError(f"found {show(value)}, allowed: text; write '{value}' to make it text")
+
+
+def parse_sha256(value: object) -> str:
+    """Raises `ValueError` without the value: it could be the token itself."""
+    if isinstance(value, str) and re.fullmatch("[0-9a-fA-F]{64}", value):
+        return value.lower()
+    quote = "" if isinstance(value, str) else ", as text"
+    allowed = f"allowed: the SHA-256 of the token, 64 hexadecimal digits{quote}"
+    raise ValueError(f"found {shape(value)}, {allowed}")
+
+
+def _broker_url(value: object) -> str:
+    parse_broker(value)
+    return str(value)
+
+
+def _nats_url(value: object) -> str:
+    parse_server(value)
+    return str(value)
+
+
+def parse_url(value: object) -> str:
+    """Raises `ValueError` for anything but the URL of a device."""
+    if not isinstance(value, str):
+        raise ValueError(f"found {show(value)}, allowed: {FORMS}")
+    if "\0" in unquote(value):
+        raise ValueError(f"found {show(value)}, allowed: a URL without NUL")
+    parse(value)
+    return value
+
+
+def _device_url(value: object, info: ValidationInfo) -> str:
+    return in_folder(parse_url(value), _folder(info))
+
+
+def _receiver_url(value: object) -> str:
+    parse_receiver(value)
+    return str(value)
+
+
+def _integral(value: object) -> object:
+    """Keeps `true` and `1.0` from being taken for 1."""
+    if type(value) is not int:
+        raise PydanticCustomError("integral", "no integer")
+    return value
+
+
+def _version(value: object) -> object:
+    return "5" if type(value) is int and value == 5 else value
+
+
+def _folder(info: ValidationInfo) -> Path:
+    """What the files of a configuration are relative to."""
+    folder: Path = (info.context or {}).get("folder", Path())
+    return folder
+
+
+def _in_folder(value: object, info: ValidationInfo) -> object:
+    if not isinstance(value, str):
+        return value
+    if not value or "\0" in value:
+        raise ValueError(f"found {show(value)}, allowed: the path of a file")
+    return _folder(info) / value
+
+
+def _function(value: object) -> int:
+    if type(value) is int and value in FUNCTIONS:
+        return value
+    raise ValueError(f"found {show(value)}, allowed: {choice(FUNCTIONS)}")
+
+
+def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
+    """Takes text of so many bytes."""
+    allowed = f"allowed: text of {least} to {most} bytes"
+
+    def text(value: object) -> str:
+        if not isinstance(value, str):
+            quote = f"; write '{value}' to make it text" if isinstance(value, int | float) else ""
+            raise ValueError(f"found {show(value)}, {allowed}{quote}")
+        for character in value:
+            if unicodedata.category(character) in ("Cc", "Cs"):
+                raise ValueError(f"found {show(value)}, allowed: text without {character!r}")
+        size = len(value.encode())
+        if not least <= size <= most:
+            raise ValueError(f"found text of {size} bytes, {allowed}")
+        return value
+
+    return text
+
+
+def _no_instant(value: float) -> float:
+    if 0 < value < MIN_TIME:
+        raise ValueError(f"found {value}, allowed: 0, or {MIN_TIME} to {MAX_TIME} seconds")
+    return value
+
+
+def _not_null(value: object) -> object:
+    if value is None:
+        raise PydanticCustomError("null", "nothing")
+    return value
+
+
+def _whole(value: float) -> int | float:
+    return int(value) if value.is_integer() else value
+
+
+class NotNull:
+    """For a key that can be left out, but not be empty: `None` is its default and nothing else."""
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(_not_null, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        made = handler(schema)
+        kinds = [kind for kind in made.get("anyOf", []) if kind != {"type": "null"}]
+        if len(kinds) == 1:
+            del made["anyOf"]
+            made.update(kinds[0])
+        elif kinds:
+            made["anyOf"] = kinds
+        return made
+
+
+Name = Annotated[
+    str,
+    PlainValidator(_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"}),
+]
+AdapterName = Annotated[
+    str,
+    PlainValidator(_adapter_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"}),
+]
+OptionName = Annotated[str, PlainValidator(_option_name), WithJsonSchema({"type": "string"})]
+UnitId = Annotated[
+    int,
+    PlainValidator(_id_of("a unit id", 0, 255)),
+    WithJsonSchema({"type": "integer", "minimum": 0, "maximum": 255}),
+]
+SerialUnitId = Annotated[
+    int,
+    PlainValidator(_id_of("a unit id", 1, 247, NOT_ON_A_LINE)),
+    WithJsonSchema({"type": "integer"}),
+]
+RawUnitId = Annotated[
+    int, PlainValidator(_id_of("a unit id", 0, 65535)), WithJsonSchema({"type": "integer"})
+]
+ObjectId = Annotated[
+    int, PlainValidator(_id_of("an object id", 128, 255)), WithJsonSchema({"type": "integer"})
+]
+Text = Annotated[
+    str,
+    PlainValidator(_text_of(MAX_BYTES)),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_BYTES}),
+]
+Role = Annotated[
+    str,
+    PlainValidator(_text_of(MAX_ROLE, least=0)),
+    WithJsonSchema({"type": "string", "maxLength": MAX_ROLE, "examples": ["operator"]}),
+]
+DeviceName = Annotated[
+    str,
+    PlainValidator(_text_of(MAX_DEVICE)),
+    WithJsonSchema({"type": "string", "minLength": 1, "examples": ["/dev/ttyUSB0", "COM3"]}),
+]
+MqttText = Annotated[
+    str,
+    PlainValidator(_text_of(MAX_TEXT)),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_TEXT}),
+]
+FilePath = Annotated[Path, BeforeValidator(_in_folder, json_schema_input_type=str)]
+Sha256 = Annotated[
+    str,
+    PlainValidator(parse_sha256),
+    WithJsonSchema({"type": "string", "pattern": "^[0-9a-fA-F]{64}$"}),
+]
+BrokerUrl = Annotated[
+    str,
+    PlainValidator(_broker_url),
+    WithJsonSchema(
+        {"type": "string", "examples": ["mqtt://127.0.0.1:1883", "mqtts://broker.example"]}
+    ),
+]
+NatsUrl = Annotated[
+    str,
+    PlainValidator(_nats_url),
+    WithJsonSchema({"type": "string", "examples": ["nats://127.0.0.1:4222", "tls://nats.example"]}),
+]
+SubjectPrefix = Annotated[
+    str,
+    PlainValidator(parse_prefix),
+    WithJsonSchema({"type": "string", "examples": [PREFIX, "plant.modbus"]}),
+]
+PollableEntry = Annotated[
+    Pollable,
+    PlainValidator(parse_pollable),
+    PlainSerializer(str, return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7", "/dev/ttyUSB0"]}),
+]
+EgressEntry = Annotated[
+    Allowed,
+    PlainValidator(parse_allowed),
+    PlainSerializer(str, return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7:5020", "[fd00::]/64"]}),
+]
+DeviceUrl = Annotated[
+    str,
+    PlainValidator(_device_url),
+    WithJsonSchema(
+        {"type": "string", "examples": ["tcp://10.0.0.9:502", "rtu:///dev/ttyUSB0?baud=9600"]}
+    ),
+]
+ReceiverUrl = Annotated[
+    str,
+    PlainValidator(_receiver_url),
+    WithJsonSchema({"type": "string", "examples": ["raw://10.0.2.9:9000"]}),
+]
+TopicFilter = Annotated[
+    str,
+    PlainValidator(parse_topic_filter),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_TEXT}),
+]
+MqttVersion = Annotated[
+    Literal["5", "3.1.1"],
+    BeforeValidator(_version, json_schema_input_type=Literal["5", "3.1.1", 5]),
+]
+QualityOfService = Annotated[Literal[0, 1, 2], BeforeValidator(_integral)]
+StopBits = Annotated[Literal[1, 2], BeforeValidator(_integral)]
+DataBits = Annotated[Literal[7, 8], BeforeValidator(_integral)]
+EightBits = Annotated[Literal[8], BeforeValidator(_integral)]
+Connections = Annotated[int, Field(ge=1, le=65535)]
+Source = Annotated[
+    Network,
+    PlainValidator(parse_source),
+    PlainSerializer(str, return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7", "fd00::/64"]}),
+]
+BindAddress = Annotated[
+    Bind,
+    PlainValidator(parse_bind),
+    PlainSerializer(str, return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["0.0.0.0:502", "127.0.0.1:5020", "[::]:502"]}),
+]
+whole_number = PlainSerializer(_whole, return_type=int | float)
+"""Writes `1.0` as `1`."""
+Duration = Annotated[float, Field(ge=MIN_TIME, le=MAX_TIME, allow_inf_nan=False), whole_number]
+Milliseconds = Annotated[float, Field(ge=0, le=3_600_000, allow_inf_nan=False), whole_number]
+DurationOrZero = Annotated[
+    float,
+    Field(ge=0, le=MAX_TIME, allow_inf_nan=False),
+    AfterValidator(_no_instant),
+    whole_number,
+]
+FunctionCode = Annotated[
+    int,
+    PlainValidator(_function),
+    WithJsonSchema({"type": "integer", "enum": list(FUNCTIONS)}),
+]
+Codes = Annotated[
+    tuple[FunctionCode, ...], Strict(False), Field(json_schema_extra={"uniqueItems": True})
+]
+
+Sources = Annotated[tuple[Source, ...], Strict(False), Field(min_length=1)]
+MemoryNames = Annotated[
+    tuple[Name, ...],
+    Strict(False),
+    Field(min_length=1, json_schema_extra={"uniqueItems": True}),
+]
+Areas = Annotated[
+    tuple[Area, ...],
+    Strict(False),
+    Field(min_length=1, json_schema_extra={"uniqueItems": True}),
+]
+
+NAME_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_NAME}$"}}
+UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_BYTE}$"}}
+SERIAL_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_SERIAL}$"}}
+RAW_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_WORD}$"}}
+OBJECT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_HIGH_BYTE}$"}}
+ADAPTER_KEYS: JsonDict = {
+    "propertyNames": {"pattern": f"^{_NAME}$", "not": {"enum": list(RESERVED)}}
+}
+"""What a schema says of the keys of a mapping, which are text to it."""

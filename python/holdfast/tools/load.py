@@ -1,0 +1,205 @@
+"""Load for a Modbus server: as many reads as it answers, and how long each took.
+
+The clients are those of asyncio, in one thread: what they can ask for in a second, some tens
+of thousands of reads, is the most that can be measured.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import bisect
+import contextlib
+import math
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from holdfast.client import Client
+from holdfast.client.requests import ADDRESSES, READ_LIMITS
+from holdfast.client.target import IN_FLIGHT, NetworkTarget, SerialTarget, parse
+from holdfast.errors import (
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    RequestTimeout,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.types import Area
+
+MIN_TIME = 1e-6
+GROWTH = math.log(1.02)
+"""Times are kept to 2 percent."""
+
+EDGES = [digit * 10.0**exponent for exponent in range(-6, 4) for digit in (1, 2, 5)]
+"""Where the bars of a histogram begin and end, in seconds."""
+
+MAX_CONNECTIONS = 1000
+PAUSE = 0.1
+"""Seconds before a connection that was lost is made again."""
+
+BETWEEN = 0.1
+"""Seconds between two calls of `progress`."""
+
+
+class Latencies:
+    """Times of any number of requests, in little memory."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = 0.0
+        self.least = math.inf
+        self.most = 0.0
+        self._counts: Counter[int] = Counter()
+
+    def add(self, seconds: float) -> None:
+        """One more."""
+        self.count += 1
+        self.total += seconds
+        self.least = min(self.least, seconds)
+        self.most = max(self.most, seconds)
+        self._counts[max(0, int(math.log(max(seconds, MIN_TIME) / MIN_TIME) / GROWTH))] += 1
+
+    @property
+    def mean(self) -> float:
+        """The average; 0 if there was none."""
+        return self.total / self.count if self.count else 0.0
+
+    def quantile(self, share: float) -> float:
+        """The time within which that share was done, to 2 percent; 0 if there was none."""
+        wanted = max(1, math.ceil(share * self.count))
+        seen = 0
+        for step in sorted(self._counts):
+            seen += self._counts[step]
+            if seen >= wanted:
+                return min(self.most, max(self.least, _middle(step)))
+        return 0.0
+
+    def histogram(self) -> list[tuple[float, float, int]]:
+        """From, to, and how many, from the first that has any to the last."""
+        bars = [0] * (len(EDGES) + 1)
+        for step, count in self._counts.items():
+            bars[bisect.bisect_right(EDGES, min(self.most, _middle(step)))] += count
+        filled = [at for at, count in enumerate(bars) if count]
+        if not filled:
+            return []
+        edges = [0.0, *EDGES, math.inf]
+        return [(edges[at], edges[at + 1], bars[at]) for at in range(filled[0], filled[-1] + 1)]
+
+
+class Load:
+    """Reads of one range by several connections, some in flight on each, for some seconds."""
+
+    def __init__(
+        self,
+        url: str,
+        area: Area,
+        address: int,
+        count: int,
+        *,
+        unit: int = 1,
+        connections: int = 1,
+        in_flight: int = 1,
+        seconds: float = 5.0,
+        timeout: float = 1.0,
+    ) -> None:
+        target = parse(url)
+        if not 1 <= count <= READ_LIMITS[area]:
+            raise ValueError(f"count is {count}, one read returns 1 to {READ_LIMITS[area]}")
+        if not 0 <= address <= ADDRESSES - count:
+            raise ValueError(f"{count} from address {address}: the last address is 65535")
+        if not 1 <= connections <= MAX_CONNECTIONS:
+            raise ValueError(f"connections is {connections}, allowed are 1 to {MAX_CONNECTIONS}")
+        if isinstance(target, SerialTarget) and connections > 1:
+            raise ValueError("a serial line has one connection")
+        many = isinstance(target, NetworkTarget) and target.transport in IN_FLIGHT
+        if in_flight > 1 and not many:
+            raise ValueError("only tcp and tls have more than one request in flight")
+        self.seconds = seconds
+        self.elapsed = 0.0
+        """The seconds that it has taken so far."""
+        self.latencies = Latencies()
+        self.errors: Counter[str] = Counter()
+        self._clients = [
+            Client(url, unit=unit, timeout=timeout, max_in_flight=in_flight)
+            for _ in range(connections)
+        ]
+        self._in_flight = in_flight
+        self._area = area
+        self._address = address
+        self._count = count
+
+    @property
+    def rate(self) -> float:
+        """Reads a second."""
+        return self.latencies.count / self.elapsed if self.elapsed else 0.0
+
+    async def run(self, progress: Callable[[Load], object] | None = None) -> None:
+        """Loads the server; `progress` is called now and then.
+
+        Before it begins, every connection is made and used once. Raises what the first one raises.
+        """
+        try:
+            await self._read(self._clients[0])
+            await asyncio.gather(*(self._warmed_up(client) for client in self._clients[1:]))
+            await self._loaded(progress)
+        finally:
+            for client in self._clients:
+                await client.close()
+
+    async def _loaded(self, progress: Callable[[Load], object] | None) -> None:
+        began = time.monotonic()
+        workers = [
+            asyncio.create_task(self._work(client, began + self.seconds))
+            for client in self._clients
+            for _ in range(self._in_flight)
+        ]
+        try:
+            left = set(workers)
+            while left:
+                _, left = await asyncio.wait(left, timeout=BETWEEN)
+                self.elapsed = time.monotonic() - began
+                if progress is not None:
+                    progress(self)
+        finally:
+            self.elapsed = time.monotonic() - began
+            for worker in workers:
+                worker.cancel()
+            await asyncio.gather(*workers, return_exceptions=True)
+        for worker in workers:
+            worker.result()
+
+    async def _warmed_up(self, client: Client) -> None:
+        with contextlib.suppress(ModbusError):
+            await self._read(client)
+
+    async def _work(self, client: Client, end: float) -> None:
+        """Reads one after the other."""
+        while (began := time.monotonic()) < end:
+            try:
+                await self._read(client)
+            except ModbusError as error:
+                self.errors[_kind(error)] += 1
+                if isinstance(error, ConnectionLost):
+                    await asyncio.sleep(min(PAUSE, max(0.0, end - time.monotonic())))
+            else:
+                self.latencies.add(time.monotonic() - began)
+
+    async def _read(self, client: Client) -> None:
+        await getattr(client, f"read_{self._area}")(self._address, self._count)
+
+
+def _kind(error: ModbusError) -> str:
+    """What counts as the same error."""
+    if isinstance(error, RequestTimeout):
+        return "timeout"
+    if isinstance(error, ConnectionLost):
+        return "connection lost"
+    return "invalid response" if isinstance(error, InvalidResponse) else str(error)
+
+
+def _middle(step: int) -> float:
+    """The time that stands for a step."""
+    return MIN_TIME * math.exp(GROWTH * (step + 0.5))

@@ -1,0 +1,213 @@
+"""Which requests read a device, why each ends where it does, and what other rules would ask for.
+
+The plan is the native poller's own; here it is explained. Nothing is sent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict
+
+from holdfast._core import plan_blocks
+from holdfast.types import AREAS, BIT_AREAS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from holdfast.config import DeviceConfig, RangeConfig
+    from holdfast.types import Area
+
+Field: TypeAlias = "tuple[Area, int, int]"
+"""An area, an address and a count."""
+
+Preset: TypeAlias = Literal["none", "max_insert"]
+
+MAX_REGISTERS = 125
+MAX_BITS = 2000
+BITS = 16
+"""Bits that take the room of a register."""
+
+
+class Rules(TypedDict, total=False):
+    """What a plan keeps; a range is an area, its first address and the one behind its last."""
+
+    max_gap: int | None
+    cost: tuple[float, float] | None
+    max_registers: int
+    max_bits: int
+    readable: Sequence[tuple[Area, int, int]]
+    forbidden: Sequence[tuple[Area, int, int]]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One request."""
+
+    area: Area
+    address: int
+    count: int
+    reads: tuple[int, ...]
+    """The reads that it carries, or parts of, by their numbers from 0."""
+    holes: tuple[tuple[int, int], ...]
+    """What is read though nothing wants it: addresses and counts."""
+    cost: float | None
+    """Milliseconds, where the rules say what reading costs."""
+    ends: str
+    """Why it ends where it does."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The requests of one poll."""
+
+    reads: tuple[Field, ...]
+    blocks: tuple[Block, ...]
+
+    @property
+    def cost(self) -> float | None:
+        """Milliseconds of all requests."""
+        known = [block.cost for block in self.blocks if block.cost is not None]
+        return sum(known) if len(known) == len(self.blocks) else None
+
+    @property
+    def unwanted(self) -> int:
+        """Bits and registers that are read though nothing wants them."""
+        return sum(count for block in self.blocks for _, count in block.holes)
+
+
+def rules(settings: DeviceConfig) -> Rules:
+    """What the configuration of a device says of its plan."""
+    cost = settings.cost
+    return {
+        "max_gap": settings.max_gap,
+        "cost": None if cost is None else (cost.per_request, cost.per_register),
+        "max_registers": settings.max_registers,
+        "max_bits": settings.max_bits,
+        "readable": _stretches(settings.readable),
+        "forbidden": _stretches(settings.forbidden),
+    }
+
+
+def plan(reads: Sequence[Field], rules: Rules) -> Plan:
+    """The plan of some reads. Raises `ValueError` for what can't be read by the rules."""
+    for area, address, count in reads:
+        for start, stop in _of_area(rules.get("forbidden", ()), area):
+            if address < stop and start < address + count:
+                raise ValueError(
+                    f"{area} {_span(address, address + count)} meets what is forbidden, "
+                    f"{_span(start, stop)}"
+                )
+    parts = [(part, number) for number, read in enumerate(reads) for part in _parts(read, rules)]
+    fields = [part for part, _ in parts]
+    planned = plan_blocks(fields, **rules)
+    blocks = []
+    for index, (area, address, count, inside, _) in enumerate(planned):
+        following = planned[index + 1] if index + 1 < len(planned) else None
+        behind = None if following is None else _first(fields, following)
+        blocks.append(
+            Block(
+                area,
+                address,
+                count,
+                tuple(dict.fromkeys(parts[each][1] for each in inside)),
+                tuple(_holes([fields[each] for each in inside])),
+                _cost(area, count, rules),
+                _ends((area, address, count), behind, rules),
+            )
+        )
+    return Plan(tuple(reads), tuple(blocks))
+
+
+def preset(reads: Sequence[Field], rules: Rules, name: Preset, fill: int) -> int:
+    """How many requests the rule of that name asks for, with the same limits.
+
+    `none`: reads are joined only where one begins exactly where the one before it ends.
+    `max_insert`: also over holes of up to `fill`. Neither knows of forbidden or readable ranges.
+    """
+    requests = 0
+    for area in AREAS:
+        parts = [part for read in reads if read[0] == area for part in _parts(read, rules)]
+        most, start, end = _most(area, rules), 0, -1
+        for _, address, count in sorted(parts, key=lambda part: (part[1], -part[2])):
+            near = address == end if name == "none" else address - end <= fill
+            if end < 0 or not near or max(end, address + count) - start > most:
+                requests, start, end = requests + 1, address, address
+            end = max(end, address + count)
+    return requests
+
+
+def _stretches(ranges: Sequence[RangeConfig]) -> list[tuple[Area, int, int]]:
+    return [(each.area, each.addresses.start, each.addresses.stop) for each in ranges]
+
+
+def _most(area: Area, rules: Rules) -> int:
+    if area in BIT_AREAS:
+        return rules.get("max_bits", MAX_BITS)
+    return rules.get("max_registers", MAX_REGISTERS)
+
+
+def _parts(read: Field, rules: Rules) -> Iterator[Field]:
+    """A read in pieces that one request can carry."""
+    area, address, count = read
+    most = _most(area, rules)
+    for at in range(0, count, most):
+        yield area, address + at, min(most, count - at)
+
+
+def _first(fields: Sequence[Field], block: tuple[Area, int, int, list[int], int]) -> Field:
+    """The field that a block begins with."""
+    return min((fields[each] for each in block[3]), key=lambda field: field[1:])
+
+
+def _holes(fields: Sequence[Field]) -> Iterator[tuple[int, int]]:
+    end = None
+    for _, address, count in sorted(fields, key=lambda field: field[1]):
+        if end is not None and address > end:
+            yield end, address - end
+        end = max(end or 0, address + count)
+
+
+def _cost(area: Area, count: int, rules: Rules) -> float | None:
+    cost = rules.get("cost")
+    if cost is None:
+        return None
+    request, register = cost
+    return request + register * (count / BITS if area in BIT_AREAS else count)
+
+
+def _ends(block: Field, behind: Field | None, rules: Rules) -> str:
+    """Why a block does not go on with the field behind it."""
+    area, address, count = block
+    if behind is None:
+        return "nothing more to read"
+    if behind[0] != area:
+        return "another area"
+    end = address + count
+    hole = behind[1] - end
+    if hole > 0:
+        for start, stop in _of_area(rules.get("forbidden", ()), area):
+            if start < behind[1] and end < stop:
+                return f"forbidden: {_span(max(start, end), min(stop, behind[1]))}"
+    joined = behind[1] + behind[2] - address
+    cost, most = rules.get("cost"), _most(area, rules)
+    max_gap = (rules.get("max_gap") or 0) if cost is None else None
+    if hole > 0 and max_gap is not None and hole > max_gap:
+        return f"gap: {hole}, max_gap is {max_gap}"
+    readable = list(_of_area(rules.get("readable", ()), area))
+    if (
+        hole > 0
+        and readable
+        and not any(start <= end and behind[1] <= stop for start, stop in readable)
+    ):
+        return f"not readable: {_span(end, behind[1])}"
+    if joined > most:
+        return f"limit: {joined} with the next, the most is {most}"
+    return f"gap: {hole}, which costs more than a request"
+
+
+def _of_area(stretches: Sequence[tuple[Area, int, int]], area: Area) -> Iterator[tuple[int, int]]:
+    return ((start, stop) for of, start, stop in stretches if of == area)
+
+
+def _span(start: int, stop: int) -> str:
+    return str(start) if stop - start == 1 else f"{start} to {stop - 1}"

@@ -1,0 +1,554 @@
+"""A host for ASGI applications: HTTP/1.1 for peers from given networks, within limits.
+
+uvicorn and httptools do the protocol. What is added here holds against peers that mean harm or are
+broken: a peer from elsewhere gets not one byte, connections are counted, a request has to arrive
+and a reply to be taken in time, and what a peer sends ahead waits as bytes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import math
+import socket
+import sys
+import time
+from dataclasses import asdict, dataclass
+from email.utils import formatdate
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import httptools
+import msgspec
+import uvicorn
+from uvicorn.protocols.http.flow_control import FlowControl
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from holdfast import logs
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+    from ipaddress import IPv4Network, IPv6Network
+
+    from holdfast.adapters import Stop
+
+    Scope: TypeAlias = MutableMapping[str, Any]
+    Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
+    Send: TypeAlias = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+    App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
+    Headers: TypeAlias = list[tuple[bytes, bytes]]
+    Rejection: TypeAlias = Callable[[str, str], tuple[Headers, bytes]]
+
+BACKLOG = 512
+"""Connections that the system holds before they are accepted."""
+
+MAX_HEADER = 65536
+"""Bytes of the header of a request; chunk extensions and trailers have as many."""
+
+SLICE = 8192
+"""Bytes that are parsed at a time: it bounds the requests that wait behind another."""
+
+KEEP_ALIVE = 60.0
+"""Seconds that a connection may stay open without a request."""
+
+LATE_ANSWER_TIMEOUT = 1.0
+"""Seconds that the application has to answer a request that did not arrive in time."""
+
+STOP_TIMEOUT = 1.0
+"""Seconds that requests under way have to end when the host is stopped."""
+
+SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
+"""Headers of every answer: nothing is kept, nothing is taken for what it does not say it is."""
+
+# uvicorn's own log goes nowhere: what matters is logged here, in the project's form.
+logging.getLogger("uvicorn").addHandler(logging.NullHandler())
+logging.getLogger("uvicorn").propagate = False
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens on an IP address; `::` takes IPv4 too. Raises `OSError`."""
+    flags = socket.AI_NUMERICHOST | socket.AI_PASSIVE
+    [(family, kind, number, _, address)] = socket.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP, flags=flags
+    )
+    listener = socket.socket(family, kind, number)
+    try:
+        if sys.platform == "win32":
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        else:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            any_address = ipaddress.IPv6Address(host).is_unspecified
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, not any_address)
+        listener.bind(address)
+        listener.listen(BACKLOG)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def address_of(host: str, port: int) -> str:
+    """`10.0.0.9:51200` or `[fd00::9]:51200`; an IPv4 address in IPv6 is that IPv4 address."""
+    address = _unmapped(host)
+    return f"[{address}]:{port}" if address.version == 6 else f"{address}:{port}"
+
+
+def _unmapped(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    address = ipaddress.ip_address(host)
+    return getattr(address, "ipv4_mapped", None) or address
+
+
+def rejection(reason: str, detail: str, status: str = "rejected") -> tuple[Headers, bytes]:
+    """The headers and the JSON of a refusal."""
+    body = msgspec.json.encode({"status": status, "reason": reason, "detail": detail})
+    return headers_of(b"application/json", body), body
+
+
+def headers_of(kind: bytes, body: bytes) -> Headers:
+    """The headers of an answer with this body."""
+    return [(b"content-type", kind), (b"content-length", b"%d" % len(body)), *SAFE]
+
+
+@dataclass
+class Counts:
+    """What became of connections: how many are `open`, and why others were refused or closed."""
+
+    accepted: int = 0
+    refused_source: int = 0
+    refused_full: int = 0
+    idle: int = 0
+    request_timeout: int = 0
+    slow_reader: int = 0
+    broken_request: int = 0
+    open: int = 0
+
+
+class Host:
+    """Serves one ASGI application on a socket that listens.
+
+    The application finds its peer, as text for logs, in `scope["state"]["peer"]`. When a request
+    did not arrive in time, `scope["state"]["late"]` is set and `receive` returns: the application
+    has a moment to answer, then the connection is dropped.
+
+    `rejection` makes what a request is answered with that the application never sees.
+
+    A peer that has sent its last byte still gets its answers, unless `leaving` says that it has
+    left then: the end of what it sends is all that tells that it closed the connection.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        app: App,
+        listener: socket.socket,
+        *,
+        sources: Iterable[IPv4Network | IPv6Network],
+        max_connections: int,
+        request_timeout: float,
+        leaving: bool = False,
+        rejection: Rejection = rejection,
+    ) -> None:
+        self.name = name
+        self.rejection = rejection
+        self.leaving = leaving
+        self.max_connections = max_connections
+        self.request_timeout = request_timeout
+        self.sources = tuple(sources)
+        self.counted = Counts()
+        host, port, *_ = listener.getsockname()
+        self.address = address_of(host, port)
+        self._app = app
+        self._listener = listener
+
+    def counts(self) -> dict[str, int]:
+        """What became of connections, from any thread."""
+        return asdict(self.counted)
+
+    def run(self, stop: Stop) -> None:
+        """Serves in this thread until `stop`; again, when called again. The socket stays open."""
+        asyncio.run(self._serve(stop))
+
+    def admits(self, host: str) -> bool:
+        """Whether a peer with this address may connect."""
+        address = _unmapped(host)
+        return any(address in network for network in self.sources)
+
+    def note(self, event: str, peer: str) -> None:
+        """Counts and logs what happened to a connection. Called in the thread of `run`."""
+        setattr(self.counted, event, getattr(self.counted, event) + 1)
+        if event != "idle":
+            logs.refused(event, kind=(self.name, event), listener=self.name, peer=peer)
+
+    async def _serve(self, stop: Stop) -> None:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._fault)
+        stopped = asyncio.Event()
+
+        def end() -> None:
+            with contextlib.suppress(RuntimeError):  # This run is over, it was another that ended.
+                loop.call_soon_threadsafe(stopped.set)
+
+        stop.then(end)
+        config = uvicorn.Config(
+            self._guarded,
+            interface="asgi3",
+            ws="none",
+            log_config=None,
+            access_log=False,
+            proxy_headers=False,
+        )
+        config.load()
+        state = ServerState()
+        self.counted.open = 0
+        with self._listener.dup() as listener:
+            server = await loop.create_server(
+                lambda: _Connection(config, state, {}, loop, host=self),
+                sock=listener,
+                backlog=BACKLOG,
+            )
+            while not stopped.is_set():
+                state.default_headers = [(b"date", formatdate(usegmt=True).encode())]
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(stopped.wait(), 1.0)
+            server.close()
+            await _end(cast("set[_Connection]", state.connections))
+
+    async def _guarded(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The application, whose faults are logged and answered without a detail."""
+        try:
+            await self._app(scope, receive, send)
+        except Exception:
+            logs.problem("request_failed", listener=self.name, peer=scope["state"]["peer"])
+            with contextlib.suppress(RuntimeError):  # The answer has begun: it ends unfinished.
+                await respond(send, 500, *rejection("internal_error", "see the log", "failed"))
+
+    def _fault(self, loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:  # noqa: ARG002
+        """Such as no file descriptor for a connection that came in."""
+        error = context.get("exception")
+        logs.refused(
+            "listener_fault",
+            kind=self.name,
+            listener=self.name,
+            message=context["message"],
+            error="-" if error is None else f"{type(error).__name__}: {error}",
+        )
+
+
+async def respond(send: Send, status: int, headers: Headers, body: bytes = b"") -> None:
+    """Sends a whole answer."""
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+async def _end(connections: set[_Connection]) -> None:
+    """Ends connections: those with a request under way have a while to answer it."""
+    for connection in list(connections):
+        connection.shutdown()
+    deadline = time.monotonic() + STOP_TIMEOUT
+    while connections and time.monotonic() < deadline:
+        await asyncio.sleep(0.01)
+    for connection in list(connections):
+        connection.transport.abort()
+    await asyncio.sleep(0)
+
+
+class _Flow(FlowControl):
+    """Reads no more while bytes wait."""
+
+    def __init__(self, connection: _Connection) -> None:
+        super().__init__(connection.transport)
+        self._connection = connection
+
+    def resume_reading(self) -> None:
+        if not self._connection.held:
+            super().resume_reading()
+
+
+class _Output:
+    """Where the answer to one request goes: its header and what follows leave in one packet."""
+
+    def __init__(self, connection: _Connection) -> None:
+        self._connection = connection
+        self._transport = connection.transport
+        self._cycle = connection.cycle
+        self._header: bytes | None = None
+        self.is_closing = self._transport.is_closing
+
+    def write(self, data: bytes) -> None:
+        """Keeps the header until the body comes."""
+        if self._header is None and self._cycle.response_started:
+            self._header = data
+        elif self._header:
+            self._transport.write(self._header + data)
+            self._header = b""
+        else:
+            self._transport.write(data)
+
+    def close(self) -> None:
+        """Ends the connection behind what was written."""
+        self.write(b"")
+        self._transport.close()
+
+    def end(self) -> None:
+        """Ends the answer."""
+        self.write(b"")
+        self._connection.on_response_complete()
+
+
+class _Connection(HttpToolsProtocol):
+    """One connection.
+
+    Three deadlines, `math.inf` when they don't apply: for the request to arrive, for the reply to
+    be taken, for the next request to begin. All are at least `step` away when they are set, and the
+    alarm goes off at least that often, so none has a timer of its own.
+    """
+
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+        *,
+        host: Host,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self.host = host
+        self.held = b""
+        self._admitted = False
+        self._ended = self._broken = False
+        self._in_message = False
+        self._in_header = False
+        self._messages = 0
+        self._unparsed = 0
+        self._overhead = 0
+        self._step = min(host.request_timeout, KEEP_ALIVE)
+        self._request_due = self._reply_due = self._idle_due = math.inf
+        self._alarm: asyncio.TimerHandle | None = None
+
+    # The transport's calls.
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Admits the peer, or drops it before a byte."""
+        host, port, *_ = transport.get_extra_info("peername") or ("", 0)
+        if not host:  # It is gone already.
+            transport.abort()
+            return
+        peer = address_of(host, port)
+        refusal = (
+            "refused_source"
+            if not self.host.admits(host)
+            else "refused_full"
+            if len(self.connections) >= self.host.max_connections
+            else None
+        )
+        if refusal is not None:
+            self.host.note(refusal, peer)
+            transport.abort()
+            return
+        self._admitted = True
+        self.host.counted.accepted += 1
+        self.host.counted.open += 1
+        super().connection_made(transport)
+        self.app_state = {"peer": peer}
+        transport.set_write_buffer_limits(high=0)  # One reply waits at most, and its time is taken.
+        self.flow = _Flow(self)
+        self._request_due = self.loop.time() + self.host.request_timeout
+        self._set_alarm()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forgets what was under way."""
+        if not self._admitted:
+            return
+        self.host.counted.open -= 1
+        if self._alarm is not None:
+            self._alarm.cancel()
+        self.held = b""
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Parses what came, as far as it is its turn."""
+        if not self._broken and not self.transport.is_closing():
+            self.held += data
+            self._parse()
+
+    def eof_received(self) -> bool:  # type: ignore[override]
+        """A peer that sends no more may still want its answers."""
+        if self.host.leaving:
+            return False
+        self._ended = True
+        whole = self._busy() and not self.cycle.more_body
+        return bool(whole or self.pipeline or self.held)
+
+    def pause_writing(self) -> None:
+        """The peer takes less than it is sent."""
+        super().pause_writing()
+        self._reply_due = self.loop.time() + self.host.request_timeout
+
+    def resume_writing(self) -> None:
+        """The peer has taken everything."""
+        self._reply_due = math.inf
+        super().resume_writing()
+
+    # The parser's calls.
+
+    def on_message_begin(self) -> None:
+        """A request begins."""
+        self._in_message = self._in_header = True
+        super().on_message_begin()
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """A header; trailers, which come behind the body, are left out."""
+        if self._in_header:
+            super().on_header(name, value)
+
+    def on_headers_complete(self) -> None:
+        """The request can be looked at."""
+        if self.parser.get_http_version() not in ("1.1", "1.0"):
+            raise httptools.HttpParserError("another version of HTTP")
+        self._in_header = False
+        self._overhead = 0
+        super().on_headers_complete()
+        output = _Output(self)
+        self.cycle.transport = cast("asyncio.Transport", output)
+        self.cycle.on_response = output.end
+
+    def on_body(self, body: bytes) -> None:
+        """A piece of the body."""
+        self._overhead = 0
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """The request is whole; but one that offers another protocol may have a body still."""
+        if self.parser.should_upgrade():
+            headers = dict(self.headers)
+            if b"transfer-encoding" in headers:
+                raise httptools.HttpParserError("chunked, and another protocol")
+            self._unparsed = int(headers.get(b"content-length", 0))
+        if not self._unparsed:
+            self._complete()
+
+    def _complete(self) -> None:
+        self._in_message = False
+        self._messages += 1
+        self._overhead = 0
+        super().on_message_complete()
+
+    # The application's calls.
+
+    def on_response_complete(self) -> None:
+        """An answer is sent: the next request has its turn, or the connection is idle."""
+        self.server_state.total_requests += 1
+        if self.transport.is_closing():
+            return
+        if self.pipeline:
+            self._start_asgi_task(*self.pipeline.pop())
+        if self.held:
+            self._parse()
+        if not self.held and not self.pipeline:
+            self.flow.resume_reading()
+        self._settle()
+
+    def _settle(self) -> None:
+        """When nothing is under way, the connection is idle, or done."""
+        if self._busy() or self._request_due != math.inf or self.transport.is_closing():
+            return
+        if self._ended:
+            self.transport.close()
+        else:
+            self._idle_due = self.loop.time() + KEEP_ALIVE
+
+    def _busy(self) -> bool:
+        """Whether a request waits for its answer."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _parse(self) -> None:
+        """Parses slice after slice, as long as no request waits behind another."""
+        whole, at, messages = memoryview(self.held), 0, self._messages
+        self._idle_due = math.inf
+        if self._request_due == math.inf:
+            self._request_due = self.loop.time() + self.host.request_timeout
+        while at < len(whole) and not self.pipeline and not self._broken:
+            at += self._take(whole[at : at + SLICE])
+        self.held = b"" if self._broken else bytes(whole[at:])
+        if self.held:
+            self.flow.pause_reading()
+        if self._broken or self._messages != messages:
+            more = self._in_message and not self._broken
+            self._request_due = self.loop.time() + self.host.request_timeout if more else math.inf
+        self._settle()
+
+    def _take(self, piece: memoryview) -> int:
+        """Parses a slice; how much of it is done with."""
+        if self._unparsed:
+            body = bytes(piece[: self._unparsed])
+            self._unparsed -= len(body)
+            self.on_body(body)
+            if not self._unparsed:
+                self._complete()
+            return len(body)
+        self._overhead += len(piece)
+        try:
+            self.parser.feed_data(piece)
+        except httptools.HttpParserUpgrade as upgrade:  # The parser stops at the body.
+            return int(upgrade.args[0])
+        except httptools.HttpParserError:
+            self._refuse(400, "not an HTTP request")
+        else:
+            if self._overhead > MAX_HEADER:
+                self._refuse(431, f"the header has more than {MAX_HEADER} bytes")
+        return len(piece)
+
+    def _refuse(self, status: int, detail: str) -> None:
+        """Ends a connection on which no request can be found any more, after its last answer."""
+        self._broken = True
+        self.host.note("broken_request", self.app_state["peer"])
+        if self._busy() and not self.cycle.more_body:
+            self.cycle.keep_alive = False
+        elif self.pipeline or (self._busy() and self.cycle.response_started):
+            self.transport.abort()
+        else:
+            headers, body = self.host.rejection("malformed", detail)
+            lines = [b"%b: %b\r\n" % header for header in [*headers, (b"connection", b"close")]]
+            self.transport.write(b"".join([STATUS_LINE[status], *lines, b"\r\n", body]))
+            self.transport.close()
+
+    # Time.
+
+    def _set_alarm(self) -> None:
+        now = self.loop.time()
+        due = min(self._request_due, self._reply_due, self._idle_due, now + self._step)
+        self._alarm = self.loop.call_at(due, self._look)
+
+    def _look(self) -> None:
+        """Drops the connection when a deadline is over."""
+        now = self.loop.time()
+        peer = self.app_state["peer"]
+        if self._reply_due <= now:
+            self.host.note("slow_reader", peer)
+            self.transport.abort()
+        elif self._request_due <= now and self.flow.read_paused:  # It waits for us.
+            self._request_due = now + self.host.request_timeout
+        elif self._request_due <= now:
+            self._be_late()
+        elif self._idle_due <= now:
+            self.host.note("idle", peer)
+            self.transport.close()
+        self._set_alarm()
+
+    def _be_late(self) -> None:
+        """Lets the application answer, if it waits for the body; else the connection ends."""
+        cycle = self.cycle
+        if not (self._busy() and cycle.more_body) or self.pipeline:
+            self.host.note("request_timeout", self.app_state["peer"])
+            self.transport.abort()
+        elif "late" in cycle.scope["state"]:
+            self.transport.abort()
+        else:
+            self.host.note("request_timeout", self.app_state["peer"])
+            cycle.scope["state"]["late"] = True
+            cycle.message_event.set()
+            self._request_due = self.loop.time() + LATE_ANSWER_TIMEOUT

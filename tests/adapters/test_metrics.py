@@ -1,0 +1,313 @@
+"""Metrics, as Prometheus reads them."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from prometheus_client.openmetrics import parser as openmetrics
+from prometheus_client.parser import text_string_to_metric_families
+
+import holdfast
+from holdfast.adapters import Grant, MemoryAccess, Refused
+from holdfast.adapters.metrics import Metrics
+from holdfast.appliance.supervision import Supervisor
+from holdfast.config import MetricsConfig
+from holdfast.web.host import listen
+from support import web, wire
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from prometheus_client.metrics_core import Metric
+
+    from holdfast.appliance.diagnostics import Diagnostics
+
+LISTENER: dict[str, Any] = {
+    "requests": {3: 7, 16: 2},
+    "exceptions": {2: 1},
+    "unanswered": 4,
+    "connections": {"accepted": 5, "refused_source": 1, "idle": 3, "open": 2},
+    "frames": {"foreign": 6, "broken": 0},
+}
+RAW: dict[str, Any] = {
+    "packets": {"accepted": 9, "refused": {"crc": 1, "range": 2}},
+    "fresh": 8,
+    "name": "not a number",
+}
+
+METER: dict[str, Any] = {
+    "health": "error",
+    "last_error": 0x8001,
+    "seconds_in_error": 4.5,
+    "age": 5.5,
+    "failures": 3,
+    "round_trip": 0.25,
+    "requests_per_poll": 2,
+    "polls": 30,
+    "missed": 1,
+    "requests": 60,
+    "valid": 50,
+    "exceptions": 4,
+    "timeouts": 5,
+    "transport_errors": 1,
+    "reads": 29,
+    "values": 290,
+    "forward": [{"sent": 20, "refused": 2, "failed": 3, "replaced": 4}],
+}
+
+
+@pytest.fixture
+def memories() -> dict[str, holdfast.Memory]:
+    return {
+        "plant_a": holdfast.Memory(coils=16, holding_registers=(10, 90)),
+        "gated": holdfast.Memory(coils=8, seal=("coils", 7, "level")),
+    }
+
+
+@pytest.fixture
+def memory_access(memories: dict[str, holdfast.Memory]) -> MemoryAccess:
+    return MemoryAccess("rest", memories)
+
+
+@pytest.fixture
+def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAccess) -> Diagnostics:
+    engine = web.StandIn({"scada": LISTENER, "replication": RAW}, lost_events=11)
+    made = web.diagnostics_of(memories, engine)
+    status = {
+        "state": "failed",
+        "restarts": 3,
+        "last_error": "gone",
+        "connected": True,
+        "messages": {"in": 12},
+        "topics": ["a"],
+    }
+    rest: Any = SimpleNamespace(
+        status=lambda: {"state": "running", "restarts": 0, "connections": {"idle": 1, "open": 2}}
+    )
+    mqtt: Any = SimpleNamespace(status=lambda: status)
+    made.adapters = {"rest": (rest, memory_access), "mqtt": (mqtt, None)}
+    polled: Any = SimpleNamespace(
+        counters=lambda: {"meter": METER, "fresh": {**METER, "health": "unknown", "age": None}}
+    )
+    made.poller = polled
+    made.disabled = ["spare"]
+    return made
+
+
+@pytest.fixture
+def address(diagnostics: Diagnostics) -> Iterator[tuple[str, int]]:
+    settings = MetricsConfig.model_validate({"bind": "127.0.0.1:0"})
+    listener = listen("127.0.0.1", 0)
+    supervisor = Supervisor("metrics", lambda: Metrics(settings, diagnostics, listener))
+    diagnostics.adapters["metrics"] = (supervisor, None)
+    with web.supervised(supervisor, listener):
+        yield listener.getsockname()
+
+
+@pytest.fixture
+def client(address: tuple[str, int]) -> Iterator[web.Client]:
+    with contextlib.closing(web.Client(address)) as connected:
+        yield connected
+
+
+def families(text: str) -> list[Metric]:
+    return list(text_string_to_metric_families(text))
+
+
+def samples(text: str) -> dict[tuple[str, ...], float]:
+    """Each sample by its name and the values of its labels."""
+    return {
+        (sample.name, *(value for _, value in sorted(sample.labels.items()))): sample.value
+        for family in families(text)
+        for sample in family.samples
+    }
+
+
+@pytest.fixture
+def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
+    answer = client.get("/metrics")
+    assert answer.status == 200
+    return samples(answer.body.decode())
+
+
+@pytest.mark.parametrize(
+    ("sample", "value"),
+    [
+        # Labels in the order of their names.
+        (("holdfast_build_info", holdfast.__version__), 1),
+        (("holdfast_events_lost_total",), 11),
+        (("holdfast_requests_total", "3", "scada"), 7),
+        (("holdfast_requests_total", "16", "scada"), 2),
+        (("holdfast_exceptions_total", "2", "scada"), 1),
+        (("holdfast_connections_open", "scada"), 2),
+        (("holdfast_connections_total", "scada", "accepted"), 5),
+        (("holdfast_connections_total", "scada", "refused_source"), 1),
+        (("holdfast_listener_total", "unanswered", "scada"), 4),
+        (("holdfast_listener_total", "frames_foreign", "scada"), 6),
+        (("holdfast_listener_total", "frames_broken", "scada"), 0),
+        (("holdfast_listener_total", "fresh", "replication"), 8),
+        (("holdfast_listener_total", "packets_accepted", "replication"), 9),
+        (("holdfast_listener_total", "packets_refused_crc", "replication"), 1),
+        (("holdfast_device_health", "meter", "error"), 1),
+        (("holdfast_device_health", "meter", "ok"), 0),
+        (("holdfast_device_health", "fresh", "unknown"), 1),
+        (("holdfast_device_health", "spare", "disabled"), 1),
+        (("holdfast_device_requests_total", "meter", "valid"), 50),
+        (("holdfast_device_requests_total", "meter", "exceptions"), 4),
+        (("holdfast_device_requests_total", "meter", "timeouts"), 5),
+        (("holdfast_device_requests_total", "meter", "transport_errors"), 1),
+        (("holdfast_device_polls_total", "meter"), 30),
+        (("holdfast_device_missed_polls_total", "meter"), 1),
+        (("holdfast_device_reads_total", "meter"), 29),
+        (("holdfast_device_values_total", "meter"), 290),
+        (("holdfast_device_age_seconds", "meter"), 5.5),
+        (("holdfast_device_error_seconds", "meter"), 4.5),
+        (("holdfast_device_failures", "meter"), 3),
+        (("holdfast_device_last_error", "meter"), 0x8001),
+        (("holdfast_device_round_trip_seconds", "meter"), 0.25),
+        (("holdfast_device_requests_per_poll", "meter"), 2),
+        (("holdfast_device_forward_total", "meter", "sent", "0"), 20),
+        (("holdfast_device_forward_total", "meter", "replaced", "0"), 4),
+        (("holdfast_adapter_state", "rest", "running"), 1),
+        (("holdfast_adapter_state", "rest", "failed"), 0),
+        (("holdfast_adapter_state", "mqtt", "failed"), 1),
+        (("holdfast_adapter_restarts_total", "mqtt"), 3),
+        (("holdfast_adapter_connections_open", "rest"), 2),
+        (("holdfast_adapter_connections_total", "rest", "idle"), 1),
+        (("holdfast_adapter_status", "mqtt", "connected"), 1),
+        (("holdfast_adapter_status", "mqtt", "messages_in"), 12),
+        (("holdfast_adapter_state", "metrics", "running"), 1),
+        (("holdfast_adapter_connections_open", "metrics"), 1),
+        (("holdfast_memory_sealed", "gated"), 1),
+        (("holdfast_memory_sealed", "plant_a"), 0),
+        (("holdfast_memory_seal_opened_total", "gated"), 0),
+        (("holdfast_memory_size", "coils", "plant_a"), 16),
+        (("holdfast_memory_size", "holding_registers", "plant_a"), 90),
+    ],
+)
+def test_every_counter_is_there(
+    scraped: dict[tuple[str, ...], float], sample: tuple[str, ...], value: float
+) -> None:
+    assert scraped[sample] == value
+
+
+def test_what_the_process_does_is_there(scraped: dict[tuple[str, ...], float]) -> None:
+    assert ("holdfast_connections_total", "scada", "open") not in scraped
+    assert ("holdfast_device_age_seconds", "fresh") not in scraped
+    assert ("holdfast_device_polls_total", "spare") not in scraped
+    assert scraped["holdfast_uptime_seconds",] >= 0
+    assert ("python_gc_collections_total", "0") in scraped
+    if ("process_open_fds",) in scraped:
+        assert scraped["process_open_fds",] > 0
+
+
+def test_it_shows_the_moment(
+    client: web.Client, memory_access: MemoryAccess, memories: dict[str, holdfast.Memory]
+) -> None:
+    grant = Grant("test", {"plant_a", "gated"}, web.AREAS)
+    memory_access.write(
+        [web.command("coils", 0, [1, 1]), web.command("coils", 7, [1], "gated")], grant, "-"
+    )
+    with pytest.raises(Refused):
+        memory_access.write([web.command("coils", 0, [2])], grant, "-")
+    memory_access.read("plant_a", "coils", 0, 1, grant, "-")
+    memories["gated"].write("coils", 7, [0])
+    seen = samples(client.get("/metrics").body.decode())
+    assert seen["holdfast_ingest_accepted_total", "rest"] == 1
+    assert seen["holdfast_ingest_values_total", "rest"] == 3
+    assert seen["holdfast_ingest_reads_total", "rest"] == 1
+    assert seen["holdfast_ingest_refused_total", "rest", "invalid_value"] == 1
+    assert seen["holdfast_memory_seal_opened_total", "gated"] == 1
+    assert seen["holdfast_memory_seal_closed_total", "gated"] == 1
+    assert seen["holdfast_memory_sealed", "gated"] == 1
+
+
+@pytest.mark.parametrize("audit", [None, {"lines": 5, "failed": 1}])
+def test_the_audit_log_when_there_is_one(
+    client: web.Client, diagnostics: Diagnostics, audit: dict[str, int] | None
+) -> None:
+    log: Any = None if audit is None else SimpleNamespace(counts=lambda: audit)
+    diagnostics.audit = log
+    seen = samples(client.get("/metrics").body.decode())
+    assert seen.get(("holdfast_audit_lines_total",)) == (None if audit is None else 5)
+    assert seen.get(("holdfast_audit_failed_total",)) == (None if audit is None else 1)
+
+
+def test_a_real_server_is_shown(
+    client: web.Client, diagnostics: Diagnostics, server: holdfast.Server
+) -> None:
+    with wire.Connection(server.address) as modbus:
+        modbus.ask(bytes.fromhex("0300000001"))
+        modbus.ask(bytes.fromhex("03ffff0002"))
+        diagnostics._engine.listeners = {"real": server.counters()}  # type: ignore[attr-defined]
+        seen = samples(client.get("/metrics").body.decode())
+    assert seen["holdfast_requests_total", "3", "real"] == 2
+    assert seen["holdfast_exceptions_total", "2", "real"] == 1
+    assert seen["holdfast_connections_open", "real"] == 1
+
+
+def test_names_follow_the_conventions(client: web.Client) -> None:
+    text = client.get("/metrics").body.decode()
+    for family in families(text):
+        assert family.documentation
+        if family.name.startswith("holdfast_") and family.type == "counter":
+            assert all(sample.name.endswith("_total") for sample in family.samples)
+        assert family.type != "unknown"
+
+
+def test_openmetrics_when_it_is_asked_for(client: web.Client) -> None:
+    accept = {"Accept": "application/openmetrics-text; version=1.0.0"}
+    answer = client.ask("GET", "/metrics", headers=accept)
+    assert answer.headers["content-type"].startswith("application/openmetrics-text")
+    text = answer.body.decode()
+    assert text.endswith("# EOF\n")
+    parsed: list[Metric] = list(openmetrics.text_string_to_metric_families(text))  # type: ignore[no-untyped-call]
+    names = {family.name for family in parsed}
+    assert {"holdfast_requests", "holdfast_build", "holdfast_memory_sealed"} <= names
+
+
+def test_plain_text_otherwise_and_compressed_when_asked_for(client: web.Client) -> None:
+    plain = client.get("/metrics")
+    assert plain.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    assert plain.headers["cache-control"] == "no-store"
+    packed = client.ask("GET", "/metrics", headers={"Accept-Encoding": "gzip"})
+    assert packed.headers["content-encoding"] == "gzip"
+    assert (
+        samples(gzip.decompress(packed.body).decode()).keys() == samples(plain.body.decode()).keys()
+    )
+
+
+def test_head_and_other_methods(client: web.Client) -> None:
+    assert client.ask("HEAD", "/metrics").status == 200
+    options = client.ask("OPTIONS", "/metrics")
+    assert (options.status, options.headers["allow"]) == (204, "GET, HEAD, OPTIONS")
+    post = client.ask("POST", "/metrics", b"{}")
+    assert (post.status, post.headers["allow"]) == (405, "GET, HEAD, OPTIONS")
+
+
+@pytest.mark.parametrize("path", ["/", "/metrics/", "/api/v1/health", "/openapi.json"])
+def test_nothing_else_is_there(client: web.Client, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status == 404
+    assert "/metrics" in answer.json["detail"]
+
+
+def test_a_name_of_any_kind_is_quoted(client: web.Client, diagnostics: Diagnostics) -> None:
+    name = 'a"b\\c\nd'
+    diagnostics._engine.listeners[name] = {"requests": {3: 1}}  # type: ignore[attr-defined]
+    seen = samples(client.get("/metrics").body.decode())
+    assert seen["holdfast_requests_total", "3", name] == 1
+
+
+def test_a_fault_of_one_part_is_answered_without_a_detail(
+    client: web.Client, diagnostics: Diagnostics
+) -> None:
+    diagnostics._engine.listeners["broken"] = None  # type: ignore[attr-defined]
+    answer = client.get("/metrics")
+    assert (answer.status, answer.json["reason"]) == (500, "internal_error")
+    del diagnostics._engine.listeners["broken"]  # type: ignore[attr-defined]
+    assert client.get("/metrics").status == 200

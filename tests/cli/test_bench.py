@@ -1,0 +1,179 @@
+"""`holdfast bench`, and the load that it makes."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+import random
+import re
+import signal
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from holdfast.tools.load import Latencies, Load
+from support import cli, wire
+from support.cli import answer, done, failure, invoke, usage_error
+from support.fake_device import HANG_UP, FakeDevice, exception, registers
+from support.terminal import Terminal
+
+if TYPE_CHECKING:
+    import holdfast
+
+SHORT = ("--seconds", "0.1")
+
+
+def test_rate_latencies_and_histogram_are_shown(server: holdfast.Server) -> None:
+    url = cli.url(server)
+    head, _, *lines = done("bench", url, *SHORT, "--connections", "2", "--in-flight", "3")
+    assert re.fullmatch(
+        rf"{url}, unit 1: holding_registers 0 to 9, 2 connections, 3 in flight on each, \d\.\d s",
+        head,
+    )
+    assert [line.split()[0] for line in lines[:7]] == [
+        "requests", "rate", "p50", "p90", "p99", "max", "errors",
+    ]  # fmt: skip
+    assert lines[6].split() == ["errors", "none"]
+    bars = [re.fullmatch(r"under +\S+ \S+ +(█*) +([0-9.]+) % +(\d+)", each) for each in lines[8:]]
+    assert bars
+    assert sum(int(bar[3]) for bar in bars if bar) == int(lines[0].split()[1])
+
+
+def test_the_server_answers_as_many_as_are_counted(server: holdfast.Server) -> None:
+    options = ("--area", "co", "--address", "7", "--count", "100", "--connections", "3")
+    found = answer("bench", cli.url(server), *SHORT, *options)
+    assert found["ok"] is True
+    counters = server.counters()
+    assert counters["requests"] == {1: found["requests"] + 3}
+    assert counters["connections"]["accepted"] == 3
+    assert found["rate"] == pytest.approx(found["requests"] / found["seconds"], rel=0.05)
+    times = found["latency_ms"]
+    assert 0 < times["min"] <= times["p50"] <= times["p90"] <= times["p99"] <= times["max"]
+    assert sum(bar["requests"] for bar in found["histogram"]) == found["requests"]
+
+
+def test_errors_are_counted_by_kind() -> None:
+    numbers = itertools.count()
+
+    def answers(pdu: bytes) -> bytes | None:
+        number = next(numbers)
+        if number == 3:
+            return exception(pdu, 6)
+        if number == 5:
+            return None
+        if number == 7:
+            return b"\x03\x01\x00"
+        return HANG_UP if number == 9 else registers(pdu)
+
+    with FakeDevice(answers) as device:
+        options = ("--timeout", "0.05", "--seconds", "0.6")
+        found = answer("bench", device.url, *options)
+        assert found["errors"] == {
+            "exception 06 (Server Device Busy)": 1,
+            "timeout": 1,
+            "invalid response": 1,
+            "connection lost": 1,
+        }
+        assert found["requests"] > 0
+        device.answer = lambda pdu: registers(pdu) if pdu[2] else exception(pdu, 6)
+
+
+def test_a_device_that_refuses_is_told_at_once(server: holdfast.Server) -> None:
+    url = cli.url(server)
+    assert failure("bench", url, "--address", "1000") == [
+        f"holdfast: {url}: exception 02 (Illegal Data Address)"
+    ]
+    assert answer("bench", url, "--address", "1000", code=1)["code"] == 2
+    assert failure("bench", "tcp://127.0.0.1:1")[0].startswith("holdfast: tcp://127.0.0.1:1: can't")
+
+
+def test_no_answer_after_the_first_is_a_failure() -> None:
+    numbers = itertools.count()
+
+    def answers(pdu: bytes) -> bytes | None:
+        return exception(pdu, 4) if next(numbers) else registers(pdu)
+
+    with FakeDevice(answers) as device:
+        result = invoke("bench", device.url, *SHORT)
+    assert result.exit_code == 1
+    assert re.search(r"requests +0\n", result.stdout)
+    assert "exception 04 (Server Device Failure)" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("tcp://127.0.0.1", "--count", "126"), "count is 126, one read returns 1 to 125."),
+        (("tcp://127.0.0.1", "--address", "65530"), "the last address is 65535."),
+        (
+            ("udp://127.0.0.1", "--in-flight", "2"),
+            "only tcp and tls have more than one request in flight.",
+        ),
+        (("rtu:///dev/ttyX", "--connections", "2"), "a serial line has one connection."),
+        (("tcp://127.0.0.1", "--area", "x"), "'x' is no area"),
+        (("tcp://127.0.0.1", "--seconds", "inf"), "'inf' is no number of seconds"),
+    ],
+)
+def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("bench", *arguments)
+
+
+def test_the_help_warns() -> None:
+    assert "THIS LOADS THE DEVICE" in "\n".join(done("bench", "--help"))
+
+
+def test_it_can_be_ended_earlier_with_what_was_measured(server: holdfast.Server) -> None:
+    with Terminal("bench", cli.url(server), "--seconds", "1000") as terminal:
+        wire.until(lambda: server.counters()["requests"].get(3, 0) > 10, "it is loaded")
+        terminal.until("Loading", "/s")
+        assert terminal.end(signal.SIGINT) == 0
+    assert "p99" in terminal.shown
+    assert "█" in terminal.shown
+
+
+def test_connections_are_limited() -> None:
+    for connections in (0, 1001):
+        with pytest.raises(ValueError, match="allowed are 1 to 1000"):
+            Load("tcp://127.0.0.1", "coils", 0, 1, connections=connections)
+
+
+def test_progress_is_told(server: holdfast.Server) -> None:
+    load = Load(cli.url(server), "input_registers", 0, 5, seconds=0.3)
+    seen: list[float] = []
+    asyncio.run(load.run(lambda load: seen.append(load.elapsed)))
+    assert seen == sorted(seen)
+    assert load.elapsed >= 0.3
+    assert load.rate > 0
+
+
+@given(st.lists(st.floats(1e-6, 1000), min_size=1))
+@settings(deadline=None)
+def test_quantiles_are_right_to_2_percent(times: list[float]) -> None:
+    latencies = Latencies()
+    for each in times:
+        latencies.add(each)
+    for share in (0.01, 0.5, 0.9, 0.99, 1.0):
+        true = sorted(times)[max(1, math.ceil(share * len(times))) - 1]
+        assert latencies.quantile(share) == pytest.approx(true, rel=0.02)
+    assert latencies.most == max(times)
+    assert latencies.least == min(times)
+    assert latencies.mean == pytest.approx(sum(times) / len(times))
+    assert sum(number for _, _, number in latencies.histogram()) == len(times)
+
+
+def test_a_histogram_has_no_gaps() -> None:
+    latencies = Latencies()
+    generator = random.Random(1)
+    for _ in range(1000):
+        latencies.add(generator.choice((0.00015, 0.003)))
+    bars = latencies.histogram()
+    assert [end for _, end, _ in bars] == pytest.approx([2e-4, 5e-4, 1e-3, 2e-3, 5e-3])
+    assert [number > 0 for _, _, number in bars] == [True, False, False, False, True]
+
+
+def test_nothing_was_measured_at_first() -> None:
+    latencies = Latencies()
+    assert (latencies.quantile(0.5), latencies.mean, latencies.histogram()) == (0, 0, [])

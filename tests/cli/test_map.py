@@ -1,0 +1,173 @@
+"""`holdfast map`, as people and programs use it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+import holdfast
+from support import cli, wire
+from support.cli import answer, done, failure, usage_error
+from support.fake_device import FakeDevice, exception, registers
+from support.terminal import Terminal
+
+if TYPE_CHECKING:
+    from support.running import Serve
+
+
+@pytest.fixture
+def url(serve: Serve) -> str:
+    memory = holdfast.Memory(coils=64, holding_registers=(1000, 16384), input_registers=(65000, 10))
+    return cli.url(serve({1: memory}))
+
+
+def test_ranges_are_a_picture_and_a_table(url: str) -> None:
+    head, empty, *lines = done("map", url)
+    assert empty == ""
+    assert re.fullmatch(
+        rf"{url}, unit 1: 16458 addresses; samples read, \d+ requests in \d+\.\d s", head
+    )
+    coils, inputs, holding, registers, scale, *table = lines
+    assert re.fullmatch(r"coils +▁·{59}", coils)
+    assert re.fullmatch(r"discrete inputs +·{60}", inputs)
+    assert re.fullmatch(r"holding registers +[▁-▇]█{14}[▁-▇]·{44}", holding)
+    assert re.fullmatch(r"input registers +·{59}▁", registers)
+    assert scale.split() == ["0", "16384", "32768", "49152", "65535"]
+    assert [line.split() for line in table] == [
+        [],
+        ["area", "first", "last", "count"],
+        ["coils", "0", "63", "64"],
+        ["holding_registers", "1000", "17383", "16384"],
+        ["input_registers", "65000", "65009", "10"],
+    ]
+
+
+def test_a_program_gets_the_same(url: str) -> None:
+    found = answer("map", url)
+    assert (found["ok"], found["exact"]) == (True, False)
+    assert {area: each["ranges"] for area, each in found["areas"].items()} == {
+        "coils": [[0, 63]],
+        "discrete_inputs": [],
+        "holding_registers": [[1000, 17383]],
+        "input_registers": [[65000, 65009]],
+    }
+    assert found["requests"] == sum(each["requests"] for each in found["areas"].values())
+    assert found["areas"]["holding_registers"]["largest_read"] == 125
+
+
+def test_exact_finds_what_samples_miss() -> None:
+    def hidden(pdu: bytes) -> bytes:
+        address, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        inside = address >= 1011 and address + count <= 1014
+        return registers(pdu) if inside else exception(pdu, 2)
+
+    with FakeDevice(hidden) as device:
+        options = ("--areas", "hr", "--range", "900-1099")
+        fast = answer("map", device.url, *options)["areas"]["holding_registers"]
+        exact = answer("map", device.url, *options, "--exact")["areas"]["holding_registers"]
+    assert (fast["ranges"], exact["ranges"]) == ([], [[1011, 1013]])
+    assert fast["requests"] < 10 < exact["requests"] < 220
+
+
+def test_reads_stay_within_what_is_allowed() -> None:
+    with FakeDevice(registers) as device:
+        options = ("--areas", "ir,hr", "--range", "0x10-99", "--max-quantity", "7")
+        found = answer("map", device.url, *options)
+        asked = [
+            (pdu[0], int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])) for pdu in device.asked
+        ]
+    assert [area["ranges"] for area in found["areas"].values()] == [[[16, 99]]] * 2
+    assert list(found["areas"]) == ["holding_registers", "input_registers"]
+    assert max(count for _, _, count in asked) == 7
+    assert (min(at for _, at, _ in asked), max(at + n for _, at, n in asked)) == (16, 100)
+
+
+def test_failures_are_told_apart() -> None:
+    def answers(pdu: bytes) -> bytes | None:
+        address, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3:
+            return exception(pdu, 1)
+        if address <= 5 < address + count:
+            return exception(pdu, 4)
+        return registers(pdu) if address + count <= 9 else exception(pdu, 2)
+
+    with FakeDevice(answers) as device:
+        lines = done("map", device.url, "--exact", "--range", "0-15")
+        areas = answer("map", device.url, "--exact", "--range", "0-15")["areas"]
+    assert "holding registers  █████!███·······" in lines
+    assert lines[-4:] == [
+        "coils: exception 01 (Illegal Function); not looked at further",
+        "discrete_inputs: exception 01 (Illegal Function); not looked at further",
+        "holding_registers: exception 04 (Server Device Failure) at 5",
+        "input_registers: exception 01 (Illegal Function); not looked at further",
+    ]
+    assert areas["coils"]["given_up"]["code"] == 1
+    [failed] = areas["holding_registers"]["failures"]
+    assert (failed["reason"], failed["code"], failed["ranges"]) == ("exception", 4, [[5, 5]])
+
+
+def test_a_device_without_addresses_is_no_failure() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
+        assert done("map", device.url, "--range", "0-99")[-1] == "No address was found."
+
+
+def test_a_device_that_does_not_answer_is_a_failure() -> None:
+    with FakeDevice(lambda _: None) as device:
+        assert failure("map", device.url, "--timeout", "0.02") == [
+            f"holdfast: {device.url}: no answer to 4 reads"
+        ]
+        found = answer("map", device.url, "--timeout", "0.02", code=1)
+    assert (found["ok"], found["detail"]) == (False, "no answer to 4 reads")
+
+
+def test_only_ascii_is_shown_where_there_is_no_more(url: str) -> None:
+    with Terminal("map", url, "--areas", "hr", columns=80, PYTHONIOENCODING="ascii") as terminal:
+        assert re.search(r"holding registers  -#{14}-\.{44}\n", terminal.until("first"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--areas", "hr,x"), "'x' is no area"),
+        (("--range", "5-4"), "'5-4' is not FIRST-LAST, as 0-999, up to 65535."),
+        (("--range", "0-65536"), "'0-65536' is not FIRST-LAST"),
+        (("--range", "-4"), "'-4' is not FIRST-LAST"),
+        (("--max-quantity", "0"), "0 is not in the range x>=1."),
+        (("--step", "0"), "0 is not in the range x>=1."),
+    ],
+)
+def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("map", "tcp://127.0.0.1:1", *arguments)
+
+
+def test_progress_is_shown_on_a_terminal_and_the_picture_has_its_width(url: str) -> None:
+    with Terminal("map", url, columns=60) as terminal:
+        shown = terminal.until("Mapping", "input_registers")
+        assert terminal.end() == 0
+    assert "100%" in shown
+    assert re.search(r"\d+ requests", shown)
+    assert re.search(r"^discrete inputs +·{40}$", shown, re.M)
+
+
+def test_what_was_found_is_shown_when_it_is_interrupted() -> None:
+    reached, go_on = threading.Event(), threading.Event()
+
+    def answers(pdu: bytes) -> bytes:
+        if int.from_bytes(pdu[1:3]) >= 500:
+            reached.set()
+            go_on.wait(wire.DEADLINE)
+        return registers(pdu)
+
+    with FakeDevice(answers) as device:
+        options = ("--areas", "hr", "--exact", "--timeout", "60")
+        with Terminal("map", device.url, *options) as terminal:
+            assert reached.wait(wire.DEADLINE)
+            terminal.process.send_signal(signal.SIGINT)
+            go_on.set()
+            assert terminal.end() == 1
+    assert re.search(r"holding_registers +0 +\d+", terminal.shown)
+    assert "interrupted" in terminal.shown

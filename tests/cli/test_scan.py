@@ -1,0 +1,304 @@
+"""`holdfast scan` as a user has it: a process, its output, its signals, its exit codes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from nats.errors import NoRespondersError
+
+from holdfast.scanner.schema import json_schema
+from support import wire
+from support.cli import done, invoke, usage_error
+from support.nats_bus import Caller, NatsServer, subscription, tag
+from support.nats_keys import Operator, User
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    import holdfast
+
+    Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts `holdfast scan`; it is killed when the test ends."""
+    started: list[subprocess.Popen[str]] = []
+
+    def scan(*options: str, **environment: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "holdfast", "scan", *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **environment},
+        )
+        started.append(process)
+        return process
+
+    yield scan
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def greeting(process: subprocess.Popen[str]) -> str:
+    """What it says first."""
+    assert process.stdout is not None
+    text = ""
+    while "Ctrl-C stops it." not in text:
+        line = process.stdout.readline()
+        assert line, process.communicate()
+        text += line
+    return text
+
+
+def connected(process: subprocess.Popen[str]) -> None:
+    """Waits until it says that it is connected."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        if "nats_connected" in line:
+            return
+    raise AssertionError(process.communicate())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_says_what_it_does_and_a_signal_ends_it(
+    start: Start, nats: NatsServer, number: signal.Signals
+) -> None:
+    process = start("--prefix", "plant", NATS_SERVERS=f"127.0.0.1:{nats.port}")
+    said = greeting(process)
+    assert f"Scanning for whoever subscribes at nats://127.0.0.1:{nats.port}." in said
+    assert "plant.subscribe, plant.unsubscribe, plant.browse" in said
+    connected(process)
+    process.send_signal(number)
+    out, log = process.communicate(timeout=wire.DEADLINE)
+    assert (process.returncode, out) == (0, "")
+    assert log.splitlines()[-1].endswith("info stopped")
+    assert "Traceback" not in log
+
+
+def test_a_message_ends_it(start: Start, nats: NatsServer, caller: Caller) -> None:
+    process = start("--nats", nats.url, "--log-format", "json")
+    connected(process)
+    # The subjects are subscribed to when the connection is there, a moment after it says so.
+    wire.until(lambda: _ended(process, caller), "it ends")
+    assert process.returncode == 0
+    assert process.stderr is not None
+    logged = [json.loads(line)["event"] for line in process.stderr]
+    assert "shutdown_asked" in logged
+
+
+def _ended(process: subprocess.Popen[str], caller: Caller) -> bool:
+    if process.poll() is None:
+        caller.publish("modbus.shutdown")
+    return process.poll() is not None
+
+
+def test_secrets_are_used_and_not_shown(
+    start: Start, tmp_path: Path, server: holdfast.Server
+) -> None:
+    own = NatsServer(tmp_path, "--user", "scan", "--pass", "s3cret")
+    try:
+        password = tmp_path / "password"
+        password.write_text("s3cret\n")
+        wrong = tmp_path / "wrong"
+        wrong.write_text("guess")
+        refused = start("--nats", own.url, "--user", "scan", "--password-file", str(wrong))
+        assert refused.stderr is not None
+        line = refused.stderr.readline()
+        assert "nats_connect_failed" in line
+        assert "uthorization" in line
+        for options in (
+            ("--nats", own.url, "--user", "scan", "--password-file", str(password)),
+            ("--nats", f"nats://scan:s3cret@127.0.0.1:{own.port}"),
+        ):
+            process = start(*options)
+            assert "s3cret" not in greeting(process)
+            connected(process)
+            with Caller(own.url.replace("//", "//scan:s3cret@")) as caller:
+                data = caller.listen("modbus.data.plc1")
+                _subscribe(caller, server)
+                data.next()
+            process.terminate()
+            _, log = process.communicate(timeout=wire.DEADLINE)
+            assert "s3cret" not in log
+    finally:
+        own.kill()
+
+
+def test_credentials_are_used_and_not_shown(start: Start, tmp_path: Path) -> None:
+    operator = Operator()
+    own = NatsServer(tmp_path, "-c", str(operator.configure(tmp_path / "nats.conf")))
+    try:
+        user = User(operator.plant)
+        process = start("--nats", own.url, "--creds", str(user.write(tmp_path / "scan.creds")))
+        said = greeting(process)
+        connected(process)
+        process.terminate()
+        _, log = process.communicate(timeout=wire.DEADLINE)
+        assert process.returncode == 0
+        for secret in (user.key.seed, user.jwt):
+            assert secret not in said + log
+    finally:
+        own.kill()
+
+
+def _subscribe(caller: Caller, server: holdfast.Server) -> None:
+    """Subscribes as soon as the scanner serves."""
+
+    def subscribed() -> bool:
+        with contextlib.suppress(NoRespondersError):
+            request = subscription(server, tag("a", 0))
+            return bool(caller.request("modbus.subscribe", request)["success"])
+        return False
+
+    wire.until(subscribed, "it answers")
+
+
+def test_it_brings_its_own_server_and_takes_it_along(
+    start: Start, tmp_path: Path, server: holdfast.Server
+) -> None:
+    process = start("--embedded", "--nats", "nats://127.0.0.1:0", "--store", str(tmp_path / "kept"))
+    found = re.search(r"nats://127\.0\.0\.1:([0-9]+)\.", greeting(process))
+    assert found is not None
+    port = int(found[1])
+    connected(process)
+    with Caller(f"nats://127.0.0.1:{port}") as caller:
+        data = caller.listen("modbus.data.plc1")
+        _subscribe(caller, server)
+        data.next()
+    assert process.stderr is not None
+    while " heartbeat " not in (line := process.stderr.readline()):
+        assert line
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=wire.DEADLINE)
+    assert process.returncode == 0
+    assert not _listens(port)
+    assert (tmp_path / "kept" / "jetstream").is_dir()
+
+
+LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="as only Linux has it")
+
+
+@LINUX
+def test_its_own_server_ends_even_when_it_is_killed(start: Start) -> None:
+    process = start("--embedded", "--nats", "nats://127.0.0.1:0")
+    found = re.search(r"nats://127\.0\.0\.1:([0-9]+)\.", greeting(process))
+    assert found is not None
+    process.kill()
+    process.wait()
+    wire.until(lambda: not _listens(int(found[1])), "the server has ended too")
+
+
+@LINUX
+def test_it_ends_with_its_own_server(start: Start) -> None:
+    process = start("--embedded", "--nats", "nats://127.0.0.1:0")
+    greeting(process)
+    connected(process)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    os.kill(int(children[0]), signal.SIGKILL)
+    _, log = process.communicate(timeout=wire.DEADLINE)
+    assert process.returncode == 1
+    assert "holdfast: nats-server ended: killed by signal 9" in log
+    assert "Traceback" not in log
+
+
+def _listens(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+        return True
+    return False
+
+
+def test_a_port_that_is_taken_is_one_line(start: Start) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        process = start("--embedded", "--nats", f"nats://127.0.0.1:{port}")
+        out, log = process.communicate(timeout=wire.DEADLINE)
+    assert (process.returncode, out) == (1, "")
+    assert log.startswith("holdfast: nats-server ended:")
+    assert "address already in use" in log
+    assert log.count("\n") == 1
+
+
+def test_a_server_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
+    result = invoke("scan", "--embedded")
+    assert result.exit_code == 1
+    assert "nats-server is not installed" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["--nats", "http://localhost"], "found neither nats:// nor tls://, allowed: nats://host"),
+        (["--nats", "nats://host:port"], "found a host or port that can't be"),
+        (["--nats", "nats://me:secret@"], "found no host"),
+        (["--allow", "10.0.0.1/8"], "found '10.0.0.1/8', which has host bits set: the network is"),
+        (["--allow", "example"], "found 'example', allowed: a network or an address"),
+        (["--prefix", "a b"], "found 'a b', allowed: the first part of subjects"),
+        (["--prefix", "a.>"], "found 'a.>', allowed: the first part of subjects"),
+        (["--password-file", __file__], "--password-file goes with --user."),
+        (["--tls-cert", __file__], "--tls-cert goes with --tls-key."),
+        (["--device-key", __file__], "--device-key goes with --device-cert."),
+        (["--device-ca", "missing"], "'missing' does not exist."),
+        (["--user", "a", "--token-file", __file__], "--user and --token-file exclude each other."),
+        (["--user", "a", "--creds", __file__], "--user and --creds exclude each other."),
+        (["--creds", "missing"], "'missing' does not exist."),
+        (["--store", "x"], "--store goes with --embedded."),
+        (["--embedded", "--nats", "nats://10.0.0.1"], "--embedded serves at 127.0.0.1 only"),
+        (["--embedded", "--user", "a"], "--embedded serves at 127.0.0.1 only"),
+        (["--max-tags", "0"], "0 is not in the range x>=1."),
+    ],
+)
+def test_wrong_usage_is_told(options: list[str], error: str) -> None:
+    assert error in usage_error("scan", *options)
+
+
+def test_a_wrong_server_in_the_environment_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NATS_SERVERS", "localhost:4222,ftp://x")
+    assert "found neither nats:// nor tls://" in usage_error("scan")
+
+
+def test_a_serial_device_is_allowed_beside_private_addresses(
+    start: Start, nats: NatsServer
+) -> None:
+    said = greeting(start("--nats", f"{nats.url}/", "--allow", "/dev/ttyUSB7"))
+    assert "devices    /dev/ttyUSB7, 127.0.0.0/8, 10.0.0.0/8, " in said
+
+
+def test_the_schema_is_printed() -> None:
+    assert json.loads("\n".join(done("scan", "--schema"))) == json_schema()
+
+
+@pytest.mark.parametrize("option", ["--creds", "--tls-ca"])
+def test_a_file_that_can_not_be_used_is_told(start: Start, nats: NatsServer, option: str) -> None:
+    process = start("--nats", nats.url, option, __file__)
+    _, log = process.communicate(timeout=wire.DEADLINE)
+    assert process.returncode == 1
+    assert "holdfast: " in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize("embedded", [False, True])
+def test_a_file_for_devices_that_can_not_be_used_is_told_before_anything_is_served(
+    start: Start, nats: NatsServer, embedded: bool
+) -> None:
+    where = ("--embedded", "--nats", "nats://127.0.0.1:0") if embedded else ("--nats", nats.url)
+    process = start(*where, "--device-ca", __file__)
+    out, log = process.communicate(timeout=wire.DEADLINE)
+    assert (process.returncode, out) == (1, "")
+    assert log.startswith("holdfast: ")
+    assert __file__ in log
+    assert log.count("\n") == 1

@@ -1,0 +1,428 @@
+"""`holdfast watch`, as people and programs use it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+import holdfast
+from holdfast.cli.sources import WatchedRange, cut, within
+from holdfast.cli.watching import WINDOW, Tracker
+from support import cli, wire
+from support.cli import answer, failure, invoke, usage_error
+from support.fake_device import FakeDevice, exception, registers
+from support.running import endpoint
+from support.terminal import Terminal, interruptible, plain
+from support.web import token
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from holdfast.appliance import Appliance
+    from support.running import Run, Serve
+
+OFTEN = ("--every", "0.01")
+FRESH = "\x1b[1;7;33m"
+
+MEMORIES = """
+memories:
+  boiler: {coils: 8, holding_registers: {start: 100, size: 20}}
+  pumps: {input_registers: 4}
+"""
+LISTENER = """
+listeners:
+  other: {type: modbus-udp, bind: 127.0.0.1:0, rules: [
+    {sources: [127.0.0.1], units: {1: pumps}, access: read-only}]}
+  scada: {type: modbus-tcp, bind: 127.0.0.1:SCADA, rules: [
+    {sources: [10.0.0.1], units: {1: pumps}, access: read-only},
+    {sources: [127.0.0.0/8], units: {3: boiler, 4: boiler, 5: pumps},
+     access: read-only, deny: [1]}]}
+"""
+REST = "rest: {bind: 127.0.0.1:REST, sources: [127.0.0.1], tokens: TOKENS}\n"
+
+
+class Watch:
+    """`holdfast watch` without a terminal."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "holdfast", "watch", *arguments, *OFTEN],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=interruptible,
+        )
+        assert self.process.stderr is not None
+        self.greeting = self.process.stderr.readline()
+
+    def line(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline()
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        _, log = self.process.communicate(timeout=wire.DEADLINE)
+        assert log == ""
+        return self.process.returncode
+
+
+@pytest.fixture
+def watch() -> Iterator[Callable[..., Watch]]:
+    with contextlib.ExitStack() as started:
+
+        def start(*arguments: str) -> Watch:
+            running = Watch(*arguments)
+            started.callback(running.process.communicate)
+            started.callback(running.process.kill)
+            return running
+
+        yield start
+
+
+@pytest.fixture
+def plant(run: Run, tmp_path: Path) -> Callable[..., tuple[Appliance, str]]:
+    """Runs an appliance, and writes a file that names the ports that it has."""
+
+    def start(*parts: str, tokens: str = "none") -> tuple[Appliance, str]:
+        text = "".join(parts).replace("TOKENS", tokens)
+        appliance = run(re.sub("SCADA|REST", "0", text))
+        for name, mark in (("scada", "SCADA"), ("rest", "REST")):
+            if mark in text:
+                text = text.replace(mark, str(endpoint(appliance, name)[1]))
+        file = tmp_path / "running.yaml"
+        file.write_text(text)
+        return appliance, str(file)
+
+    return start
+
+
+def test_changes_of_a_device_are_lines(
+    server: holdfast.Server, memory: holdfast.Memory, watch: Callable[..., Watch]
+) -> None:
+    watching = watch(cli.url(server), "hr", "5", "10")
+    assert watching.greeting == f"watching {cli.url(server)}, unit 1\n"
+    wire.until(lambda: server.counters()["requests"].get(3, 0) > 1, "it reads")
+    memory.write("holding_registers", 4, [1, 2, 3])
+    time, *words = watching.line().split()
+    assert re.fullmatch(r"\d\d:\d\d:\d\d\.\d\d\d", time)
+    assert words == ["holding_registers", "5:", "0", "->", "2", "+2"]
+    assert watching.line().split()[1:] == ["holding_registers", "6:", "0", "->", "3", "+3"]
+    assert watching.end() == 0
+
+
+def test_changes_are_objects_for_programs(
+    server: holdfast.Server, memory: holdfast.Memory, watch: Callable[..., Watch]
+) -> None:
+    watching = watch(cli.url(server), "co", "0", "8", "--json")
+    wire.until(lambda: server.counters()["requests"].get(1, 0) > 1, "it reads")
+    memory.write("coils", 3, [1])
+    change = json.loads(watching.line())
+    assert change.pop("time").endswith("Z")
+    assert change == {"ok": True, "area": "coils", "address": 3, "was": 0, "now": 1}
+    assert watching.end() == 0
+
+
+def test_all_that_a_device_has_is_watched_if_nothing_is_named(
+    serve: Serve, watch: Callable[..., Watch]
+) -> None:
+    memory = holdfast.Memory(discrete_inputs=10, input_registers=(1000, 10))
+    server = serve({1: memory})
+    watching = watch(cli.url(server))
+    assert "finding out which addresses there are" in watching.greeting
+    assert watching.process.stderr is not None
+    assert watching.process.stderr.readline() == f"watching {cli.url(server)}, unit 1\n"
+    reads = server.counters()["requests"][4]
+    wire.until(lambda: server.counters()["requests"][4] > reads + 1, "it reads")
+    memory.write_many([("discrete_inputs", 9, [1]), ("input_registers", 1009, [7])])
+    assert watching.line().split()[1:] == ["discrete_inputs", "9:", "0", "->", "1"]
+    assert watching.line().split()[1:] == ["input_registers", "1009:", "0", "->", "7", "+7"]
+    assert watching.end() == 0
+
+
+def test_errors_are_told_and_it_goes_on(watch: Callable[..., Watch]) -> None:
+    with FakeDevice(registers) as device:
+        watching = watch(device.url, "hr", "0")
+        wire.until(lambda: len(device.asked) > 2, "it reads")
+        device.answer = lambda pdu: exception(pdu, 6)
+        assert watching.line().split(maxsplit=1)[1] == "exception 06 (Server Device Busy)\n"
+        device.answer = lambda pdu: registers(pdu, 9)
+        while "->" not in (line := watching.line()):
+            assert "exception 06" in line
+        assert line.split()[1:] == ["holding_registers", "0:", "0", "->", "9", "+9"]
+        assert watching.end() == 0
+
+
+def test_an_appliance_is_watched_over_rest(
+    plant: Callable[..., tuple[Appliance, str]], watch: Callable[..., Watch]
+) -> None:
+    appliance, file = plant(MEMORIES, LISTENER, REST)
+    watching = watch(file)
+    host, port = endpoint(appliance, "rest")
+    assert watching.greeting == f"watching REST at http://{host}:{port}\n"
+
+    def reads() -> int:
+        rest = appliance.diagnostics.adapter("rest")
+        assert rest is not None
+        counted: int = rest["reads"]
+        return counted
+
+    wire.until(lambda: reads() > 6, "it reads")
+    appliance.memories["boiler"].write("holding_registers", 119, [7])
+    appliance.memories["pumps"].write("input_registers", 0, [8])
+    lines = {" ".join(watching.line().split()[1:]) for _ in range(2)}
+    assert lines == {
+        "boiler holding_registers 119: 0 -> 7 +7",
+        "pumps input_registers 0: 0 -> 8 +8",
+    }
+    assert watching.end() == 0
+
+
+def test_a_token_opens_what_it_may_read(
+    plant: Callable[..., tuple[Appliance, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    granted = token("panel", "s3cret", memories=("pumps", "boiler"), areas=("coils",))
+    _, file = plant(MEMORIES, REST, tokens=json.dumps([granted]))
+    result = invoke("watch", file, "--times", "1")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == f"{file}: rest asks for a token; give it in HOLDFAST_TOKEN\n"
+    monkeypatch.setenv("HOLDFAST_TOKEN", "other")
+    assert "rest knows no token like that" in invoke("watch", file, "--times", "1").stderr
+    monkeypatch.setenv("HOLDFAST_TOKEN", "s3cret")
+    result = invoke("watch", file, "--times", "2", *OFTEN)
+    assert (result.exit_code, result.stdout) == (0, "")
+
+
+def test_an_appliance_without_rest_is_watched_over_modbus(
+    plant: Callable[..., tuple[Appliance, str]], watch: Callable[..., Watch]
+) -> None:
+    appliance, file = plant(MEMORIES, LISTENER)
+    watching = watch(file)
+    host, port = endpoint(appliance, "scada")
+    assert watching.greeting == f"watching listener scada at tcp://{host}:{port}\n"
+
+    def reads() -> int:
+        counted: int = appliance.diagnostics.stats()["listeners"]["scada"]["requests"].get(4, 0)
+        return counted
+
+    wire.until(lambda: reads() > 1, "it reads")
+    appliance.memories["pumps"].write("input_registers", 2, [9])
+    assert watching.line().split()[1:] == ["pumps", "input_registers", "2:", "0", "->", "9", "+9"]
+    assert watching.end() == 0
+    assert 1 not in appliance.diagnostics.stats()["listeners"]["scada"]["requests"]
+
+
+@pytest.mark.parametrize(
+    ("parts", "arguments", "told"),
+    [
+        ((MEMORIES, LISTENER), ("--memory", "fans"), "has no memory 'fans', it has boiler, pumps."),
+        ((MEMORIES, LISTENER), ("--memory", "pumps", "hr", "0"), "nothing of that can be read"),
+        ((MEMORIES, LISTENER), ("co", "0", "8"), "nothing of that can be read"),
+        (
+            (MEMORIES, LISTENER.replace("127.0.0.0/8", "127.0.0.2")),
+            (),
+            "no rule of listener scada lets 127.0.0.1 in",
+        ),
+        (
+            (MEMORIES, LISTENER.replace("SCADA", "0")),
+            (),
+            "listener scada is bound to port 0, so that its port is not known",
+        ),
+        (
+            (MEMORIES, LISTENER, REST.replace("REST", "0")),
+            (),
+            "rest is bound to port 0, so that its port is not known",
+        ),
+        (
+            (MEMORIES, LISTENER.replace("modbus-tcp", "modbus-rtu-over-tcp")),
+            (),
+            "there is neither rest nor a listener of type modbus-tcp",
+        ),
+        (("memories: {}\n",), (), "problem"),
+    ],
+)
+def test_an_appliance_that_can_not_be_watched_is_told(
+    parts: tuple[str, ...], arguments: tuple[str, ...], told: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "plant.yaml"
+    text = "".join(parts).replace("TOKENS", "none").replace("SCADA", "5020")
+    file.write_text(text.replace("REST", "5021"))
+    result = invoke("watch", str(file), *arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert told in result.stderr
+
+
+def test_the_first_reading_must_succeed(server: holdfast.Server, tmp_path: Path) -> None:
+    url = cli.url(server)
+    assert failure("watch", url, "hr", "999", "2") == [
+        f"holdfast: {url}, unit 1: exception 02 (Illegal Data Address)"
+    ]
+    found = answer("watch", url, "hr", "999", "2", code=1)
+    assert found["ok"] is False
+    file = tmp_path / "plant.yaml"
+    file.write_text(MEMORIES + REST.replace("REST", "1").replace("TOKENS", "none"))
+    [line] = failure("watch", str(file))
+    assert line.startswith("holdfast: REST at http://127.0.0.1:1: ")
+
+
+def test_a_device_without_addresses_can_not_be_watched() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 1)) as device:
+        assert failure("watch", device.url)[-1] == f"holdfast: {device.url}: no address was found"
+    assert failure("watch", "tcp://127.0.0.1:1")[-1].startswith(
+        "holdfast: tcp://127.0.0.1:1: can't"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("tcp://127.0.0.1", "--memory", "x"), "--memory goes with FILE."),
+        (("foo://127.0.0.1",), "is no URL of a device"),
+        (("tcp://127.0.0.1", "hr"), "Missing argument 'ADDRESS'."),
+        (("tcp://127.0.0.1", "hr", "65535", "2"), "the last address is 65535."),
+    ],
+)
+def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("watch", *arguments)
+
+
+def frame(terminal: Terminal) -> list[str]:
+    """The last whole screen."""
+    return plain(terminal.shown.split("\x1b[H")[-1]).splitlines()
+
+
+def test_a_terminal_shows_values_and_highlights_what_changed(
+    server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [11, 22, 33])
+    arguments = ("watch", cli.url(server), "hr", "0", "32", "--every", "0.05")
+    with Terminal(*arguments, lines=24, columns=80) as terminal:
+        shown = terminal.until("11    22    33", "q quits")
+        assert "changing" not in shown
+        memory.write("holding_registers", 1, [4711])
+        terminal.until("holding_registers 1:  4711", "1 change")
+        assert f"{FRESH}4711" in terminal.shown
+        memory.write("holding_registers", 1, [4712])
+        terminal.until("holding_registers 1:  4712", "2 changes")
+        terminal.keys("q")
+        assert terminal.end() == 0
+    assert terminal.shown.endswith("\x1b[?25h\x1b[?1049l")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leaves_the_terminal_as_it_was(
+    server: holdfast.Server, number: signal.Signals
+) -> None:
+    with Terminal("watch", cli.url(server), "hr", "0") as terminal:
+        terminal.until("q quits")
+        assert terminal.end(number) == 0
+    assert terminal.shown.endswith("\x1b[?25h\x1b[?1049l")
+
+
+def test_colours_are_left_out_if_they_are_not_wanted(
+    server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    arguments = ("watch", cli.url(server), "hr", "0", "--every", "0.05")
+    with Terminal(*arguments, NO_COLOR="1") as terminal:
+        terminal.until("q quits")
+        memory.write("holding_registers", 0, [4711])
+        terminal.until("4711", "1 change")
+        terminal.keys("q")
+        assert terminal.end() == 0
+    assert "\x1b[1;7m4711" in terminal.shown
+    assert not re.search(r"\x1b\[[0-9;]*3[0-9]m", terminal.shown)
+
+
+def test_the_size_of_the_terminal_may_change(server: holdfast.Server) -> None:
+    arguments = ("watch", cli.url(server), "hr", "0", "300", "--every", "0.05")
+    with Terminal(*arguments, lines=20, columns=60) as terminal:
+        terminal.until("n, p turn pages (1/3)")
+        assert "    8 " in plain(terminal.shown)
+        terminal.resize(60, 120)
+        shown = terminal.until("   16 ", "  288 ", "q quits")
+        assert "turn pages" not in shown.rpartition("  288 ")[2]
+        terminal.resize(8, 30)
+        terminal.until("(1/")
+        terminal.keys("q")
+        assert terminal.end() == 0
+
+
+def test_pages_are_turned(server: holdfast.Server) -> None:
+    arguments = ("watch", cli.url(server), "hr", "0", "300", "--every", "0.05")
+    with Terminal(*arguments, lines=20, columns=60) as terminal:
+        terminal.until("(1/3)")
+        terminal.keys("n")
+        terminal.until("(2/3)")
+        terminal.keys(" ")
+        terminal.until("  296 ", "(3/3)")
+        terminal.keys("n")
+        terminal.keys("p")
+        terminal.until("(2/3)")
+        terminal.keys("\x03")
+        assert terminal.end() == 0
+
+
+def test_errors_are_shown_on_a_terminal_and_it_goes_on() -> None:
+    with FakeDevice(registers) as device:
+        arguments = ("watch", device.url, "hr", "0", "--every", "0.05")
+        with Terminal(*arguments) as terminal:
+            terminal.until("q quits")
+            device.answer = lambda pdu: exception(pdu, 6)
+            terminal.until("exception 06 (Server Device Busy)", "error")
+            device.answer = lambda pdu: registers(pdu, 4711)
+            terminal.until("4711")
+            terminal.keys("q")
+            assert terminal.end() == 0
+
+
+def test_it_ends_after_so_many_readings(server: holdfast.Server) -> None:
+    arguments = ("watch", cli.url(server), "hr", "0", *OFTEN, "--times", "3")
+    with Terminal(*arguments) as terminal:
+        assert terminal.end() == 0
+    assert "3 readings" in plain(terminal.shown)
+    assert server.counters()["requests"][3] == 3
+
+
+REGISTERS = WatchedRange(None, 1, "holding_registers", 100, 4)
+
+
+def test_rates_are_taken_over_the_last_time() -> None:
+    tracker = Tracker([REGISTERS])
+    for second in range(8):
+        tracker.update(second, [[2 * second, 5, 65530 + second if second < 6 else second - 6, 0]])
+    found = {address: (value, history) for _, address, value, history in tracker.latest(9)}
+    assert list(found) == [100, 102]
+    assert [found[address][1].rate(7) for address in found] == [2, 1]
+    assert found[100][1].changes == 7
+    assert found[100][1].rate(7 + WINDOW + 1) == 0
+    for second in range(8, 30):
+        tracker.update(second, [[14 - second, 5, 1, 0]])
+    assert found[100][1].rate(29) == pytest.approx(-1)
+
+
+def test_only_the_latest_changes_are_listed() -> None:
+    tracker = Tracker([REGISTERS])
+    for values in ([0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1], [1, 1, 1, 1]):
+        changes = tracker.update(tracker.at + 1, [values])
+    assert [(change.address, change.was, change.now) for change in changes] == [(102, 0, 1)]
+    assert [address for _, address, _, _ in tracker.latest(3)] == [101, 102, 103]
+    assert [tracker.age(0, address) for address in range(100, 104)] == [2, 1, 0, 1]
+
+
+def test_blocks_are_cut_to_what_is_asked_for_and_to_what_is_allowed() -> None:
+    coils = WatchedRange("m", 1, "coils", 0, 10)
+    assert within([coils, REGISTERS], "holding_registers", 102, 50) == [
+        WatchedRange(None, 1, "holding_registers", 102, 2)
+    ]
+    assert within([coils], "coils", 10, 5) == []
+    assert cut([coils, REGISTERS], 12) == (
+        [coils, WatchedRange(None, 1, "holding_registers", 100, 2)],
+        2,
+    )

@@ -1,0 +1,176 @@
+"""`holdfast write`, as people and programs use it."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+
+from support import cli
+from support.cli import answer, done, failure, usage_error
+from support.fake_device import FakeDevice, exception
+
+if TYPE_CHECKING:
+    import holdfast
+    from holdfast.types import Area
+
+NOWHERE = "tcp://127.0.0.1:1"
+
+
+@pytest.mark.parametrize(
+    ("words", "area", "address", "stored"),
+    [
+        (("hr", "3", "7"), "holding_registers", 3, [7]),
+        (("hr", "3", "7", "0xFFFF", "0X10"), "holding_registers", 3, [7, 65535, 16]),
+        (("co", "3", "on"), "coils", 3, [1]),
+        (("coils", "3", "true", "FALSE", "on", "off", "1", "0"), "coils", 3, [1, 0, 1, 0, 1, 0]),
+        (("40004", "9", "--modicon"), "holding_registers", 3, [9]),
+        (("0x0004", "1", "--modicon"), "coils", 3, [1]),
+        (("hr", "0", "-5", "--type", "int16"), "holding_registers", 0, [0xFFFB]),
+        (("hr", "0", "--type", "int16", "--", "-0x5"), "holding_registers", 0, [0xFFFB]),
+        (("hr", "0", "-1", "2", "--type", "int16"), "holding_registers", 0, [0xFFFF, 2]),
+        (("hr", "0", "1", "2", "--type", "int16[2]"), "holding_registers", 0, [1, 2]),
+        (
+            ("hr", "0", "21.5", "--type", "float32", "--order", "CDAB"),
+            "holding_registers",
+            0,
+            [0, 0x41AC],
+        ),
+        (("hr", "0", "-.5", "--type", "float16"), "holding_registers", 0, [0xB800]),
+        (("hr", "0", "-inf", "--type", "float16"), "holding_registers", 0, [0xFC00]),
+        (("hr", "0", "ABC", "--type", "string:4"), "holding_registers", 0, [0x4142, 0x4300]),
+        (("hr", "0", "01 02", "--type", "bytes:2"), "holding_registers", 0, [0x0102]),
+        (("hr", "0", "0x0102", "--type", "bytes:2"), "holding_registers", 0, [0x0102]),
+        (("hr", "0", "1234", "--type", "bcd16"), "holding_registers", 0, [0x1234]),
+        (("hr", "0", "true", "off", "--type", "bool"), "holding_registers", 0, [1, 0]),
+    ],
+)
+def test_values_are_written_and_read_back(
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    words: tuple[str, ...],
+    area: Area,
+    address: int,
+    stored: list[int],
+) -> None:
+    last = address + len(stored) - 1
+    where = f"{address}" if len(stored) == 1 else f"{address} to {last}"
+    call = ("write", cli.url(server), "--verify", *words)
+    assert done(*call) == [f"Written: {area} {where}, 1 request; read back alike."]
+    assert memory.read(area, address, len(stored)) == stored
+
+
+def test_one_bit_of_a_register_is_written_and_the_others_are_kept(
+    server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 4, [0x0F0F])
+    url = cli.url(server)
+    done("write", url, "hr", "4", "on", "--type", "bit:15", "--verify")
+    assert memory.read("holding_registers", 4, 1) == [0x8F0F]
+    done("write", url, "hr", "4", "off", "--type", "bit:0", "--verify")
+    assert memory.read("holding_registers", 4, 1) == [0x8F0E]
+
+
+@pytest.mark.parametrize(
+    ("words", "pdus"),
+    [
+        (("co", "172", "on"), ["0500acff00"]),
+        (("hr", "1", "3"), ["0600010003"]),
+        (("co", "19", *"1011001110"), ["0f0013000a02cd01"]),
+        (("hr", "1", "10", "258"), ["100001000204000a0102"]),
+        (("hr", "1", "1.5", "--type", "float32"), ["1000010002043fc00000"]),
+        (("hr", "4", "on", "--type", "bit:1"), ["160004fffd0002"]),
+        (
+            ("hr", "0", *["7"] * 124, "--split"),
+            ["100000007bf6" + "0007" * 123, "10007b0001020007"],
+        ),
+    ],
+)
+def test_a_dry_run_prints_the_requests_and_sends_nothing(
+    words: tuple[str, ...], pdus: list[str]
+) -> None:
+    assert done("write", NOWHERE, *words, "--dry-run") == pdus
+    assert answer("write", NOWHERE, *words, "--dry-run") == {"requests": pdus}
+
+
+def test_many_values_are_written_by_several_requests_if_that_is_wanted(
+    server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    many = [str(number) for number in range(300)]
+    told = usage_error("write", cli.url(server), "hr", "0", *many)
+    assert told.startswith("Error: 300 values, one request writes at most 123; with --split ")
+    found = answer("write", cli.url(server), "hr", "0", *many, "--split", "--verify")
+    assert (found["ok"], found["count"], found["verified"]) == (True, 300, True)
+    assert memory.read("holding_registers", 0, 300) == list(range(300))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("hr", "0", "65536"), "65536 is outside 0 to 65535 of uint16."),
+        (("hr", "0", "1", "-1"), "values[1]: -1 is outside 0 to 65535 of uint16."),
+        (("hr", "0", "1.5"), "'1.5' is no integer, decimal or 0x; others need --type."),
+        (("hr", "0", "1_0"), "'1_0' is no integer, decimal or 0x; others need --type."),
+        (("co", "0", "2"), "'2' is not true, false, on, off, 1 or 0."),
+        (("hr", "0", "x", "--type", "float32"), "'x' is no number."),
+        (("hr", "0", "1e99", "--type", "float32"), "of float32."),
+        (("hr", "0", "xy", "--type", "bytes:1"), "'xy' is not pairs of hex digits."),
+        (("hr", "0", "ABC", "--type", "string:2"), "holds up to 2."),
+        (("hr", "0", "1", "--type", "int16[2]"), "int16[2] takes 2 values, found 1."),
+        (("hr", "0", "1", "0", "--type", "bit:1"), "bit:1 takes one value, found 2."),
+        (("co", "0", "1", "--type", "int16"), "coils hold bits, whose type is bool."),
+        (("hr", "0"), "Missing argument 'VALUE...'."),
+        (("ir", "0", "1"), "input_registers can't be written, only read."),
+        (("30001", "1", "--modicon"), "input_registers can't be written, only read."),
+        (("hr", "0", "1", "--tpye", "int16"), "No such option '--tpye'."),
+        (("hr", "0", "1", "-v"), "No such option '-v'."),
+        (("hr", "65535", "1", "2"), "65535"),
+    ],
+)
+def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("write", NOWHERE, *words)
+
+
+def test_a_refusal_is_told(server: holdfast.Server) -> None:
+    url = cli.url(server)
+    assert failure("write", url, "hr", "1000", "1") == [
+        f"holdfast: {url}: exception 02 (Illegal Data Address)"
+    ]
+    found = answer("write", url, "hr", "1000", "1", code=1)
+    assert (found["ok"], found["code"], found["maybe_written"]) == (False, 2, False)
+
+
+def test_silence_leaves_it_open_whether_something_was_written() -> None:
+    with FakeDevice(lambda _: None) as device:
+        found = answer("write", device.url, "hr", "0", "1", "--timeout", "0.05", code=1)
+    assert (found["reason"], found["maybe_written"]) == ("timeout", True)
+
+
+def forgetful(pdu: bytes) -> bytes | None:
+    """A device that accepts every write, and holds 8 in every register."""
+    if pdu[0] == 3:
+        return bytes([3, 2 * pdu[4]]) + struct.pack(">H", 8) * pdu[4]
+    return pdu[:5]
+
+
+def test_what_is_not_read_back_alike_is_told() -> None:
+    with FakeDevice(forgetful) as device:
+        call = ("write", device.url, "hr", "5", "7", "8", "9", "--verify")
+        assert failure(*call) == [
+            "holdfast: holding_registers 5: wrote 7, read back 8",
+            "holdfast: holding_registers 7: wrote 9, read back 8",
+        ]
+        found = answer(*call, code=1)
+    assert (found["ok"], found["verified"]) == (False, False)
+
+
+def test_what_can_not_be_read_back_is_told() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 1) if pdu[0] == 3 else pdu[:5]) as device:
+        call = ("write", device.url, "hr", "5", "7", "--verify")
+        assert failure(*call) == [
+            "Written: holding_registers 5, 1 request; could not be read back",
+            f"holdfast: {device.url}: exception 01 (Illegal Function)",
+        ]
+        found = answer(*call, code=1)
+    assert (found["ok"], found["maybe_written"], found["code"]) == (False, True, 1)

@@ -1,0 +1,1040 @@
+"""The client against our own server: every method by every transport, sync and asyncio; arguments,
+threads, tasks, event loops, cancellation and closing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import doctest
+import gc
+import itertools
+import re
+import signal
+import socket
+import threading
+import time
+import warnings
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast.client.target import NetworkTarget, SerialTarget, Tls, parse
+from holdfast.server import Identity
+from holdfast.types import AREAS
+from support import lines, transports, wire
+from support.faces import FACES, Awaited, Dial, Face, dialling, run
+from support.hostile import Hostile, Stream, Udp, silent
+from support.paths import DOCS
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Iterator, Sequence
+
+    from holdfast.types import Area
+    from support.hostile import Behaviour
+    from support.running import Run, Serve
+
+REGISTERS = [0, 1, 255, 256, 32767, 32768, 65535]
+BITS = [True, False, True, True, False, False, True, True, True, False, True]
+LONG = "long " * 40
+"""Five of these objects take more than one reply."""
+
+
+@pytest.fixture(params=FACES)
+def dial(request: pytest.FixtureRequest) -> Iterator[Dial]:
+    yield from dialling(request.param)
+
+
+@dataclass
+class Device:
+    """A server of ours, and how a client finds it: unit 1 is `memory`, unit 2 is another one."""
+
+    url: str
+    memory: holdfast.Memory
+    other: holdfast.Memory
+
+
+MEMORIES = {"plant": transports.ALL, "other": transports.ALL}
+UNITS = {1: "plant", 2: "other"}
+IDENTITY = {"vendor_name": "Acme", "product_code": "P1", "revision": "1.2", "model_name": LONG}
+PRIVATE = {128: LONG, 129: "short"}
+MORE: dict[str, Any] = {"identity": {**IDENTITY, "objects": PRIVATE}}
+TRANSPORTS = ("tcp", "udp", "rtu+tcp", "rtu", "ascii")
+
+
+@pytest.fixture(params=TRANSPORTS)
+def device(request: pytest.FixtureRequest, run: Run, tmp_path: Path) -> Iterator[Device]:
+    kind: str = request.param
+    with ExitStack() as stack:
+        if kind in ("rtu", "ascii"):
+            cable = stack.enter_context(lines.Cable(tmp_path))
+            mode = lines.RTU if kind == "rtu" else lines.ASCII
+            appliance = run(
+                lines.configuration(mode, cable.devices[0], memories=MEMORIES, units=UNITS, **MORE)
+            )
+            url = f"{kind}://{cable.devices[1]}?parity=none"
+        else:
+            rules = [transports.rule(["127.0.0.1"], units=UNITS)]
+            listener = "rtu" if kind == "rtu+tcp" else kind
+            text = transports.configuration(listener, rules=rules, memories=MEMORIES, more=MORE)
+            appliance = run(text)
+            host, port = endpoint(appliance, "scada")
+            url = f"{kind}://{host}:{port}"
+        yield Device(url, appliance.memories["plant"], appliance.memories["other"])
+
+
+@pytest.fixture
+def client(device: Device, dial: Dial) -> Face:
+    return dial(device.url)
+
+
+def url_of(server: holdfast.Server) -> str:
+    host, port = server.address
+    return f"tcp://{host}:{port}"
+
+
+# Every method, by every transport
+
+
+@pytest.mark.parametrize("area", AREAS)
+def test_an_area_is_read(area: Area, device: Device, client: Face) -> None:
+    written = BITS if area in AREAS[:2] else REGISTERS
+    device.memory.write(area, 100, written)
+
+    read: list[Any] = getattr(client, f"read_{area}")(99, len(written) + 2)
+
+    assert read == [0, *written, 0]
+    assert {type(item) for item in read} == {type(written[0])}
+
+
+def test_the_most_of_one_request_is_read(device: Device, client: Face) -> None:
+    device.memory.write("input_registers", 875, range(125))
+    device.memory.write("coils", 0, [1, 0, 0] * 333)
+
+    assert client.read_input_registers(875, 125) == list(range(125))
+    assert client.read_coils(0, 999) == [True, False, False] * 333
+
+
+def test_a_coil_and_a_register_are_written(device: Device, client: Face) -> None:
+    client.write_coil(7, True)
+    client.write_coil(8, True)
+    client.write_coil(8, False)
+    client.write_register(7, 65535)
+
+    assert device.memory.read("coils", 6, 3) == [0, 1, 0]
+    assert device.memory.read("holding_registers", 6, 3) == [0, 65535, 0]
+
+
+def test_coils_and_registers_are_written(device: Device, client: Face) -> None:
+    client.write_coils(7, BITS)
+    client.write_registers(7, REGISTERS)
+    client.write_registers(100, range(123))
+
+    assert device.memory.read("coils", 6, 13) == [0, *BITS, 0]
+    assert device.memory.read("holding_registers", 6, 9) == [0, *REGISTERS, 0]
+    assert device.memory.read("holding_registers", 100, 123) == list(range(123))
+
+
+def test_a_register_is_masked(device: Device, client: Face) -> None:
+    device.memory.write("holding_registers", 4, [0x12])
+
+    client.mask_write(4, and_mask=0xF2, or_mask=0x25)
+
+    assert device.memory.read("holding_registers", 4, 1) == [0x17]
+
+
+def test_registers_are_written_and_read_in_one_step(device: Device, client: Face) -> None:
+    device.memory.write("holding_registers", 0, [1, 2, 3, 4])
+
+    assert client.read_write(0, 4, 1, [70, 80]) == [1, 70, 80, 4]
+    assert client.read_write(0, 125, 0, range(121)) == [*range(121), 0, 0, 0, 0]
+
+
+VALUES: list[tuple[str, Any, str]] = [
+    ("int16", -2, "ABCD"),
+    ("uint32", 305419896, "CDAB"),
+    ("float32", 21.5, "BADC"),
+    ("float64", -1e300, "DCBA"),
+    ("bcd32", 12345678, "ABCD"),
+    ("string:7", "Höhe 2", "ABCD"),
+    ("bytes:3", b"\0\xff\1", "ABCD"),
+    ("bool", True, "ABCD"),
+    ("int32[3]", [1, -1, 2**31 - 1], "CDAB"),
+]
+
+
+@pytest.mark.parametrize(("kind", "value", "order"), VALUES, ids=[kind for kind, _, _ in VALUES])
+def test_a_typed_value_is_written_and_read(
+    kind: str, value: Any, order: str, device: Device, client: Face
+) -> None:
+    encoding = "utf-8" if kind == "string:7" else None
+    raw = holdfast.values.encode(value, kind, order, encoding=encoding)
+
+    client.write("holding_registers", 10, value, kind, order, encoding=encoding)
+
+    assert device.memory.read("holding_registers", 9, len(raw) + 2) == [0, *raw, 0]
+    read = client.read("holding_registers", 10, kind, order, encoding=encoding)
+    assert (read, type(read)) == (value, type(value))
+
+
+def test_a_device_says_who_it_is(client: Face) -> None:
+    who = client.identify()
+
+    assert (who.vendor_name, who.product_code, who.revision) == ("Acme", "P1", "1.2")
+    assert (who.model_name, who.vendor_url) == (LONG, None)
+    assert who.conformity_level == 0x83
+    assert who.objects[128] == LONG.encode()
+    assert sorted(who.objects) == [0, 1, 2, 5, 128, 129]
+
+
+def test_a_device_has_a_server_id(client: Face) -> None:
+    answer = client.report_server_id()
+
+    assert (answer.server_id, answer.running) == (1, True)
+    assert answer.additional == b"Acme P1 1.2"
+    assert answer.data == b"\x01\xff" + answer.additional
+
+
+def test_a_device_is_diagnosed(device: Device, client: Face) -> None:
+    assert client.diagnostics(0, [0x1234]) == [0x1234]
+    if not device.url.startswith("rtu+tcp"):
+        # Where nothing but its length ends a request, the server knows only those of one word.
+        assert client.diagnostics(0, [0x1234, 0xFFFF]) == [0x1234, 0xFFFF]
+    [before] = client.diagnostics(14)
+    client.read_coils(0, 1)
+    assert client.diagnostics(14) == [before + 2]
+
+
+def test_events_are_counted(client: Face) -> None:
+    before = client.event_counter()
+    client.read_coils(0, 1)
+
+    assert before == (False, 0)
+    assert client.event_counter() == (False, 1)
+
+
+def test_an_exception_has_code_and_name(client: Face) -> None:
+    with pytest.raises(
+        holdfast.ModbusException, match=r"^exception 02 \(Illegal Data Address\)$"
+    ) as caught:
+        client.read_holding_registers(1000, 1)
+    assert (caught.value.code, caught.value.name) == (2, "Illegal Data Address")
+    # It does no harm to the connection.
+    assert client.read_holding_registers(999, 1) == [0]
+
+
+def test_a_call_may_be_for_another_unit(device: Device, client: Face) -> None:
+    client.write_register(5, 11)
+    client.write_register(5, 22, unit=2)
+
+    assert device.memory.read("holding_registers", 5, 1) == [11]
+    assert device.other.read("holding_registers", 5, 1) == [22]
+    assert client.read("holding_registers", 5, "int16", unit=2) == 22
+    assert client.read_holding_registers(5, 1) == [11]
+
+
+def test_a_client_is_for_the_unit_it_is_made_for(device: Device, dial: Dial) -> None:
+    device.other.write("coils", 0, [1])
+
+    assert dial(device.url, unit=2).read_coils(0, 1) == [True]
+
+
+def test_a_closed_client_connects_anew(client: Face) -> None:
+    for value in (1, 2, 3):
+        client.write_register(0, value)
+        assert client.read_holding_registers(0, 1) == [value]
+        client.close()
+        client.close()
+
+
+def test_a_client_that_was_never_used_can_be_closed(device: Device, dial: Dial) -> None:
+    dial(device.url).close()
+
+
+@pytest.mark.parametrize("device", ["rtu", "ascii"], indirect=True)
+def test_a_write_to_all_units_of_a_line_waits_for_no_reply(client: Face) -> None:
+    client.write("holding_registers", 5, 21.5, "float32", unit=0)
+    client.write_coil(3, True, unit=0)
+
+    for unit in (1, 2):
+        assert client.read_holding_registers(5, 2, unit=unit) == [0x41AC, 0]
+        assert client.read_coils(3, 1, unit=unit) == [True]
+
+
+@pytest.mark.parametrize("device", ["rtu", "ascii"], indirect=True)
+def test_nothing_is_read_from_all_units_of_a_line(client: Face) -> None:
+    for read in (
+        lambda: client.read_coils(0, 1, unit=0),
+        lambda: client.read_write(0, 1, 0, [1], unit=0),
+        lambda: client.identify(unit=0),
+        lambda: client.diagnostics(0, unit=0),
+    ):
+        with pytest.raises(ValueError, match="unit 0 of a serial line is the broadcast"):
+            read()
+
+
+# What takes several requests
+
+
+@pytest.fixture
+def large(serve: Serve) -> tuple[holdfast.Server, holdfast.Memory]:
+    """A server with all addresses that there are."""
+    memory = holdfast.Memory(**dict.fromkeys(AREAS, 65536))  # type: ignore[arg-type]
+    return serve({1: memory}), memory
+
+
+Large = tuple[holdfast.Server, holdfast.Memory]
+
+
+@pytest.mark.parametrize(
+    ("area", "count", "requests"),
+    [
+        ("coils", 2000, 1),
+        ("coils", 2001, 2),
+        ("discrete_inputs", 65536, 33),
+        ("holding_registers", 126, 2),
+        ("input_registers", 65536, 525),
+    ],
+)
+def test_a_large_read_takes_several_requests(
+    area: Area, count: int, requests: int, large: Large, dial: Dial
+) -> None:
+    server, memory = large
+    bits = area in AREAS[:2]
+    start = 65536 - count
+    memory.write(area, start, [at * 7 & (1 if bits else 0xFFFF) for at in range(count)])
+
+    read = getattr(dial(url_of(server)), f"read_{area}")(start, count)
+
+    assert read == memory.read(area, start, count)
+    [counted] = server.counters()["requests"].values()
+    assert counted == requests
+
+
+@pytest.mark.parametrize(
+    ("area", "count", "requests"),
+    [
+        ("coils", 1968, 1),
+        ("coils", 1969, 2),
+        ("coils", 65536, 34),
+        ("holding_registers", 123, 1),
+        ("holding_registers", 124, 2),
+        ("holding_registers", 65536, 533),
+    ],
+)
+def test_a_large_write_takes_several_requests_if_that_is_allowed(
+    area: Area, count: int, requests: int, large: Large, dial: Dial
+) -> None:
+    server, memory = large
+    client = dial(url_of(server))
+    method: Any = client.write_coils if area == "coils" else client.write_registers
+    start = 65536 - count
+    values: list[Any] = [at % 3 == 0 if area == "coils" else at for at in range(count)]
+    if requests > 1:
+        with pytest.raises(ValueError, match=f"{count} values, one request writes at most"):
+            method(start, values)
+        assert server.counters()["requests"] == {}
+
+    method(start, values, split=True)
+
+    assert memory.read(area, start, count) == values
+    [counted] = server.counters()["requests"].values()
+    assert counted == requests
+
+
+def test_a_typed_value_may_take_several_requests(large: Large, dial: Dial) -> None:
+    client = dial(url_of(large[0]))
+    values = [float(at) for at in range(100)]
+    with pytest.raises(ValueError, match="200 values, one request writes at most 123"):
+        client.write("holding_registers", 7, values, "float32[100]")
+
+    client.write("holding_registers", 7, values, "float32[100]", "CDAB", split=True)
+
+    assert client.read("holding_registers", 7, "float32[100]", "CDAB") == values
+
+
+def test_single_bits_and_registers_are_written_by_functions_5_and_6(
+    large: Large, dial: Dial
+) -> None:
+    server, memory = large
+    client = dial(url_of(server))
+
+    client.write("coils", 3, True, "bool")
+    client.write("holding_registers", 3, 7, "uint16")
+    client.write("coils", 4, [True, False], "bool[2]")
+    client.write("holding_registers", 4, 7, "uint32")
+
+    assert memory.read("coils", 3, 3) == [1, 1, 0]
+    assert memory.read("holding_registers", 3, 3) == [7, 0, 7]
+    assert server.counters()["requests"] == {5: 1, 6: 1, 15: 1, 16: 1}
+
+
+@pytest.mark.parametrize("order", ["ABCD", "BADC"])
+def test_one_bit_of_a_register_leaves_the_others_alone(
+    order: str, large: Large, dial: Dial
+) -> None:
+    server, memory = large
+    client = dial(url_of(server))
+    memory.write("holding_registers", 0, [0xF00F, 0xF00F])
+
+    client.write("holding_registers", 0, True, "bit:4", order)
+    client.write("holding_registers", 1, False, "bit:0", order)
+
+    assert client.read("holding_registers", 0, "bit:4", order) is True
+    assert client.read("holding_registers", 1, "bit:0", order) is False
+    expected = [0xF01F, 0xF00E] if order == "ABCD" else [0xF00F | 0x1000, 0xF00F & ~0x100]
+    assert memory.read("holding_registers", 0, 2) == expected
+    assert server.counters()["requests"] == {22: 2, 3: 2}
+
+
+# Arguments
+
+HUGE = 1 << 200
+
+REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]] = [
+    ("read_coils", (0, 0), {}, ValueError, "count is 0"),
+    ("read_coils", (-1, 1), {}, ValueError, "address is -1"),
+    ("read_coils", (65536, 1), {}, ValueError, "address is 65536"),
+    ("read_coils", (65535, 2), {}, ValueError, "the last address is 65535"),
+    ("read_coils", (0, 65537), {}, ValueError, "the last address is 65535"),
+    ("read_coils", (-1, 3000), {}, ValueError, "the last address is 65535"),
+    ("read_coils", (0, -1), {}, ValueError, "count is -1"),
+    ("read_coils", (HUGE, 1), {}, ValueError, "address is"),
+    ("read_coils", (0, HUGE), {}, ValueError, "the last address"),
+    ("read_coils", (0, -HUGE), {}, ValueError, "count is"),
+    ("read_coils", (0.0, 1), {}, TypeError, "float"),
+    ("read_coils", (0, "1"), {}, TypeError, "str"),
+    ("read_coils", (0, 1), {"unit": 256}, ValueError, "unit is 256, allowed are 0 to 255"),
+    ("read_coils", (0, 1), {"unit": -1}, ValueError, "unit is -1"),
+    ("read_coils", (0, 1), {"unit": True}, ValueError, "unit is True"),
+    ("read_coils", (0, 1), {"unit": "1"}, ValueError, "unit is '1'"),
+    ("read_discrete_inputs", (65000, 537), {}, ValueError, "the last address is 65535"),
+    ("read_holding_registers", (65535, 126), {}, ValueError, "the last address is 65535"),
+    ("read_input_registers", (0, None), {}, TypeError, "NoneType"),
+    ("write_coil", (0, 2), {}, ValueError, "is 2, allowed are 0, 1, False, True"),
+    ("write_coil", (0, "on"), {}, TypeError, "is 'on'"),
+    ("write_coil", (65536, True), {}, ValueError, "address is 65536"),
+    ("write_coils", (0, []), {}, ValueError, "count is 0"),
+    ("write_coils", (0, [2]), {}, ValueError, r"values\[0\] is 2"),
+    ("write_coils", (65535, [1, 0]), {}, ValueError, "the last address is 65535"),
+    ("write_coils", (0, [0] * 1969), {}, ValueError, "with split=True"),
+    ("write_coils", (0, [0] * 2000 + [2]), {"split": True}, ValueError, r"is 2"),
+    ("write_coils", (0, 1), {}, TypeError, "int"),
+    ("write_coils", (65000, [0] * 2000), {"split": True}, ValueError, "the last address"),
+    ("write_register", (0, 65536), {}, ValueError, "is 65536, allowed are integers 0 to 65535"),
+    ("write_register", (0, -1), {}, ValueError, "is -1"),
+    ("write_register", (0, HUGE), {}, ValueError, "is 16069"),
+    ("write_register", (0, 1.0), {}, TypeError, "is 1.0"),
+    ("write_register", (0, True), {}, TypeError, "is True"),
+    ("write_registers", (0, [1, 65536]), {}, ValueError, r"values\[1\] is 65536"),
+    ("write_registers", (0, b"\1\2"), {}, TypeError, "bytes"),
+    ("write_registers", (0, []), {"split": True}, ValueError, "count is 0"),
+    ("write_registers", (0, [1] * 124), {}, ValueError, "with split=True"),
+    ("write_registers", (-1, [1] * 200), {"split": True}, ValueError, "the last address"),
+    ("mask_write", (0,), {"and_mask": 65536, "or_mask": 0}, ValueError, "and_mask is 65536"),
+    ("mask_write", (0,), {"and_mask": 0, "or_mask": -1}, ValueError, "or_mask is -1"),
+    ("read_write", (0, 126, 0, [1]), {}, ValueError, "count is 126, allowed are 1 to 125"),
+    ("read_write", (0, 1, 0, [1] * 122), {}, ValueError, "count is 122, allowed are 1 to 121"),
+    ("read_write", (65535, 2, 0, [1]), {}, ValueError, "the last address is 65535"),
+    ("diagnostics", (5,), {}, ValueError, "sub_function 5 is not one of the standard"),
+    ("diagnostics", (65536,), {}, ValueError, "sub_function is 65536"),
+    ("diagnostics", (0, []), {}, ValueError, "does not allow these arguments"),
+    ("diagnostics", (0, [65536]), {}, ValueError, "data holds 65536"),
+    ("diagnostics", (0, [0] * 126), {}, ValueError, "does not allow these arguments"),
+    ("diagnostics", (10, [1]), {}, ValueError, "does not allow these arguments"),
+    ("read", ("coil", 0, "bool"), {}, ValueError, 'unknown area "coil"'),
+    ("read", ("coils", 0, "uint16"), {}, ValueError, "coils hold only bool"),
+    ("read", ("holding_registers", 0, "int24"), {}, ValueError, "int24"),
+    ("read", ("holding_registers", 0, "int32", "ACBD"), {}, ValueError, "ACBD"),
+    ("read", ("holding_registers", 0, "string:4"), {"encoding": "klingon"}, ValueError, "klingon"),
+    ("read", ("holding_registers", 65535, "int32"), {}, ValueError, "the last address is 65535"),
+    ("write", ("holding_registers", 0, 1 << 15, "int16"), {}, ValueError, "32768"),
+    ("write", ("holding_registers", 0, 1.5, "int16"), {}, ValueError, "1.5"),
+    ("write", ("input_registers", 0, 1, "int16"), {}, ValueError, "can be written"),
+    ("write", ("coils", 0, 5, "uint16"), {}, ValueError, "coils hold only bool"),
+    ("write", ("holding_registers", 0, [True] * 2, "bit:3[2]"), {}, ValueError, "only one bit"),
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "named", "error", "text"),
+    REFUSED,
+    ids=[f"{method}-{number}" for number, (method, *_) in enumerate(REFUSED)],
+)
+def test_what_cannot_be_asked_is_not_sent(
+    method: str,
+    arguments: tuple[Any, ...],
+    named: dict[str, Any],
+    error: type[Exception],
+    text: str,
+    dial: Dial,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as nobody:
+        client = dial(f"tcp://127.0.0.1:{nobody.getsockname()[1]}")
+        with pytest.raises(error, match=text):
+            getattr(client, method)(*arguments, **named)
+        nobody.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            nobody.accept()
+
+
+@pytest.mark.parametrize("face", FACES.values(), ids=FACES)
+@pytest.mark.parametrize(
+    ("options", "error", "text"),
+    [
+        ({"unit": 256}, ValueError, "unit is 256, allowed are 0 to 255"),
+        ({"unit": None}, ValueError, "unit is None"),
+        ({"timeout": 0}, ValueError, "timeout is 0, allowed are more than 0 to 86400 seconds"),
+        ({"timeout": -1}, ValueError, "timeout is -1"),
+        ({"timeout": float("nan")}, ValueError, "timeout is nan"),
+        ({"timeout": 10**400}, ValueError, "timeout is 1000"),
+        ({"timeout": "1"}, TypeError, "str"),
+    ],
+)
+def test_what_a_client_cannot_be_is_refused(
+    face: Any, options: dict[str, Any], error: type[Exception], text: str
+) -> None:
+    make = holdfast.Client if face is Awaited else face
+    with pytest.raises(error, match=text):
+        make("tcp://127.0.0.1", **options)
+
+
+@pytest.mark.parametrize("number", [0, 1025, 1.0, True, None])
+def test_the_number_in_flight_has_its_limits(number: Any) -> None:
+    with pytest.raises(ValueError, match="allowed are 1 to 1024"):
+        holdfast.Client("tcp://127.0.0.1", max_in_flight=number)
+
+
+# URLs
+
+
+@pytest.mark.parametrize(
+    ("url", "target"),
+    [
+        ("tcp://plc", NetworkTarget("tcp", "plc", 502)),
+        ("tcp://10.0.0.1:1502/", NetworkTarget("tcp", "10.0.0.1", 1502)),
+        ("udp://[fe80::1%25eth0]:502", NetworkTarget("udp", "fe80::1%eth0", 502)),
+        ("rtu+tcp://gateway:4001", NetworkTarget("rtu+tcp", "gateway", 4001)),
+        ("tls://plc", NetworkTarget("tls", "plc", 802)),
+        ("tls://[fd00::1]:1802/?ca=ca.pem", NetworkTarget("tls", "fd00::1", 1802, Tls("ca.pem"))),
+        (
+            "tls://10.0.0.5?ca=/a%20b/c+d%26.pem&cert=c.pem&key=C:\\k.pem&name=plc7",
+            NetworkTarget(
+                "tls", "10.0.0.5", 802, Tls("/a b/c+d&.pem", "c.pem", "C:\\k.pem", "plc7")
+            ),
+        ),
+        ("rtu:///dev/ttyUSB0", SerialTarget("rtu", "/dev/ttyUSB0", 19200, "even", 1, 8)),
+        ("rtu:///dev/ttyS0?parity=none", SerialTarget("rtu", "/dev/ttyS0", 19200, "none", 2, 8)),
+        (
+            "rtu:///dev/a%20b?baud=115200&parity=odd&stop_bits=2&silence=0.01&echo=1",
+            SerialTarget("rtu", "/dev/a b", 115200, "odd", 2, 8, 0.01, True),
+        ),
+        ("ascii:///dev/ttyS0", SerialTarget("ascii", "/dev/ttyS0", 19200, "even", 1, 7)),
+        ("ascii:///dev/ttyS0?data_bits=8", SerialTarget("ascii", "/dev/ttyS0", data_bits=8)),
+        ("rtu:///COM3", SerialTarget("rtu", "COM3")),
+    ],
+)
+def test_a_url_names_a_device(url: str, target: NetworkTarget | SerialTarget) -> None:
+    assert parse(url) == target
+
+
+def test_a_target_is_shown_as_a_url() -> None:
+    assert str(parse("udp://[::1]:1502")) == "udp://[::1]:1502"
+    assert str(parse("rtu:///dev/ttyUSB0?baud=9600")) == "rtu:///dev/ttyUSB0"
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("", "is no URL of a device; allowed are tcp://host:502"),
+        ("plc", "is no URL of a device"),
+        ("http://plc", "is no URL of a device"),
+        ("tls://", "is no address of a device"),
+        ("tls://plc/unit", "is no address of a device"),
+        ("tls://plc?baud=9600", "'baud' is not known, allowed are ca, cert, key, name"),
+        ("tls://plc?ca=a&ca=b", "ca is given twice"),
+        ("tls://plc?ca=", "ca is '', allowed are paths of files"),
+        ("tls://plc?ca=a%00b", r"ca is 'a\\x00b', allowed are paths of files"),
+        ("tls://plc?name=", "name is '', allowed are host names and IP addresses"),
+        ("tls://plc?cert=a", "cert is alone, allowed are cert and key, or none of both"),
+        ("tls://plc?key=a", "key is alone"),
+        ("tcp://plc?ca=a", "is no address of a device"),
+        ("rtu:///dev/x?ca=a", "'ca' is not known, allowed are baud, parity"),
+        ("tcp://", "is no address of a device"),
+        ("tcp://plc:0", "port 0"),
+        ("tcp://plc:65536", "[Pp]ort out of range"),
+        ("tcp://plc:x", "x"),
+        ("tcp://[::1", "Invalid IPv6 URL"),
+        ("tcp://plc/unit", "is no address of a device"),
+        ("tcp://plc?unit=1", "is no address of a device"),
+        ("tcp://me@plc", "has a user or a fragment"),
+        ("tcp://plc#1", "has a user or a fragment"),
+        ("rtu://", "names no device"),
+        ("rtu:///", "names no device"),
+        ("rtu:///dev/x?baud=10", "baud is '10', allowed are 50 to 4000000"),
+        ("rtu:///dev/x?baud=fast", "baud is 'fast'"),
+        ("rtu:///dev/x?parity=mark", "parity is 'mark', allowed are none, even, odd"),
+        ("rtu:///dev/x?stop_bits=3", "stop_bits is '3', allowed are 1, 2"),
+        ("rtu:///dev/x?data_bits=7", "data_bits is 7, allowed with rtu is 8"),
+        ("rtu:///dev/x?silence=0", "silence is '0', allowed are seconds, up to 10"),
+        ("rtu:///dev/x?echo=yes", "echo is 'yes', allowed are 0, 1"),
+        ("rtu:///dev/x?speed=1", "'speed' is not known, allowed are baud, parity"),
+        ("rtu:///dev/x?baud=9600&baud=9600", "baud is given twice"),
+        ("ascii:///dev/x?silence=1", "'silence' is not known"),
+    ],
+)
+def test_a_url_that_names_no_device_is_refused(url: str, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        holdfast.SyncClient(url)
+
+
+def test_a_url_is_a_text() -> None:
+    with pytest.raises(TypeError, match="5 is no URL of a device"):
+        holdfast.Client(5)  # type: ignore[arg-type]
+
+
+# Errors, as a caller catches them
+
+
+def test_all_errors_are_modbus_errors() -> None:
+    assert issubclass(holdfast.ModbusException, holdfast.ModbusError)
+    assert issubclass(holdfast.InvalidResponse, holdfast.ModbusError)
+    assert issubclass(holdfast.ConnectionLost, holdfast.ModbusError)
+    assert issubclass(holdfast.ConnectionLost, ConnectionError)
+    assert issubclass(holdfast.RequestTimeout, holdfast.ModbusError)
+    assert issubclass(holdfast.RequestTimeout, TimeoutError)
+
+
+# Threads
+
+
+def test_threads_share_a_client(device: Device, dial: Dial) -> None:
+    device.memory.write("holding_registers", 0, range(1000))
+    client = dial(device.url)
+    wrong: list[Any] = []
+
+    def read(first: int) -> None:
+        for address in range(first, 80, 8):
+            found = client.read_holding_registers(address, 1)
+            if found != [address]:
+                wrong.append((address, found))
+
+    threads = [threading.Thread(target=read, args=(first,)) for first in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(wire.DEADLINE)
+    assert wrong == []
+
+
+def test_a_thread_that_waits_for_its_turn_does_not_lose_time() -> None:
+    caught: list[holdfast.ModbusError] = []
+
+    with Stream("tcp", then=silent) as device, holdfast.SyncClient(device.url, timeout=0.1) as plc:
+
+        def read() -> None:
+            with pytest.raises(holdfast.RequestTimeout) as error:
+                plc.read_coils(0, 1)
+            caught.append(error.value)
+
+        threads = [threading.Thread(target=read) for _ in range(3)]
+        began = time.monotonic()
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(wire.DEADLINE)
+
+        assert len(caught) == 3
+        assert time.monotonic() - began >= 0.3
+        device.await_requests(3)
+        assert device.connections == 1
+
+
+# Tasks
+
+
+async def gathered(calls: Sequence[Awaitable[Any]]) -> list[Any]:
+    return list(await asyncio.gather(*calls))
+
+
+@pytest.mark.parametrize("in_flight", [1, 16, 1024])
+def test_a_thousand_tasks_share_a_client(
+    in_flight: int, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, range(1000))
+
+    async def main() -> None:
+        async with holdfast.Client(
+            url_of(server), timeout=wire.DEADLINE, max_in_flight=in_flight
+        ) as plc:
+            calls = [plc.read_holding_registers(address, 1) for address in range(1000)]
+            assert await gathered(calls) == [[address] for address in range(1000)]
+
+    asyncio.run(main())
+    assert server.counters()["connections"]["accepted"] == 1
+
+
+@pytest.mark.parametrize("device", ["udp", "rtu", "ascii", "rtu+tcp"], indirect=True)
+def test_tasks_share_a_client_where_one_request_goes_at_a_time(device: Device) -> None:
+    device.memory.write("holding_registers", 0, range(1000))
+
+    async def main() -> None:
+        async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+            calls = [plc.read_holding_registers(address, 1) for address in range(50)]
+            assert await gathered(calls) == [[address] for address in range(50)]
+
+    run(main)
+
+
+def test_no_more_requests_are_in_flight_than_allowed() -> None:
+    async def main() -> None:
+        with Stream("tcp", then=silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=3) as plc:
+                tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(5)]
+                await asyncio.to_thread(device.await_requests, 3)
+                device.asked[1].answer()
+                assert await tasks[1] == [False]
+                await asyncio.to_thread(device.await_requests, 4)
+                device.then = lambda asked: asked.answer()
+                for asked in [device.asked[3], device.asked[0], device.asked[2]]:
+                    asked.answer()
+                assert await gathered(tasks) == [[False]] * 5
+                assert [asked.pdu[2] for asked in device.asked] == [0, 1, 2, 3, 4]
+
+    run(main)
+
+
+# Cancellation
+
+
+async def cancelled(task: asyncio.Task[Any]) -> None:
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+
+
+def test_a_call_that_is_cancelled_before_it_ran_sends_nothing() -> None:
+    async def main() -> None:
+        with Stream("tcp") as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                await cancelled(asyncio.create_task(plc.write_register(0, 1)))
+                assert await plc.read_holding_registers(7, 1) == [7]
+                assert [asked.pdu[0] for asked in device.asked] == [3]
+
+    run(main)
+
+
+def test_a_call_that_is_cancelled_while_it_connects_sends_nothing() -> None:
+    async def main() -> None:
+        with Stream("tcp") as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                both = [asyncio.create_task(plc.write_register(at, 1)) for at in range(2)]
+                await asyncio.sleep(0)
+                await cancelled(both[0])
+                await both[1]
+                assert await plc.read_holding_registers(1, 1) == [1]
+                assert [asked.pdu[2] for asked in device.asked] == [1, 1]
+                assert device.connections == 1
+
+    run(main)
+
+
+def test_the_only_call_may_be_cancelled_while_it_connects() -> None:
+    async def main() -> None:
+        with Stream("tcp") as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                task = asyncio.create_task(plc.write_register(0, 1))
+                await asyncio.sleep(0)
+                await cancelled(task)
+                assert await plc.read_holding_registers(7, 1) == [7]
+                assert len(device.asked) == 1
+
+    run(main)
+
+
+def test_a_call_that_is_cancelled_in_the_queue_sends_nothing_and_keeps_no_place() -> None:
+    async def main() -> None:
+        with Stream("tcp", silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=1) as plc:
+
+                async def first() -> None:
+                    await plc.read_holding_registers(0, 1)
+                    # Its place is given to the third, who does not know it yet.
+                    tasks[2].cancel()
+
+                calls = [first(), *[plc.read_holding_registers(at, 1) for at in (1, 2, 3)]]
+                tasks = [asyncio.create_task(call) for call in calls]
+                await asyncio.to_thread(device.await_requests, 1)
+                await cancelled(tasks[1])
+                device.asked[0].answer()
+                await tasks[0]
+                with pytest.raises(asyncio.CancelledError):
+                    await tasks[2]
+                assert await tasks[3] == [3]
+                assert await plc.read_holding_registers(9, 1) == [9]
+                assert [asked.pdu[2] for asked in device.asked] == [0, 3, 9]
+
+    run(main)
+
+
+def test_the_reply_to_a_cancelled_call_is_dropped_and_counted() -> None:
+    async def main() -> None:
+        with Stream("tcp", silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=1) as plc:
+                task = asyncio.create_task(plc.read_holding_registers(1, 1))
+                await asyncio.to_thread(device.await_requests, 1)
+                await cancelled(task)
+                device.asked[0].answer()
+                assert await plc.read_holding_registers(2, 1) == [2]
+                assert plc.late == 1
+                assert device.connections == 1
+            assert plc.late == 1
+
+    run(main)
+
+
+def test_a_call_may_be_cancelled_while_its_reply_is_read() -> None:
+    async def main() -> None:
+        with Stream("tcp", silent) as device:
+            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
+                task = asyncio.create_task(plc.read_holding_registers(1, 1))
+                await asyncio.to_thread(device.await_requests, 1)
+                # Both happen in one turn of the loop, first this, then that.
+                asyncio.get_running_loop().call_soon(task.cancel)
+                device.asked[0].answer()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+                assert await plc.read_holding_registers(2, 1) == [2]
+                assert device.connections == 1
+
+    run(main)
+
+
+@pytest.mark.parametrize("kind", ["udp", "rtu+tcp"])
+def test_a_call_in_a_thread_may_be_cancelled(kind: str) -> None:
+    async def main() -> None:
+        with device_of(kind, silent) as device:
+            async with holdfast.Client(device.url, timeout=0.3) as plc:
+                under_way = asyncio.create_task(plc.write_register(1, 1))
+                await asyncio.to_thread(device.await_requests, 1)
+                waiting = asyncio.create_task(plc.write_register(2, 1))
+                await asyncio.sleep(0)
+                await cancelled(waiting)
+                await cancelled(under_way)
+                assert await plc.read_holding_registers(7, 1) == [7]
+                assert [asked.pdu[2] for asked in device.asked] == [1, 7]
+
+    run(main)
+
+
+def device_of(kind: str, *script: Behaviour, **options: Any) -> Hostile:
+    return Udp(*script, **options) if kind == "udp" else Stream(kind, *script, **options)
+
+
+def test_timeouts_of_others_leave_a_cancelled_call_alone() -> None:
+    async def main() -> None:
+        with Stream("tcp", then=silent) as device:
+            async with holdfast.Client(device.url, timeout=0.1) as plc:
+                tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(3)]
+                await asyncio.to_thread(device.await_requests, 3)
+                await cancelled(tasks[0])
+                for task in tasks[1:]:
+                    with pytest.raises(holdfast.RequestTimeout):
+                        await task
+
+    run(main)
+
+
+# Closing while calls wait
+
+
+def test_calls_that_wait_are_told_that_the_client_was_closed() -> None:
+    async def main() -> None:
+        with Stream("tcp", *[silent] * 2) as device:
+            plc = holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=2)
+            tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(4)]
+            await asyncio.to_thread(device.await_requests, 2)
+
+            await plc.close()
+
+            for task in tasks:
+                with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                    await task
+            assert device.connections == 1
+            assert await plc.read_holding_registers(7, 1) == [7]
+            assert device.connections == 2
+            assert len(device.asked) == 3
+            await plc.close()
+
+    run(main)
+
+
+def test_calls_that_wait_for_a_connection_are_told_that_the_client_was_closed() -> None:
+    async def main() -> None:
+        with Stream("tcp") as device:
+            plc = holdfast.Client(device.url, timeout=wire.DEADLINE)
+            tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(3)]
+            await asyncio.sleep(0)
+
+            await plc.close()
+
+            for task in tasks:
+                with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                    await task
+            assert device.asked == []
+
+    run(main)
+
+
+def test_calls_that_wait_for_a_thread_are_told_that_the_client_was_closed() -> None:
+    async def main() -> None:
+        with Stream("rtu+tcp", silent) as device:
+            plc = holdfast.Client(device.url, timeout=0.3)
+            tasks = [asyncio.create_task(plc.write_register(at, 1)) for at in range(3)]
+            await asyncio.to_thread(device.await_requests, 1)
+
+            await plc.close()
+
+            with pytest.raises(holdfast.RequestTimeout):
+                await tasks[0]
+            for task in tasks[1:]:
+                with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                    await task
+            assert len(device.asked) == 1
+            assert await plc.read_holding_registers(7, 1) == [7]
+            await plc.close()
+
+    run(main)
+
+
+# Event loops
+
+
+@pytest.mark.parametrize("device", ["tcp", "udp"], indirect=True)
+def test_a_client_serves_one_event_loop_after_the_other(device: Device) -> None:
+    device.memory.write("holding_registers", 7, [42])
+    plc = holdfast.Client(device.url, timeout=wire.DEADLINE)
+
+    async def main() -> None:
+        assert await plc.read_holding_registers(7, 1) == [42]
+        await plc.close()
+
+    for _ in range(3):
+        run(main)
+
+
+def test_a_client_that_was_not_closed_begins_anew_when_its_event_loop_is_closed(
+    server: holdfast.Server,
+) -> None:
+    plc = holdfast.Client(url_of(server), timeout=wire.DEADLINE)
+
+    async def main() -> None:
+        assert await plc.read_holding_registers(0, 1) == [0]
+
+    run(main)
+    # What was forgotten is asyncio's to tell.
+    with warnings.catch_warnings(record=True, action="always") as told:
+        run(main)
+        run(plc.close)
+        gc.collect()
+    assert {warning.category for warning in told} == {ResourceWarning}
+    assert any("unclosed transport" in str(warning.message) for warning in told)
+
+
+def test_a_client_is_in_use_in_one_event_loop_only(server: holdfast.Server) -> None:
+    plc = holdfast.Client(url_of(server), timeout=wire.DEADLINE)
+
+    async def read() -> list[int]:
+        return await plc.read_holding_registers(0, 1)
+
+    with asyncio.Runner() as one, asyncio.Runner() as other:
+        one.run(read())
+        with pytest.raises(RuntimeError, match="in use in another event loop"):
+            other.run(read())
+        with pytest.raises(RuntimeError, match="in use in another event loop"):
+            other.run(plc.close())
+        assert one.run(read()) == [0]
+        one.run(plc.close())
+        assert other.run(read()) == [0]
+        other.run(plc.close())
+
+
+def test_the_event_loop_is_not_held_up_by_other_transports() -> None:
+    async def main() -> None:
+        with Stream("rtu+tcp", silent) as device:
+            async with holdfast.Client(device.url, timeout=0.3) as plc:
+                task = asyncio.create_task(plc.read_coils(0, 1))
+                turns = 0
+                while not task.done():
+                    await asyncio.sleep(0)
+                    turns += 1
+                with pytest.raises(holdfast.RequestTimeout):
+                    await task
+                assert turns > 10
+
+    run(main)
+
+
+# Signals
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "udp"])
+def test_a_signal_does_not_end_a_call(kind: str) -> None:
+    beats = itertools.count()
+    before = signal.signal(signal.SIGALRM, lambda *_: next(beats))
+    try:
+        with device_of(kind, then=silent) as device:
+            signal.setitimer(signal.ITIMER_REAL, 0.02, 0.02)
+            began = time.monotonic()
+            with (
+                holdfast.SyncClient(device.url, timeout=0.3) as plc,
+                pytest.raises(holdfast.RequestTimeout),
+            ):
+                plc.write_register(0, 1)
+            assert time.monotonic() - began >= 0.3
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert next(beats) > 0
+
+
+# The page
+
+PAGE = DOCS / "client.md"
+
+
+@pytest.fixture
+def page(serve: Serve) -> str:
+    """The page, with a server where it says that there is one."""
+    memory = holdfast.Memory(coils=64, holding_registers=200)
+    memory.write("holding_registers", 0, [11, 22, 33])
+    identity = Identity(vendor_name="Acme", product_code="P1", revision="1.2")
+    host, port = serve({1: memory}, identity=identity).address
+    return PAGE.read_text().replace("127.0.0.1:5020", f"{host}:{port}")
+
+
+def test_the_examples_of_the_page_print_what_it_says(page: str) -> None:
+    blocks = re.findall(r"^```pycon\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    examples = doctest.DocTestParser().get_doctest("\n".join(blocks), {}, PAGE.name, str(PAGE), 0)
+    told: list[str] = []
+
+    results = doctest.DocTestRunner().run(examples, out=told.append)
+
+    assert told == []
+    assert results.attempted == 8
+
+
+def test_the_program_of_the_page_prints_what_it_says(
+    page: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    [(program, printed)] = re.findall(
+        r"^```python\n(.*?)^```\n\nprints\n\n```text\n(.*?)^```$", page, re.MULTILINE | re.DOTALL
+    )
+
+    exec(compile(program, PAGE.name, "exec"), {})
+
+    assert capsys.readouterr().out == printed

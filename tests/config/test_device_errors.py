@@ -1,0 +1,298 @@
+"""What wrong devices are told, and what has no effect."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.client.target import NetworkTarget, Tls
+from support.config_folder import Folder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HEAD = """\
+memories:
+  plant: {coils: 8, input_registers: {start: 100, size: 100}, holding_registers: 65536}
+"""
+METER = """\
+devices:
+  meter:
+    url: tcp://10.0.0.9
+    unit: 1
+    interval: 1
+    reads:
+      - area: input_registers
+        address: 10
+        count: 20
+        into: {memory: plant, area: input_registers, address: 100}
+    status: {memory: plant, area: input_registers, slot: 4}
+"""
+ANOTHER = """\
+  other:
+    url: tcp://10.0.0.9
+    unit: 2
+    interval: 1
+    reads: [{area: coils, address: 0, count: 8, into: {memory: plant, area: coils, address: 0}}]
+"""
+URLS = (
+    "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
+    "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+)
+RECEIVER = "raw://host:port, as in raw://10.0.2.9:9000 or raw://[fd00::9]:9000"
+READS = "  reads: a list"
+WORD = "an integer from 0 to 65535"
+SERIAL = "a unit id from 1 to 247; 0 is the broadcast, 248 to 255 are reserved"
+OWN = "allowed: addresses of its own"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Folder:
+    return Folder(tmp_path)
+
+
+def changed(old: str, new: str, text: str = METER) -> str:
+    assert text.count(old) == 1, old
+    return HEAD + text.replace(old, new)
+
+
+def test_files_of_a_url_are_relative_to_the_folder_of_the_configuration(folder: Folder) -> None:
+    (folder.path / "a b.pem").write_text("")
+    url = "tls://plc:1802?ca=a%20b.pem&name=plc7"
+
+    config = folder.config(changed("tcp://10.0.0.9", url))
+
+    path = f"{folder.path}/a%20b.pem"
+    assert config.devices["meter"].url == f"tls://plc:1802?ca={path}&name=plc7"
+    assert config.devices["meter"].target == NetworkTarget(
+        "tls", "plc", 1802, Tls(ca=f"{folder.path}/a b.pem", name="plc7")
+    )
+    assert folder.config(config.dump()) == config
+
+
+def told(folder: Folder, text: str) -> list[str]:
+    """The problems, without the name of the file and of the device."""
+    return [
+        problem.removeprefix("p.yaml:").replace(" devices.meter.", " ", 1)
+        for problem in folder.problems(text)
+    ]
+
+
+def test_a_right_device_is_right(folder: Folder) -> None:
+    assert folder.warnings(HEAD + METER + ANOTHER) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("    url: tcp://10.0.0.9\n", "", "4: url: missing, allowed: text, as in "
+         "tcp://10.0.0.9:502 or rtu:///dev/ttyUSB0?baud=9600"),
+        ("url: tcp://10.0.0.9", "url: 7", f"5: url: found 7, allowed: {URLS}"),
+        ("tcp://10.0.0.9", "http://a", "5: url: 'http://a' is no URL of a device; allowed are "
+         f"{URLS}"),
+        ("tcp://10.0.0.9", "tcp://a:0", "5: url: 'tcp://a:0': port 0, allowed are 1 to 65535"),
+        ("tcp://10.0.0.9", "tls://plc?ca=none.pem",
+         "5: url: found ca='none.pem', which can't be read: No such file or directory"),
+        ("tcp://10.0.0.9", "tls://plc?cert=p.yaml&key=/",
+         "5: url: found key='/', which can't be read: Is a directory"),
+        ("tcp://10.0.0.9", "tls://plc?cert=p.yaml",
+         "5: url: 'tls://plc?cert=p.yaml': cert is alone, allowed are cert and key, or none of "
+         "both"),
+        ("tcp://10.0.0.9", "rtu:///dev/a%00",
+         "5: url: found 'rtu:///dev/a%00', allowed: a URL without NUL"),
+        ("    unit: 1\n", "", "4: unit: missing, allowed: an integer from 0 to 255"),
+        ("unit: 1", "unit: 256", "6: unit: found 256, allowed: a unit id from 0 to 255"),
+        ("    interval: 1\n", "", "4: interval: missing, allowed: a number from 0.01 to 31622400"),
+        ("interval: 1", "interval: 0.009",
+         "7: interval: found 0.009, allowed: a number from 0.01 to 31622400"),
+        ("interval: 1", "interval: .nan",
+         "7: interval: found nan, allowed: a number from 0.01 to 31622400"),
+        ("    reads", "    timeout: 0\n    reads",
+         "8: timeout: found 0, allowed: a number from 0.001 to 31622400"),
+        ("    reads", "    enabled: 1\n    reads",
+         "8: enabled: found 1, allowed: true or false"),
+        ("    reads", "    max_gap: -1\n    reads", f"8: max_gap: found -1, allowed: {WORD}"),
+        ("    reads", "    max_registers: 126\n    reads",
+         "8: max_registers: found 126, allowed: an integer from 1 to 125"),
+        ("    reads", "    max_bits: 0\n    reads",
+         "8: max_bits: found 0, allowed: an integer from 1 to 2000"),
+        ("    reads", "    max_gap: 1\n    cost: {per_request: 1, per_register: 1}\n    reads",
+         "9: cost: found beside max_gap, allowed: one of both"),
+        ("    reads", "    cost: {per_request: 1}\n    reads",
+         "8: cost.per_register: missing, allowed: a number from 0 to 3600000"),
+        ("    reads", "    cost: {per_request: -1, per_register: 1}\n    reads",
+         "8: cost.per_request: found -1, allowed: a number from 0 to 3600000"),
+        ("    reads", "    forbidden: [{area: coils, start: 1}]\n    reads",
+         "8: forbidden[0]: found neither end nor count, allowed: one of both"),
+        ("    reads", "    forbidden: [{area: coils, start: 1, end: 1, count: 1}]\n    reads",
+         "8: forbidden[0].count: found beside end, allowed: one of both"),
+        ("    reads", "    readable: [{area: coils, start: 2, end: 1}]\n    reads",
+         "8: readable[0].end: found 1, allowed: the last address, 2 or more"),
+        ("    reads", "    readable: [{area: coils, start: 65535, count: 2}]\n    reads",
+         "8: readable[0].count: found start 65535 and count 2, allowed: a sum up to 65536"),
+        ("    reads", "    forbidden: [{area: input_registers, start: 29, count: 1}]\n    reads",
+         "10: reads[0]: found 10 to 29, which meets 29 to 29 of forbidden[0] in line 8, "
+         "allowed: other addresses"),
+        ("    reads", "    forbidden: [{area: input_registers, start: 0, end: 10}]\n    reads",
+         "10: reads[0]: found 10 to 29, which meets 0 to 10 of forbidden[0] in line 8, "
+         "allowed: other addresses"),
+        ("area: input_registers\n", "area: registers\n", "9: reads[0].area: found 'registers', "
+         "allowed: coils, discrete_inputs, holding_registers or input_registers"),
+        ("address: 10\n", "address: 65536\n",
+         f"10: reads[0].address: found 65536, allowed: {WORD}"),
+        ("count: 20", "count: 0",
+         "11: reads[0].count: found 0, allowed: an integer from 1 to 65536"),
+        ("address: 10\n", "address: 65517\n",
+         "11: reads[0].count: found address 65517 and count 20, allowed: a sum up to 65536"),
+        ("{memory: plant, area: input_registers, address: 100}", "{}",
+         "12: reads[0].into.memory: missing, allowed: text"),
+        ("into: {memory: plant,", "into: {memory: plan,",
+         "12: reads[0].into.memory: found 'plan', allowed: plant; did you mean 'plant'?"),
+        ("area: input_registers, address", "area: coils, address", "12: reads[0].into.area: found "
+         "'coils', allowed for input_registers: holding_registers or input_registers"),
+        ("address: 100}", "address: 181}", "12: reads[0].into.address: found 20 registers from 181 "
+         "on, allowed in input_registers of plant: 100 to 199"),
+        ("address: 100}", "address: 99}", "12: reads[0].into.address: found 20 registers from 99 "
+         "on, allowed in input_registers of plant: 100 to 199"),
+        ("slot: 4", "slot: 3", "13: status.slot: found 3, which is addresses 90 to 119, allowed in "
+         "input_registers of plant: 100 to 199"),
+        ("slot: 4", "slot: 6", "13: status.slot: found 6, which is addresses 180 to 209, "
+         "allowed in input_registers of plant: 100 to 199"),
+        ("slot: 4", "slot: 2184",
+         "13: status.slot: found 2184, allowed: an integer from 0 to 2183"),
+        ("area: input_registers, slot", "area: coils, slot",
+         "13: status.area: found 'coils', allowed: holding_registers or input_registers"),
+        ("    status: {memory: plant", "    status: {memory: other",
+         "13: status.memory: found 'other', allowed: plant"),
+        ("    status", "    forward: [{url: 'raw://a', unit: 1}]\n    status",
+         f"13: forward[0].url: found 'raw://a', allowed: {RECEIVER}"),
+        ("    status", "    forward: [{url: 'tcp://a:1', unit: 1}]\n    status",
+         f"13: forward[0].url: found 'tcp://a:1', allowed: {RECEIVER}"),
+        ("    status", "    forward: [{url: 'raw://a:1/', unit: 1}]\n    status",
+         f"13: forward[0].url: found 'raw://a:1/', allowed: {RECEIVER}"),
+        ("    status", "    forward: [{url: 'raw://u@a:1', unit: 1}]\n    status",
+         f"13: forward[0].url: found 'raw://u@a:1', allowed: {RECEIVER}"),
+        ("    status", "    forward: [{url: 'raw://a:0', unit: 1}]\n    status",
+         f"13: forward[0].url: found 'raw://a:0', allowed: {RECEIVER}"),
+        ("    status", "    forward: [{url: 'raw://a:1'}]\n    status",
+         f"13: forward[0].unit: missing beside format v1, allowed: {WORD}"),
+        ("    status", "    forward: [{url: 'raw://a:1', format: crc}]\n    status",
+         f"13: forward[0].memory_id: missing beside format crc, allowed: {WORD}"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, memory_id: 1}]\n    status",
+         "13: forward[0].memory_id: found beside format v1, allowed: unit"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, crc: none}]\n    status",
+         "13: forward[0].crc: found beside format v1, allowed: beside format crc only"),
+    ],
+)  # fmt: skip
+def test_a_device_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
+    assert problem in told(folder, changed(old, new))
+
+
+def test_an_area_that_the_memory_lacks_is_told(folder: Folder) -> None:
+    text = HEAD + METER + ANOTHER.replace("plant, area: coils", "plant, area: discrete_inputs")
+    assert folder.problems(text) == [
+        "p.yaml:18: devices.other.reads[0].into.area: found 'discrete_inputs', an area that plant "
+        "does not have, allowed: coils, holding_registers, input_registers"
+    ]
+
+
+def test_a_read_of_a_whole_area_is_not_forwarded(folder: Folder) -> None:
+    read = "{area: holding_registers, address: 0, count: 65536}"
+    forward = "forward: [{url: 'raw://a:1', unit: 1}]"
+    text = f"devices: {{a: {{url: tcp://a, unit: 1, interval: 1, reads: [{read}], {forward}}}}}\n"
+    assert folder.problems(HEAD + text) == [
+        "p.yaml:3: devices.a.reads[0].count: found 65536, allowed beside forward: up to 65535, "
+        "which one packet holds"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (HEAD + METER + ANOTHER.replace(
+            "{memory: plant, area: coils, address: 0}",
+            "{memory: plant, area: coils, address: 0}}, {area: input_registers, address: 0, "
+            "count: 2, into: {memory: plant, area: input_registers, address: 118}"),
+         "p.yaml:18: devices.other.reads[1].into: found input_registers 118 to 119 of plant, which "
+         f"overlaps 100 to 119 of devices.meter.reads[0].into in line 12, {OWN}"),
+        (HEAD + METER.replace("address: 100}", "address: 140}"),
+         "p.yaml:13: devices.meter.status: found input_registers 120 to 149 of plant, which "
+         f"overlaps 140 to 159 of devices.meter.reads[0].into in line 12, {OWN}"),
+        (HEAD + METER + ANOTHER + "    status: {memory: plant, area: input_registers, slot: 4}\n",
+         "p.yaml:19: devices.other.status: found input_registers 120 to 149 of plant, which "
+         f"overlaps 120 to 149 of devices.meter.status in line 13, {OWN}"),
+    ],
+)  # fmt: skip
+def test_no_address_is_written_by_two(folder: Folder, text: str, problem: str) -> None:
+    assert folder.problems(text) == [problem]
+
+
+def test_every_overlap_in_a_long_range_is_told(folder: Folder) -> None:
+    reads = [(0, 1000), (10, 5), (900, 50), (999, 1), (1000, 1)]
+    into = "into: {{memory: plant, area: holding_registers, address: {}}}"
+    written = ", ".join(
+        f"{{area: input_registers, address: 0, count: {count}, {into.format(address)}}}"
+        for address, count in reads
+    )
+    text = f"devices: {{a: {{url: tcp://a, unit: 1, interval: 1, reads: [{written}]}}}}\n"
+    found = [problem.split(": ")[1] for problem in folder.problems(HEAD + text)]
+    assert found == [f"devices.a.reads[{index}].into" for index in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("unit", [0, 248, 255])
+@pytest.mark.parametrize("scheme", ["rtu", "ascii"])
+def test_a_unit_of_a_serial_line_is_1_to_247(folder: Folder, unit: int, scheme: str) -> None:
+    text = changed("tcp://10.0.0.9", f"{scheme}:///dev/ttyX").replace("unit: 1", f"unit: {unit}")
+    assert told(folder, text) == [f"6: unit: found {unit}, allowed on a serial line: {SERIAL}"]
+
+
+def test_a_serial_line_is_driven_in_one_way(folder: Folder) -> None:
+    one, other = "'rtu:///dev/ttyX?baud=9600'", "'rtu:///dev/../dev/ttyX'"
+    text = changed("tcp://10.0.0.9", one) + ANOTHER.replace("tcp://10.0.0.9", other)
+    assert folder.problems(text) == [
+        "p.yaml:15: devices.other.url: found other settings of the line than devices.meter in "
+        "line 4 has, allowed: the same"
+    ]
+
+
+def test_a_serial_line_is_not_served_and_polled(folder: Folder) -> None:
+    listener = (
+        "listeners: {line: {type: modbus-rtu, serial: {device: /dev/ttyX}, "
+        "rules: [{units: {1: plant}, access: read-only}]}}\n"
+    )
+    text = changed("tcp://10.0.0.9", "ascii:///dev/ttyX") + listener
+    assert told(folder, text) == [
+        "5: url: found '/dev/ttyX', which is the device of listeners.line in line 14, "
+        "allowed: another"
+    ]
+
+
+def test_a_read_that_goes_nowhere_is_a_warning(folder: Folder) -> None:
+    text = changed("        into: {memory: plant, area: input_registers, address: 100}\n", "")
+    assert folder.warnings(text) == [
+        "p.yaml:9: devices.meter.reads[0]: it has no effect: neither into nor forward says where "
+        "it goes"
+    ]
+    forward = "    forward: [{url: 'raw://a:1', unit: 1}]\n"
+    assert folder.warnings(text + forward) == []
+
+
+@pytest.mark.parametrize(
+    ("more", "warned"),
+    [
+        ("", True),
+        ("    max_gap: 0\n", True),
+        ("    max_gap: 1\n", False),
+        ("    cost: {per_request: 1, per_register: 1}\n", False),
+    ],
+)
+def test_readable_ranges_without_holes_are_a_warning(
+    folder: Folder, more: str, warned: bool
+) -> None:
+    text = HEAD + METER + "    readable: [{area: coils, start: 0, end: 1}]\n" + more
+    message = (
+        "p.yaml:14: devices.meter.readable: it has no effect: without max_gap or cost no holes "
+        "are read"
+    )
+    assert folder.warnings(text) == ([message] if warned else [])

@@ -1,0 +1,466 @@
+"""What wrong services are told: REST, MQTT, adapters, metrics, audit; and seals without a key."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from support.config_folder import Folder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MEMORIES = """\
+memories:
+  plant: {id: 1, coils: 8, input_registers: 10}
+  other: {coils: 8}
+"""
+HASH = "0123456789abcdef" * 4
+REST = f"""\
+rest:
+  bind: 127.0.0.1:8080
+  sources: [127.0.0.0/8]
+  tokens:
+    - name: edge
+      sha256: {HASH}
+      memories: [plant]
+      areas: [coils]
+      access: read-write
+"""
+MQTT = """\
+mqtt:
+  url: mqtts://broker
+  client_id: plant
+  subscriptions:
+    - {topic: plant/+/in/#, memories: [plant], areas: [coils]}
+"""
+EXTRAS = """\
+adapters:
+  weather: {type: weather, memories: [plant], areas: [coils], access: read-only}
+metrics: {bind: 127.0.0.1:9464}
+audit: {file: audit.log}
+"""
+NAME = "1 to 64 letters, digits, '_', '.' and '-'"
+OTHER = "a name other than rest, mqtt, nats, gateway or metrics"
+SOME = "a list with at least one entry"
+DIGEST = "the SHA-256 of the token, 64 hexadecimal digits"
+URL = "mqtt://host:port or mqtts://host:port"
+HOST = "a host name or an address, IPv6 in brackets, and a port from 1 to 65535"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Folder:
+    return Folder(tmp_path)
+
+
+def changed(text: str, old: str, new: str) -> str:
+    assert text.count(old) == 1, old
+    return MEMORIES + text.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [("", "missing"), ("listeners: {}\n", "found an empty mapping"), (EXTRAS, "missing")],
+)
+def test_an_appliance_serves_something(folder: Folder, text: str, found: str) -> None:
+    (problem,) = folder.problems(MEMORIES + text)
+    assert problem.partition(": ")[2] == (
+        f"listeners: {found}, allowed: a mapping with at least one entry, "
+        "or none beside rest, mqtt, nats, gateway or devices"
+    )
+
+
+def test_listeners_are_not_empty_text(folder: Folder) -> None:
+    assert folder.problems(MEMORIES + "listeners:\n" + REST) == [
+        "p.yaml:4: listeners: found nothing, allowed: a mapping"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("  bind: 127.0.0.1:8080\n", "",
+         "4: bind: missing, allowed: text, as in 0.0.0.0:502, 127.0.0.1:5020 or [::]:502"),
+        ("  sources: [127.0.0.0/8]\n", "", f"4: sources: missing, allowed: {SOME}"),
+        ("[127.0.0.0/8]", "[]", f"6: sources: found an empty list, allowed: {SOME}"),
+        ("127.0.0.0/8", "any", "6: sources[0]: found 'any', allowed: a network or an address, "
+         "as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"),
+        ("  tokens:", "  max_body: 1023\n  tokens:",
+         "7: max_body: found 1023, allowed: an integer from 1024 to 1073741824"),
+        ("  tokens:", "  max_connections: 0\n  tokens:",
+         "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
+        ("  tokens:", "  request_timeout: 0\n  tokens:",
+         "7: request_timeout: found 0, allowed: a number from 0.001 to 31622400"),
+        ("  tokens:", "  token: []\n  tokens:",
+         "7: token: unknown key, allowed: bind, sources, tokens, max_body, max_connections, "
+         "request_timeout; did you mean 'tokens'?"),
+        ("name: edge", "name: ''", f"8: tokens[0].name: found '', allowed: {NAME}"),
+        ("[plant]", "[]", f"10: tokens[0].memories: found an empty list, allowed: {SOME}"),
+        ("[plant]", "[plan]", "10: tokens[0].memories[0]: found 'plan', allowed: plant, other; "
+         "did you mean 'plant'?"),
+        ("[plant]", "[plant, other, plant]",
+         "10: tokens[0].memories[2]: found 'plant' again, allowed: once"),
+        ("[coils]", "[]", f"11: tokens[0].areas: found an empty list, allowed: {SOME}"),
+        ("read-write", "all",
+         "12: tokens[0].access: found 'all', allowed: read-only or read-write"),
+        ("      access: read-write\n", "",
+         "8: tokens[0].access: missing, allowed: read-only or read-write"),
+    ],
+)  # fmt: skip
+def test_rest_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
+    line, _, rest = problem.partition(" ")
+    assert folder.problems(changed(REST, old, new)) == [f"p.yaml:{line} rest.{rest}"]
+
+
+@pytest.mark.parametrize(
+    ("digest", "found"),
+    [
+        ("my-secret-token", "text of 15 characters"),
+        (HASH[1:], "text of 63 characters"),
+        (f"{HASH}0", "text of 65 characters"),
+        ("g" * 64, "text of 64 characters"),
+        ("''", "text of 0 characters"),
+        ("[my-secret-token]", "a list"),
+    ],
+)
+def test_a_secret_in_the_place_of_its_hash_is_not_repeated(
+    folder: Folder, digest: str, found: str
+) -> None:
+    (problem,) = folder.problems(changed(REST, HASH, digest))
+    quote = "" if found.startswith("text") else ", as text"
+    assert problem == f"p.yaml:9: rest.tokens[0].sha256: found {found}, allowed: {DIGEST}{quote}"
+
+
+def test_a_number_in_the_place_of_a_hash_is_not_repeated(folder: Folder) -> None:
+    assert folder.problems(changed(REST, HASH, "123456")) == [
+        f"p.yaml:9: rest.tokens[0].sha256: found a number, allowed: {DIGEST}, as text"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("tokens", "problem"),
+    [
+        ("my-secret-token", f"found text of 15 characters, allowed: {SOME} or none"),
+        ("12345", f"found a number, allowed: {SOME} or none"),
+        ("[]", f"found an empty list, allowed: {SOME} or none"),
+        ("{}", f"found an empty mapping, allowed: {SOME} or none"),
+        ("", f"found nothing, allowed: {SOME} or none"),
+    ],
+)
+def test_tokens_are_a_list_or_none(folder: Folder, tokens: str, problem: str) -> None:
+    text = MEMORIES + REST[: REST.index("tokens:")] + f"tokens: {tokens}\n"
+    assert folder.problems(text) == [f"p.yaml:7: rest.tokens: {problem}"]
+
+
+def test_a_secret_in_the_place_of_a_token_is_not_repeated(folder: Folder) -> None:
+    text = MEMORIES + REST[: REST.index("tokens:")] + "tokens: [my-secret-token, 12345]\n"
+    keys = "name, sha256, memories, areas, access"
+    assert folder.problems(text) == [
+        f"p.yaml:7: rest.tokens[0]: found text of 15 characters, allowed: a mapping with the keys "
+        f"{keys}",
+        f"p.yaml:7: rest.tokens[1]: found a number, allowed: a mapping with the keys {keys}",
+    ]
+
+
+def test_tokens_are_said(folder: Folder) -> None:
+    assert folder.problems(MEMORIES + REST[: REST.index("  tokens:")]) == [
+        f"p.yaml:4: rest.tokens: missing, allowed: {SOME} or none"
+    ]
+
+
+@pytest.mark.parametrize("bind", ["0.0.0.0:80", "10.0.0.7:80", "[::]:80", "[fd00::1]:80"])
+def test_rest_without_tokens_stays_on_loopback(folder: Folder, bind: str) -> None:
+    rest = f"rest:\n  bind: '{bind}'\n  sources: [127.0.0.1]\n  tokens: none\n"
+    assert folder.problems(MEMORIES + rest) == [
+        f"p.yaml:7: rest.tokens: found 'none' beside bind {bind}, "
+        "allowed: none on a loopback address only"
+    ]
+
+
+@pytest.mark.parametrize("bind", ["127.0.0.1:80", "127.9.9.9:80", "[::1]:80"])
+def test_rest_without_tokens_serves_loopback(folder: Folder, bind: str) -> None:
+    rest = f"rest:\n  bind: '{bind}'\n  sources: [127.0.0.1]\n  tokens: none\n"
+    config = folder.config(MEMORIES + rest).rest
+    assert config is not None
+    assert config.tokens == "none"
+
+
+def test_tokens_differ_in_name_and_hash(folder: Folder) -> None:
+    token = REST[REST.index("    - name") :].replace(HASH, HASH.upper())
+    assert folder.problems(MEMORIES + REST + token) == [
+        "p.yaml:13: rest.tokens[1].name: found 'edge', which is the name of rest.tokens[0] "
+        "in line 8, allowed: another",
+        "p.yaml:14: rest.tokens[1].sha256: found a hash, which is the sha256 of rest.tokens[0] "
+        "in line 8, allowed: another",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("url", "problem"),
+    [
+        ("tcp://broker", f"found neither mqtt:// nor mqtts://, allowed: {URL}"),
+        ("broker:1883", f"found neither mqtt:// nor mqtts://, allowed: {URL}"),
+        ("MQTT://broker", f"found neither mqtt:// nor mqtts://, allowed: {URL}"),
+        ("mqtt://", f"found no host, allowed: {URL}"),
+        ("1883", f"found a number, allowed: {URL}"),
+        ("mqtt://broker/", f"found more than host and port, allowed: {URL}"),
+        ("mqtt://broker?password=secret", f"found more than host and port, allowed: {URL}"),
+        ("mqtt://broker#secret", f"found more than host and port, allowed: {URL}"),
+        ("mqtt://broker:0", f"found a host or port that can't be, allowed: {HOST}"),
+        ("mqtt://broker:65536", f"found a host or port that can't be, allowed: {HOST}"),
+        ("mqtt://user:secret", f"found a host or port that can't be, allowed: {HOST}"),
+        ("mqtt://bro ker", f"found a host or port that can't be, allowed: {HOST}"),
+        ("mqtt://[fd00::g]", f"found a host or port that can't be, allowed: {HOST}"),
+        ("mqtt://fd00::1", f"found a host or port that can't be, allowed: {HOST}"),
+        ("mqtt://user:secret@broker", f"found a user in it, allowed: {URL}; the user is username, "
+         "the password is in the file that password_file names"),
+        ("mqtt://user:se/cr#et@broker", f"found a user in it, allowed: {URL}; the user is "
+         "username, the password is in the file that password_file names"),
+    ],
+)  # fmt: skip
+def test_the_url_of_a_broker_is_checked_and_not_repeated(
+    folder: Folder, url: str, problem: str
+) -> None:
+    assert folder.problems(changed(MQTT, "mqtts://broker", url)) == [
+        f"p.yaml:5: mqtt.url: {problem}"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("topic", "problem"),
+    [
+        ("''", "found text of 0 bytes, allowed: a topic filter of 1 to 65535 bytes"),
+        ("7", "found 7, allowed: a topic filter of 1 to 65535 bytes"),
+        ("ü" * 32768, "found text of 65536 bytes, allowed: a topic filter of 1 to 65535 bytes"),
+        ('"a\\0"', "found 'a\\x00', allowed: a topic filter without NUL and surrogates"),
+        ("'a/#/b'", "found 'a/#/b', allowed: '#' only alone in the last level"),
+        ("'a#'", "found 'a#', allowed: '#' only alone in the last level"),
+        ("'##'", "found '##', allowed: '#' only alone in the last level"),
+        ("'a/+b'", "found 'a/+b', allowed: '+' only alone in its level"),
+        ("'++'", "found '++', allowed: '+' only alone in its level"),
+    ],
+)
+def test_a_topic_filter_is_checked(folder: Folder, topic: str, problem: str) -> None:
+    text = changed(MQTT, "plant/+/in/#", topic)
+    assert folder.problems(text) == [f"p.yaml:8: mqtt.subscriptions[0].topic: {problem}"]
+
+
+@pytest.mark.parametrize("topic", ["'#'", "'+'", "'+/#'", "/", "a//b", "'/+/'", "$share/g/a"])
+def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) -> None:
+    config = folder.config(changed(MQTT, "plant/+/in/#", topic)).mqtt
+    assert config is not None
+    assert config.subscriptions[0].topic == topic.strip("'")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("  url: mqtts://broker\n", "",
+         "4: url: missing, allowed: text, as in mqtt://127.0.0.1:1883 or mqtts://broker.example"),
+        ("  client_id: plant\n", "", "4: client_id: missing, allowed: text"),
+        ("client_id: plant", "client_id: ''",
+         "6: client_id: found text of 0 bytes, allowed: text of 1 to 65535 bytes"),
+        ("client_id: plant", "client_id: 5", "6: client_id: found 5, allowed: text of 1 to 65535 "
+         "bytes; write '5' to make it text"),
+        ("  client", "  version: 4\n  client", "6: version: found 4, allowed: 5 or 3.1.1"),
+        ("  client", "  version: 5.0\n  client", "6: version: found 5.0, allowed: 5 or 3.1.1"),
+        ("  client", "  keep_alive: 0\n  client",
+         "6: keep_alive: found 0, allowed: an integer from 1 to 65535"),
+        ("  client", "  username: ''\n  client",
+         "6: username: found text of 0 bytes, allowed: text of 1 to 65535 bytes"),
+        ("  client", "  password_file: p.yaml\n  client",
+         "6: password_file: found without username, allowed: both or none"),
+        ("  client", "  username: a\n  password_file: none.txt\n  client",
+         "7: password_file: found 'none.txt', which can't be read: No such file or directory"),
+        ("  client", "  username: a\n  password_file: /\n  client",
+         "7: password_file: found '/', which can't be read: Is a directory"),
+        ("  client", '  username: a\n  password_file: "\\0"\n  client',
+         "7: password_file: found '\\x00', allowed: the path of a file"),
+        ("  client", "  tls: {ca_file: none.pem}\n  client",
+         "6: tls.ca_file: found 'none.pem', which can't be read: No such file or directory"),
+        ("  client", "  tls: {cert_file: p.yaml}\n  client",
+         "6: tls.cert_file: found without key_file, allowed: both or none"),
+        ("  client", "  tls: {key_file: p.yaml}\n  client",
+         "6: tls.key_file: found without cert_file, allowed: both or none"),
+        ("  client", "  tls: {}\n  client",
+         "6: tls: found beside a url that begins with mqtt://, allowed: beside mqtts:// only"),
+        ("topic:", "qos: 3, topic:", "8: subscriptions[0].qos: found 3, allowed: 0, 1 or 2"),
+        ("topic:", "qos: true, topic:", "8: subscriptions[0].qos: found true, allowed: 0, 1 or 2"),
+        ("[plant]", "[plnt]", "8: subscriptions[0].memories[0]: found 'plnt', "
+         "allowed: plant, other; did you mean 'plant'?"),
+        (", areas: [coils]", "", f"8: subscriptions[0].areas: missing, allowed: {SOME}"),
+        ("    - {topic: plant/+/in/#, memories: [plant], areas: [coils]}\n", "    []\n",
+         f"7: subscriptions: found an empty list, allowed: {SOME}"),
+    ],
+)  # fmt: skip
+def test_mqtt_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
+    line, _, rest = problem.partition(" ")
+    text = changed(MQTT, old, new)
+    text = text.replace("mqtts", "mqtt") if rest.startswith("tls: ") else text
+    assert folder.problems(text) == [f"p.yaml:{line} mqtt.{rest}"]
+
+
+def test_a_password_in_the_file_is_an_unknown_key_and_not_repeated(folder: Folder) -> None:
+    (problem,) = folder.problems(MEMORIES + MQTT + "  password: my-secret\n")
+    assert problem.startswith("p.yaml:9: mqtt.password: unknown key, allowed: url, ")
+    assert "my-secret" not in problem
+
+
+def test_a_topic_is_subscribed_once(folder: Folder) -> None:
+    again = MQTT[MQTT.index("    - {topic") :].replace("[plant]", "[other]")
+    assert folder.problems(MEMORIES + MQTT + again) == [
+        "p.yaml:9: mqtt.subscriptions[1].topic: found 'plant/+/in/#', which is the topic of "
+        "mqtt.subscriptions[0] in line 8, allowed: another"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("weather:", "rest:",
+         f"5: adapters.rest: found 'rest', allowed: {OTHER}"),
+        ("weather:", "mqtt:",
+         f"5: adapters.mqtt: found 'mqtt', allowed: {OTHER}"),
+        ("weather:", "gateway:", f"5: adapters.gateway: found 'gateway', allowed: {OTHER}"),
+        ("weather:", "7:", f"5: adapters.7: found 7, allowed: {NAME}; write '7' to make it text"),
+        ("type: weather, ", "", "5: adapters.weather.type: missing, allowed: text"),
+        ("type: weather", "type: a b", f"5: adapters.weather.type: found 'a b', allowed: {NAME}"),
+        ("[plant]", "[othr]", "5: adapters.weather.memories[0]: found 'othr', "
+         "allowed: plant, other; did you mean 'other'?"),
+        ("[coils]", "[]", f"5: adapters.weather.areas: found an empty list, allowed: {SOME}"),
+        (", access: read-only", "",
+         "5: adapters.weather.access: missing, allowed: read-only or read-write"),
+        ("read-only", "read-only, options: [1]",
+         "5: adapters.weather.options: found a list, allowed: a mapping"),
+        ("read-only", "read-only, options: {7: 1}", "5: adapters.weather.options.7: found 7, "
+         "allowed: text; write '7' to make it text"),
+        ("{bind: 127.0.0.1:9464}", "{}", "6: metrics.bind: missing, allowed: text, as in "
+         "0.0.0.0:502, 127.0.0.1:5020 or [::]:502"),
+        ("{bind: 127.0.0.1:9464}", "{bind: '127.0.0.1:9464', sources: []}",
+         f"6: metrics.sources: found an empty list, allowed: {SOME}"),
+        ("file: audit.log", "keep: 1", "7: audit.file: missing, allowed: text"),
+        ("audit.log", "none/audit.log", "7: audit.file: found 'none/audit.log', "
+         "allowed: a file in a folder that is there"),
+        ("audit.log", ".", "7: audit.file: found '.', which is a folder, allowed: a file"),
+        ("audit.log", "audit.log, max_bytes: 65535",
+         "7: audit.max_bytes: found 65535, allowed: an integer of at least 65536"),
+        ("audit.log", "audit.log, keep: 1001",
+         "7: audit.keep: found 1001, allowed: an integer from 1 to 1000"),
+    ],
+)  # fmt: skip
+def test_adapters_metrics_and_audit_are_checked(
+    folder: Folder, old: str, new: str, problem: str
+) -> None:
+    assert folder.problems(changed(EXTRAS, old, new) + REST) == [f"p.yaml:{problem}"]
+
+
+def test_rest_and_metrics_need_sockets_of_their_own(folder: Folder) -> None:
+    listener = (
+        "listeners:\n  raw:\n    type: raw-ingest\n    bind: 0.0.0.0:8080\n    rules:\n"
+        "      - {sources: [10.0.0.7], units: {1: plant}, areas: [coils]}\n"
+    )
+    metrics = "metrics: {bind: '[::]:8080'}\n"
+    own = "allowed: an address and port of its own"
+    assert folder.problems(MEMORIES + listener + metrics + REST) == [
+        f"p.yaml:10: metrics.bind: found '[::]:8080', which overlaps 0.0.0.0:8080 of "
+        f"listeners.raw in line 7, {own}",
+        f"p.yaml:10: metrics.bind: found '[::]:8080', which overlaps 127.0.0.1:8080 of "
+        f"rest in line 12, {own}",
+        f"p.yaml:12: rest.bind: found '127.0.0.1:8080', which overlaps 0.0.0.0:8080 of "
+        f"listeners.raw in line 7, {own}",
+    ]
+
+
+def test_a_udp_listener_and_rest_share_a_port_number(folder: Folder) -> None:
+    listener = (
+        "listeners:\n  udp:\n    type: modbus-udp\n    bind: 127.0.0.1:8080\n    rules:\n"
+        "      - {sources: [10.0.0.7], units: {1: plant}, access: read-only}\n"
+    )
+    assert folder.warnings(MEMORIES + listener + REST) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        (REST, "11: rest.tokens[0].areas"),
+        (MQTT, "8: mqtt.subscriptions[0].areas"),
+        (MQTT + EXTRAS, "10: adapters.weather.areas"),
+    ],
+)
+def test_an_area_that_no_memory_of_a_grant_has_is_a_warning(
+    folder: Folder, text: str, place: str
+) -> None:
+    changed = text.replace("[coils]", "[coils, discrete_inputs]")
+    message = "discrete_inputs has no effect: plant has no such area"
+    assert folder.warnings(MEMORIES + changed)[-1] == f"p.yaml:{place}[1]: {message}"
+
+
+SEALED = MEMORIES.replace("10}", "10, seal: {area: coils, address: 0}}")
+OTHER_MQTT = MQTT.replace("[plant]", "[other]")
+RAW = """\
+listeners:
+  raw:
+    type: raw-ingest
+    bind: 127.0.0.1:9000
+    rules:
+      - {sources: [10.0.0.7], units: {1: plant}, areas: [coils]}
+"""
+MODBUS = """\
+listeners:
+  modbus:
+    type: modbus-tcp
+    bind: 127.0.0.1:9000
+    rules:
+      - {sources: [10.0.0.7], units: {1: plant}, access: read-write}
+"""
+DEVICE = """\
+devices:
+  source:
+    url: tcp://10.0.0.9
+    unit: 1
+    interval: 1
+    reads:
+      - area: discrete_inputs
+        address: 9
+        count: 2
+        into: {memory: plant, area: coils, address: 0}
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        MODBUS,
+        OTHER_MQTT,
+        RAW.replace("[coils]", "[input_registers]"),
+        REST.replace("read-write", "read-only"),
+        OTHER_MQTT + EXTRAS,
+        DEVICE.replace("address: 0}", "address: 1}"),
+        DEVICE.replace("    unit", "    enabled: false\n    unit"),
+    ],
+)
+def test_a_seal_that_nothing_can_open_is_a_warning(folder: Folder, text: str) -> None:
+    assert folder.warnings(SEALED + text) == [
+        "p.yaml:2: memories.plant.seal: it can never be opened: no raw-ingest rule, token, "
+        "subscription, adapter or device may write coils of plant"
+    ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        RAW,
+        RAW.replace("{1: plant}", "{1: other, 2: plant}"),
+        RAW.replace("bind", "format: crc\n    bind").replace(
+            "units: {1: plant}", "memories: [plant]"
+        ),
+        REST,
+        "rest: {bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none}\n",
+        MQTT,
+        OTHER_MQTT + EXTRAS.replace("read-only", "read-write"),
+        DEVICE,
+    ],
+)
+def test_a_seal_that_something_can_open_is_no_warning(folder: Folder, text: str) -> None:
+    assert folder.warnings(SEALED + text) == []

@@ -1,0 +1,181 @@
+"""Broadcasts through the gateway: writes to unit id 0 with RTU over TCP, which nobody answers."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import socket
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.gateway.broadcasting import crc
+from support import gateways, lines, wire
+from support.fake_device import FakeDevice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from support import web
+    from support.gateways import Running
+
+
+WRITES: dict[str, tuple[dict[str, Any], bytes]] = {
+    "/write/coil": ({"address": 3, "value": True}, bytes.fromhex("05 0003 ff00")),
+    "/write/coils": ({"address": 3, "values": [1, 0, 1]}, bytes.fromhex("0f 0003 0003 01 05")),
+    "/write/register": ({"address": 3, "value": 7}, bytes.fromhex("06 0003 0007")),
+    "/write/registers": ({"address": 3, "values": [7]}, bytes.fromhex("10 0003 0001 02 0007")),
+    "/write/mask": (
+        {"address": 3, "andMask": 0xFFF0, "orMask": 5},
+        bytes.fromhex("16 0003 fff0 0005"),
+    ),
+}
+
+
+class Line:
+    """A serial gateway that takes frames and, unless told, says nothing."""
+
+    def __init__(self) -> None:
+        self.frames: queue.Queue[bytes] = queue.Queue()
+        self.reply: bytes | None = b""
+        """What is sent back; `None` to hang up."""
+        self.connections = 0
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        found: int = self._listening.getsockname()[1]
+        return found
+
+    def close(self) -> None:
+        self._listening.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._listening.close()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listening.accept()
+            except OSError:
+                return
+            self.connections += 1
+            with connection, contextlib.suppress(OSError):
+                connection.settimeout(wire.DEADLINE)
+                while frame := connection.recv(256):
+                    self.frames.put(frame)
+                    if self.reply is None:
+                        break
+                    connection.sendall(self.reply)
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    made = Line()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def gateway() -> Iterator[Running]:
+    with gateways.running() as running:
+        yield running
+
+
+def to_all(line: Line, **body: Any) -> dict[str, Any]:
+    where = {"host": "127.0.0.1", "port": line.port, "transport": "rtu+tcp", "unitId": 0}
+    return {**where, **body}
+
+
+@pytest.mark.parametrize("path", WRITES)
+def test_a_broadcast_is_sent_and_not_waited_for(
+    gateway: Running, line: Line, log: web.Records, path: str
+) -> None:
+    body, pdu = WRITES[path]
+    answer = gateway.ask(path, to_all(line, **body, timeout=60000))
+    assert (answer.status, answer.json["success"]) == (200, True)
+    assert answer.json["note"] == "a broadcast is sent, and nobody confirms it"
+    assert line.frames.get(timeout=wire.DEADLINE) == lines.rtu(pdu, unit=0)
+    assert line.frames.empty()
+    assert [each["outcome"] for each in log.of("gateway_write")] == ["sent"]
+
+
+def test_another_unit_of_the_line_is_asked_afterwards(gateway: Running, line: Line) -> None:
+    """On one connection at a time."""
+    pdu = bytes.fromhex("06 0003 0007")
+    one = {"address": 3, "value": 7}
+    line.reply = lines.rtu(pdu, unit=5)
+    for unit in (5, 0, 5):
+        if unit == 0:
+            line.reply = b""
+        answer = gateway.ask("/write/register", to_all(line, **{**one, "unitId": unit}))
+        assert answer.json["success"] is True, unit
+        assert ("note" in answer.json) == (unit == 0)
+        line.reply = lines.rtu(pdu, unit=5)
+    assert line.connections == 3
+
+
+def test_a_line_that_is_not_there_is_told(gateway: Running, line: Line) -> None:
+    with FakeDevice(lambda _: None) as gone:
+        port = gone.port
+    answer = gateway.ask("/write/coil", to_all(line, port=port, address=0, value=1))
+    assert (answer.status, answer.headers["holdfast-reason"]) == (500, "no_connection")
+    assert answer.json["error"] == f"can't connect to 127.0.0.1:{port}: Connection refused"
+
+
+@pytest.mark.parametrize(
+    ("reply", "reason", "says"),
+    [
+        (None, "connection_lost", "closed by the peer"),
+        (lines.rtu(b"\x85\x02", unit=0), "invalid_reply", "00 85 02"),
+    ],
+)
+def test_a_line_that_refuses_is_told(
+    gateway: Running, line: Line, reply: bytes | None, reason: str, says: str
+) -> None:
+    line.reply = reply
+    answer = gateway.ask("/write/coil", to_all(line, address=0, value=1))
+    assert (answer.status, answer.headers["holdfast-reason"]) == (500, reason)
+    assert says in answer.json["error"]
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/connect", {}),
+        ("/read", {"functionCode": 3, "address": 0}),
+        ("/readwrite", {"readAddress": 0, "readQuantity": 1, "writeAddress": 0, "values": [1]}),
+        ("/diagnostics", {}),
+        ("/identify", {}),
+        ("/map", {}),
+    ],
+)
+def test_what_needs_an_answer_is_no_broadcast(
+    gateway: Running, line: Line, path: str, body: dict[str, Any]
+) -> None:
+    answer = gateway.ask(path, to_all(line, **body))
+    assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
+    assert "nobody answers" in answer.json["error"]
+    assert line.connections == 0
+
+
+def test_over_tcp_unit_0_is_a_unit_as_any(gateway: Running) -> None:
+    body = {"host": "127.0.0.1", "unitId": 0, "address": 3, "value": 7, "timeout": 100}
+    with FakeDevice(lambda pdu: pdu) as device:
+        answer = gateway.ask("/write/register", {**body, "port": device.port})
+        assert (answer.status, "note" in answer.json) == (200, False)
+    with FakeDevice(lambda _: None) as mute:
+        answer = gateway.ask("/write/register", {**body, "port": mute.port})
+    assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
+    assert answer.json["error"] == (
+        "Connection timeout: unit id 0 is the broadcast of serial lines, which nobody answers"
+    )
+
+
+@given(st.binary(max_size=256))
+def test_the_crc_is_that_of_the_standard(body: bytes) -> None:
+    assert crc(body) == lines.crc(body)

@@ -1,0 +1,1025 @@
+"""The gateway's console as people use it, in a real browser, on a desk and on a phone."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+from playwright.sync_api import expect
+
+from holdfast.client.target import Tls
+from support import gateway_pages
+from support.fake_device import HANG_UP, FakeDevice, exception, registers
+from support.gateway_pages import DESK, PHONE, Opened, View, browsing, floats, opening
+from support.secured import Authority, Relay, context
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from playwright.sync_api import Browser, Locator, Route
+
+    import holdfast
+
+HARMFUL = "<img src=x onerror=alert(1)>"
+SECRET = "correct-horse-battery-staple"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing() as launched:
+        yield launched
+
+
+@pytest.fixture
+def plant() -> holdfast.Memory:
+    return gateway_pages.plant()
+
+
+@pytest.fixture
+def opened(browser: Browser, plant: holdfast.Memory) -> Iterator[Opened]:
+    with opening(browser, plant, model=HARMFUL) as pages:
+        yield pages
+
+
+both = pytest.mark.parametrize(
+    ("size", "scheme"), [(DESK, "light"), (PHONE, "dark")], ids=["desk-light", "phone-dark"]
+)
+
+
+@both
+def test_a_device_is_connected_to_and_read(
+    opened: Opened, size: Any, scheme: Literal["light", "dark"]
+) -> None:
+    view = opened(size, scheme)
+    view.connect()
+    view.says("The device answers")
+    view.says("Acme")
+    view.says(HARMFUL)
+    view.choose(quantity="8")
+    view.button("Read").click()
+    view.says("Holding registers 0 to 7: read in")
+    cells = [
+        [text.strip() for text in view.row(address).get_by_role("cell").all_inner_texts()[:4]]
+        for address in (0, 1, 4)
+    ]
+    assert cells[0] == ["16812", "41AC", "0100 0001 1010 1100", "21.5"]
+    assert cells[1][:3] == ["0", "0000", "0000 0000 0000 0000"]
+    assert cells[2][:2] == ["1234", "04D2"]
+
+
+def test_every_type_of_a_register_is_shown(opened: Opened) -> None:
+    view = opened(PHONE)
+    view.connect()
+    view.button("Read").click()
+    view.button("All types from 0").click()
+    dialog = view.page.get_by_role("dialog")
+    expect(dialog.get_by_role("row", name="float32 21.5")).to_be_visible()
+    expect(dialog.get_by_role("row", name="uint16 16812 16812")).to_be_visible()
+    view.button("Close").click()
+    expect(dialog).to_be_hidden()
+
+
+@both
+def test_a_register_is_written_after_old_and_new_were_seen(
+    opened: Opened, plant: holdfast.Memory, size: Any, scheme: Literal["light", "dark"]
+) -> None:
+    view = opened(size, scheme)
+    view.connect()
+    view.choose(type="uint16")
+    view.button("Read").click()
+    view.button("Write 4").click()
+    dialog = view.page.get_by_role("dialog")
+    view.page.get_by_role("textbox", name="New value").fill("0x04D5")
+    view.page.keyboard.press("Enter")
+    expect(dialog.get_by_role("row", name="Now 1234 04D2 0000 0100 1101 0010")).to_be_visible()
+    expect(dialog.get_by_role("row", name="New 1237 04D5 0000 0100 1101 0101")).to_be_visible()
+    assert dialog.evaluate("(each) => each.scrollWidth <= each.clientWidth")
+    assert "" not in dialog.get_by_role("columnheader").all_text_contents()
+    assert plant.read("holding_registers", 4, 1) == [1234], "not before it is confirmed"
+    view.button("Write it").click()
+    view.says("Written, and read back")
+    assert plant.read("holding_registers", 4, 1) == [1237]
+    expect(view.row(4).get_by_role("cell").first).to_have_text("1237")
+
+
+def test_typed_values_are_written(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    view.choose(order="CDAB")
+    view.button("Read").click()
+    view.button("Write 8").click()
+    view.page.get_by_role("textbox", name="New value").fill("21.5, -1")
+    view.button("Review").click()
+    expect(view.page.get_by_role("row", name="10 0 -1")).to_be_visible()
+    view.button("Write it").click()
+    view.says("Written, and read back")
+    assert plant.read("holding_registers", 8, 4) == [0, 0x41AC, 0, 0xBF80]
+
+
+def test_a_coil_is_written(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    view.choose(area="1", quantity="20")
+    view.button("Read").click()
+    view.button("1 is off").click()
+    view.page.get_by_role("textbox", name="New value").fill("on")
+    view.button("Review").click()
+    expect(view.page.get_by_role("row", name="1 off on")).to_be_visible()
+    view.button("Write it").click()
+    expect(view.button("1 is on")).to_be_visible()
+    assert plant.read("coils", 0, 3) == [1, 1, 1]
+
+
+def test_a_value_that_is_none_is_not_written(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type="uint16")
+    view.button("Read").click()
+    view.button("Write 4").click()
+    for text, says in (("70000", "is no register"), ("1, x", "is no register")):
+        view.page.get_by_role("textbox", name="New value").fill(text)
+        view.button("Review").click()
+        expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
+    view.page.get_by_role("textbox", name="New value").fill("5")
+    view.button("Review").click()
+    view.button("Back").click()
+    view.page.keyboard.press("Escape")
+    expect(view.page.get_by_role("dialog")).to_be_hidden()
+    assert plant.read("holding_registers", 4, 1) == [1234]
+
+
+@both
+def test_what_changes_is_marked_and_plotted(
+    opened: Opened, plant: holdfast.Memory, size: Any, scheme: Literal["light", "dark"]
+) -> None:
+    view = opened(size, scheme)
+    view.connect()
+    view.choose(quantity="4", interval="50")
+    view.button("Watch").click()
+    view.says("Watching holding registers 0 to 3")
+    plot = view.page.get_by_role("article").filter(has=view.page.get_by_role("heading", name="0"))
+    for value in (22.25, 23.0, 22.75):
+        plant.write("holding_registers", 0, floats(value))
+        cell = view.row(0).get_by_role("cell").nth(3)
+        expect(cell).to_have_text(f"{value:g}")
+        expect(plot.get_by_role("status")).to_have_text(f"{value:g}")
+    expect(view.row(0).locator(".changed").first).to_be_visible()
+    expect(plot.locator("canvas")).to_be_visible()
+    view.button("Stop").click()
+    view.says("Stopped.")
+    expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
+
+
+def test_a_plot_is_chosen_and_removed(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.choose(quantity="8", interval="50")
+    view.button("Read").click()
+    view.button("Plot 4").click()
+    expect(view.button("Remove the plot of 4")).to_be_visible()
+    view.page.get_by_role("spinbutton", name="Plot address").fill("6")
+    view.button("Add plot").click()
+    view.button("Remove the plot of 6").click()
+    expect(view.button("Remove the plot of 6")).to_be_hidden()
+    expect(view.button("Remove the plot of 4")).to_be_visible()
+
+
+@both
+def test_a_map_is_a_picture_whose_ranges_can_be_read(
+    opened: Opened, size: Any, scheme: Literal["light", "dark"]
+) -> None:
+    view = opened(size, scheme)
+    view.connect()
+    view.page.get_by_role("tab", name="Map").click()
+    view.button("Map device").click()
+    view.says("Done in")
+    for name in (
+        "Coils: 48 addresses in 1 ranges",
+        "Discrete inputs: 20 addresses in 1 ranges",
+        "Holding registers: 300 addresses in 1 ranges",
+        "Input registers: 64 addresses in 1 ranges",
+    ):
+        expect(view.page.get_by_role("img", name=name)).to_be_visible()
+    view.button("Read input registers 1000–1063").click()
+    view.says("Input registers 1000 to 1063: read in")
+    expect(view.page.get_by_role("tab", name="Values")).to_have_attribute("aria-selected", "true")
+
+
+def test_a_dead_device_is_told_in_plain_words(opened: Opened) -> None:
+    view = opened()
+    with FakeDevice(lambda _: None) as mute:
+        view.page.get_by_role("spinbutton", name="Timeout").fill("50")
+        view.connect(port=mute.port)
+        view.says("No answer in time.")
+        view.says("Is the unit id right?")
+        port = mute.port
+    view.connect(port=port)
+    view.says("it takes no connection")
+    view.connect(host="no-such-name.invalid")
+    view.says("Nobody knows this name.")
+
+
+@both
+def test_a_device_with_tls_is_connected_to_and_read(
+    opened: Opened, tmp_path: Path, size: Any, scheme: Literal["light", "dark"]
+) -> None:
+    authority = Authority(tmp_path)
+    owner = authority.issue("drive", "DNS:drive-7")
+    with Relay(("127.0.0.1", opened.port), context(owner)) as relay:
+        view = opened(size, scheme, tls=Tls(ca=str(authority.ca)))
+        transport = view.page.get_by_role("combobox", name="Transport")
+        port = view.page.get_by_role("spinbutton", name="Port")
+        name = view.page.get_by_role("textbox", name="Name in its certificate")
+        expect(name).to_be_hidden()
+        transport.select_option("tls")
+        expect(port).to_have_value("802")
+        transport.select_option("udp")
+        expect(port).to_have_value("502")
+        port.fill("1502")
+        transport.select_option("tls")
+        expect(port).to_have_value("1502")
+        view.connect(port=relay.address[1])
+        view.says("TLS was not agreed on.")
+        view.says("the certificate is not for '127.0.0.1'")
+        view.check()
+        name.fill("drive-7")
+        view.button("Connect").click()
+        view.says("The device answers")
+        view.choose(quantity="4", interval="50")
+        view.button("Watch").click()
+        view.says("Watching holding registers")
+        view.page.reload()
+        expect(name).to_have_value("drive-7")
+        view.button("Connect").click()
+        view.says("The device answers")
+        transport.select_option("tcp")
+        expect(name).to_be_hidden()
+        view.connect(port=opened.port)
+        view.says("The device answers")
+        assert "drive-7" not in view.page.url
+
+
+def test_a_refused_target_is_told_in_plain_words(opened: Opened) -> None:
+    view = opened(allow=["10.0.0.0/8"])
+    view.connect()
+    view.says("This gateway may not connect there.")
+    view.says("--allow")
+
+
+def test_an_address_that_is_not_there_is_told_in_plain_words(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.choose(address="5000")
+    view.button("Read").click()
+    view.says("The device has no such address.")
+    view.says("this page counts from 0")
+
+
+def test_a_gateway_that_only_reads_offers_no_writing(opened: Opened) -> None:
+    view = opened(writes=False)
+    view.says("reads only")
+    view.connect()
+    view.button("Read").click()
+    view.says("This gateway only reads")
+    expect(view.button("Plot 0")).to_be_visible()
+    expect(view.button("Write 0")).to_have_count(0)
+
+
+def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
+    view = opened(tokens=(("edge", hashlib.sha256(SECRET.encode()).digest()),))
+    box = view.page.get_by_label("Token", exact=True)
+    box.fill("wrong")
+    view.page.keyboard.press("Enter")
+    view.says("The gateway does not know this token.")
+    box.fill(SECRET)
+    view.page.keyboard.press("Enter")
+    view.says("reads and writes")
+    view.connect()
+    view.says("The device answers")
+    view.choose(interval="50")
+    view.button("Watch").click()
+    view.says("Watching holding registers")
+    kept = "Object.values({0}).includes('{1}')"
+    assert view.page.evaluate(kept.format("sessionStorage", SECRET))
+    assert view.page.evaluate("localStorage.length + document.cookie.length") == 0
+    assert [url for url in view.requests if SECRET in url] == []
+    view.button("Forget token").click()
+    expect(box).to_be_visible()
+    assert not view.page.evaluate(kept.format("sessionStorage", SECRET))
+
+
+def test_a_device_is_part_of_the_address_of_the_page(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.says("The device answers")
+    view.page.reload()
+    expect(view.page.get_by_role("spinbutton", name="Port")).to_have_value(str(view.port))
+    assert view.page.get_by_role("textbox", name="Device").input_value() == "127.0.0.1"
+
+
+def test_the_keyboard_is_enough(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    page, keyboard = view.page, view.page.keyboard
+    page.get_by_role("textbox", name="Device").focus()
+    keyboard.type("127.0.0.1")
+    keyboard.press("Tab")
+    keyboard.press("Control+a")
+    keyboard.type(str(view.port))
+    page.get_by_role("button", name="Connect").focus()
+    keyboard.press("Enter")
+    view.says("The device answers")
+    expect(view.button("Connect")).to_be_focused()
+    keyboard.press("Tab")
+    expect(page.get_by_role("tab", name="Values")).to_be_focused()
+    keyboard.press("ArrowRight")
+    expect(page.get_by_role("tab", name="Map")).to_be_focused()
+    expect(view.button("Map device")).to_be_visible()
+    keyboard.press("ArrowRight")
+    page.get_by_role("combobox", name="Type").select_option("uint16")
+    view.button("Read").focus()
+    keyboard.press("Enter")
+    view.says("read in")
+    expect(view.button("Read")).to_be_focused()
+    for name in ("Watch", "All types from 0", "Plot 0", "Write 0"):
+        keyboard.press("Tab")
+        expect(view.button(name)).to_be_focused()
+    keyboard.press("Enter")
+    expect(page.get_by_role("textbox", name="New value")).to_be_focused()
+    keyboard.type("4711")
+    keyboard.press("Enter")
+    expect(view.button("Write it")).to_be_focused()
+    assert plant.read("holding_registers", 0, 1) != [4711]
+    keyboard.press("Enter")
+    view.says("Written, and read back")
+    assert plant.read("holding_registers", 0, 1) == [4711]
+    expect(view.button("Write 0")).to_be_focused()
+    keyboard.press("Shift+Tab")
+    keyboard.press("Enter")
+    view.says("Watching")
+    expect(view.button("Plot 0")).to_be_focused()
+    expect(view.button("Remove the plot of 0")).to_be_visible()
+    view.button("Stop").focus()
+    keyboard.press("Space")
+    view.says("Stopped.")
+    expect(view.button("Watch")).to_be_focused()
+    page.get_by_role("tab", name="Values").focus()
+    keyboard.press("ArrowRight")
+    view.button("Map device").focus()
+    keyboard.press("Enter")
+    view.says("Done in")
+    expect(view.button("Map device")).to_be_focused()
+    view.button("Read input registers 1000–1063").focus()
+    keyboard.press("Enter")
+    view.says("Input registers 1000 to 1063: read in")
+    expect(view.button("Read")).to_be_focused()
+
+
+def test_a_key_that_is_held_down_confirms_nothing(opened: Opened, plant: holdfast.Memory) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type="uint16")
+    view.button("Read").click()
+    view.button("Write 4").click()
+    view.page.get_by_role("textbox", name="New value").fill("1")
+    view.page.keyboard.down("Enter")
+    expect(view.button("Write it")).to_be_focused()
+    for _ in range(3):
+        view.page.keyboard.down("Enter")
+    view.page.keyboard.up("Enter")
+    expect(view.button("Write it")).to_be_visible()
+    assert plant.read("holding_registers", 4, 1) == [1234]
+
+
+UNNAMED = """
+[...document.querySelectorAll("input, select, button, canvas, [role=img]")]
+  .filter((each) => each.checkVisibility())
+  .filter((each) => !each.labels?.length && !each.textContent.trim()
+    && !each.getAttribute("aria-label") && !each.closest("[role=img]"))
+  .map((each) => each.outerHTML)
+"""
+
+CONTRAST = """
+(pairs) => pairs.map(([front, back]) => {
+  const shine = (name) => {
+    const text = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+    const short = text.length === 4 ? text.replace(/[^#]/g, "$&$&") : text;
+    const [r, g, b] = [1, 3, 5].map((at) => parseInt(short.slice(at, at + 2), 16) / 255)
+      .map((part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const [low, high] = [shine(front), shine(back)].sort((a, b) => a - b);
+  return (high + 0.05) / (low + 0.05);
+})
+"""
+
+
+@both
+def test_everything_has_a_name_and_enough_contrast(
+    opened: Opened, size: Any, scheme: Literal["light", "dark"]
+) -> None:
+    view = opened(size, scheme)
+    view.connect()
+    view.choose(interval="50")
+    view.button("Watch").click()
+    view.says("Watching")
+    assert view.page.evaluate(UNNAMED) == []
+    pairs = [
+        ("--ink", "--paper"),
+        ("--ink", "--card"),
+        ("--dim", "--card"),
+        ("--dim", "--paper"),
+        ("--dim", "--soft"),
+        ("--accent", "--card"),
+        ("--accent", "--paper"),
+        ("--on-accent", "--accent"),
+        ("--accent", "--accent-soft"),
+        ("--warm-ink", "--warm"),
+        ("--bad", "--card"),
+        ("--ink", "--bad-soft"),
+    ]
+    ratios = view.page.evaluate(CONTRAST, pairs)
+    poor = {pair: ratio for pair, ratio in zip(pairs, ratios, strict=True) if ratio < 4.5}
+    assert poor == {}
+
+
+def test_the_theme_follows_the_system(opened: Opened) -> None:
+    view = opened()
+    paper = "getComputedStyle(document.body).backgroundColor"
+    light = view.page.evaluate(paper)
+    view.page.emulate_media(color_scheme="dark")
+    assert view.page.evaluate(paper) != light
+
+
+class Registers:
+    """A device with ten holding registers; `fault` answers writes, `heard` has what was asked."""
+
+    def __init__(self, fault: Callable[[bytes], bytes | None] | None = None) -> None:
+        self.values = [1234] * 10
+        self.fault = fault
+        self.heard: list[bytes] = []
+
+    def __call__(self, pdu: bytes) -> bytes | None:
+        self.heard.append(pdu)
+        first = int.from_bytes(pdu[1:3])
+        if pdu[0] == 3:
+            count = int.from_bytes(pdu[3:5])
+            if first + count > len(self.values):
+                return exception(pdu, 2)
+            found = self.values[first : first + count]
+            return bytes([3, 2 * count]) + b"".join(each.to_bytes(2) for each in found)
+        if pdu[0] == 6 and self.fault is None:
+            self.values[first] = int.from_bytes(pdu[3:5])
+            return pdu
+        return exception(pdu, 1) if self.fault is None else self.fault(pdu)
+
+    @property
+    def writes(self) -> list[bytes]:
+        return [pdu for pdu in self.heard if pdu[0] == 6]
+
+
+def read_registers(view: View, port: int) -> None:
+    """Connects and reads the ten registers."""
+    view.connect(port=port)
+    view.says("The device answers")
+    view.choose(type="uint16", quantity="10")
+    view.button("Read").click()
+    view.says("Holding registers 0 to 9: read in")
+
+
+def write_4711(view: View) -> Locator:
+    """Asks to write 4711 to register 1, and confirms it; the dialog."""
+    view.button("Write 1").click()
+    view.page.get_by_role("textbox", name="New value").fill("4711")
+    view.button("Review").click()
+    view.button("Write it").click()
+    return view.page.get_by_role("dialog")
+
+
+@pytest.mark.parametrize("leave", ["escape", "cancel"])
+def test_a_write_that_is_refused_is_not_told_as_written(opened: Opened, leave: str) -> None:
+    device = Registers(lambda pdu: exception(pdu, 4))
+    with FakeDevice(device) as refusing:
+        view = opened()
+        read_registers(view, refusing.port)
+        alert = write_4711(view).get_by_role("alert")
+        expect(alert).to_contain_text("Not written.")
+        expect(alert).to_contain_text("The device failed at this.")
+        expect(alert).to_contain_text("look at the device")
+        expect(alert).to_contain_text("Read back: it is as it was before.")
+        if leave == "escape":
+            view.page.keyboard.press("Escape")
+        else:
+            view.button("Cancel").click()
+        view.says("Not written. Read back")
+        expect(view.page.get_by_text("what has changed is marked")).to_be_hidden()
+        expect(view.row(1).get_by_role("cell").first).to_have_text("1234")
+        assert len(device.writes) == 1
+
+
+@pytest.mark.parametrize("carried_out", [True, False])
+def test_a_write_without_a_reply_is_told_as_unknown_and_read_back(
+    opened: Opened, carried_out: bool
+) -> None:
+    def silent(pdu: bytes) -> None:
+        if carried_out:
+            device.values[1] = int.from_bytes(pdu[3:5])
+
+    device = Registers(silent)
+    with FakeDevice(device) as mute:
+        view = opened()
+        view.page.get_by_role("spinbutton", name="Timeout").fill("300")
+        read_registers(view, mute.port)
+        alert = write_4711(view).get_by_role("alert")
+        expect(alert).to_contain_text("Not known whether it was written.")
+        expect(alert).to_contain_text("No answer in time.")
+        told = "what was to be written" if carried_out else "as it was before"
+        expect(alert).to_contain_text(f"Read back: it is {told}.")
+        view.page.keyboard.press("Escape")
+        view.says("Not known whether it was written. Read back")
+        expect(view.row(1).get_by_role("cell").first).to_have_text(
+            "4711" if carried_out else "1234"
+        )
+
+
+def test_a_write_that_can_not_be_read_back_says_so(opened: Opened) -> None:
+    device = Registers(lambda _: HANG_UP)
+    with FakeDevice(device) as leaving:
+        view = opened()
+        read_registers(view, leaving.port)
+        view.button("Write 1").click()
+        view.page.get_by_role("textbox", name="New value").fill("4711")
+        view.button("Review").click()
+        expect(view.button("Write it")).to_be_visible()
+        device.values = []
+        view.button("Write it").click()
+        view.says("It could not be read back: read it before you go on.")
+        view.page.keyboard.press("Escape")
+        view.says("Not known whether it was written. It could not be read back.")
+        view.says("Old values of 127.0.0.1")
+
+
+def test_a_write_that_is_left_alone_is_told_when_it_ends(opened: Opened) -> None:
+    device = Registers(lambda _: None)
+    with FakeDevice(device) as mute:
+        view = opened()
+        view.page.get_by_role("spinbutton", name="Timeout").fill("1000")
+        read_registers(view, mute.port)
+        dialog = write_4711(view)
+        view.page.keyboard.press("Escape")
+        expect(dialog).to_be_hidden()
+        view.says("Not known whether it was written. Read back")
+
+
+def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as vanishing:
+        view = opened()
+        read_registers(view, vanishing.port)
+        device.values = []
+        view.button("Write 1").click()
+        view.page.get_by_role("textbox", name="New value").fill("4711")
+        view.button("Review").click()
+        view.says("The device has no such address.")
+        view.says("this page counts from 0")
+        assert device.writes == []
+
+
+def test_a_change_of_the_device_makes_what_is_shown_old(opened: Opened) -> None:
+    first, second = Registers(), Registers()
+    second.values = [7] * 10
+    with FakeDevice(first) as a, FakeDevice(second) as b:
+        view = opened()
+        read_registers(view, a.port)
+        expect(view.page.get_by_text(f"Values of 127.0.0.1:{a.port}, unit 1")).to_be_visible()
+        port = view.page.get_by_role("spinbutton", name="Port")
+        port.fill(str(b.port))
+        view.says("Not connected: connect to go on.")
+        view.says(f"Old values of 127.0.0.1:{a.port}, unit 1")
+        for name in ("Write 1", "Read", "Watch", "Plot 1"):
+            expect(view.button(name)).to_be_disabled()
+        expect(view.page.get_by_text("The device answers")).to_be_hidden()
+        port.fill("1")
+        view.button("Connect").click()
+        view.says("it takes no connection")
+        expect(view.button("Write 1")).to_be_disabled()
+        view.says(f"Old values of 127.0.0.1:{a.port}, unit 1")
+        view.connect(port=b.port)
+        view.says("The device answers")
+        expect(view.button("Write 1")).to_have_count(0)
+        view.button("Read").click()
+        expect(view.row(1).get_by_role("cell").first).to_have_text("7")
+
+
+def test_a_write_goes_to_the_device_of_the_table(opened: Opened) -> None:
+    first, second = Registers(), Registers()
+    with FakeDevice(first) as a, FakeDevice(second) as b:
+        view = opened()
+        read_registers(view, a.port)
+        # A value that is set by something other than a hand tells nobody.
+        view.page.evaluate(f"document.getElementById('port').value = {b.port}")
+        view.button("Write 1").click()
+        expect(view.page.get_by_text(f"of unit 1 at 127.0.0.1:{a.port}")).to_be_visible()
+        view.page.get_by_role("textbox", name="New value").fill("4711")
+        view.button("Review").click()
+        view.button("Write it").click()
+        view.says("Written, and read back")
+        assert (first.values[1], second.heard) == (4711, [])
+
+
+def test_a_change_of_the_device_gives_up_what_is_under_way(opened: Opened) -> None:
+    with FakeDevice(lambda _: None) as mute:
+        view = opened()
+        view.connect(port=mute.port)
+        view.says("Connecting…")
+        view.page.get_by_role("textbox", name="Device").fill("127.0.0.2")
+        view.says("Not connected")
+        expect(view.button("Read")).to_be_hidden()
+        view.connect()
+        view.says("The device answers")
+        view.choose(interval="50")
+        view.button("Watch").click()
+        view.says("Watching holding registers")
+        view.page.get_by_role("spinbutton", name="Unit id").fill("2")
+        view.says("Stopped.")
+        view.says("Old values of")
+
+
+def only(*there: range) -> Callable[[bytes], bytes]:
+    """A device that has these holding registers."""
+
+    def answer(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        fits = any(first in each and first + count - 1 in each for each in there)
+        return registers(pdu, 5) if pdu[0] == 3 and fits else exception(pdu, 2)
+
+    return answer
+
+
+def survey(view: View, first: int, last: int) -> None:
+    """Maps the holding registers of a device in a stretch."""
+    view.page.get_by_role("tab", name="Map").click()
+    for name in ("Coils", "Discrete inputs", "Input registers"):
+        view.page.get_by_role("checkbox", name=name).uncheck()
+    view.page.get_by_role("spinbutton", name="First address").fill(str(first))
+    view.page.get_by_role("spinbutton", name="Last address").fill(str(last))
+    view.button("Map device").click()
+    view.says("Done in")
+
+
+@pytest.mark.parametrize(
+    ("there", "asked", "kind"),
+    [
+        (range(1000, 1001), 1, "uint16"),
+        (range(1000, 1003), 3, "uint16"),
+        (range(1000, 1004), 4, "float32"),
+        (range(1000, 1300), 124, "float32"),
+    ],
+    ids=["one", "three", "four", "many"],
+)
+def test_a_click_on_a_range_reads_no_more_than_that(
+    opened: Opened, there: range, asked: int, kind: str
+) -> None:
+    with FakeDevice(only(there)) as device:
+        view = opened()
+        view.connect(port=device.port)
+        survey(view, 900, 1400)
+        last = f"–{there[-1]}" if len(there) > 1 else ""
+        view.button(f"Read holding registers 1000{last}").click()
+        view.says(f"Holding registers 1000 to {999 + asked}: read in")
+        assert device.asked[-1] == bytes([3]) + (1000).to_bytes(2) + asked.to_bytes(2)
+        expect(view.page.get_by_role("combobox", name="Type")).to_have_value(kind)
+        expect(view.page.get_by_text("one read does not take")).to_be_visible(
+            visible=len(there) > asked
+        )
+
+
+def test_a_map_of_samples_says_so_and_offers_all(opened: Opened) -> None:
+    with FakeDevice(only(range(1000, 1004), range(1120, 1122))) as device:
+        view = opened()
+        view.connect(port=device.port)
+        survey(view, 980, 1149)
+        view.says("gaps may hide more")
+        expect(view.page.get_by_role("button", name="Read holding registers")).to_have_count(1)
+        view.button("Ask every address (slow)").click()
+        expect(view.button("Read holding registers 1120–1121")).to_be_visible()
+        expect(view.page.get_by_text("gaps may hide more")).to_be_hidden()
+        asked = {int.from_bytes(pdu[1:3]) for pdu in device.asked}
+        assert set(range(980, 1000)) <= asked
+
+
+@pytest.mark.parametrize("answer", ["exception", "nothing"])
+def test_a_device_without_function_3_can_be_read(opened: Opened, answer: str) -> None:
+    def inputs(pdu: bytes) -> bytes | None:
+        if pdu[0] == 4:
+            return registers(pdu, 77)
+        return exception(pdu, 1) if answer == "exception" else None
+
+    with FakeDevice(inputs) as device:
+        view = opened()
+        view.page.get_by_role("spinbutton", name="Timeout").fill("200")
+        view.connect(port=device.port)
+        if answer == "nothing":
+            view.says("No answer in time.")
+            view.page.get_by_role("spinbutton", name="Timeout").fill("201")
+            expect(view.button("Go on all the same")).to_be_hidden()
+            view.button("Connect").click()
+            view.button("Go on all the same").click()
+            expect(view.page.get_by_role("tab", name="Values")).to_be_focused()
+        view.says("It did not answer this probe, holding register 0; other areas may")
+        view.choose(area="4", type="uint16", quantity="2")
+        view.button("Read").click()
+        view.says("Input registers 0 to 1: read in")
+        expect(view.row(0).get_by_role("cell").first).to_have_text("77")
+
+
+TYPES: list[tuple[dict[str, str], list[int], str]] = [
+    ({"type": "float64", "order": "letters", "letters": "efghabcd"}, [0, 0, 0x3FF8, 0], "1.5"),
+    ({"type": "bit", "size": "3"}, [8], "true"),
+    ({"type": "bool"}, [0], "false"),
+    ({"type": "bytes", "size": "3"}, [0x0A0B, 0x0C00], "0a 0b 0c"),
+    ({"type": "string", "size": "4"}, [0x5031, 0x2D37], "P1-7"),
+    ({"type": "float16"}, [0x3E00], "1.5"),
+    ({"type": "bcd32"}, [0x1234, 0x5678], "12345678"),
+]
+
+
+@pytest.mark.parametrize(("fields", "held", "text"), TYPES, ids=[each[0]["type"] for each in TYPES])
+def test_any_type_is_read(
+    opened: Opened, plant: holdfast.Memory, fields: dict[str, str], held: list[int], text: str
+) -> None:
+    plant.write("holding_registers", 8, held)
+    view = opened(PHONE)
+    view.connect()
+    view.choose(address="8", quantity=str(len(held)), **fields)
+    view.button("Read").click()
+    view.says(f"Holding registers 8 to {7 + len(held)}: read in")
+    expect(view.row(8).locator(".typed")).to_have_text(text)
+
+
+@pytest.mark.parametrize(
+    ("fields", "given", "held"),
+    [
+        ({"type": "string", "size": "6"}, "a, b", [0x612C, 0x2062, 0]),
+        ({"type": "string", "size": "4"}, "", [0, 0]),
+        ({"type": "bytes", "size": "4"}, "0a0B 0c0d", [0x0A0B, 0x0C0D]),
+        ({"type": "bit", "size": "3"}, "on", [0x0008]),
+        ({"type": "bit", "size": "3", "order": "BADC"}, "on", [0x0800]),
+        ({"type": "bool"}, "true", [1]),
+        ({"type": "bcd16"}, "1234", [0x1234]),
+        ({"type": "int64", "order": "letters"}, "1", [0, 1, 0, 0]),
+    ],
+    ids=["text", "no text", "bytes", "bit", "swapped bit", "bool", "bcd", "letters"],
+)
+def test_any_type_is_written(
+    opened: Opened, plant: holdfast.Memory, fields: dict[str, str], given: str, held: list[int]
+) -> None:
+    view = opened()
+    view.connect()
+    view.choose(address="8", quantity="4", **fields)
+    view.button("Read").click()
+    view.button("Write 8").click()
+    view.page.get_by_role("textbox", name="New value").fill(given)
+    view.button("Review").click()
+    view.button("Write it").click()
+    view.says("Written, and read back")
+    assert plant.read("holding_registers", 8, len(held)) == held
+
+
+@pytest.mark.parametrize(
+    ("fields", "given", "says"),
+    [
+        ({"type": "string", "size": "4"}, "abcde", "up to 4 characters of ASCII"),
+        ({"type": "string", "size": "4"}, "5 °C", "up to 4 characters of ASCII"),
+        ({"type": "bytes", "size": "4"}, "0a0b", "4 pairs of hexadecimal digits"),
+        ({"type": "bit", "size": "3"}, "2", "is no bit"),
+        ({"type": "bit", "size": "3"}, "1, 0", "One bit at a time"),
+    ],
+)
+def test_a_value_that_is_none_of_a_type_is_told(
+    opened: Opened, fields: dict[str, str], given: str, says: str
+) -> None:
+    view = opened()
+    view.connect()
+    view.choose(address="8", quantity="4", **fields)
+    view.button("Read").click()
+    view.button("Write 8").click()
+    view.page.get_by_role("textbox", name="New value").fill(given)
+    view.button("Review").click()
+    expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
+
+
+@pytest.mark.parametrize(
+    ("kind", "letters", "says"),
+    [
+        ("int64", "ABCDEFGG", "has A to H once each"),
+        ("int64", "ACBDEFGH", "A register stays whole"),
+        ("int64", "CDEFGHAB", "applied twice"),
+        ("int32", "EFGHABCD", "int32 has 4"),
+    ],
+)
+def test_letters_that_are_no_order_are_told(
+    opened: Opened, kind: str, letters: str, says: str
+) -> None:
+    view = opened()
+    view.connect()
+    view.says("The device answers")
+    view.choose(type=kind, order="letters", letters=letters)
+    told = view.page.locator("#letters").evaluate("(each) => each.validationMessage")
+    assert says in told
+    view.button("Read").click()
+    expect(view.page.locator("#letters")).to_be_focused()
+    view.choose(letters="GHEFCDAB", type="int64")
+    view.button("Read").click()
+    view.says("read in")
+
+
+def test_all_orders_of_eight_bytes_are_shown(opened: Opened, plant: holdfast.Memory) -> None:
+    plant.write("holding_registers", 8, [0, 0, 0x3FF8, 0])
+    view = opened(PHONE)
+    view.connect()
+    view.choose(address="8", quantity="4")
+    view.button("Read").click()
+    view.button("All types from 8").click()
+    dialog = view.page.get_by_role("dialog")
+    expect(dialog.get_by_role("columnheader", name="EFGHABCD")).to_be_visible()
+    cells = dialog.get_by_role("row").filter(has_text="float64").nth(1).get_by_role("cell")
+    assert cells.nth(1).inner_text() == "1.5"
+    for name in ("float16 0 0 0 0", "bcd16 0 0 0 0", "bits on none none none none"):
+        expect(dialog.get_by_role("row", name=name)).to_be_visible()
+
+
+def test_a_field_that_the_gateway_refuses_is_marked(opened: Opened) -> None:
+    view = opened()
+    view.connect(host="no name")
+    view.says("The gateway can't take this request.")
+    view.says("Check the marked value.")
+    host = view.page.get_by_role("textbox", name="Device")
+    expect(host).to_have_attribute("aria-invalid", "true")
+    assert host.evaluate("(each) => getComputedStyle(each).borderColor") == "rgb(164, 39, 27)"
+    view.connect()
+    view.says("The device answers")
+    expect(host).not_to_have_attribute("aria-invalid", "true")
+
+
+def test_a_range_is_checked_before_it_is_watched_or_read(opened: Opened) -> None:
+    view = opened(limits={"interval": 0.1})
+    view.connect()
+    view.says("The device answers")
+    for fields, wrong in (
+        ({"interval": "5"}, "interval"),
+        ({"interval": "100", "address": ""}, "address"),
+        ({"address": "65530", "quantity": "10"}, "quantity"),
+    ):
+        view.choose(**fields)
+        view.button("Watch").click()
+        expect(view.page.locator(f"#{wrong}")).to_be_focused()
+        expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
+    assert [url for url in view.requests if "/watch" in url] == []
+
+
+def test_whole_values_are_read_and_that_is_told(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.choose(quantity="125")
+    view.button("Read").click()
+    view.says("Each float32 takes 2 registers: 124 rather than 125.")
+    view.choose(quantity="1")
+    view.button("Watch").click()
+    view.says("Each float32 takes 2 registers: 2 rather than 1.")
+
+
+def test_a_plot_that_can_not_be_is_told(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.choose(quantity="20", type="uint16", interval="50")
+    view.button("Watch").click()
+    view.says("Watching")
+    box = view.page.get_by_role("spinbutton", name="Plot address")
+    box.fill("5000")
+    view.button("Add plot").click()
+    view.says("5000 is not watched: 0 to 19 are.")
+    for address in range(9):
+        box.fill(str(address))
+        view.button("Add plot").click()
+    view.says("There are 8 plots, which is the most.")
+    box.fill("3")
+    view.button("Add plot").click()
+    view.says("3 is plotted.")
+    expect(view.button("Remove the plot of 3")).to_be_visible()
+
+
+def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
+    view = opened()
+    view.connect()
+    view.says("The device answers")
+    view.choose(quantity="2", interval="50")
+    told = {"time": 0, "rtt": 0, "address": 0, "quantity": 2, "format": "registers"}
+    body = json.dumps({**told, "values": [0, 0], "typed": [0.0], "typedText": ["0"]})
+    answers = iter([f"event: values\ndata: {body}\n\n"])
+
+    def gone(route: Route) -> None:
+        once = next(answers, None)
+        if once is None:
+            route.abort()
+        else:
+            route.fulfill(content_type="text/event-stream", body=once)
+
+    view.page.route("**/api/modbus/watch*", gone)
+    view.button("Watch").click()
+    view.says("The gateway has ended the watch, or is gone. It goes on by itself")
+    view.says("Old values of")
+    view.page.unroute("**/api/modbus/watch*")
+    view.says("Watching holding registers 0 to 1")
+    expect(view.row(0).locator(".typed")).to_have_text("21.5")
+    view.button("Stop").click()
+    view.says("Stopped.")
+
+
+LABELS = """
+() => {
+  const fill = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+    document.body.dataset.labels = `${document.body.dataset.labels ?? ""} ${text}`;
+    return fill.call(this, text, ...rest);
+  };
+}
+"""
+
+
+def test_a_plot_of_tiny_values_has_labels(opened: Opened, plant: holdfast.Memory) -> None:
+    plant.write("holding_registers", 0, floats(1e-30))
+    view = opened()
+    view.page.evaluate(LABELS)
+    view.connect()
+    view.choose(quantity="2", interval="50")
+    view.button("Watch").click()
+    view.says("Watching")
+    plant.write("holding_registers", 0, floats(2e-30))
+    expect(view.page.locator("body")).to_have_attribute("data-labels", re.compile(r"[1-9]e-30 "))
+
+
+def test_old_values_can_be_read(opened: Opened) -> None:
+    schemes: tuple[Literal["light", "dark"], ...] = ("light", "dark")
+    for scheme in schemes:
+        view = opened(DESK, scheme)
+        view.page.emulate_media(reduced_motion="reduce")
+        view.connect()
+        for area, selector in (("3", ".values td, .values tbody th, .age"), ("1", ".bit")):
+            view.choose(area=area)
+            view.button("Read").click()
+            view.says("read in")
+            view.page.get_by_role("spinbutton", name="Unit id").fill("2")
+            view.says("Old values")
+            assert view.page.evaluate(MIN_CONTRAST, f"#table :is({selector})") >= 4.5
+            view.page.get_by_role("spinbutton", name="Unit id").fill("1")
+            view.button("Connect").click()
+            view.says("The device answers")
+
+
+@both
+def test_no_choice_is_cut(opened: Opened, size: Any, scheme: Literal["light", "dark"]) -> None:
+    view = opened(size, scheme)
+    view.connect()
+    view.says("The device answers")
+    assert view.page.evaluate(CUT) == []
+
+
+CUT = """
+[...document.querySelectorAll("select")].filter((each) => each.checkVisibility()).filter((each) => {
+  const alone = each.cloneNode(true);
+  alone.style.cssText = "position: absolute; width: max-content";
+  document.body.append(alone);
+  const cut = each.offsetWidth < alone.offsetWidth;
+  alone.remove();
+  return cut;
+}).map((each) => each.id)
+"""
+"""Selects that are narrower than their widest choice."""
+
+MIN_CONTRAST = """
+(selector) => {
+  const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+  const shine = ([r, g, b]) => [r, g, b].map((each) => each / 255)
+    .map((part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, part, at) => sum + part * [0.2126, 0.7152, 0.0722][at], 0);
+  const behind = (each) => {
+    const [r, g, b, a = 1] = parts(getComputedStyle(each).backgroundColor);
+    return a === 1 || !each.parentElement ? [r, g, b] : behind(each.parentElement);
+  };
+  const opaque = (each) =>
+    each === null ? 1 : Number(getComputedStyle(each).opacity) * opaque(each.parentElement);
+  const found = [...document.querySelectorAll(selector)];
+  return Math.min(...found.map((each) => {
+    const [front, back] = [parts(getComputedStyle(each).color), behind(each)];
+    const part = opaque(each);
+    const seen = front.slice(0, 3).map((own, at) => own * part + back[at] * (1 - part));
+    const [low, high] = [shine(seen), shine(back)].sort((a, b) => a - b);
+    return (high + 0.05) / (low + 0.05);
+  }));
+}
+"""
+"""The least contrast of the texts of some elements, with their opacity."""

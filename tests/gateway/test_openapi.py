@@ -1,0 +1,140 @@
+"""The gateway's OpenAPI document: true of what a gateway answers to all sorts of requests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import positive_data_acceptance
+
+import holdfast
+from holdfast import __version__
+from holdfast.gateway import Settings, app, openapi
+from support import gateways
+from support.gateways import Dialed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from schemathesis import Case
+
+    from holdfast.client.target import NetworkTarget
+    from support.gateways import Running
+
+EXAMPLES = 25
+
+EXCLUDED: list[Any] = [
+    # 500 says that there was no connection or no reply.
+    not_a_server_error,
+    # A schema takes 1.0 for an integer, and can't say that a type goes with a quantity.
+    positive_data_acceptance,
+]
+
+DOCUMENT = openapi.document(__version__, app.ENDPOINTS, Settings(()))
+OPERATIONS = [
+    (path, method.upper(), mode)
+    for path, methods in DOCUMENT["paths"].items()
+    for method, operation in methods.items()
+    for mode in GenerationMode
+    if "watch" not in path  # It does not end.
+    if mode is GenerationMode.POSITIVE or "requestBody" in operation
+]
+
+
+class Everywhere(Dialed):
+    """Leads to one and the same device, whoever is asked for."""
+
+    def __init__(self, device: tuple[str, int]) -> None:
+        super().__init__()
+        self._device = device
+
+    def __call__(self, target: NetworkTarget, **options: Any) -> Any:
+        host, port = self._device
+        return super().__call__(replace(target, host=host, port=port), **options)
+
+
+@pytest.fixture(scope="module")
+def gateway() -> Iterator[Running]:
+    async def anybody(_: str) -> list[str]:
+        return ["127.0.0.1"]
+
+    memory = holdfast.Memory(
+        coils=65536, discrete_inputs=1000, holding_registers=65536, input_registers=1000
+    )
+    with (
+        holdfast.Server({1: memory, 0: memory}, bind="127.0.0.1:0", access="read-write") as server,
+        gateways.running(
+            allow=["0.0.0.0/0:*"],
+            resolve=anybody,
+            dialed=Everywhere(server.address),
+            limits={"timeout": 0.2, "mapping": 0.02},
+        ) as running,
+    ):
+        yield running
+
+
+@pytest.mark.parametrize(("path", "method", "mode"), OPERATIONS)
+def test_what_is_answered_is_what_the_document_says(
+    gateway: Running, path: str, method: str, mode: GenerationMode
+) -> None:
+    schema = schemathesis.openapi.from_url(f"{gateway.url}/openapi.json")
+    strategy = schema[path][method].as_strategy(generation_mode=mode)
+
+    @seed(7)
+    @settings(
+        max_examples=EXAMPLES,
+        deadline=None,
+        database=None,
+        phases=[Phase.explicit, Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(case=strategy)
+    def asked(case: Case[Any]) -> None:
+        response = case.call_and_validate(base_url=gateway.url, excluded_checks=EXCLUDED)
+        assert response.headers.get("holdfast-reason") != ["internal_error"]
+
+    asked()
+
+
+def test_every_request_of_a_device_may_have_tls() -> None:
+    for path, methods in DOCUMENT["paths"].items():
+        if not path.startswith(gateways.API):
+            continue
+        [operation] = methods.values()
+        if "parameters" in operation:
+            fields = {each["name"]: each["schema"] for each in operation["parameters"]}
+        else:
+            content = operation["requestBody"]["content"]
+            fields = content["application/json"]["schema"]["properties"]
+        assert "tls" in fields["transport"]["enum"], path
+        assert fields["serverName"]["type"] == "string", path
+
+
+def test_every_example_is_answered_as_the_document_says(gateway: Running) -> None:
+    document = gateway.client().get("/openapi.json").json
+    for path, methods in document["paths"].items():
+        if path == "/api/modbus/map" or "post" not in methods:
+            continue
+        content = methods["post"]["requestBody"]["content"]["application/json"]
+        for example in content["examples"].values():
+            answer = gateway.client().ask("POST", path, {**example["value"], "timeout": 200})
+            assert (answer.status, answer.json["success"]) == (200, True), (path, answer.json)
+        told = methods["post"]["responses"]["200"]["content"]["application/json"]
+        properties, *_ = told["schema"]["oneOf"]
+        assert set(properties["required"]) <= set(told["example"])
+        assert set(told["example"]) <= set(properties["properties"])
+
+
+def test_the_page_has_every_route_and_needs_nothing(gateway: Running) -> None:
+    answer = gateway.client().get("/docs")
+    text = answer.body.decode()
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "<script" not in text
+    for path in DOCUMENT["paths"]:
+        assert f"<code>GET {path}</code>" in text or f"<code>POST {path}</code>" in text
+    assert f"curl {gateway.url}/api/modbus/read" in text

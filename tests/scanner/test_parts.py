@@ -1,0 +1,493 @@
+"""Parts of the scanner by themselves: what is due, what is kept, how a device does."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.client.target import NetworkTarget
+from holdfast.scanner import outbox as outboxes
+from holdfast.scanner.browsing import browsed
+from holdfast.scanner.decoding import decoder
+from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
+from holdfast.scanner.groups import Group, grouped
+from holdfast.scanner.health import Health
+from holdfast.scanner.messages import BrowseRequest, ServiceReport
+from holdfast.scanner.outbox import Outbox
+from holdfast.scanner.publishing import Publisher
+from holdfast.scanner.tags import Places, Tag
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from nats.aio.client import Client
+
+    from holdfast.scanner.messages import Publish
+    from holdfast.scanner.polling import PolledBlock
+
+TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
+ANSWERED = 1_700_000_000.0
+"""Seconds since 1970."""
+
+
+def made(id: str, address: int = 0, type: str = "uint16") -> Tag:
+    return Tag(id, "holding_registers", address, type, "ABCD", frozenset())
+
+
+def device(**subscribers: tuple[int, Publish, float, str]) -> ScannedDevice:
+    """A device whose subscribers have rate, mode, deadband, and tags of one letter."""
+    found = ScannedDevice("plc", Source(TARGET, 1, 1000, False, Plan()), TARGET, Health())
+    for name, (rate, publish, deadband, ids) in subscribers.items():
+        found.subscribers[name] = Subscriber(
+            rate, publish, deadband, dict.fromkeys(ids, Wanted(False, None))
+        )
+        found.tags |= {id: made(id, ord(id) - ord("a")) for id in ids}
+    return found
+
+
+def told(groups: Sequence[Group]) -> list[tuple[bool, int, str, tuple[float, ...]]]:
+    return [
+        (group.change, group.rate, "".join(tag.id for tag in group.tags), group.deadbands)
+        for group in groups
+    ]
+
+
+def test_a_tag_is_published_as_often_as_the_fastest_wants_it() -> None:
+    groups = grouped(device(slow=(1000, "scan", 0.0, "abc"), fast=(100, "scan", 0.0, "bcd")))
+    assert told(groups) == [
+        (False, 100, "bcd", (0.0, 0.0, 0.0)),
+        (False, 1000, "a", (0.0,)),
+    ]
+
+
+def test_changes_are_wanted_beside_scans_only_where_they_come_sooner() -> None:
+    groups = grouped(
+        device(
+            scan=(500, "scan", 0.0, "ab"),
+            sooner=(100, "change", 2.0, "a"),
+            later=(500, "change", 0.0, "b"),
+        )
+    )
+    assert told(groups) == [(False, 500, "ab", (0.0, 0.0)), (True, 100, "a", (2.0,))]
+
+
+def test_a_deadband_is_kept_only_where_no_other_is_as_narrow_and_as_fast() -> None:
+    groups = grouped(
+        device(
+            fast=(100, "change", 5.0, "ab"),
+            slow=(1000, "change", 1.0, "a"),
+            wide=(1000, "change", 7.0, "ab"),
+        )
+    )
+    assert told(groups) == [(True, 100, "ab", (5.0, 5.0)), (True, 1000, "a", (1.0,))]
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from("pqrs"),
+        st.tuples(
+            st.sampled_from([50, 100, 1000]),
+            st.sampled_from(["scan", "change"]),
+            st.sampled_from([0.0, 1.0]),
+            st.text("abc", min_size=1, max_size=3),
+        ),
+        min_size=1,
+    )
+)
+def test_nobody_is_forgotten(subscribers: dict[str, tuple[int, Publish, float, str]]) -> None:
+    groups = grouped(device(**subscribers))
+    for rate, publish, deadband, ids in subscribers.values():
+        for id in ids:
+            assert any(
+                group.rate <= rate
+                and (not group.change or (publish == "change" and width <= deadband))
+                for group in groups
+                for tag, width in zip(group.tags, group.deadbands, strict=True)
+                if tag.id == id
+            )
+
+
+class Line:
+    """A publisher, and what it publishes at given times."""
+
+    def __init__(self) -> None:
+        self.publisher = Publisher("modbus", "plc")
+
+    def at(self, seconds: float, *registers: int, address: int = 0) -> dict[str, Any]:
+        """The values that are published for registers."""
+        data = b"".join(register.to_bytes(2) for register in registers)
+        block: PolledBlock = ("holding_registers", address, len(registers), data, 0, ANSWERED)
+        found = {}
+        for id, text in self.publisher.messages(seconds, [block]):
+            head, _, payload = text.partition(b"\r\n")
+            word, subject, size = head.decode().split()
+            assert (word, subject, int(size) + 2) == ("PUB", "modbus.data.plc", len(payload))
+            message = json.loads(payload)
+            assert message["variableId"] == id
+            found[id] = message["value"]
+        return found
+
+
+@pytest.mark.parametrize(
+    ("interval", "rate", "published"),
+    [
+        (1000, 1000, [0, 1, 2, 3, 4, 5, 6]),
+        (1000, 2000, [0, 2, 4, 6]),
+        (1000, 2500, [0, 3, 6]),
+        (1000, 60_000, [0]),
+        (900, 1000, [0, 2, 4, 6]),
+        (1000, 1250, [0, 2, 4, 6]),
+    ],
+)
+def test_messages_are_never_closer_than_their_rate(
+    interval: int, rate: int, published: list[int]
+) -> None:
+    line = Line()
+    line.publisher.regroup([Group(rate, False, (made("a"),), (0.0,))], set())
+    scans = [line.at(0.123456789 + scan * interval / 1000, 1) for scan in range(7)]
+    assert [scan for scan, values in enumerate(scans) if values] == published
+
+
+def test_a_device_that_is_scanned_anew_does_not_publish_too_early() -> None:
+    line = Line()
+    group = Group(1000, False, (made("a"),), (0.0,))
+    line.publisher.regroup([group], set())
+    assert line.at(0, 1)
+    more = Group(1000, False, (made("a"), made("b", 1)), (0.0, 0.0))
+    line.publisher.regroup([more], {"b"})
+    assert line.at(0.3, 1, 2) == {"b": 2}
+    assert line.at(1.3, 1, 2) == {"a": 1, "b": 2}
+
+
+@pytest.mark.parametrize("change", [False, True])
+def test_everything_is_published_anew_when_that_is_asked_for(change: bool) -> None:
+    line = Line()
+    tags = tuple(made(id, ord(id) - ord("a")) for id in "abc")
+    seldom = Group(60_000, change, tags[:2], (0.0, 0.0))
+    often = Group(1000, False, tags[2:], (0.0,))
+    line.publisher.want(lambda: [often, seldom])
+    assert line.at(0, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
+    assert line.at(1, 1, 2, 3) == {"c": 3}
+    line.publisher.renew()
+    assert line.at(1.5, 1, 2, 3) == {"a": 1, "b": 2, "c": 3}
+    assert line.at(2.5, 1, 2, 3) == {"c": 3}
+
+
+def test_who_comes_to_known_tags_gets_their_next_values() -> None:
+    line = Line()
+    tags = tuple(made(id, ord(id) - ord("a")) for id in "ab")
+    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+    assert line.at(0, 1, 2) == {"a": 1, "b": 2}
+    for newcomers in (["a"], ["b"]):
+        line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], newcomers)
+    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))])
+    assert line.at(10, 1, 2) == {"a": 1, "b": 2}
+    line.publisher.want(lambda: [Group(60_000, False, tags, (0.0, 0.0))], ["b", "gone"])
+    assert line.at(20, 1, 2) == {"b": 2}
+    assert line.at(30, 1, 2) == {}
+
+
+def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    count = 0
+    end: Any = Tag.end
+
+    def counted(tag: Tag) -> int:
+        nonlocal count
+        count += 1
+        return int(end.fget(tag))
+
+    monkeypatch.setattr(Tag, "end", property(counted))
+    tags = {f"t{at}": made(f"t{at}", 12 * at) for at in range(2000)}
+    plc = device()
+    plc.tags = tags
+    plc.subscribers["x"] = Subscriber(1000, "scan", 0.0, dict.fromkeys(tags, Wanted(False, None)))
+    blocks: list[PolledBlock] = [
+        ("holding_registers", 12 * at, 1, b"\0\1", 0, ANSWERED) for at in range(2000)
+    ]
+    line = Line()
+    line.publisher.want(lambda: grouped(plc))
+    assert len(line.publisher.messages(0, blocks)) == 2000
+    assert count <= 2 * 2000
+    plc.health.judge([(*block[:3], None, 2, ANSWERED) for block in blocks])
+    service = ServiceReport(0, 0, 0, 0, 0)
+    answer = browsed(BrowseRequest("plc"), {"plc": (plc, {})}, {}, service, 2**20)
+    [report] = answer.devices
+    assert len(report.blocks or []) == len(report.tags or []) == 2000
+    assert all(each.error for each in report.tags or [])
+    assert count <= 8 * 2000
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 60), st.integers(1, 5)), max_size=20),
+    st.integers(0, 60),
+    st.integers(1, 20),
+)
+def test_tags_are_found_where_a_block_has_them_whole(
+    places: list[tuple[int, int]], address: int, count: int
+) -> None:
+    tags = [
+        Tag(f"{at}", area, start, f"uint16[{size}]", "ABCD", frozenset())
+        for at, (start, size) in enumerate(places)
+        for area in ("holding_registers", "input_registers")
+    ]
+    found = Places(tags).inside("input_registers", address, count)
+    assert sorted(tag.id for tag in found) == sorted(
+        tag.id
+        for tag in tags
+        if tag.area == "input_registers" and address <= tag.address
+        if tag.address + tag.count <= address + count
+    )
+
+
+@pytest.mark.parametrize("change", [False, True])
+def test_a_new_tag_does_not_wait_for_the_others(change: bool) -> None:
+    line = Line()
+
+    def regroup(ids: str, *newcomers: str) -> None:
+        tags = tuple(made(id, ord(id) - ord("a")) for id in ids)
+        group = Group(60_000, change, tags, (0.0,) * len(tags))
+        line.publisher.regroup([group], set(newcomers))
+
+    regroup("a", "a")
+    assert line.at(0, 1, 2, 3) == {"a": 1}
+    regroup("ab", "b")
+    regroup("abc", "c")
+    assert line.publisher.messages(0, []) == []
+    assert line.at(0.1, 9, 2, 3) == {"b": 2, "c": 3}
+    regroup("ab")
+    assert line.at(0.2, 9, 2, 3) == {}
+    assert line.at(60.2, 9, 2, 3) == ({"a": 9} if change else {"a": 9, "b": 2})
+    assert line.at(120.2, 9, 2, 3) == ({} if change else {"a": 9, "b": 2})
+
+
+def test_a_new_tag_comes_once_when_the_others_are_due_too() -> None:
+    line = Line()
+    line.publisher.regroup([Group(1000, False, (made("a"),), (0.0,))], set())
+    assert line.at(0, 1)
+    more = Group(1000, False, (made("a"), made("b", 1)), (0.0, 0.0))
+    line.publisher.regroup([more], set())
+    block: PolledBlock = ("holding_registers", 0, 2, b"\0\1\0\2", 0, ANSWERED)
+    ids = [id for id, _ in line.publisher.messages(1, [block])]
+    assert sorted(ids) == ["a", "b"]
+
+
+def test_a_value_that_somebody_else_got_is_no_change() -> None:
+    line = Line()
+    scans = Group(2000, False, (made("a"),), (0.0,))
+    changes = Group(1000, True, (made("a"),), (0.0,))
+    line.publisher.regroup([scans, changes], set())
+    assert [line.at(second, 7) for second in range(4)] == [{"a": 7}, {}, {"a": 7}, {}]
+    assert line.at(5, 8) == {"a": 8}
+
+
+def test_a_tag_that_two_blocks_have_is_published_once() -> None:
+    line = Line()
+    line.publisher.regroup([Group(1000, False, (made("a", 1),), (0.0,))], set())
+    one: PolledBlock = ("holding_registers", 0, 2, b"\0\0\0\1", 0, ANSWERED)
+    two: PolledBlock = ("holding_registers", 1, 1, b"\0\1", 0, ANSWERED)
+    assert len(line.publisher.messages(0, [one, two])) == 1
+    failed: PolledBlock = ("holding_registers", 0, 2, None, 2, ANSWERED)
+    assert len(line.publisher.messages(1, [failed, two])) == 1
+
+
+def test_a_block_has_all_of_its_tags_again_when_no_other_has_them() -> None:
+    line = Line()
+    tags = (made("a", 0), made("b", 1), made("c", 2))
+    line.publisher.regroup([Group(1, False, tags, (0.0,) * 3)], set())
+    one: PolledBlock = ("holding_registers", 0, 2, b"\0\0\0\1", 0, ANSWERED)
+    two: PolledBlock = ("holding_registers", 1, 2, b"\0\1\0\2", 0, ANSWERED)
+    assert [id for id, _ in line.publisher.messages(0, [one, two])] == ["a", "b", "c"]
+    assert [id for id, _ in line.publisher.messages(1, [two])] == ["b", "c"]
+    assert [id for id, _ in line.publisher.messages(2, [two, one])] == ["b", "c", "a"]
+    assert [id for id, _ in line.publisher.messages(3, [one])] == ["a", "b"]
+
+
+@pytest.mark.parametrize("change", [False, True])
+def test_a_first_value_that_a_scan_does_not_bring_is_waited_for(change: bool) -> None:
+    line = Line()
+    tags = (made("a", 0), made("b", 50), made("c", 99))
+    seldom = Group(60_000, change, tags[:2], (0.0, 0.0))
+    line.publisher.regroup([Group(1000, False, tags[2:], (0.0,)), seldom], set())
+    assert line.at(0, 1) == {"a": 1}
+    assert line.at(1, 9) == {}
+    assert line.at(2, 2, address=50) == {"b": 2}
+    assert line.at(3, 3, address=50) == {}
+    assert line.at(60, 4) == {"a": 4}
+
+
+def test_blocks_that_change_all_the_time_are_not_all_remembered() -> None:
+    line = Line()
+    line.publisher.regroup([Group(50, False, (made("a", 500),), (0.0,))], set())
+    for start in range(300):
+        assert line.at(start, *range(501), address=start)["a"] == 500 - start
+    assert len(line.publisher._shapes) <= 64
+
+
+@given(st.binary(min_size=3, max_size=3))
+def test_bits_are_taken_from_their_places(data: bytes) -> None:
+    tags = [Tag(f"{at}", "coils", at, "bool", "ABCD", frozenset()) for at in range(7, 31)]
+    values = decoder(tags, 7, 24)(data)
+    assert values == [bool(data[at // 8] >> at % 8 & 1) for at in range(24)]
+
+
+class Wire:
+    """A connection that takes as much as a test wants."""
+
+    def __init__(self) -> None:
+        self.is_connected = True
+        self.pending_data_size = 0
+        self.sent: list[bytes] = []
+        self.stats = {"out_msgs": 0, "out_bytes": 0}
+        self._flush_queue = None
+
+    async def _send_command(self, texts: bytes) -> None:
+        self.sent.append(texts)
+
+
+async def _run(outbox: Outbox, seconds: float = 0.1) -> None:
+    running = asyncio.create_task(outbox.run())
+    await asyncio.wait([running], timeout=seconds)
+    running.cancel()
+
+
+def test_messages_flow_in_order_while_they_are_taken() -> None:
+    async def flow() -> list[bytes]:
+        wire, outbox = Wire(), Outbox()
+        outbox.connected(cast("Client", wire))
+        outbox.put([("a", b"1"), ("b", b"2"), ("a", b"3")])
+        outbox.put([("a", b"4")])
+        await _run(outbox)
+        return wire.sent
+
+    assert asyncio.run(flow()) == [b"1234"]
+
+
+def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outboxes, "LOOK", 0.001)
+    monkeypatch.setattr(outboxes, "PIECE", 20)
+    keys = range(100)
+
+    async def flow() -> list[bytes]:
+        wire, outbox = Wire(), Outbox()
+        outbox.put([(key, b"%02d" % key) for key in keys])
+        outbox.connected(cast("Client", wire))
+        running = asyncio.create_task(outbox.run())
+        while len(wire.sent) < 30:
+            await asyncio.sleep(0)
+            wire.pending_data_size = 0
+            outbox.put([(key, b"%02d" % key) for key in keys])
+        running.cancel()
+        return wire.sent
+
+    sent = b"".join(asyncio.run(flow()))
+    assert {int(sent[at : at + 2]) for at in range(0, len(sent), 2)} == set(keys)
+
+
+@pytest.mark.parametrize("how", ["away", "slow"])
+def test_the_newest_of_each_is_kept_while_they_are_not_taken(
+    how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outboxes, "LOOK", 0.001)
+
+    async def flow() -> tuple[Outbox, list[bytes]]:
+        wire, outbox = Wire(), Outbox(most=3)
+        if how == "slow":
+            wire.pending_data_size = outboxes.BACKLOG
+            outbox.connected(cast("Client", wire))
+        for text in (b"a1", b"b1", b"a2", b"c1", b"b2", b"d1"):
+            outbox.put([(text[:1], text)])
+        await _run(outbox)
+        assert wire.sent == []
+        wire.pending_data_size = 0
+        outbox.connected(cast("Client", wire))
+        await _run(outbox)
+        outbox.put([("e", b"e1"), ("e", b"e2")])
+        await _run(outbox)
+        return outbox, wire.sent
+
+    outbox, sent = asyncio.run(flow())
+    assert sent == [b"b2c1d1", b"e1e2"]
+    assert (outbox.sent, outbox.replaced, outbox.dropped) == (5, 2, 1)
+
+
+def judged(*polls: Sequence[int]) -> list[tuple[bool, str, int, str | None]]:
+    """What becomes of a device whose blocks have these faults, poll by poll."""
+    health = Health()
+    found: list[tuple[bool, str, int, str | None]] = []
+    for faults in polls:
+        blocks: list[PolledBlock] = [
+            ("coils", at, 1, None if fault else b"\0", fault, ANSWERED)
+            for at, fault in enumerate(faults)
+        ]
+        worth = health.judge(blocks)
+        found.append((worth, health.state, health.failures, health.error))
+    return found
+
+
+def test_a_device_is_told_of_when_it_comes_or_goes_or_refuses_something_new() -> None:
+    refused = "exception 02 (Illegal Data Address)"
+    assert judged([0], [0], [0, 2], [0, 2], [0, 0], [0x8001], [0x8001], [0x8002], [2]) == [
+        (True, "online", 0, None),
+        (False, "online", 0, None),
+        (True, "online", 0, refused),
+        (False, "online", 0, refused),
+        (True, "online", 0, None),
+        (True, "online", 1, "no reply in time"),
+        (True, "offline", 2, "no reply in time"),
+        (False, "offline", 3, "no connection"),
+        (True, "online", 0, refused),
+    ]
+
+
+def test_one_scan_without_an_answer_is_forgiven_unless_there_is_no_connection() -> None:
+    gateway = "exception 0B (Gateway Target ScannedDevice Failed to Respond)"
+    assert [found[1:] for found in judged([0], [0x0B], [0], [0x8003], [0], [0x8002], [0])] == [
+        ("online", 0, None),
+        ("online", 1, gateway),
+        ("online", 0, None),
+        ("online", 1, "the connection was lost"),
+        ("online", 0, None),
+        ("offline", 1, "no connection"),
+        ("online", 0, None),
+    ]
+    assert judged([0x8001]) == [(True, "offline", 1, "no reply in time")]
+
+
+def poll(*blocks: tuple[int, int, float]) -> list[PolledBlock]:
+    """Blocks of one register with address, fault and time."""
+    return [
+        ("holding_registers", at, 1, None if fault else b"\0\0", fault, time)
+        for at, fault, time in blocks
+    ]
+
+
+def test_the_last_error_stays_with_its_time_and_so_does_that_of_the_state() -> None:
+    health = Health()
+    health.judge(poll((0, 0, 10.0)))
+    assert (health.since, health.last_error, health.last_error_at) == (10.0, None, None)
+    for time in (20.0, 30.0):
+        health.judge(poll((0, 0x8002, time)))
+    assert (health.since, health.last_error_at) == (20.0, 30.0)
+    health.judge(poll((0, 0, 40.0)))
+    assert (health.state, health.error, health.since) == ("online", None, 40.0)
+    assert (health.last_error, health.last_error_at) == ("no connection", 30.0)
+    assert not health.judge([])
+    assert health.state == "online"
+
+
+def test_blocks_that_a_scan_did_not_come_to_stay_as_they_were() -> None:
+    health = Health()
+    health.judge(poll((0, 0, 1.0), (5, 2, 1.0), (9, 0, 1.0)))
+    health.judge(poll((9, 0x8001, 2.0)))
+    assert sorted((block[1], block[4]) for block in health.blocks) == [(0, 0), (5, 2), (9, 0x8001)]
+    health.judge([("holding_registers", 4, 3, None, 0x8001, 3.0)])
+    assert sorted(block[1] for block in health.blocks) == [0, 4, 9]
+    health.judge(poll((0, 0, 4.0)))
+    assert [block[1] for block in health.blocks] == [0]

@@ -1,0 +1,324 @@
+"""What the scanner refuses: whole, with a reason, and without any change."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import TYPE_CHECKING, Any
+
+import jsonschema_rs
+import pytest
+
+from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.scanner import ScannerLimits
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.hosts import Allowed
+from holdfast.scanner.schema import json_schema
+from support.nats_bus import leaving, subscription, tag
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    import holdfast
+    from support.nats_bus import Caller, Run, Running
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"deviceId": None}, "Expected `str`, got `null` - at `$.deviceId`"),
+    ({"deviceId": ""}, "Expected `str` of length >= 1 - at `$.deviceId`"),
+    ({"deviceId": "a b"}, "deviceId is 'a b', allowed is"),
+    ({"deviceId": "a.*"}, "deviceId is 'a.*', allowed is"),
+    ({"deviceId": "a..b"}, "deviceId is 'a..b', allowed is"),
+    ({"deviceId": "a\r\nPUB x 0"}, "deviceId is"),
+    ({"subscriberId": 7}, "Expected `str`, got `int` - at `$.subscriberId`"),
+    ({"host": None}, "host is missing; a url in its place would do"),
+    ({"host": 5}, "Expected `str | null`, got `int` - at `$.host`"),
+    ({"port": 0}, "Expected `int` >= 1 - at `$.port`"),
+    ({"port": "502"}, "Expected `int | null`, got `str` - at `$.port`"),
+    ({"url": "tcp://127.0.0.1"}, "host stands beside url, allowed is one of both"),
+    ({"host": None, "port": None, "url": "http://127.0.0.1"}, "url: 'http://127.0.0.1' is no URL"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1?ca=/etc/passwd"}, "url: ca is given, al"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1?cert=a&key=b"}, "url: cert is given, al"),
+    ({"host": None, "port": None, "url": "tls://127.0.0.1?sni=a"}, "url: sni is given, allo"),
+    ({"host": None, "port": None, "unitId": 0, "url": "rtu:///dev/ttyS0"}, "unitId is 0, which is"),
+    ({"plan": {"forbidden": [[0, 1]] * 33}}, "Expected `array` of length <= 32"),
+    ({"unitId": 256}, "Expected `int` <= 255 - at `$.unitId`"),
+    ({"transport": "rtu+tcp", "unitId": 0}, "unitId is 0, which is the broadcast of a serial line"),
+    ({"transport": "can"}, "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp"),
+    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed are ABCD"),
+    ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
+    ({"scanRate": 86_400_001}, "scanRate is 86400001, allowed are"),
+    ({"scanRate": 100.5}, "Expected `int | null`, got `float` - at `$.scanRate`"),
+    ({"timeout": 5}, "timeout is 5, allowed are 10 to 30000 ms"),
+    ({"publish": "always"}, "at `$.publish`, allowed are scan, change"),
+    ({"deadband": 1}, 'deadband goes with "publish": "change"'),
+    ({"deadband": -1, "publish": "change"}, "Expected `float` >= 0.0 - at `$.deadband`"),
+    ({"plan": {"max_registers": 126}}, "Expected `int` <= 125 - at `$.plan.max_registers`"),
+    ({"plan": {"maxGap": 1}}, "Object contains unknown field `maxGap` - at `$.plan`"),
+    ({"plan": {"readable": [[5, 4]]}}, "plan.readable[0] is [5, 4], allowed are first and last"),
+    ({"plan": {"readable": [["coil", 4]]}}, "plan.readable[0] is ['coil', 4], allowed are"),
+    ({"plan": {"readable": [[1, 2, 3]]}}, "plan.readable[0] is [1, 2, 3], allowed are"),
+    ({"plan": {"forbidden": [[0, 9]]}}, "tag 'a' from address 5 on: plan.forbidden has 0 to 9"),
+    ({"scanrate": 100}, "Object contains unknown field `scanrate`"),
+    ({"tags": None}, "Expected `array`, got `null` - at `$.tags`"),
+    (
+        {"tags": [tag("a", 0) | {"address": 0.5}]},
+        "Expected `int`, got `float` - at `$.tags[0].address`",
+    ),
+    ({"tags": [tag("a", 0, encoding="ascii")]}, "tags[0]: encoding 'ascii' is for strings, uint16"),
+    ({"tags": [tag("a", 0, "string:2", encoding="x")]}, "tags[0]: encoding 'x' is unknown"),
+    (
+        {"tags": [tag("a", 0, "uint16[124]", writable=True)]},
+        "tags[0]: uint16[124] takes 124 registers, one request writes at most 123",
+    ),
+    (
+        {"tags": [tag("a", 0, "boolean[1969]", functionCode="coil", writable=True)]},
+        "tags[0]: boolean[1969] takes 1969 coils, one request writes at most 1968",
+    ),
+    (
+        {"tags": [tag("a", 0, "bit:3[2]", writable=True)]},
+        "tags[0]: bit:3[2] can't be written, only one bit can",
+    ),
+    ({"tags": [{"id": "a"}]}, "Object missing required field `address` - at `$.tags[0]`"),
+    ({"tags": [tag("", 0)]}, "Expected `str` of length >= 1 - at `$.tags[0].id`"),
+    ({"tags": [tag("a", 0), tag("a", 1)]}, "tags[1]: the id 'a' is there twice"),
+    ({"tags": [tag("a", -1)]}, "Expected `int` >= 0 - at `$.tags[0].address`"),
+    ({"tags": [tag("a", 65535, "int32")]}, "tags[0]: int32 from address 65535 on, the last is"),
+    ({"tags": [tag("a", 0, "int8")]}, "tags[0]: type 'int8' is unknown, allowed are"),
+    ({"tags": [tag("a", 0, "string:252")]}, "tag 'a': string:252 takes 126 registers, one request"),
+    ({"tags": [tag("a", 0, functionCode="coils")]}, "allowed are coil, discrete, holding, input"),
+    (
+        {"tags": [tag("a", 0, functionCode="coil")]},
+        "datatype is uint16, functionCode coil reads boolean",
+    ),
+    (
+        {"tags": [tag("a", 0, functionCode="input", writable=True)]},
+        "what functionCode input reads can't be written",
+    ),
+    ({"tags": [tag("a", 0, byteOrder="CDABGHEF")]}, "order CDABGHEF is for 8 bytes"),
+    ({"tags": [tag("a", 0, unit="V")]}, "Object contains unknown field `unit` - at `$.tags[0]`"),
+    ({"tags": [tag("a", 0, null=[70000])]}, "tags[0].null: 70000 is outside 0 to 65535 of uint16"),
+    ({"tags": [tag("a", 0, null=["nan"])]}, "tags[0].null: 'nan'"),
+    ({"tags": [tag("a", 0, "bytes:2", null=["AA=="])]}, "tags[0].null: not for bytes:2"),
+]
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize("known", [False, True])
+def test_a_request_with_anything_wrong_is_refused_and_changes_nothing(
+    caller: Caller, server: holdfast.Server, known: bool
+) -> None:
+    if known:
+        first = subscription(server, tag("known", 9), scanRate=60_000)
+        assert caller.request("modbus.subscribe", first)["success"]
+    before = _browsed(caller)
+    for change, error in WRONG:
+        right = subscription(server, tag("a", 5), tag("b", 6))
+        answer = caller.request("modbus.subscribe", right | change)
+        assert answer["success"] is False
+        assert error in answer["error"], (change, answer)
+    for text in ("", "{", "[]", "7", "\xff", '{"deviceId": "plc1"}'):
+        assert caller.request("modbus.subscribe", text)["success"] is False
+        assert caller.request("modbus.unsubscribe", text)["success"] is False
+    unknown = caller.request("modbus.unsubscribe", leaving("known", all=True))
+    assert unknown == {"success": False, "error": "Object contains unknown field `all`"}
+    assert _browsed(caller) == before
+
+
+def _browsed(caller: Caller) -> Any:
+    """All that browsing tells apart from what moves by itself."""
+    answer = caller.request("modbus.browse", b"")
+    del answer["service"]
+    for device in answer["devices"]:
+        for key in ("scans", "missed", "roundTrip", "lastAnswer", "state", "stateSince"):
+            device.pop(key, None)
+        del device["blocks"]
+    return answer
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"port": 1}, "plc1 is known as tcp://127.0.0.1:{port} unit 1, not as tcp://127.0.0.1:1"),
+        ({"unitId": 2}, "plc1 is known as"),
+        ({"transport": "udp"}, "plc1 is known as"),
+        ({"host": "localhost"}, "plc1 is known as"),
+        ({"timeout": 2000}, "timeout of plc1 is another one already"),
+        ({"release": True}, "release of plc1 is another one already"),
+        ({"plan": {"max_gap": 0}}, "plan of plc1 is another one already"),
+        ({"tags": [tag("b", 0), tag("a", 6)]}, "tag 'a' of plc1 has another definition already"),
+        ({"tags": [tag("b", 0), tag("a", 5, "int16")]}, "tag 'a' of plc1 has another"),
+        ({"tags": [tag("a", 5, functionCode="input")]}, "tag 'a' of plc1 has another"),
+        ({"tags": [tag("a", 5, null=[0])]}, "tag 'a' of plc1 has another"),
+        ({"byteOrder": "DCBA"}, "tag 'a' of plc1 has another"),
+    ],
+)
+@pytest.mark.parametrize("who", ["hmi", "historian"])
+def test_what_is_known_otherwise_is_refused(
+    caller: Caller, server: holdfast.Server, who: str, change: dict[str, Any], error: str
+) -> None:
+    right = subscription(server, tag("a", 5), scanRate=60_000)
+    assert caller.request("modbus.subscribe", right)["success"]
+    before = _browsed(caller)
+    answer = caller.request("modbus.subscribe", right | {"subscriberId": who} | change)
+    assert not answer["success"]
+    assert error.format(port=server.address[1]) in answer["error"]
+    assert _browsed(caller) == before
+    again = right | {"subscriberId": who, "byteOrder": "ABCD", "transport": "tcp"}
+    assert caller.request("modbus.subscribe", again) == {"success": True, "count": 1}
+
+
+def test_limits_are_kept_and_told(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner(limits=ScannerLimits(devices=2, tags=5, device_tags=3, subscribers=2, request=2000))
+
+    def ask(device: str, who: str, *ids: str) -> Any:
+        tags = [tag(id, 0) for id in ids]
+        request = subscription(server, *tags, deviceId=device, subscriberId=who, scanRate=60_000)
+        return caller.request("modbus.subscribe", request)
+
+    assert ask("d1", "a", "1", "2", "3", "4")["error"] == "d1 would have 4 tags, allowed are 3"
+    assert ask("d1", "a", "1", "2")["success"]
+    assert ask("d1", "b", "3")["success"]
+    assert ask("d1", "b", "4")["error"] == "d1 would have 4 tags, allowed are 3"
+    assert ask("d1", "c", "3")["error"] == "d1 has 2 subscribers, no more are allowed"
+    assert ask("d2", "a", "1", "2", "3")["error"] == "there would be 6 tags, allowed are 5"
+    assert ask("d2", "a", "1", "2")["success"]
+    assert ask("d3", "a", "1")["error"] == "there are 2 devices, more are not allowed"
+    assert "allowed are 2000" in ask("d2", "a", "x" * 2000)["error"]
+
+    left = leaving("1", "2", deviceId="d2", subscriberId="a")
+    assert caller.request("modbus.unsubscribe", left)["success"]
+    assert ask("d3", "a", "1", "2")["success"]
+
+
+def test_hosts_beyond_private_and_loopback_addresses_are_refused_after_they_are_looked_up(
+    scanner: Running, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del scanner
+    real = socket.getaddrinfo
+
+    def names(host: Any, *rest: Any, **more: Any) -> Any:
+        known = {"plc.test": "127.0.0.1", "evil.test": "93.184.216.34"}
+        return real(known.get(host, host), *rest, **more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", names)
+    for host in ("93.184.216.34", "evil.test", "169.254.169.254", "0.0.0.0", "::ffff:8.8.8.8"):
+        answer = caller.request("modbus.subscribe", subscription(server, tag("a", 0), host=host))
+        assert f"{host}" in answer["error"]
+        assert "is not allowed, allowed are 127.0.0.0/8, 10.0.0.0/8" in answer["error"]
+    missing = subscription(server, tag("a", 0), host="nobody.invalid")
+    assert "host nobody.invalid: " in caller.request("modbus.subscribe", missing)["error"]
+
+    data = caller.listen("modbus.data.plc1")
+    named = subscription(server, tag("a", 0), host="plc.test")
+    assert caller.request("modbus.subscribe", named)["success"]
+    data.next()
+    [found] = caller.request("modbus.browse", b"")["devices"]
+    assert found["url"] == f"tcp://plc.test:{server.address[1]}"
+    assert found["address"] == f"tcp://127.0.0.1:{server.address[1]}"
+
+
+def test_networks_that_are_given_take_the_place_of_the_private_ones(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner(allow=("192.0.2.0/24", "2001:db8::/32"))
+    answer = caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+    assert answer["error"] == "127.0.0.1 is not allowed, allowed are 192.0.2.0/24, 2001:db8::/32"
+    for host in ("192.0.2.7", "2001:db8::7", "::ffff:192.0.2.8"):
+        request = subscription(server, tag("a", 0), host=host, deviceId=host)
+        assert caller.request("modbus.subscribe", request)["success"]
+
+
+def test_devices_on_one_serial_line_have_the_same_settings(
+    run_scanner: Run, caller: Caller
+) -> None:
+    run_scanner(allow=("/dev/ttyNONE0", "/dev/ttyNONE1"))
+
+    def ask(id: str, url: str) -> Any:
+        request = {"deviceId": id, "subscriberId": "x", "url": url, "tags": [tag("a", 0)]}
+        return caller.request("modbus.subscribe", request)
+
+    assert ask("one", "rtu:///dev/ttyNONE0?baud=9600")["success"]
+    for url, error in (
+        ("rtu:///dev/ttyNONE0", "baud of /dev/ttyNONE0 is 9600 for one already, not 19200; dev"),
+        ("rtu:///dev/ttyNONE0?baud=9600&parity=none", "parity of /dev/ttyNONE0 is even for one"),
+        ("ascii:///dev/ttyNONE0?baud=9600", "mode of /dev/ttyNONE0 is rtu for one already"),
+        ("rtu:///dev/ttyNONE0?baud=9600&silence=0.1", "is the default for one already, not 0.1"),
+    ):
+        assert error in ask("two", url)["error"]
+    assert "baud 9600" in ask("one", "rtu:///dev/ttyNONE0")["error"]
+    assert ask("two", "rtu:///dev/ttyNONE0?baud=9600&parity=even")["success"]
+    assert ask("three", "rtu:///dev/ttyNONE1")["success"]
+
+
+def test_a_serial_device_is_refused_that_is_not_named(scanner: Running, caller: Caller) -> None:
+    del scanner
+    request = {
+        "deviceId": "meter",
+        "subscriberId": "x",
+        "url": "rtu:///dev/ttyUSB7?baud=9600",
+        "tags": [tag("a", 0)],
+    }
+    answer = caller.request("modbus.subscribe", request)
+    assert answer["error"] == (
+        "/dev/ttyUSB7 is not allowed; name it with --allow, or in nats.devices of the configuration"
+    )
+
+
+def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
+    caller: Caller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def two(host: str, port: int, **_: Any) -> Any:
+        del host
+        return [
+            (socket.AF_INET6, 1, 6, "", ("fd00::1", port, 0, 0)),
+            (socket.AF_INET, 1, 6, "", ("10.0.0.1", port)),
+            (socket.AF_INET, 1, 6, "", ("8.8.8.8", port)),
+            (socket.AF_INET, 1, 6, "", ("10.0.0.2", port)),
+        ]
+
+    monkeypatch.setattr(socket, "getaddrinfo", two)
+    allowed, asked = Allowed(), NetworkTarget("tcp", "plc", 502)
+    found = [caller.do(allowed.address(asked))]
+    for _ in range(3):
+        found.append(caller.do(allowed.address(asked, after=found[-1])))
+    hosts = [each.host for each in found if isinstance(each, NetworkTarget)]
+    assert hosts == ["10.0.0.1", "10.0.0.2", "fd00::1", "10.0.0.1"]
+
+
+def test_serial_devices_beside_networks(caller: Caller) -> None:
+    allowed = Allowed(["/dev/ttyUSB0", "10.0.0.0/8"])
+    line = SerialTarget("rtu", "/dev/ttyUSB0")
+    assert caller.do(allowed.address(line)) == line
+    with pytest.raises(Refused):
+        caller.do(allowed.address(SerialTarget("rtu", "/etc/passwd")))
+    device = NetworkTarget("tcp", "10.1.2.3", 502)
+    assert caller.do(allowed.address(device)) == device
+    with pytest.raises(
+        Refused, match=r"10\.1\.2\.3 is not allowed, allowed are serial devices only"
+    ):
+        caller.do(Allowed(["/dev/ttyUSB0"]).address(device))
+
+
+@pytest.mark.parametrize("entry", ["10.0.0.1/8", "plc", "::ffff:10.0.0.1", "COMPANY"])
+def test_what_is_no_device_can_not_be_allowed(entry: str) -> None:
+    with pytest.raises(ValueError, match="found"):
+        Allowed([entry])
+
+
+def test_the_schema_of_the_docs_is_that_of_the_program() -> None:
+    kept = json.loads((ROOT / "docs" / "scanner.schema.json").read_text())
+    assert kept == json_schema(), "run `holdfast scan --schema > docs/scanner.schema.json`"
+
+
+def test_the_schema_takes_what_the_program_takes(server: holdfast.Server) -> None:
+    document = json_schema() | {"$ref": "#/$defs/SubscribeRequest"}
+    validator = jsonschema_rs.validator_for(document)
+    right = subscription(server, tag("a", 0, null=["nan", -9999]), plan={"readable": [[1, 2]]})
+    assert validator.is_valid(right)
+    assert validator.is_valid(right | {"port": None})
+    wrong: list[dict[str, Any]] = [{"port": 0}, {"tags": 1}, {"more": 1}, {"transport": "can"}]
+    for change in wrong:
+        assert not validator.is_valid(right | change)

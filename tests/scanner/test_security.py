@@ -1,0 +1,425 @@
+"""Who the scanner is at NATS, and that nothing goes there in the clear that should not."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from nats.errors import NoRespondersError
+
+from holdfast import logs
+from holdfast.scanner import Scanner, Servers, Settings, broker
+from support import wire
+from support.certificates import Certificates
+from support.nats_bus import Caller, NatsServer, subscription, tag
+from support.nats_keys import ACCOUNT, Key, Operator, User, written
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    import holdfast
+    from support.nats_bus import Run, Running
+
+    Serve = Callable[..., NatsServer]
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
+    return Certificates(tmp_path_factory.mktemp("authority"))
+
+
+@pytest.fixture
+def serve_nats(tmp_path: Path) -> Iterator[Serve]:
+    started: list[NatsServer] = []
+
+    def start(*options: str, jetstream: bool = False) -> NatsServer:
+        started.append(NatsServer(tmp_path, *options, jetstream=jetstream))
+        return started[-1]
+
+    yield start
+    for server in started:
+        server.kill()
+
+
+@pytest.fixture(autouse=True)
+def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
+def reasons(caplog: pytest.LogCaptureFixture, event: str) -> list[str]:
+    """What an event was logged with, each time."""
+    found = [record for record in caplog.records if record.getMessage() == event]
+    return [vars(record)["fields"].get("reason", "") for record in found]
+
+
+def failure(caplog: pytest.LogCaptureFixture) -> str:
+    """Why it can't connect, when it says so."""
+    wire.until(lambda: reasons(caplog, "nats_connect_failed"), "it is told")
+    return reasons(caplog, "nats_connect_failed")[0]
+
+
+def told(caplog: pytest.LogCaptureFixture, event: str, text: str) -> None:
+    """Waits until an event is logged with a reason that has a text in it."""
+    wire.until(lambda: text in str(reasons(caplog, event)), f"{event} tells {text!r}")
+
+
+def certified(authority: Certificates, name: str) -> list[str]:
+    certificate, key = authority.issue(name, "IP:127.0.0.1")
+    return ["--tlscert", str(certificate), "--tlskey", str(key)]
+
+
+@pytest.mark.parametrize("scheme", ["nats", "tls"])
+def test_tls_is_spoken_with_a_server_that_the_authority_vouches_for(
+    run_scanner: Run, serve_nats: Serve, authority: Certificates, scheme: str
+) -> None:
+    server = serve_nats("--tls", *certified(authority, "nats"))
+    url = server.url.replace("nats", scheme)
+    assert run_scanner(servers=Servers((url,), ca_file=authority.ca)).serves
+
+
+def test_a_server_that_the_authority_does_not_vouch_for_is_refused(
+    run_scanner: Run,
+    serve_nats: Serve,
+    authority: Certificates,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stranger = Certificates(tmp_path, "stranger")
+    server = serve_nats("--tls", *certified(stranger, "nats"))
+    scanner = run_scanner(wait=False, servers=Servers((server.url,), ca_file=authority.ca))
+    assert "CERTIFICATE_VERIFY_FAILED" in failure(caplog)
+    assert not scanner.serves
+
+
+def test_a_server_wants_our_certificate(
+    run_scanner: Run, serve_nats: Serve, authority: Certificates
+) -> None:
+    certificate, key = authority.issue("scan", "DNS:scan")
+    options = ["--tlsverify", "--tlscacert", str(authority.ca), *certified(authority, "nats")]
+    server = serve_nats(*options)
+    servers = Servers((server.url,), ca_file=authority.ca, cert_file=certificate, key_file=key)
+    assert run_scanner(servers=servers).serves
+
+
+@pytest.mark.parametrize("scheme", ["nats", "tls"])
+def test_a_server_without_tls_is_refused_where_tls_is_asked_for(
+    run_scanner: Run,
+    serve_nats: Serve,
+    authority: Certificates,
+    scheme: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    server = serve_nats()
+    url = server.url.replace("nats", scheme)
+    ca = authority.ca if scheme == "nats" else None
+    scanner = run_scanner(wait=False, servers=Servers((url,), ca_file=ca))
+    assert failure(caplog) == "the server does not use TLS"
+    assert not scanner.serves
+
+
+def test_no_secret_goes_to_a_server_without_tls(run_scanner: Run, tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("s3cret")
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"tls://127.0.0.1:{listening.getsockname()[1]}"
+        run_scanner(wait=False, servers=Servers((url,), token_file=token))
+        listening.settimeout(wire.DEADLINE)
+        connection = listening.accept()[0]
+        with connection:
+            connection.settimeout(wire.DEADLINE)
+            connection.sendall(b'INFO {"server_id":"x","version":"2.11.0","max_payload":1000}\r\n')
+            assert connection.recv(1000) == b""
+
+
+def test_a_token_opens_the_door(run_scanner: Run, serve_nats: Serve, tmp_path: Path) -> None:
+    server = serve_nats("--auth", "s3cret")
+    token = tmp_path / "token"
+    token.write_text("s3cret\n")
+    assert run_scanner(servers=Servers((server.url,), token_file=token)).serves
+
+
+def test_a_right_that_is_missing_is_told_and_the_rest_works(
+    run_scanner: Run, serve_nats: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = tmp_path / "nats.conf"
+    config.write_text(
+        "authorization {users: [{user: a, password: b,"
+        ' permissions: {subscribe: {deny: ["modbus.shutdown"]}}}]}'
+    )
+    server = serve_nats("-c", str(config))
+    url = server.url.replace("//", "//a:b@")
+    running: Running = run_scanner(servers=Servers((url,)))
+
+    told(caplog, "nats_error", "ermissions")
+    assert running.serves
+
+
+def refusal(servers: Servers) -> str:
+    """Why a scanner does not start."""
+
+    async def run() -> None:
+        await Scanner(Settings(servers)).run()
+
+    with pytest.raises(OSError) as error:  # noqa: PT011
+        asyncio.run(run())
+    return str(error.value)
+
+
+def test_files_are_read_when_it_starts(tmp_path: Path) -> None:
+    for servers in (
+        Servers(token_file=tmp_path / "missing"),
+        Servers(credentials=tmp_path / "missing"),
+        Servers(ca_file=tmp_path / "missing"),
+    ):
+        assert "No such file" in refusal(servers)
+
+
+# Credentials: a server that trusts an operator, and of its accounts the one of the plant.
+
+
+@pytest.fixture
+def operator() -> Operator:
+    return Operator()
+
+
+@pytest.fixture
+def plant(operator: Operator) -> Key:
+    return operator.plant
+
+
+@pytest.fixture
+def trusting(serve_nats: Serve, operator: Operator, tmp_path: Path) -> NatsServer:
+    """Trusts the operator, and has JetStream for those who may use it."""
+    return serve_nats("-c", str(operator.configure(tmp_path / "nats.conf")), jetstream=True)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "scan.creds"
+
+
+def at(server: NatsServer, file: Path) -> Servers:
+    return Servers((server.url,), credentials=file)
+
+
+def test_credentials_open_the_door_to_their_account_alone(
+    run_scanner: Run,
+    serve_nats: Serve,
+    operator: Operator,
+    plant: Key,
+    file: Path,
+    tmp_path: Path,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    elsewhere = operator.account()
+    trusting = serve_nats("-c", str(operator.configure(tmp_path / "nats.conf")))
+    user = User(plant)
+    run_scanner(servers=at(trusting, user.write(file)))
+    with Caller(trusting.url, **User(plant).options) as caller:
+        data = caller.listen("modbus.data.plc1")
+        assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+        data.next()
+    with (
+        Caller(trusting.url, **User(elsewhere).options) as stranger,
+        pytest.raises(NoRespondersError),
+    ):
+        stranger.request("modbus.browse", b"")
+    logged = str([vars(record) for record in caplog.records])
+    assert "nats_connected" in logged
+    assert user.key.seed not in logged
+    assert user.jwt not in logged
+
+
+@pytest.mark.parametrize("wrong", ["account", "expired", "operator"])
+def test_credentials_that_are_refused_are_told_and_read_anew(
+    run_scanner: Run,
+    trusting: NatsServer,
+    plant: Key,
+    file: Path,
+    wrong: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    users: dict[str, Callable[[], User]] = {
+        "account": lambda: User(Key(ACCOUNT)),
+        "expired": lambda: User(plant, exp=int(time.time()) - 1),
+        "operator": lambda: User(Operator().account()),
+    }
+    scanner = run_scanner(wait=False, servers=at(trusting, users[wrong]().write(file)))
+    told(caplog, "nats_connect_failed", "Authorization Violation")
+    assert not scanner.serves
+    file.write_text("")
+    told(caplog, "nats_connect_failed", "there is no block NATS USER JWT")
+    User(plant).write(file)
+    wire.until(lambda: scanner.serves, "it is connected")
+
+
+def test_credentials_that_expire_are_read_anew(
+    run_scanner: Run,
+    trusting: NatsServer,
+    plant: Key,
+    file: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    User(plant, exp=int(time.time()) + 2).write(file)
+    scanner = run_scanner(wait=False, servers=at(trusting, file))
+    failure(caplog)
+    User(plant).write(file)
+    wire.until(lambda: scanner.serves, "it is connected")
+
+
+def test_a_client_that_ends_without_a_word_is_replaced(run_scanner: Run) -> None:
+    scanner = run_scanner()
+    client = scanner.scanner._broker.client
+    assert client is not None
+    # As when the server throws it out with something still to send, which it then fails to.
+    client._disconnected_cb = client._closed_cb = None
+    scanner.do(client.close())
+    wire.until(lambda: scanner.scanner._broker.client is not client, "it is noticed")
+    wire.until(lambda: scanner.serves, "there is another client")
+
+
+def test_a_scanner_ends_while_its_client_has_ended_without_a_word(
+    run_scanner: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(broker, "CHECK_INTERVAL", 2 * wire.DEADLINE)
+    scanner = run_scanner()
+    client = scanner.scanner._broker.client
+    assert client is not None
+    client._disconnected_cb = client._closed_cb = None
+    scanner.do(client.close())
+    scanner.stop()
+
+
+def test_credentials_serve_again_when_the_server_does(
+    run_scanner: Run,
+    trusting: NatsServer,
+    plant: Key,
+    file: Path,
+    server: holdfast.Server,
+) -> None:
+    scanner = run_scanner(servers=at(trusting, User(plant).write(file)))
+    trusting.kill()
+    wire.until(lambda: not scanner.serves, "it is noticed")
+    trusting.start()
+    wire.until(lambda: scanner.serves, "it is connected again")
+    with Caller(trusting.url, **User(plant).options) as caller:
+        data = caller.listen("modbus.data.plc1")
+        assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+        data.next()
+
+
+def test_an_account_without_jetstream_has_no_heartbeat(
+    run_scanner: Run,
+    trusting: NatsServer,
+    plant: Key,
+    file: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    scanner = run_scanner(servers=at(trusting, User(plant).write(file)))
+    told(caplog, "no_heartbeat", "JetStream not enabled for account")
+    for _ in range(3):
+        scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
+    assert scanner.serves
+    assert len(reasons(caplog, "no_heartbeat")) == 1
+
+
+def test_a_refused_publish_is_told_and_the_rest_works(
+    run_scanner: Run,
+    trusting: NatsServer,
+    plant: Key,
+    file: Path,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    user = User(plant, {"pub": {"deny": ["modbus.data.>"]}})
+    scanner = run_scanner(servers=at(trusting, user.write(file)))
+    with Caller(trusting.url, **User(plant).options) as caller:
+        status = caller.listen("modbus.status.plc1")
+        assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+        status.until(lambda message: message["state"] == "online", "it is online")
+    told(caplog, "nats_error", 'ermissions violation for publish to "modbus.data.plc1"')
+    assert scanner.serves
+
+
+RIGHTS = {
+    "sub": {
+        "allow": [
+            *(f"modbus.{name}" for name in ("subscribe", "unsubscribe", "browse", "shutdown")),
+            "modbus.command.>",
+            "_INBOX.>",
+        ]
+    },
+    "pub": {
+        "allow": ["modbus.data.>", "modbus.status.>", "$JS.API.>", "$KV.service_heartbeats.modbus"]
+    },
+    "resp": {"max": 1, "ttl": 60 * 10**9},
+}
+"""As docs/scanner.md has them."""
+
+
+def test_the_rights_of_the_documentation_are_enough(
+    run_scanner: Run,
+    serve_nats: Serve,
+    operator: Operator,
+    file: Path,
+    tmp_path: Path,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    account = operator.account(mem_storage=-1, disk_storage=-1)
+    conf = operator.configure(tmp_path / "nats.conf")
+    trusting = serve_nats("-c", str(conf), jetstream=True)
+    scanner = run_scanner(servers=at(trusting, User(account, RIGHTS).write(file)))
+    wire.until(lambda: reasons(caplog, "heartbeat"), "there is a heartbeat")
+    with Caller(trusting.url, **User(account).options) as caller:
+        data = caller.listen("modbus.data.plc1")
+        status = caller.listen("modbus.status.plc1")
+        wanted = subscription(server, tag("a", 0, writable=True))
+        assert caller.request("modbus.subscribe", wanted)["success"]
+        assert caller.request("modbus.command.a", "7")["success"]
+        data.until(lambda message: message["value"] == 7, "the new value comes")
+        status.next()
+    scanner.stop()
+    assert reasons(caplog, "nats_error") == []
+
+
+def damaged(seed: str) -> str:
+    return seed[:20] + ("A" if seed[20] != "A" else "B") + seed[21:]
+
+
+@pytest.mark.parametrize(
+    ("jwt", "seed", "error"),
+    [
+        ("{jwt}", "", "there is no block USER NKEY SEED, as credentials of NATS have it"),
+        ("", "{seed}", "there is no block NATS USER JWT, as credentials of NATS have it"),
+        ("{jwt}", "{account}", "the seed is that of an account, allowed: that of a user"),
+        ("{jwt}", "{damaged}", "the seed is damaged or none"),
+        ("{jwt}", "{user}", "the seed is damaged or none"),
+        ("{jwt}", "{other}", "the seed does not belong to the JWT"),
+        ("no.jwt", "{seed}", "the JWT is damaged or none"),
+        ("e30.W10.e30", "{seed}", "the JWT is damaged or none"),
+        ("e30.e30.e30", "{seed}", "the JWT is damaged or none"),
+        ("\0", "\0", "there is no block NATS USER JWT, as credentials of NATS have it"),
+    ],
+)
+def test_credentials_that_are_none_are_told(file: Path, jwt: str, seed: str, error: str) -> None:
+    account = Key(ACCOUNT)
+    user, other = User(account), User(account)
+    texts = {
+        "jwt": user.jwt,
+        "seed": user.key.seed,
+        "account": account.seed,
+        "damaged": damaged(user.key.seed),
+        "user": user.key.name,
+        "other": other.key.seed,
+    }
+    written(file, jwt.format(**texts), seed.format(**texts))
+    assert refusal(Servers(credentials=file)) == f"{file}: {error}"

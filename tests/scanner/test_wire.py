@@ -1,0 +1,130 @@
+"""The text that publishes many messages at once, with the real server."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nats.errors import ProtocolError
+
+from holdfast.scanner import wire
+from holdfast.scanner.messages import Answer
+from holdfast.scanner.receiving import SafeClient
+from support.nats_bus import Caller
+from support.wire import until as wire_until
+
+if TYPE_CHECKING:
+    from support.nats_bus import NatsServer
+
+
+def test_texts_are_messages_in_their_order(nats: NatsServer, caller: Caller) -> None:
+    inbox = caller.listen("wire.>")
+    texts = [
+        wire.message(f"wire.{number}", Answer(success=True, count=number)) for number in range(500)
+    ]
+    texts.append(wire.text("wire.größe", '"größe"'.encode()))
+    caller.do(wire.send(caller.client, b"".join(texts), len(texts)))
+    found = [inbox.next() for _ in texts]
+    assert found[:-1] == [{"success": True, "count": number} for number in range(500)]
+    assert found[-1] == "größe"
+    assert "error" not in nats.log.lower()
+
+
+def test_texts_mix_with_what_the_client_publishes_itself(caller: Caller) -> None:
+    inbox = caller.listen("wire.>")
+
+    async def mixed() -> None:
+        for number in range(100):
+            await wire.send(caller.client, wire.text("wire.a", b"%d" % number) * 2, 2)
+            await caller.client.publish("wire.b", b"%d" % number)
+
+    caller.do(mixed())
+    expected = [number for number in range(100) for _ in range(3)]
+    assert [inbox.next() for _ in expected] == expected
+
+
+def test_a_batch_larger_than_all_buffers_arrives(caller: Caller) -> None:
+    inbox = caller.listen("wire.>")
+    payload = b'"%b"' % (b"x" * 1000)
+    text = wire.text("wire.a", payload)
+    caller.do(wire.send(caller.client, text * 5000, 5000))
+    for _ in range(5000):
+        assert len(inbox.next()) == 1000
+
+
+def test_what_waits_when_the_connection_breaks_goes_with_the_next(own_nats: NatsServer) -> None:
+    with Caller(own_nats.url) as caller:
+        inbox = caller.listen("wire.>")
+        own_nats.kill()
+        wire_until(lambda: not caller.client.is_connected, "the connection is lost")
+        caller.do(wire.send(caller.client, wire.text("wire.a", b"1") * 10, 10))
+        own_nats.start()
+        assert [inbox.next() for _ in range(10)] == [1] * 10
+
+
+class _Heard(SafeClient):
+    """A client that notes what it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[Any] = []
+
+    async def _process_msg(self, *told: Any) -> None:
+        self.heard.append(told)
+
+    async def _process_ping(self) -> None:
+        self.heard.append("ping")
+
+    async def _process_pong(self) -> None:
+        self.heard.append("pong")
+
+    async def _process_err(self, err_msg: str) -> None:
+        self.heard.append(err_msg)
+
+    async def _process_info(self, info: Any, initial_connection: bool = False) -> None:
+        assert not initial_connection
+        self.heard.append(info)
+
+
+LINES = (
+    b'PING\r\nMSG a.b 1 2\r\n\r\n\r\nMSG a\x0bb\xff 12\t_I.\x0c  5\r\nMSG 1\r\nINFO {"a": "b"} \r\n'
+    b"HMSG c 3 12 13\r\nNATS/1.0\r\n\r\nx\r\n+OK\r\n"
+    b"HMSG c 3 r 7 7\r\ngarbage\r\n-ERR 'Some Thing'\r\n"
+    b"PONG\r\nMSG d 4 0\r\n\r\n"
+)
+
+
+@given(st.lists(st.integers(0, len(LINES)), max_size=40))
+def test_what_the_server_sends_is_taken_apart_wherever_it_is_cut(cuts: list[int]) -> None:
+    async def heard() -> list[Any]:
+        client = _Heard()
+        for start, end in pairwise(sorted({0, *cuts, len(LINES)})):
+            await client._ps.parse(LINES[start:end])
+        return client.heard
+
+    assert asyncio.run(heard()) == [
+        "ping",
+        (1, b"a.b", b"", b"\r\n", b""),
+        (12, b"a\x0bb\xff", b"_I.\x0c", b"MSG 1", b""),
+        {"a": "b"},
+        (3, b"c", b"", b"x", b"NATS/1.0\r\n\r\n"),
+        (3, b"c", b"r", b"", b"garbage"),
+        "'some thing'",
+        "pong",
+        (4, b"d", b"", b"", b""),
+    ]
+
+
+@pytest.mark.parametrize(
+    "line", [b"HELLO", b"MSG a", b"MSG a b 1", b"MSG a 1 x", b"HMSG a 1 2", b"INFO {", b""]
+)
+def test_a_line_that_no_server_sends_ends_the_connection(line: bytes) -> None:
+    async def parse() -> None:
+        await _Heard()._ps.parse(line + b"\r\n")
+
+    with pytest.raises(ProtocolError):
+        asyncio.run(parse())

@@ -1,0 +1,402 @@
+"""RTU frames in a TCP connection: no silence tells them apart, their length is in themselves."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import struct
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
+from pymodbus.framer import FramerType
+
+from holdfast.types import AREAS
+from support import lines, wire
+from support.pymodbus_peer import OPTIONS, Patient, connected, tour
+from support.running import content
+from support.transports import ALL, RtuConnection, address, configuration, counters, rule, running
+from support.vectors import cases, overlay
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from holdfast.appliance import Appliance
+    from support.running import Run
+
+READ = bytes.fromhex("0300000001")
+ZERO = bytes.fromhex("03020000")
+WRITE = bytes.fromhex("0600001234")
+
+REQUESTS = [
+    bytes.fromhex(text)
+    for text in (
+        "0100000009",
+        "0200000009",
+        "030000007d",
+        "0400000002",
+        "0500090000",
+        "0600090102",
+        "080000a537",
+        "0b",
+        "0f0003000902ff01",
+        "1000000002040102 0304",
+        "11",
+        "16000400f20025",
+        "170000000200010001 02beef",
+        "2b0e0100",
+        "63",
+        "2b0d0100",
+        "0300000000",
+        "03ffff0002",
+    )
+]
+"""Requests of every function, and some that are refused, whatever memory holds."""
+
+# The function and the byte count say how long a frame is: these PDUs have another length.
+NOT_OF_THEIR_LENGTH = {
+    "PDU too short",
+    "PDU too long",
+    "FC16 quantity 124",
+    "FC23 write quantity 122",
+}
+
+
+def framed(pdus: list[bytes]) -> bytes:
+    return b"".join(lines.rtu(pdu, 1) for pdu in pdus)
+
+
+@pytest.fixture
+def appliance(run: Run) -> Appliance:
+    """Unit 1 is the memory plant."""
+    return run(configuration("rtu"))
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[[Appliance], RtuConnection]]:
+    with ExitStack() as opened:
+        yield lambda to: opened.enter_context(RtuConnection(address(to)))
+
+
+@pytest.fixture
+def client(appliance: Appliance, connect: Callable[[Appliance], RtuConnection]) -> RtuConnection:
+    return connect(appliance)
+
+
+# Vectors
+
+
+@pytest.mark.parametrize(
+    "case",
+    [case for case in cases("pdu.json") if case["name"] not in NOT_OF_THEIR_LENGTH],
+    ids=lambda case: case["name"],
+)
+def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
+    case: dict[str, Any], run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    size = 1000
+    appliance = run(configuration("rtu", memories={"plant": dict.fromkeys(AREAS, size)}))
+    memory = appliance.memories["plant"]
+    expected = {area: [0] * size for area in AREAS}
+    overlay(expected, case["setup"])
+    for area in AREAS:
+        memory.write(area, 0, expected[area])
+
+    client = connect(appliance)
+    assert client.ask(bytes.fromhex(case["request"])).hex() == case["response"]
+    overlay(expected, case["after"])
+    assert {area: memory.read(area, 0, size) for area in AREAS} == expected
+    assert client.is_quiet()
+
+
+@pytest.mark.parametrize(
+    "case",
+    [case for case in cases("pdu.json") if case["name"] in NOT_OF_THEIR_LENGTH],
+    ids=lambda case: case["name"],
+)
+def test_a_pdu_that_is_not_as_long_as_its_function_says_is_not_carried_out(
+    case: dict[str, Any], run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    appliance = run(configuration("rtu", request_timeout=0.2))
+    client = connect(appliance)
+    client.send(lines.rtu(bytes.fromhex(case["request"]), 1))
+
+    assert client.rest() == b""
+    assert counters(appliance)["requests"] == {}
+
+
+@pytest.mark.parametrize(
+    "case",
+    # Not the reply among them: a request of its function is shorter.
+    [case for case in cases("frames.json") if case["pdu"][:4] != "0306"],
+    ids=lambda case: case["pdu"],
+)
+def test_a_frame_is_served_as_its_vector_spells_it(
+    case: dict[str, Any], run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    client = connect(run(configuration("rtu", rules=[rule(["127.0.0.1"], case["unit"])])))
+    client.send(bytes.fromhex(case["rtu"]))
+
+    [(unit, reply)] = client.replies(1)
+    assert (unit, reply[0] & 0x7F) == (case["unit"], int(case["pdu"][:2], 16) & 0x7F)
+
+
+# Pieces
+
+
+@pytest.fixture
+def expected(client: RtuConnection) -> list[tuple[int, bytes]]:
+    """The replies to REQUESTS, asked one by one, once they have written what they write."""
+    return [[(1, client.ask(pdu)) for pdu in REQUESTS] for _ in range(2)][1]
+
+
+def without_counters(replies: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    return [(unit, reply) for unit, reply in replies if reply[0] != 11]
+
+
+@pytest.mark.parametrize("size", [*range(1, 12), 16, 50, 100, 1000])
+def test_requests_may_arrive_in_pieces_of_any_size(
+    size: int, client: RtuConnection, expected: list[tuple[int, bytes]]
+) -> None:
+    stream = framed(REQUESTS)
+    for at in range(0, len(stream), size):
+        client.send(stream[at : at + size])
+
+    assert without_counters(client.replies(len(REQUESTS))) == without_counters(expected)
+    assert client.is_quiet()
+
+
+@settings(max_examples=50, deadline=None)
+@given(data=st.data())
+def test_requests_may_arrive_cut_anywhere(data: st.DataObject, sturdy: Appliance) -> None:
+    values = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
+    asked = [struct.pack(">BHH", 6, at, value) for at, value in enumerate(values)]
+    stream = framed(asked)
+    cuts = sorted(data.draw(st.sets(st.integers(1, len(stream) - 1), max_size=20)))
+    with RtuConnection(address(sturdy)) as client:
+        for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+            client.send(stream[start:end])
+        assert client.replies(len(asked)) == [(1, pdu) for pdu in asked]
+    assert sturdy.memories["plant"].read("holding_registers", 0, len(values)) == values
+
+
+@pytest.fixture(scope="module")
+def sturdy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance for many examples."""
+    with running(tmp_path_factory.mktemp("rtu"), configuration("rtu")) as appliance:
+        yield appliance
+
+
+def test_many_requests_in_one_piece_are_answered_in_order(
+    appliance: Appliance, client: RtuConnection
+) -> None:
+    appliance.memories["plant"].write("holding_registers", 0, range(1000))
+    asked = [struct.pack(">BHH", 3, at, 1) for at in range(1000)]
+    client.send(framed(asked))
+
+    replies = client.replies(1000)
+    assert replies == [(1, struct.pack(">BBH", 3, 2, value)) for value in range(1000)]
+
+
+def test_the_longest_write_is_served(appliance: Appliance, client: RtuConnection) -> None:
+    values = list(range(123))
+    longest = struct.pack(">BHHB123H", 16, 5, 123, 246, *values)
+
+    assert client.ask(longest) == longest[:5]
+    assert appliance.memories["plant"].read("holding_registers", 5, 123) == values
+
+
+# Frames that are not served
+
+
+@pytest.mark.parametrize("pdu", REQUESTS[:14], ids=bytes.hex)
+@pytest.mark.parametrize("bit", [0, 7, 8, 15])
+def test_a_wrong_crc_is_passed_over_and_the_next_frame_is_served(
+    pdu: bytes, bit: int, appliance: Appliance, client: RtuConnection
+) -> None:
+    damaged = bytearray(lines.rtu(pdu, 1))
+    damaged[-2 + bit // 8] ^= 1 << bit % 8
+    client.send(bytes(damaged) + lines.rtu(READ, 1))
+
+    assert client.replies(1) == [(1, ZERO)]
+    assert client.is_quiet()
+    assert counters(appliance)["frames"]["damaged"] == 1
+    assert counters(appliance)["requests"] == {3: 1}
+    assert not any(any(values) for values in content(appliance.memories["plant"]).values())
+
+
+@pytest.mark.parametrize("code", [0, 9, 10, 0x13, 0x19, 0x2A, 0x2C, 0x63, 0x64, 0x7F, 0x80, 0xFF])
+@pytest.mark.parametrize("length", [0, 1, 2, 5, 100, 252])
+def test_an_unknown_function_of_any_length_is_an_illegal_function(
+    code: int, length: int, client: RtuConnection
+) -> None:
+    data = random.Random(length).randbytes(length)
+    client.send(lines.rtu(bytes([code]) + data, 1) + lines.rtu(READ, 1))
+
+    assert client.replies(2) == [(1, bytes([code | 0x80, 1])), (1, ZERO)]
+    assert client.is_quiet()
+
+
+@pytest.mark.parametrize("text", ["07", "0c", "140706000400010002", "15020600", "1804de"])
+def test_a_function_of_the_standard_that_is_not_served_is_an_illegal_function(
+    text: str, client: RtuConnection
+) -> None:
+    pdu = bytes.fromhex(text)
+    client.send(lines.rtu(pdu, 1) + lines.rtu(READ, 1))
+
+    assert client.replies(2) == [(1, bytes([pdu[0] | 0x80, 1])), (1, ZERO)]
+
+
+@pytest.mark.parametrize("unit", range(1, 21))
+def test_an_unknown_function_whose_crc_fits_too_early_does_not_upset_the_next_frame(
+    unit: int, run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    client = connect(run(configuration("rtu", rules=[rule(["127.0.0.1"], unit)])))
+    # The last byte of data is the first of the CRC of those before it.
+    pdu = b"\x63\x01" + lines.crc(bytes([unit]) + b"\x63\x01")[:1]
+    client.send(lines.rtu(pdu, unit) + lines.rtu(READ, unit))
+
+    assert client.replies(2) == [(unit, b"\xe3\x01"), (unit, ZERO)]
+
+
+def test_a_frame_for_unit_0_behind_an_unknown_function_is_served(
+    run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    client = connect(run(configuration("rtu", rules=[rule(["127.0.0.1"], 0)])))
+    client.send(lines.rtu(b"\x63", 0) + lines.rtu(READ, 0))
+
+    assert client.replies(2) == [(0, b"\xe3\x01"), (0, ZERO)]
+
+
+@pytest.mark.parametrize(
+    "stream",
+    [
+        b"\x01\x10\x00\x00\x00\x7e\xfc",
+        b"\x01\x10\x00\x00\x00\x7f\xff",
+        b"\x01\x0f\x00\x00\x07\xf8\xff",
+        b"\x01\x17\x00\x00\x00\x01\x00\x00\x00\x7f\xfe",
+        b"\x01\x14\xff",
+        b"\x01\x63" + b"\xaa" * 300,
+    ],
+    ids=lambda stream: stream[:12].hex(),
+)
+def test_a_frame_longer_than_any_ends_the_connection_behind_what_was_answered(
+    stream: bytes, appliance: Appliance, client: RtuConnection
+) -> None:
+    client.send(lines.rtu(READ, 1) + stream)
+
+    assert client.rest() == lines.rtu(ZERO, 1)
+    assert counters(appliance)["frames"]["broken"] == 1
+    with RtuConnection(address(appliance)) as other:
+        assert other.ask(READ) == ZERO
+
+
+@settings(max_examples=50, deadline=None)
+@given(garbage=st.binary(max_size=2000))
+def test_no_bytes_end_the_service(garbage: bytes, sturdy: Appliance) -> None:
+    with RtuConnection(address(sturdy)) as noisy:
+        with contextlib.suppress(OSError):
+            noisy.send(garbage)
+            noisy.finish()
+        noisy.rest()
+    with RtuConnection(address(sturdy)) as client:
+        assert client.ask(b"\x11")[0] == 17
+
+
+# Units
+
+
+def test_a_unit_that_no_rule_maps_fails_to_respond(client: RtuConnection) -> None:
+    for unit in (0, 2, 247, 255):
+        assert client.ask(READ, unit) == b"\x83\x0b"
+        assert client.ask(b"\x63", unit) == b"\xe3\x01"
+
+
+def test_unit_0_is_an_ordinary_unit(
+    run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    rules = [{"sources": ["127.0.0.1"], "units": {0: "plant", 1: "other"}, "access": "read-write"}]
+    appliance = run(configuration("rtu", rules=rules, memories={"plant": ALL, "other": ALL}))
+    client = connect(appliance)
+
+    assert client.ask(WRITE, 0) == WRITE
+    assert client.ask(READ, 0) == bytes.fromhex("03021234")
+    assert client.ask(READ, 1) == ZERO
+
+
+# Timeouts and stop
+
+
+def test_half_a_request_ends_the_connection_after_the_request_timeout(
+    run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    appliance = run(configuration("rtu", request_timeout=0.2))
+    client = connect(appliance)
+    assert client.ask(READ) == ZERO
+    client.send(lines.rtu(WRITE, 1)[:-1])
+
+    assert client.rest() == b""
+    assert counters(appliance)["connections"]["request_timeout"] == 1
+    assert appliance.memories["plant"].read("holding_registers", 0, 1) == [0]
+
+
+def test_an_unknown_function_whose_crc_never_fits_ends_after_the_request_timeout(
+    run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    appliance = run(configuration("rtu", request_timeout=0.2))
+    client = connect(appliance)
+    client.send(b"\x01\x63\x00\x00\x00")
+
+    assert client.rest() == b""
+    assert counters(appliance)["connections"]["request_timeout"] == 1
+
+
+def test_damaged_frames_do_not_put_off_the_idle_timeout(
+    run: Run, connect: Callable[[Appliance], RtuConnection]
+) -> None:
+    appliance = run(configuration("rtu", idle_timeout=0.3))
+    client = connect(appliance)
+
+    def idle() -> bool:
+        with contextlib.suppress(ConnectionResetError, BrokenPipeError):
+            client.send(lines.RTU.damaged(READ, 1))
+        return bool(counters(appliance)["connections"]["idle"])
+
+    wire.until(idle, "the connection ends")
+
+
+def test_what_was_received_before_a_stop_is_answered(
+    appliance: Appliance, client: RtuConnection
+) -> None:
+    assert client.ask(READ) == ZERO
+    client.send(framed([READ] * 100) + lines.rtu(WRITE, 1)[:4])
+    appliance.stop()
+
+    assert client.replies(100) == [(1, ZERO)] * 100
+    assert client.rest() == b""
+
+
+# Real clients
+
+
+def test_pymodbus_reads_and_writes(run: Run) -> None:
+    appliance = run(configuration("rtu", more={"identity": {"vendor_name": "Acme"}}))
+    host, port = address(appliance)
+
+    client = ModbusTcpClient(host, port=port, framer=FramerType.RTU, **OPTIONS)
+    with connected(client):
+        tour(client, appliance.memories["plant"], 1)
+
+
+def test_pymodbus_reads_and_writes_with_asyncio(run: Run) -> None:
+    appliance = run(configuration("rtu", more={"identity": {"vendor_name": "Acme"}}))
+    host, port = address(appliance)
+
+    def made() -> AsyncModbusTcpClient:
+        return AsyncModbusTcpClient(host, port=port, framer=FramerType.RTU, **OPTIONS)
+
+    with Patient(made) as client:
+        tour(client, appliance.memories["plant"], 1)

@@ -1,0 +1,144 @@
+"""Authorities, and certificates that they vouch for, made by openssl."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from typing import TYPE_CHECKING, NamedTuple
+
+from support.machine import tool
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+ROLE = "1.3.6.1.4.1.50316.802.1"
+"""The extension that holds a role (MB-TCP-Security)."""
+
+PAST = ("20200101000000Z", "20200201000000Z")
+FUTURE = ("20900101000000Z", "20910101000000Z")
+
+CONFIGURATION = """\
+[ca]
+default_ca = this
+[this]
+database = {folder}/{name}.index
+new_certs_dir = {folder}
+rand_serial = yes
+unique_subject = no
+default_md = sha256
+default_days = 2
+default_crl_days = 2
+policy = names
+crl_extensions = list
+[names]
+commonName = supplied
+[list]
+authorityKeyIdentifier = keyid
+"""
+
+
+class Issued(NamedTuple):
+    """The files of a certificate and its key."""
+
+    certificate: Path
+    key: Path
+
+
+def named(role: str, kind: str = "UTF8String") -> str:
+    """The extension that names a role."""
+    return f"{ROLE}=ASN1:{kind}:{role}"
+
+
+class Certificates:
+    """An authority, and certificates that it vouches for."""
+
+    def __init__(self, folder: Path, name: str = "authority") -> None:
+        self._folder = folder
+        self._name = name
+        self.ca = folder / f"{name}.pem"
+        self._key = folder / f"{name}.key"
+        (folder / f"{name}.index").touch()
+        self._configuration = folder / f"{name}.cnf"
+        self._configuration.write_text(CONFIGURATION.format(folder=folder, name=name))
+        openssl(
+            *("req", "-x509", *_new_key("P-256"), "-nodes"),
+            *("-keyout", self._key, "-out", self.ca, "-days", "2", "-subj", f"/CN={name}"),
+            *("-addext", "keyUsage=critical,keyCertSign,cRLSign"),
+        )
+
+    def issue(
+        self,
+        name: str,
+        alternative: str,
+        *options: str,
+        extensions: Sequence[str] = (),
+        dates: tuple[str, str] | None = None,
+        curve: str = "P-256",
+    ) -> Issued:
+        """A certificate and its key; `alternative` is such as `IP:127.0.0.1`."""
+        certificate, key, request, file = (
+            self._folder / f"{self._name}-{name}.{end}" for end in ("pem", "key", "csr", "ext")
+        )
+        more = (f"subjectAltName={alternative}", "authorityKeyIdentifier=keyid", *extensions)
+        file.write_text("\n".join([*more, ""]))
+        openssl(
+            *("req", *_new_key(curve)),
+            *(options or ("-nodes",)),
+            *("-keyout", key, "-out", request, "-subj", f"/CN={name}"),
+        )
+        self._ca(
+            *("-batch", "-notext", "-in", request, "-out", certificate, "-extfile", file),
+            *_from_to(dates),
+        )
+        return Issued(certificate, key)
+
+    def revoke(self, *issued: Issued) -> Path:
+        """A list of what this authority has revoked, with these."""
+        revoked = self._folder / f"{self._name}.crl"
+        for each in issued:
+            self._ca("-revoke", each.certificate)
+        self._ca("-gencrl", "-out", revoked)
+        return revoked
+
+    def _ca(self, *arguments: str | Path) -> None:
+        who = ("-config", self._configuration, "-cert", self.ca, "-keyfile", self._key)
+        openssl("ca", *who, *arguments)
+
+
+def self_signed(
+    folder: Path, name: str, *extensions: str, dates: tuple[str, str] | None = None
+) -> Issued:
+    """A certificate that vouches for itself alone."""
+    issued = Issued(folder / f"{name}.pem", folder / f"{name}.key")
+    configuration, request, file = (folder / f"{name}.{end}" for end in ("cnf", "csr", "ext"))
+    (folder / f"{name}.index").touch()
+    configuration.write_text(CONFIGURATION.format(folder=folder, name=name))
+    file.write_text("\n".join(["basicConstraints=CA:FALSE", *extensions, ""]))
+    openssl(
+        *("req", *_new_key("P-256"), "-nodes", "-subj", f"/CN={name}"),
+        *("-keyout", issued.key, "-out", request),
+    )
+    openssl(
+        *("ca", "-batch", "-notext", "-selfsign", "-config", configuration),
+        *("-keyfile", issued.key, "-in", request, "-extfile", file, "-out", issued.certificate),
+        *_from_to(dates),
+    )
+    return issued
+
+
+def _from_to(dates: tuple[str, str] | None) -> tuple[str, ...]:
+    return () if dates is None else ("-startdate", dates[0], "-enddate", dates[1])
+
+
+def _new_key(curve: str) -> tuple[str, ...]:
+    return ("-newkey", "ec", "-pkeyopt", f"ec_paramgen_curve:{curve}")
+
+
+def openssl(*arguments: str | Path) -> None:
+    subprocess.run(
+        [tool("openssl"), *map(str, arguments)],
+        check=True,
+        capture_output=True,
+        env=os.environ | {"RANDFILE": os.devnull},
+    )

@@ -1,0 +1,96 @@
+"""`holdfast` as people and programs call it, in this process."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from click.testing import CliRunner
+
+from holdfast.cli import main
+from support import wire
+
+if TYPE_CHECKING:
+    from click.testing import Result
+
+    import holdfast
+
+
+def url(server: holdfast.Server) -> str:
+    host, port = server.address
+    return f"tcp://{host}:{port}"
+
+
+def invoke(*arguments: str) -> Result:
+    """The result of a command; an error that is none of the program's is raised."""
+    result = CliRunner().invoke(main, list(arguments), prog_name="holdfast")
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def done(*arguments: str) -> list[str]:
+    """The lines that a command prints, which must succeed and complain of nothing."""
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stderr) == (0, "")
+    return result.stdout.splitlines()
+
+
+def answer(*arguments: str, code: int = 0) -> Any:
+    """The JSON that a command prints."""
+    result = invoke(*arguments, "--json")
+    assert (result.exit_code, result.stderr) == (code, "")
+    return json.loads(result.stdout)
+
+
+def failure(*arguments: str) -> list[str]:
+    """The lines on standard error of a command that fails."""
+    result = invoke(*arguments)
+    assert result.exit_code == 1
+    return result.stderr.splitlines()
+
+
+def usage_error(*arguments: str) -> str:
+    """The last line of what wrong usage is answered with."""
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("Usage: holdfast ")
+    return result.stderr.splitlines()[-1]
+
+
+class RunCommand:
+    """A running `holdfast run`, and where its first listener listens."""
+
+    def __init__(self, file: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "holdfast", "run", str(file)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.greeting = ""
+
+    def wait_for_greeting(self) -> str:
+        assert self.process.stdout is not None
+        while "Ctrl-C stops it." not in self.greeting:
+            line = self.process.stdout.readline()
+            assert line, self.process.communicate()
+            self.greeting += line
+        return self.greeting
+
+    def wait_until_it_serves(self) -> tuple[str, int]:
+        self.wait_for_greeting()
+        match = re.search(r"scada +modbus-tcp +([0-9.]+):([0-9]+)", self.greeting)
+        assert match, self.greeting
+        return match[1], int(match[2])
+
+    def end(self, number: signal.Signals) -> tuple[int, str]:
+        """Exit code and log, after a signal."""
+        self.process.send_signal(number)
+        _, log = self.process.communicate(timeout=wire.DEADLINE)
+        return self.process.returncode, log

@@ -1,0 +1,156 @@
+"""Pages of the gateway's console in a browser, on a desk and on a phone."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from playwright.sync_api import expect, sync_playwright
+
+import holdfast
+from holdfast.server import Identity
+from support import gateways, wire
+from support.machine import tool
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from playwright.sync_api import Browser, Locator, Page, Request
+
+PHONE: Any = {"viewport": {"width": 360, "height": 740}, "has_touch": True}
+DESK: Any = {"viewport": {"width": 1100, "height": 820}}
+
+
+@dataclass
+class View:
+    """A page of the console, and all that it must not do."""
+
+    page: Page
+    gateway: gateways.Running
+    port: int
+    memory: holdfast.Memory
+    requests: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.page.on("request", self._requested)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda message: self._said(message.type, message.text))
+
+    def _requested(self, request: Request) -> None:
+        self.requests.append(request.url)
+
+    def _said(self, kind: str, text: str) -> None:
+        # The browser tells every refusal of the gateway as such an error.
+        if kind in ("error", "warning") and not text.startswith("Failed to load resource"):
+            self.errors.append(text)
+
+    def check(self) -> None:
+        """Nothing went wrong, nothing went elsewhere, nothing sticks out at the side."""
+        assert self.errors == []
+        assert [url for url in self.requests if not url.startswith(f"{self.gateway.url}/")] == []
+        width = self.page.evaluate("document.documentElement.scrollWidth")
+        assert width <= self.page.viewport_size["width"]  # type: ignore[index]
+
+    def open(self, fragment: str = "") -> View:
+        self.page.goto(f"{self.gateway.url}/{fragment}")
+        return self
+
+    def button(self, name: str) -> Locator:
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def says(self, text: str) -> None:
+        expect(self.page.get_by_text(text)).to_be_visible()
+
+    def connect(self, host: str = "127.0.0.1", port: int | None = None) -> None:
+        self.page.get_by_role("textbox", name="Device").fill(host)
+        self.page.get_by_role("spinbutton", name="Port").fill(str(port or self.port))
+        self.button("Connect").click()
+
+    def choose(self, **fields: str) -> None:
+        """Fills in what is to be read."""
+        for name, value in fields.items():
+            place = self.page.locator(f"#{name}")
+            if name in ("area", "type", "order"):
+                place.select_option(value)
+            else:
+                place.fill(value)
+
+    def row(self, address: int) -> Locator:
+        """The row of a register."""
+        return self.page.locator(f"tr[data-address='{address}']")
+
+
+def floats(*values: float) -> list[int]:
+    data = struct.pack(f">{len(values)}f", *values)
+    return list(struct.unpack(f">{2 * len(values)}H", data))
+
+
+def plant() -> holdfast.Memory:
+    """A memory with some of everything."""
+    memory = holdfast.Memory(
+        coils=48,
+        discrete_inputs=(100, 20),
+        holding_registers=(0, 300),
+        input_registers=(1000, 64),
+    )
+    memory.write("holding_registers", 0, [*floats(21.5, 1.013), 1234, 0, 65535, 42])
+    memory.write("coils", 0, [1, 0, 1])
+    return memory
+
+
+@dataclass
+class Opened:
+    """Opens the console of a gateway with some settings."""
+
+    browser: Browser
+    plant: holdfast.Memory
+    port: int
+    views: list[tuple[View, Any, Any]] = field(default_factory=list)
+
+    def __call__(
+        self, size: Any = DESK, scheme: Literal["light", "dark"] = "light", **settings: Any
+    ) -> View:
+        running = gateways.running(**{"limits": {"interval": 0.05}, **settings})
+        gateway = running.__enter__()
+        context = self.browser.new_context(**size, color_scheme=scheme)
+        context.set_default_timeout(1000 * wire.DEADLINE)
+        view = View(context.new_page(), gateway, self.port, self.plant)
+        self.views.append((view, context, running))
+        return view.open()
+
+    def close(self) -> None:
+        for view, context, running in self.views:
+            try:
+                view.check()
+            finally:
+                context.close()
+                running.__exit__(None, None, None)
+
+
+@contextlib.contextmanager
+def browsing() -> Iterator[Browser]:
+    """A browser."""
+    with sync_playwright() as playwright:
+        launched = playwright.chromium.launch(
+            executable_path=tool("chromium"), args=["--no-sandbox"]
+        )
+        yield launched
+        launched.close()
+
+
+@contextlib.contextmanager
+def opening(browser: Browser, memory: holdfast.Memory, model: str) -> Iterator[Opened]:
+    """What opens pages, beside a device with this memory and this model name."""
+    expect.set_options(timeout=1000 * wire.DEADLINE)
+    identity = Identity(vendor_name="Acme", product_code="F7", revision="2.1", model_name=model)
+    with holdfast.Server(
+        {1: memory}, bind="127.0.0.1:0", access="read-write", identity=identity
+    ) as server:
+        pages = Opened(browser, memory, server.address[1])
+        try:
+            yield pages
+        finally:
+            pages.close()

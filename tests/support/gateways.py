@@ -1,0 +1,157 @@
+"""Gateways on a free port, asked as any HTTP client would, and streams read event by event."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from holdfast.adapters import Stop
+from holdfast.config.egress import parse_allowed
+from holdfast.gateway import Gateway, GatewayLimits, Settings, egress
+from holdfast.gateway.pool import dial
+from holdfast.web.host import listen
+from support import web, wire
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from holdfast.client import Client
+    from holdfast.client.target import NetworkTarget
+    from holdfast.gateway.egress import Resolve
+
+API = "/api/modbus"
+PLC = "plc.factory.local"
+
+
+class Dialed:
+    """Makes clients as the gateway does, and notes of whom; some are led elsewhere."""
+
+    def __init__(self, elsewhere: dict[tuple[str, int], tuple[str, int]] | None = None) -> None:
+        self.calls: list[NetworkTarget] = []
+        self._elsewhere = elsewhere or {}
+
+    def __call__(self, target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
+        self.calls.append(target)
+        host, port = self._elsewhere.get((target.host, target.port), (target.host, target.port))
+        there = replace(target, host=host, port=port)
+        return dial(there, timeout=timeout, in_flight=in_flight)
+
+
+class Names:
+    """A resolver that gives its answers one after the other, the last one again and again."""
+
+    def __init__(self, **names: list[list[str]]) -> None:
+        self.asked: list[str] = []
+        self._names = {name.replace("_", "."): list(answers) for name, answers in names.items()}
+
+    async def __call__(self, host: str) -> list[str]:
+        self.asked.append(host)
+        answers = self._names.get(host)
+        if answers is None:
+            raise egress.NoSuchName(f"can't resolve {host}: Name or service not known")
+        return answers.pop(0) if len(answers) > 1 else answers[0]
+
+
+@dataclass
+class Event:
+    """One event of a stream; a comment has the name `:`."""
+
+    name: str
+    data: Any
+
+
+class Stream:
+    """An answer that goes on."""
+
+    def __init__(self, connection: http.client.HTTPConnection) -> None:
+        self._connection = connection
+        self.reply = connection.getresponse()
+        self.status = self.reply.status
+        self.kind = self.reply.headers["Content-Type"]
+
+    def __iter__(self) -> Iterator[Event]:
+        """All events and comments to the end of the stream."""
+        name = ""
+        for line in self.reply:
+            text = line.decode().rstrip("\n")
+            if text == ":":
+                yield Event(":", None)
+            elif text.startswith("event: "):
+                name = text.removeprefix("event: ")
+            elif text.startswith("data: "):
+                yield Event(name, json.loads(text.removeprefix("data: ")))
+
+    def next(self, name: str) -> Any:
+        """The data of the next event of this name."""
+        for event in self:
+            if event.name == name:
+                return event.data
+        raise AssertionError(f"the stream ended without {name}")
+
+    def close(self) -> None:
+        self.reply.close()
+        self._connection.close()
+
+
+class Running:
+    """A gateway that runs, and a client of it."""
+
+    def __init__(self, gateway: Gateway, address: tuple[str, int], stop: Stop) -> None:
+        self.gateway = gateway
+        self.stop = stop
+        self.address = address
+        self.url = f"http://{gateway.address}"
+        self._open = contextlib.ExitStack()
+
+    def client(self, secret: str | None = None) -> web.Client:
+        """A client that is closed with the gateway."""
+        client = web.Client(self.address, secret)
+        self._open.callback(client.close)
+        return client
+
+    def ask(self, path: str, body: Any, secret: str | None = None) -> web.Answer:
+        """The answer to a POST."""
+        return self.client(secret).ask("POST", API + path, body)
+
+    def stream(
+        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
+    ) -> Stream:
+        connection = http.client.HTTPConnection(*self.address, timeout=wire.DEADLINE)
+        self._open.callback(connection.close)
+        sent = None if body is None else json.dumps(body)
+        connection.request(method, API + path, sent, {**web.JSON, **(headers or {})})
+        return Stream(connection)
+
+    def close(self) -> None:
+        self._open.close()
+
+
+@contextlib.contextmanager
+def running(
+    *,
+    allow: Sequence[str] = ("127.0.0.0/8:*",),
+    resolve: Resolve | None = None,
+    dialed: Dialed | None = None,
+    bind: str = "127.0.0.1",
+    limits: dict[str, Any] | None = None,
+    **settings: Any,
+) -> Iterator[Running]:
+    """A gateway that reads and writes whatever is on loopback, unless told."""
+    listener = listen(bind, 0)
+    host, port, *_ = listener.getsockname()
+    chosen = Settings(
+        tuple(map(parse_allowed, allow)),
+        limits=replace(GatewayLimits(), **(limits or {})),
+        **{"writes": True, **settings},
+    )
+    gateway = Gateway(chosen, listener, resolve=resolve, dial=dialed or dial)
+    stop = Stop()
+    with listener, web.in_a_thread(gateway, stop):
+        started = Running(gateway, (host, port), stop)
+        try:
+            yield started
+        finally:
+            started.close()

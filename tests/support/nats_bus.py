@@ -1,0 +1,329 @@
+"""NATS in tests: the real server, a caller to talk to it, and scanners that run.
+
+Nothing here leaves the loopback interface, and everything that is started is stopped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+import pytest
+from nats.aio.client import Client
+
+from holdfast.scanner import Scanner, Servers, Settings
+from support import wire
+from support.brokers import free_port
+from support.machine import missing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator
+    from types import TracebackType
+    from typing import Self
+
+    from nats.aio.msg import Msg
+
+    import holdfast
+
+Result = TypeVar("Result")
+
+
+class NatsServer:
+    """A server of its own, started anew with the same port and store as often as wanted."""
+
+    def __init__(self, folder: Path, *options: str, jetstream: bool = True) -> None:
+        self._program = Path(sys.executable).parent / "nats-server"
+        if not self._program.exists():
+            missing("the program nats-server")
+        self._folder = folder
+        self._options = (*options, *(("-js", "-sd", str(folder / "store")) if jetstream else ()))
+        self._process: subprocess.Popen[bytes] | None = None
+        self.port = free_port()
+        self.start()
+
+    @property
+    def url(self) -> str:
+        return f"nats://127.0.0.1:{self.port}"
+
+    @property
+    def log(self) -> str:
+        return (self._folder / "nats.log").read_text(errors="replace")
+
+    def start(self) -> None:
+        """Returns when it serves."""
+        command = [str(self._program), "-a", "127.0.0.1", "-p", str(self.port), *self._options]
+        seen = self.log.count("Server is ready") if (self._folder / "nats.log").exists() else 0
+        with (self._folder / "nats.log").open("ab") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log)
+        self._process = process
+        wire.until(
+            lambda: process.poll() is not None or self.log.count("Server is ready") > seen,
+            "nats-server starts",
+        )
+        assert process.poll() is None, self.log
+
+    def signal(self, number: signal.Signals) -> None:
+        assert self._process is not None
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """Ends it without a word to anyone."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+
+
+class _Loop:
+    """An event loop in a thread of its own."""
+
+    def __init__(self) -> None:
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever)
+        self._thread.start()
+
+    def do(self, work: Coroutine[Any, Any, Result], seconds: float = wire.DEADLINE) -> Result:
+        """The result of a coroutine."""
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(seconds)
+
+    def close(self) -> None:
+        self.do(self._cancel())
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+        self.loop.close()
+
+    @staticmethod
+    async def _cancel() -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+
+
+class Inbox:
+    """What comes on a subject: JSON, in order."""
+
+    def __init__(self) -> None:
+        self._queue: queue.Queue[Any] = queue.Queue()
+
+    async def put(self, message: Msg) -> None:
+        self._queue.put(json.loads(message.data))
+
+    def next(self, seconds: float = wire.DEADLINE) -> Any:
+        """The next message."""
+        try:
+            return self._queue.get(timeout=seconds)
+        except queue.Empty:
+            raise AssertionError(f"no message within {seconds} s") from None
+
+    def until(self, wanted: Callable[[Any], object], what: str) -> Any:
+        """The next message that is wanted; those before it are skipped."""
+        deadline = time.monotonic() + wire.DEADLINE
+        last: Any = None
+        while (left := deadline - time.monotonic()) > 0:
+            with contextlib.suppress(queue.Empty):
+                last = self._queue.get(timeout=left)
+                if wanted(last):
+                    return last
+        raise AssertionError(f"not within {wire.DEADLINE} s: {what}; the last message is {last}")
+
+    def take(self) -> list[Any]:
+        """All messages that are there."""
+        found = []
+        with contextlib.suppress(queue.Empty):
+            while True:
+                found.append(self._queue.get_nowait())
+        return found
+
+
+class Caller:
+    """A client of NATS beside the scanner; `options` are those of `Client.connect`."""
+
+    def __init__(self, url: str, **options: Any) -> None:
+        self._loop = _Loop()
+        self.client = Client()
+        self._loop.do(
+            self.client.connect(
+                url,
+                max_reconnect_attempts=-1,
+                reconnect_time_wait=0.05,  # type: ignore[arg-type]
+                error_cb=_ignored,
+                **options,
+            )
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._loop.do(self.client.close())
+        self._loop.close()
+
+    def request(self, subject: str, payload: object) -> Any:
+        """The answer to a request; text goes as it is, everything else as JSON."""
+        message = self._loop.do(
+            self.client.request(subject, _bytes(payload), timeout=wire.DEADLINE)
+        )
+        return json.loads(message.data)
+
+    def publish(self, subject: str, payload: object = b"") -> None:
+        """Returns when the server has it."""
+        self._loop.do(self._published(subject, _bytes(payload)))
+
+    async def _published(self, subject: str, payload: bytes) -> None:
+        await self.client.publish(subject, payload)
+        await self.client.flush()
+
+    def listen(self, subject: str) -> Inbox:
+        """What comes on a subject from now on."""
+        inbox = Inbox()
+        self._loop.do(self._listening(subject, inbox))
+        return inbox
+
+    async def _listening(self, subject: str, inbox: Inbox) -> None:
+        await self.client.subscribe(subject, cb=inbox.put)
+        await self.client.flush()
+
+    def do(self, work: Coroutine[Any, Any, Result]) -> Result:
+        """The result of a coroutine in the loop of the client."""
+        return self._loop.do(work)
+
+
+async def _ignored(_: Exception) -> None:
+    pass
+
+
+def _bytes(payload: object) -> bytes:
+    if isinstance(payload, bytes):
+        return payload
+    return payload.encode() if isinstance(payload, str) else json.dumps(payload).encode()
+
+
+class Running:
+    """A scanner in a thread of its own."""
+
+    def __init__(self, settings: Settings) -> None:
+        loop = _Loop()
+        self._loop: _Loop | None = loop
+        try:
+            self.scanner = loop.do(self._made(settings))
+        except BaseException:
+            loop.close()
+            raise
+        self.ended = asyncio.run_coroutine_threadsafe(self.scanner.run(), loop.loop)
+
+    @staticmethod
+    async def _made(settings: Settings) -> Scanner:
+        return Scanner(settings)
+
+    @property
+    def serves(self) -> bool:
+        """Whether it is connected and has subscribed to its subjects."""
+        return self.scanner.serves
+
+    def do(self, work: Coroutine[Any, Any, Result]) -> Result:
+        """The result of a coroutine in the loop of the scanner."""
+        assert self._loop is not None
+        return self._loop.do(work)
+
+    def stop(self) -> None:
+        """Ends it, and waits until it has ended."""
+        if self._loop is None:
+            return
+        loop, self._loop = self._loop, None
+        loop.loop.call_soon_threadsafe(self.scanner.end)
+        try:
+            self.ended.result(2 * wire.DEADLINE)
+        finally:
+            loop.close()
+
+
+class Run(Protocol):
+    """Starts a scanner that is stopped when the test ends; waits until it serves."""
+
+    def __call__(
+        self, server: NatsServer | None = None, *, wait: bool = True, **settings: Any
+    ) -> Running: ...
+
+
+@pytest.fixture(scope="session")
+def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
+    """A server for all tests that do it no harm."""
+    server = NatsServer(tmp_path_factory.mktemp("nats"))
+    yield server
+    server.kill()
+
+
+@pytest.fixture
+def own_nats(tmp_path: Path) -> Iterator[NatsServer]:
+    """A server for one test."""
+    server = NatsServer(tmp_path)
+    yield server
+    server.kill()
+
+
+@pytest.fixture
+def caller(nats: NatsServer) -> Iterator[Caller]:
+    with Caller(nats.url) as caller:
+        yield caller
+
+
+@pytest.fixture
+def run_scanner(nats: NatsServer) -> Iterator[Run]:
+    with ExitStack() as running:
+
+        def start(server: NatsServer | None = None, *, wait: bool = True, **more: Any) -> Running:
+            more.setdefault("servers", Servers(((server or nats).url,)))
+            scanner = Running(Settings(**more))
+            running.callback(scanner.stop)
+            if wait:
+                wire.until(lambda: scanner.serves, "the scanner is connected")
+            return scanner
+
+        yield start
+
+
+@pytest.fixture
+def scanner(run_scanner: Run) -> Running:
+    """With the settings that it has by itself, at `nats`."""
+    return run_scanner()
+
+
+def tag(id: str, address: int, datatype: str = "uint16", **more: Any) -> dict[str, Any]:
+    """A tag of a request, in holding registers if nothing else is said."""
+    return {"id": id, "address": address, "functionCode": "holding", "datatype": datatype, **more}
+
+
+def subscription(server: holdfast.Server, *tags: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """A request for tags of a server, known as plc1."""
+    host, port = server.address
+    return {
+        "deviceId": "plc1",
+        "host": host,
+        "port": port,
+        "scanRate": 50,
+        "subscriberId": "hmi",
+        "tags": list(tags),
+        **more,
+    }
+
+
+def leaving(*ids: str, **more: Any) -> dict[str, Any]:
+    """A request to take tags away."""
+    return {"deviceId": "plc1", "subscriberId": "hmi", "tagIds": list(ids), **more}

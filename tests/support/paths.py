@@ -1,0 +1,12 @@
+"""Where tests find files of the project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+ROOT = TESTS.parent
+DATA = TESTS / "data"
+VECTORS = TESTS / "vectors"
+DOCS = ROOT / "docs"
+EXAMPLES = ROOT / "examples"

@@ -1,0 +1,120 @@
+"""A command in a terminal of its own: what it shows there, keys, sizes, signals."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from typing import TYPE_CHECKING
+
+from support import wire
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+ESCAPES = re.compile(r"\x1b(\[[0-9;?]*[ -/]*[@-~]|[()][A-Z0-9]|[=>78])")
+
+
+def plain(text: str) -> str:
+    """What is on the terminal, without colours and movements."""
+    return ESCAPES.sub("", text).replace("\r", "")
+
+
+class Terminal:
+    """`holdfast` with these arguments on a pseudo-terminal; killed at the end, if it still runs."""
+
+    def __init__(
+        self, *arguments: str, lines: int = 40, columns: int = 100, **environment: str
+    ) -> None:
+        self._own, theirs = pty.openpty()
+        try:
+            self._resize(lines, columns)
+            settings = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "COLUMNS")}
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "holdfast", *arguments],
+                stdin=theirs,
+                stdout=theirs,
+                stderr=theirs,
+                start_new_session=True,
+                preexec_fn=_take_terminal,
+                env=settings | {"TERM": "xterm-256color", "LANG": "C.UTF-8"} | environment,
+            )
+        except BaseException:
+            os.close(self._own)
+            raise
+        finally:
+            os.close(theirs)
+        self.shown = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._own)
+
+    def until(self, *texts: str) -> str:
+        """What has been shown, once all texts are in what came since the last call."""
+        deadline = time.monotonic() + wire.DEADLINE
+        since = len(self.shown)
+        while not all(text in plain(self.shown[since:]) for text in texts):
+            if time.monotonic() > deadline or not self._look(deadline):
+                raise AssertionError(f"{texts} not in:\n{plain(self.shown[since:])}")
+        return plain(self.shown[since:])
+
+    def keys(self, keys: str) -> None:
+        os.write(self._own, keys.encode())
+
+    def resize(self, lines: int, columns: int) -> None:
+        self._resize(lines, columns)
+        self.process.send_signal(signal.SIGWINCH)
+
+    def end(self, number: signal.Signals | None = None) -> int:
+        """The exit code, after a signal if one is given."""
+        if number is not None:
+            self.process.send_signal(number)
+        deadline = time.monotonic() + wire.DEADLINE
+        while self._look(deadline):
+            assert time.monotonic() < deadline, plain(self.shown)
+        return self.process.wait(wire.DEADLINE)
+
+    def _look(self, deadline: float) -> bool:
+        """Takes what is there; whether there may be more."""
+        patience = max(0.0, deadline - time.monotonic())
+        if not select.select([self._own], [], [], patience)[0]:
+            return True
+        piece = b""
+        with contextlib.suppress(OSError):  # Linux says so when the other side is closed.
+            piece = os.read(self._own, 65536)
+        self.shown += piece.decode(errors="replace")
+        return bool(piece)
+
+    def _resize(self, lines: int, columns: int) -> None:
+        fcntl.ioctl(self._own, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+
+
+def interruptible() -> None:
+    """For `preexec_fn`: lets Ctrl-C end the process also where that is ignored, as behind `&`."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _take_terminal() -> None:
+    """Makes standard input the terminal of the new session."""
+    interruptible()
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)

@@ -1,0 +1,200 @@
+"""A Modbus client inside TLS whose records a test has in its hands, and appliances to talk to."""
+
+from __future__ import annotations
+
+import contextlib
+import ssl
+from typing import TYPE_CHECKING, Any
+
+from support import wire
+from support.config_folder import written
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+    from types import TracebackType
+    from typing import Self
+
+    from holdfast.appliance import Appliance
+    from support.certificates import Issued
+
+VERSIONS = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
+
+
+def context(ca: Path, issued: Issued | None = None, version: str | None = None) -> ssl.SSLContext:
+    """Trusts `ca`, and shows what was issued."""
+    made = ssl.create_default_context(cafile=str(ca))
+    if issued is not None:
+        made.load_cert_chain(issued.certificate, issued.key)
+    if version is not None:
+        made.minimum_version = made.maximum_version = VERSIONS[version]
+    return made
+
+
+class Refused(Exception):
+    """The server ended the connection, by an alert, or by none."""
+
+
+class Peer:
+    """One connection; `shake` makes it one of TLS."""
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        trust: ssl.SSLContext,
+        *,
+        source: str | None = None,
+        receive_buffer: int | None = None,
+        session: ssl.SSLSession | None = None,
+    ) -> None:
+        self.wire = wire.Connection(address, source=source, receive_buffer=receive_buffer)
+        self._in, self._out = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self.tls = trust.wrap_bio(self._in, self._out, server_hostname="localhost", session=session)
+        self.drips = False
+        """Whether every byte is sent alone."""
+        self._received = b""
+        self._transaction = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.wire.close()
+
+    def shake(self) -> Self:
+        """The handshake, as far as a client can see it."""
+        while True:
+            try:
+                self.tls.do_handshake()
+            except ssl.SSLWantReadError:
+                self.flush()
+                self._fill()
+            except ssl.SSLError as error:
+                raise Refused(error.reason) from None
+            else:
+                self.flush()
+                return self
+
+    def hello(self) -> bytes:
+        """What begins the handshake; it is not sent."""
+        with contextlib.suppress(ssl.SSLWantReadError):
+            self.tls.do_handshake()
+        return self._out.read()
+
+    def goodbye(self) -> bytes:
+        """What tells the server of the end; it is not sent."""
+        with contextlib.suppress(ssl.SSLWantReadError):
+            self.tls.unwrap()
+        return self._out.read()
+
+    def seal(self, data: bytes) -> bytes:
+        """The records that carry some bytes; they are not sent."""
+        self.tls.write(data)
+        return self._out.read()
+
+    def send(self, data: bytes) -> None:
+        """Sends bytes in records of their own."""
+        self._send(self.seal(data))
+
+    def flush(self) -> None:
+        """Sends what TLS has to say."""
+        self._send(self._out.read())
+
+    def _send(self, records: bytes) -> None:
+        for piece in (bytes([byte]) for byte in records) if self.drips else (records,):
+            self.wire.send(piece)
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes:
+        """The PDU of the reply to one request."""
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        self.send(wire.frame(pdu, unit, self._transaction))
+        [reply] = self.receive_many(1)
+        assert (reply.transaction, reply.unit) == (self._transaction, unit)
+        return reply.pdu
+
+    def ask_many(self, pdus: Iterable[bytes]) -> list[bytes]:
+        """The PDUs of the replies to requests that are sent at once, in order."""
+        asked = list(pdus)
+        self.send(wire.frames(asked))
+        return [reply.pdu for reply in self.receive_many(len(asked))]
+
+    def receive_many(self, count: int) -> list[wire.Frame]:
+        """The next frames, exactly as many; raises `Refused` when the connection ends before."""
+        got: list[wire.Frame] = []
+        while len(got) < count:
+            got += self.receive_some()
+        assert len(got) == count
+        return got
+
+    def receive_some(self) -> list[wire.Frame]:
+        """The frames that come next, perhaps none."""
+        piece = self._read()
+        if not piece:
+            raise Refused("close_notify")
+        whole, self._received = wire.split(self._received + piece)
+        return whole
+
+    def end(self) -> str:
+        """How the server ends the connection: `close_notify`, an alert, or `cut`."""
+        try:
+            while self._read():
+                pass
+        except Refused as refused:
+            return str(refused)
+        return "close_notify"
+
+    def _read(self) -> bytes:
+        """Plain text, nothing at the end."""
+        while True:
+            try:
+                return self.tls.read(65536)
+            except ssl.SSLWantReadError:
+                self._fill()
+            except ssl.SSLZeroReturnError:
+                return b""
+            except ssl.SSLEOFError:
+                raise Refused("cut") from None
+            except ssl.SSLError as error:
+                raise Refused(error.reason) from None
+
+    def _fill(self) -> None:
+        self.wire.socket.settimeout(wire.DEADLINE)
+        try:
+            piece = self.wire.socket.recv(65536)
+        except (ConnectionResetError, BrokenPipeError):
+            piece = b""
+        if piece:
+            self._in.write(piece)
+        elif self._in.eof:
+            raise Refused("cut")
+        else:
+            self._in.write_eof()
+
+
+def configuration(tls: dict[str, Path], rules: list[dict[str, Any]], **listener: Any) -> str:
+    """The text of a configuration with one listener, `secure`, for the memory `plant`."""
+    secure = {
+        "type": "modbus-tls",
+        "bind": "127.0.0.1:0",
+        "tls": {key: str(path) for key, path in tls.items()},
+        "rules": [{"units": {1: "plant"}, **rule} for rule in rules],
+        **listener,
+    }
+    memories = {"plant": {"coils": 1000, "holding_registers": 1000}}
+    return written({"memories": memories, "listeners": {"secure": secure}})
+
+
+def connections(appliance: Appliance) -> dict[str, int]:
+    """What became of the connections."""
+    counted: dict[str, int] = appliance.diagnostics.stats()["listeners"]["secure"]["connections"]
+    return counted
+
+
+def address(appliance: Appliance) -> tuple[str, int]:
+    return endpoint(appliance, "secure")

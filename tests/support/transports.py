@@ -1,0 +1,193 @@
+"""Modbus over UDP, and RTU frames over TCP: clients as plain as that of `wire`, and appliances
+with one listener.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import time
+from typing import TYPE_CHECKING, Any
+
+from holdfast.appliance import Appliance
+from holdfast.config import load
+from holdfast.types import AREAS
+from support import lines, wire
+from support.config_folder import written
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from types import TracebackType
+    from typing import Self
+
+TYPES = {"tcp": "modbus-tcp", "udp": "modbus-udp", "rtu": "modbus-rtu-over-tcp"}
+"""The types of listener by the names that tests go by."""
+
+ALL: dict[str, Any] = dict.fromkeys(AREAS, 1000)
+"""Every area with the addresses 0 to 999."""
+
+
+def rule(sources: list[str], unit: int = 1, memory: str = "plant", **more: Any) -> dict[str, Any]:
+    """A rule for one unit id, to read and to write unless told."""
+    return {"sources": sources, "units": {unit: memory}, "access": "read-write", **more}
+
+
+def configuration(
+    kind: str,
+    *,
+    bind: str = "127.0.0.1:0",
+    rules: list[dict[str, Any]] | None = None,
+    memories: dict[str, Any] | None = None,
+    more: dict[str, Any] | None = None,
+    **listener: Any,
+) -> str:
+    """The text of a configuration with one listener, `scada`."""
+    scada = {
+        "type": TYPES[kind],
+        "bind": bind,
+        "rules": rules or [rule(["127.0.0.1", "::1"])],
+        **listener,
+    }
+    return written(
+        {"memories": memories or {"plant": ALL}, "listeners": {"scada": scada}, **(more or {})}
+    )
+
+
+@contextlib.contextmanager
+def running(folder: Path, text: str) -> Iterator[Appliance]:
+    """An appliance that several tests share."""
+    file = folder / "appliance.yaml"
+    file.write_text(text)
+    with Appliance(load(file)) as started:
+        yield started
+
+
+def counters(appliance: Appliance) -> dict[str, Any]:
+    """What the listener has counted."""
+    counted: dict[str, Any] = appliance.diagnostics.stats()["listeners"]["scada"]
+    return counted
+
+
+def await_count(appliance: Appliance, group: str, key: str | int, number: int) -> None:
+    """Waits until a counter has come to a number."""
+
+    def count() -> int:
+        counted: int = counters(appliance)[group].get(key, 0)
+        return counted
+
+    wire.until(lambda: count() >= number, f"{group}.{key} is {number}")
+    assert count() == number
+
+
+def address(appliance: Appliance) -> tuple[str, int]:
+    return endpoint(appliance, "scada")
+
+
+class Datagrams:
+    """A UDP client of one server."""
+
+    def __init__(self, to: tuple[str, int], *, source: str | None = None) -> None:
+        family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
+        self.socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            if source is not None:
+                self.socket.bind((source, 0))
+            self.socket.connect(to)
+            self.socket.settimeout(wire.DEADLINE)
+        except BaseException:
+            self.socket.close()
+            raise
+        self._transaction = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def send(self, datagram: bytes) -> None:
+        self.socket.send(datagram)
+
+    def receive(self) -> wire.Frame:
+        """The frame of the next datagram, which must be one and whole."""
+        datagram = self.socket.recv(65536)
+        whole, left = wire.split(datagram)
+        if len(whole) != 1 or left:
+            raise AssertionError(f"not one frame: {datagram.hex()}")
+        return whole[0]
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes:
+        """The PDU of the next reply, whose header must be that of the request."""
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        self.send(wire.frame(pdu, unit, self._transaction))
+        reply = self.receive()
+        if (reply.transaction, reply.unit) != (self._transaction, unit):
+            raise AssertionError(
+                f"the header is not that of transaction {self._transaction}: {reply}"
+            )
+        return reply.pdu
+
+    def is_quiet(self) -> bool:
+        """Whether no datagram is there."""
+        return not select.select([self.socket], [], [], 0)[0]
+
+
+class RtuConnection(wire.Connection):
+    """RTU frames over one TCP connection."""
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes:
+        self.send(lines.rtu(pdu, unit))
+        [(answered, reply)] = self.replies(1)
+        assert answered == unit
+        return reply
+
+    def replies(self, count: int) -> list[tuple[int, bytes]]:
+        """Unit ids and PDUs of the next frames, exactly as many."""
+        deadline = time.monotonic() + self.deadline
+        got: list[tuple[int, bytes]] = []
+        while len(got) < count:
+            if (end := lines.rtu_length(self._received)) is not None:
+                frame, self._received = self._received[:end], self._received[end:]
+                got.append(lines.from_rtu(frame))
+                continue
+            patience = deadline - time.monotonic()
+            if patience <= 0:
+                raise TimeoutError(f"{len(got)} of {count} replies: {self._received.hex()}")
+            self._receive(patience)
+        return got
+
+    def is_quiet(self) -> bool:
+        """Whether nothing has come that was not received."""
+        return not self._received and not select.select([self.socket], [], [], 0)[0]
+
+
+Client = wire.Connection | Datagrams
+
+
+def client(kind: str, to: tuple[str, int], source: str | None = None) -> Client:
+    """A client of a transport, to be closed."""
+    if kind == "udp":
+        return Datagrams(to, source=source)
+    return (RtuConnection if kind == "rtu" else wire.Connection)(to, source=source)
+
+
+def is_stranger(kind: str, appliance: Appliance, to: tuple[str, int], source: str | None) -> bool:
+    """Whether a peer gets no answer, and is counted as one that no rule names."""
+    request = bytes.fromhex("0300000001")
+    refused = counters(appliance)["connections"]["refused_source"]
+    with client(kind, to, source) as stranger:
+        with contextlib.suppress(ConnectionResetError, BrokenPipeError):
+            stranger.send(lines.rtu(request, 1) if kind == "rtu" else wire.frame(request))
+        await_count(appliance, "connections", "refused_source", refused + 1)
+        return stranger.is_quiet() if isinstance(stranger, Datagrams) else stranger.rest() == b""

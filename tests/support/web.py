@@ -1,0 +1,241 @@
+"""HTTP adapters in a thread, as the appliance runs them, and clients that know only HTTP.
+
+`Client` speaks through the standard library's client, `raw` sends the bytes it is given.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import http.client
+import json
+import logging
+import socket
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from holdfast.adapters import MemoryAccess, Stop
+from holdfast.adapters.rest import Rest
+from holdfast.appliance.diagnostics import Diagnostics
+from holdfast.appliance.supervision import Supervisor
+from holdfast.config import RestConfig
+from holdfast.web.host import listen
+from support import wire
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    import holdfast
+    from holdfast._core import Engine
+    from holdfast.ingest.audit import Audit
+
+AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
+JSON = {"Content-Type": "application/json"}
+INGEST = "/api/v1/ingest"
+READ = "/api/v1/memory/read"
+
+LOOPBACK = ["127.0.0.0/8", "::1"]
+
+
+def token(
+    name: str,
+    secret: str,
+    *,
+    memories: tuple[str, ...] = ("plant_a",),
+    areas: tuple[str, ...] = AREAS,
+    access: str = "read-write",
+) -> dict[str, object]:
+    """A token as the configuration has it."""
+    digest = hashlib.sha256(secret.encode()).hexdigest()
+    return {
+        "name": name,
+        "sha256": digest,
+        "memories": list(memories),
+        "areas": list(areas),
+        "access": access,
+    }
+
+
+def command(area: str, address: Any, values: Any, memory: Any = "plant_a") -> dict[str, Any]:
+    return {"memory": memory, "area": area, "address": address, "values": values}
+
+
+@dataclass
+class Answer:
+    """What came back."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Client:
+    """A connection that stays open, as far as the server lets it."""
+
+    def __init__(self, address: tuple[str, int], secret: str | None = None) -> None:
+        self._connection = http.client.HTTPConnection(*address, timeout=wire.DEADLINE)
+        self._more = {} if secret is None else {"Authorization": f"Bearer {secret}"}
+
+    def ask(
+        self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = JSON
+    ) -> Answer:
+        """One request; a body that is not bytes is sent as JSON."""
+        if body is not None and not isinstance(body, bytes):
+            body = json.dumps(body).encode()
+        self._connection.request(method, path, body, {**headers, **self._more})
+        reply = self._connection.getresponse()
+        lower = {name.lower(): value for name, value in reply.getheaders()}
+        return Answer(reply.status, lower, reply.read())
+
+    def get(self, path: str) -> Answer:
+        return self.ask("GET", path, headers={})
+
+    def ingest(self, body: Any) -> Answer:
+        return self.ask("POST", INGEST, body)
+
+    def read(self, area: str, address: object, count: object, memory: str = "plant_a") -> Answer:
+        return self.get(f"{READ}?memory={memory}&area={area}&address={address}&count={count}")
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+@dataclass
+class StandIn:
+    """An engine as far as diagnostics look at it."""
+
+    listeners: dict[str, Any] = field(default_factory=dict)
+    lost_events: int = 0
+
+    def counters(self) -> dict[str, Any]:
+        return self.listeners
+
+
+def diagnostics_of(
+    memories: Mapping[str, holdfast.Memory], engine: object | None = None
+) -> Diagnostics:
+    chosen: Engine = engine or StandIn()  # type: ignore[assignment]
+    return Diagnostics(memories, chosen)
+
+
+class Service:
+    """A REST adapter under its supervisor."""
+
+    def __init__(
+        self,
+        memories: Mapping[str, holdfast.Memory],
+        *,
+        audit: Audit | None = None,
+        bind: str = "127.0.0.1:0",
+        **settings: Any,
+    ) -> None:
+        given = {"bind": bind, "sources": LOOPBACK, "tokens": "none", **settings}
+        self.settings = RestConfig.model_validate(given)
+        self.memories = memories
+        self.memory_access = MemoryAccess("rest", memories, audit)
+        self.diagnostics = diagnostics_of(memories)
+        self.listener = listen(self.settings.bind.host, self.settings.bind.port)
+        self.supervisor = Supervisor("rest", self.made)
+        self.diagnostics.adapters["rest"] = (self.supervisor, self.memory_access)
+
+    def made(self) -> Rest:
+        return Rest(self.settings, self.memory_access, self.diagnostics, self.listener)
+
+    @property
+    def address(self) -> tuple[str, int]:
+        host, port, *_ = self.listener.getsockname()
+        return host, port
+
+    def refusals(self) -> dict[str, int]:
+        found: Any = self.memory_access.counts()["refused"]
+        return dict(found)
+
+    def connections(self) -> dict[str, int]:
+        found: Any = self.supervisor.status()["connections"]
+        return dict(found)
+
+    def until_counted(self, event: str, times: int = 1) -> None:
+        wire.until(lambda: self.connections()[event] >= times, f"{times} times {event}")
+
+
+@contextlib.contextmanager
+def supervised(supervisor: Supervisor, listener: socket.socket) -> Iterator[None]:
+    """Runs an adapter; when it is over, its thread must have ended, and never have failed."""
+    supervisor.start()
+    wire.until(lambda: supervisor.status()["state"] == "running", "it runs")
+    try:
+        yield
+    finally:
+        supervisor.stop()
+        supervisor.join()
+        listener.close()
+    status = supervisor.status()
+    assert (status["state"], status["restarts"]) == ("stopped", 0), status["last_error"]
+
+
+class Runs(Protocol):
+    """An adapter or a host."""
+
+    def run(self, stop: Stop) -> None: ...
+
+
+@contextlib.contextmanager
+def in_a_thread(what: Runs, stop: Stop | None = None) -> Iterator[None]:
+    """Runs it; when it is over, its thread must have ended without an error."""
+    stop = stop or Stop()
+    with ThreadPoolExecutor(1) as threads:
+        running = threads.submit(what.run, stop)
+        try:
+            yield
+        finally:
+            stop.set()
+            running.result(wire.DEADLINE)
+
+
+def head(
+    method: str, path: str, *headers: str, host: str = "127.0.0.1", version: str = "1.1"
+) -> bytes:
+    """The header of a request."""
+    lines = [f"{method} {path} HTTP/{version}", f"Host: {host}", *headers, "", ""]
+    return "\r\n".join(lines).encode("latin-1")
+
+
+def post(body: bytes, *headers: str) -> bytes:
+    """A whole request to ingest."""
+    length = f"Content-Length: {len(body)}"
+    return head("POST", INGEST, "Content-Type: application/json", length, *headers) + body
+
+
+def answers(received: bytes) -> list[Answer]:
+    """The answers, one behind the other, that a connection brought until it was closed."""
+    found, at = [], 0
+    while at < len(received):
+        end = received.index(b"\r\n\r\n", at)
+        status, *lines = received[at:end].decode("latin-1").split("\r\n")
+        headers = dict(line.lower().split(": ", 1) for line in lines)
+        begin, at = end + 4, end + 4 + int(headers.get("content-length", 0))
+        assert at <= len(received)
+        found.append(Answer(int(status.split()[1]), headers, received[begin:at]))
+    return found
+
+
+class Records(logging.Handler):
+    """What was logged, as text with all its fields."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.fields: list[dict[str, Any]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        fields = getattr(record, "fields", {})
+        self.lines.append(f"{record.levelname} {record.getMessage()} {fields} {record.exc_text}")
+        self.fields.append({"event": record.getMessage(), **fields})
+
+    def of(self, event: str) -> list[dict[str, Any]]:
+        return [entry for entry in self.fields if entry["event"] == event]

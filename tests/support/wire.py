@@ -1,0 +1,226 @@
+"""A raw Modbus TCP client, on purpose independent of the library.
+
+It sends the bytes it is given and hands back what comes, whole frames at a time. It judges nothing
+but the framing, and every wait has a deadline: a server that keeps silent fails a test, it does
+not hang it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from types import TracebackType
+    from typing import Self
+
+DEADLINE = 10.0
+"""Seconds that a condition has to come true. Generous: only a failing test waits for it."""
+
+MAX_PDU = 253
+
+
+class Frame(NamedTuple):
+    """One frame that came back."""
+
+    transaction: int
+    unit: int
+    pdu: bytes
+
+
+def frame(
+    pdu: bytes,
+    unit: int = 1,
+    transaction: int = 0,
+    *,
+    protocol: int = 0,
+    length: int | None = None,
+) -> bytes:
+    """An MBAP header and a PDU; `length` puts a lie in the header."""
+    told = len(pdu) + 1 if length is None else length
+    return struct.pack(">HHHB", transaction, protocol, told, unit) + pdu
+
+
+def frames(pdus: Iterable[bytes], unit: int = 1) -> bytes:
+    """Frames one behind the other, with the transaction ids 0, 1, 2…"""
+    return b"".join(frame(pdu, unit, index & 0xFFFF) for index, pdu in enumerate(pdus))
+
+
+def split(received: bytes) -> tuple[list[Frame], bytes]:
+    """The whole frames at the start of some bytes, and what is left over."""
+    whole, at = [], 0
+    while len(received) - at >= 7:
+        transaction, protocol, length, unit = struct.unpack_from(">HHHB", received, at)
+        if protocol != 0 or not 2 <= length <= MAX_PDU + 1:
+            raise AssertionError(f"not a Modbus frame: {received[at : at + 16].hex()}…")
+        end = at + 6 + length
+        if end > len(received):
+            break
+        whole.append(Frame(transaction, unit, received[at + 7 : end]))
+        at = end
+    return whole, received[at:]
+
+
+def until(condition: Callable[[], object], what: str, seconds: float = DEADLINE) -> None:
+    """Returns when the condition holds; fails when it does not within the deadline."""
+    deadline = time.monotonic() + seconds
+    between_looks = threading.Event()
+    while not condition():
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {seconds} s: {what}")
+        between_looks.wait(0.002)
+
+
+class Connection:
+    """One TCP connection to a server."""
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        *,
+        source: str | None = None,
+        receive_buffer: int | None = None,
+        deadline: float = DEADLINE,
+    ) -> None:
+        self.deadline = deadline
+        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        self.socket = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if receive_buffer is not None:
+                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+            if source is not None:
+                self.socket.bind((source, 0))
+            self.socket.settimeout(deadline)
+            self.socket.connect(address)
+        except BaseException:
+            self.socket.close()
+            raise
+        self._received = b""
+        self._transaction = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def reset(self) -> None:
+        """Ends the connection with RST instead of FIN."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.socket.close()
+
+    def finish(self) -> None:
+        """Says that no more will be sent."""
+        self.socket.shutdown(socket.SHUT_WR)
+
+    def send(self, data: bytes) -> None:
+        self.socket.settimeout(self.deadline)
+        self.socket.sendall(data)
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes:
+        """Sends one request; the PDU of the reply, whose header must be that of the request."""
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        self.send(frame(pdu, unit, self._transaction))
+        reply = self.receive()
+        if (reply.transaction, reply.unit) != (self._transaction, unit):
+            raise AssertionError(
+                f"the header is not that of transaction {self._transaction}: {reply}"
+            )
+        return reply.pdu
+
+    def ask_many(self, pdus: Iterable[bytes], unit: int = 1) -> list[bytes]:
+        """Sends all requests without waiting; the PDUs of the replies, which must be in order."""
+        asked = list(pdus)
+        replies = self.converse(frames(asked, unit), len(asked))
+        order = [(reply.transaction, reply.unit) for reply in replies]
+        if order != [(index & 0xFFFF, unit) for index in range(len(asked))]:
+            raise AssertionError("the replies are not in the order of the requests")
+        return [reply.pdu for reply in replies]
+
+    def receive(self) -> Frame:
+        """The next frame."""
+        return self.receive_many(1)[0]
+
+    def receive_many(self, count: int) -> list[Frame]:
+        """The next frames, exactly as many; more would be kept for later."""
+        return self.converse(b"", count)
+
+    def converse(self, data: bytes, count: int) -> list[Frame]:
+        """Sends and receives at once, so that neither side waits for the other's buffer."""
+        deadline = time.monotonic() + self.deadline
+        unsent = memoryview(data)
+        got: list[Frame] = []
+        while True:
+            whole, self._received = split(self._received)
+            got += whole
+            if len(got) >= count and not unsent:
+                self._keep(got[count:])
+                return got[:count]
+            patience = deadline - time.monotonic()
+            if patience <= 0:
+                raise TimeoutError(f"{len(got)} of {count} replies within {self.deadline} s")
+            if not unsent:
+                self._receive(patience)
+                continue
+            self.socket.setblocking(False)
+            readable, writable, _ = select.select([self.socket], [self.socket], [], patience)
+            if writable:
+                unsent = unsent[self.socket.send(unsent[:65536]) :]
+            if readable:
+                self._receive(patience)
+
+    def _receive(self, patience: float) -> None:
+        self.socket.settimeout(patience)
+        with contextlib.suppress(TimeoutError):
+            piece = self.socket.recv(262144)
+            if not piece:
+                raise ConnectionError("closed before all replies have come")
+            self._received += piece
+
+    def _keep(self, more: list[Frame]) -> None:
+        kept = b"".join(frame(pdu, unit, transaction) for transaction, unit, pdu in more)
+        self._received = kept + self._received
+
+    def rest(self) -> bytes:
+        """All bytes up to the end of the connection, which must come within the deadline."""
+        pieces, self._received = [self._received], b""
+        deadline = time.monotonic() + self.deadline
+        while True:
+            self.socket.settimeout(max(0.001, deadline - time.monotonic()))
+            try:
+                piece = self.socket.recv(65536)
+            except TimeoutError:
+                raise AssertionError(f"still open after {self.deadline} s") from None
+            except (ConnectionResetError, BrokenPipeError):
+                piece = b""
+            if not piece:
+                return b"".join(pieces)
+            pieces.append(piece)
+
+
+def rounds(enough: threading.Event, least: int = 1) -> Iterator[int]:
+    """Counts rounds until there are enough: on a slow machine threads meet later, not never."""
+    deadline = time.monotonic() + 3 * DEADLINE
+    for number in itertools.count():
+        if number >= least and enough.is_set():
+            return
+        if time.monotonic() > deadline:
+            raise AssertionError(f"the threads did not meet in {number} rounds")
+        yield number

@@ -1,0 +1,206 @@
+"""What registers are guessed to be: values as plants have them are recognised."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from holdfast import values
+from holdfast.tools.inference import guess, shortest
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.tools.inference import Guess
+
+ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
+BEHIND = [0x3A91, 0x0007]
+"""What stands in the registers behind a value."""
+
+
+def reads(kind: str, order: str, *found: Any, size: int = 4) -> list[list[int]]:
+    """Reads in which a value of a type was found, with other registers behind it."""
+    return [(values.encode(each, kind, order) + BEHIND)[:size] for each in found]
+
+
+def place(guesses: Sequence[Guess], kind: str, order: str) -> int:
+    """The rank of a type in an order, 1 the best; that it is there is taken for granted."""
+    ranks = [
+        rank
+        for rank, each in enumerate(guesses, 1)
+        if kind in (each.type, each.also) and each.order == order
+    ]
+    return ranks[0]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("kind", "found"),
+    [
+        ("float32", (21.5,)),
+        ("float32", (230.1, 230.4, 229.9)),
+        ("float32", (21.534217, 21.55123, 21.61234)),
+        ("float32", (0.1,)),
+        ("float32", (-7.25, -7.5)),
+        ("float32", (49.98, 50.01)),
+        ("float64", (21.534217123, 21.55123, 21.61234)),
+        ("float64", (1013.25,)),
+    ],
+)
+def test_a_float_is_recognised_in_every_order(
+    kind: str, found: tuple[float, ...], order: str
+) -> None:
+    best = guess(reads(kind, order, *found))[0]
+    assert (best.type, best.order) == (kind, order)
+    assert best.values == pytest.approx(found, rel=1e-6)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("kind", "found"),
+    [
+        ("int32", (100000, 100001, 100003)),
+        ("uint32", (1234567, 1234667)),
+        ("int32", (-5,)),
+        ("bcd32", (12345678,)),
+    ],
+)
+def test_a_long_integer_is_among_the_first(kind: str, found: tuple[int, ...], order: str) -> None:
+    guesses = guess(reads(kind, order, *found))
+    assert place(guesses, kind, order) <= 5
+
+
+@pytest.mark.parametrize(
+    ("kind", "found"),
+    [("uint16", (215,)), ("uint16", (2150, 2151, 2149)), ("int16", (-5, -6)), ("int16", (-5,))],
+)
+def test_a_single_register_is_recognised(kind: str, found: tuple[int, ...]) -> None:
+    best = guess([[each, 1234, 17, 0x9000] for each in [each & 0xFFFF for each in found]])[0]
+    assert kind in (best.type, best.also)
+    assert (best.order, best.values) == ("ABCD", found)
+
+
+@pytest.mark.parametrize("order", ["ABCD", "BADC"])
+def test_text_is_recognised(order: str) -> None:
+    best = guess([values.encode("PUMP-01", "string:8", order)])[0]
+    assert (best.type, best.order, best.values) == ("string:8", order, ("PUMP-01",))
+    assert "printable text" in best.reasons
+
+
+def test_text_ends_where_something_else_begins() -> None:
+    best = guess([[*values.encode("BOILER", "string:6"), 0x0001, 0x9000]])[0]
+    assert (best.type, best.values) == ("string:6", ("BOILER",))
+
+
+@pytest.mark.parametrize("registers", [[0x2020, 0x2020], [0x4142], [0, 0], [0xFFFF, 0xFFFF]])
+def test_what_is_no_text_is_not_taken_for_one(registers: list[int]) -> None:
+    assert not any(each.type.startswith("string") for each in guess([registers]))
+
+
+def test_signed_and_unsigned_are_one_guess_where_they_say_the_same() -> None:
+    found = guess([[100], [200]])
+    best = found[0]
+    assert (best.type, best.also) == ("uint16", "int16")
+    assert not any(each.type == "int16" and each.order == "ABCD" for each in found)
+    found = guess([[100], [40000]])
+    kinds = {each.type: each for each in found if each.order == "ABCD"}
+    assert kinds["uint16"].also is None
+    assert kinds["int16"].values == (100, 40000 - 65536)
+
+
+def test_bcd_is_a_guess_only_where_all_digits_are_decimal() -> None:
+    assert any(each.type == "bcd16" for each in guess([[0x1234], [0x9999]]))
+    assert not any(each.type == "bcd16" for each in guess([[0x1234], [0x123A]]))
+
+
+def test_a_type_needs_its_registers() -> None:
+    kinds = {each.type for each in guess([[1, 2]])}
+    assert {"uint16", "uint32", "float32"} <= kinds
+    assert not kinds & {"uint64", "float64"}
+
+
+def test_a_known_value_decides() -> None:
+    best = guess(reads("float32", "CDAB", 21.53), like=21.5)[0]
+    assert (best.type, best.order, best.scale) == ("float32", "CDAB", 1)
+    assert best.reasons[0] == "0.14 % off"
+
+
+@pytest.mark.parametrize(("scale", "raw"), [(1, 215), (0.1, 2150), (0.01, 21500), (10, 21)])
+def test_a_known_value_may_be_scaled(scale: float, raw: int) -> None:
+    best = guess([[raw, 0x9234]], like=raw * scale)[0]
+    assert (best.type, best.scale, best.reasons[0]) == ("uint16", scale, "equal")
+
+
+def test_a_known_value_is_found_anywhere() -> None:
+    registers = [9, 9, *values.encode(-17.25, "float32", "CDAB"), 9, 9]
+    assert guess([registers], like=-17.25) == []
+    best = guess([registers], like=-17.25, anywhere=True)[0]
+    assert (best.type, best.order, best.offset) == ("float32", "CDAB", 2)
+
+
+def test_a_known_value_may_be_that_of_any_read() -> None:
+    best = guess(reads("float32", "ABCD", 20.0, 30.0, 40.0), like=30)[0]
+    assert (best.values, best.reasons[0]) == ((20.0, 30.0, 40.0), "equal")
+
+
+def test_zero_can_be_known() -> None:
+    assert guess([[0, 0]], like=0)[0].reasons[0] == "equal"
+
+
+@settings(deadline=None)
+@given(
+    found=st.lists(st.lists(st.integers(0, 65535), min_size=4, max_size=4), min_size=1, max_size=4),
+    anywhere=st.booleans(),
+    like=st.none() | st.floats(-1e6, 1e6),
+)
+def test_every_guess_is_what_the_registers_hold(
+    found: list[list[int]], anywhere: bool, like: float | None
+) -> None:
+    guesses = guess(found, anywhere=anywhere, like=like)
+    scores = [each.score for each in guesses]
+    assert scores == sorted(scores, reverse=True)
+    assert all(0 <= score <= 1 for score in scores)
+    for each in guesses:
+        size = values.register_count(each.type)
+        held = [read[each.offset : each.offset + size] for read in found]
+        assert each.values == tuple(values.decode(raw, each.type, each.order) for raw in held)
+        assert not any(isinstance(v, float) and not math.isfinite(v) for v in each.values)
+    if like is None:
+        assert {"uint16", "int16"} & {each.type for each in guesses}
+
+
+@pytest.mark.parametrize("found", [[], [[]], [[1], [1, 2]]])
+def test_reads_without_registers_or_of_other_sizes_are_refused(found: list[list[int]]) -> None:
+    with pytest.raises(ValueError, match="reads are to have registers"):
+        guess(found)
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "text"),
+    [
+        (0.1, "float64", "0.1"),
+        (struct.unpack("f", struct.pack("f", 0.1))[0], "float32", "0.1"),
+        (16777216.0, "float32", "16777216"),
+        (65504.0, "float16", "65504"),
+        (1 / 3, "float64", "0.3333333333333333"),
+        (100000.0, "float64", "100000"),
+        (1.5e-7, "float64", "1.5e-07"),
+        (1e30, "float64", "1e+30"),
+        (-0.0, "float32", "-0"),
+        (float("inf"), "float32", "inf"),
+        (float("nan"), "float32", "nan"),
+    ],
+)
+def test_floats_are_told_shortly(value: float, kind: str, text: str) -> None:
+    assert shortest(value, kind) == text
+
+
+@settings(deadline=None)
+@given(st.floats(width=32, allow_nan=False))
+def test_a_short_float_is_the_same_float(value: float) -> None:
+    assert struct.pack("f", float(shortest(value, "float32"))) == struct.pack("f", value)
