@@ -25,7 +25,7 @@ class Datagrams:
                         [command | {"values": values}], self.context.grant, f"{peer[0]}:{peer[1]}"
                     )
                 except (TimeoutError, ValueError, Refused):
-                    continue  # A refusal has been counted and logged by the memory_access.
+                    continue  # A refusal has been counted and logged.
 
     def status(self) -> dict[str, object]:
         return {"port": self.context.options["port"]}

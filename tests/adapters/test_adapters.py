@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast import Memory
-from holdfast.adapters import Grant, MemoryAccess, Refused, Stop, supervisor
+from holdfast.adapters import Grant, MemoryAccess, Refused, Stop
 from holdfast.adapters.foreign import UnknownAdapter
+from holdfast.appliance import supervision as supervisor
 from holdfast.appliance.supervision import Supervisor
 from support import wire
 from support.paths import EXAMPLES
@@ -254,7 +255,7 @@ def test_a_status_that_raises_is_left_out(supervised: list[Supervisor]) -> None:
 
 
 def test_an_adapter_that_does_not_stop_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "GRACE", 0.01)
+    monkeypatch.setattr(supervisor, "STOP_TIMEOUT", 0.01)
     free = threading.Event()
 
     class Stubborn(Scripted):

@@ -82,7 +82,7 @@ class Written:
 
 @dataclass
 class Counts:
-    """What became of the messages that came to a memory_access."""
+    """What became of the messages that came to the memory access."""
 
     accepted: int = 0
     values: int = 0

@@ -40,7 +40,7 @@ _TICK = 1.0
 
 
 class Mqtt:
-    """Takes messages from a broker, and hands them to the memory_access."""
+    """Takes messages from a broker, and hands them to the memory access."""
 
     def __init__(self, settings: MqttConfig, memory_access: MemoryAccess) -> None:
         host = f"[{settings.host}]" if ":" in settings.host else settings.host

@@ -1,4 +1,4 @@
-"""What becomes of a message: written by the memory_access, or refused."""
+"""What becomes of a message: written by the memory access, or refused."""
 
 from __future__ import annotations
 

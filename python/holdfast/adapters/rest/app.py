@@ -1,7 +1,7 @@
 """The routes: what a request asks for, who asks, and how it is answered.
 
 A plain ASGI application. All that bears on memory is the door's work; what is refused here was
-refused before it came to the memory_access.
+refused before it came to the memory access.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ LINGER_TIMEOUT = 2.0
 
 
 class Declined(Refused):
-    """Refused before it came to the memory_access, which does not know of it yet."""
+    """Refused before it came to the memory access, which does not know of it yet."""
 
 
 class App:
