@@ -370,7 +370,7 @@ def test_messages_flow_in_order_while_they_are_taken() -> None:
 
 
 def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outboxes, "LOOK", 0.001)
+    monkeypatch.setattr(outboxes, "CHECK_INTERVAL", 0.001)
     monkeypatch.setattr(outboxes, "PIECE", 20)
     keys = range(100)
 
@@ -394,7 +394,7 @@ def test_each_has_its_turn_while_more_comes_than_is_taken(monkeypatch: pytest.Mo
 def test_the_newest_of_each_is_kept_while_they_are_not_taken(
     how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(outboxes, "LOOK", 0.001)
+    monkeypatch.setattr(outboxes, "CHECK_INTERVAL", 0.001)
 
     async def flow() -> tuple[Outbox, list[bytes]]:
         wire, outbox = Wire(), Outbox(most=3)
@@ -447,7 +447,7 @@ def test_a_device_is_told_of_when_it_comes_or_goes_or_refuses_something_new() ->
 
 
 def test_one_scan_without_an_answer_is_forgiven_unless_there_is_no_connection() -> None:
-    gateway = "exception 0B (Gateway Target ScannedDevice Failed to Respond)"
+    gateway = "exception 0B (Gateway Target Device Failed to Respond)"
     assert [found[1:] for found in judged([0], [0x0B], [0], [0x8003], [0], [0x8002], [0])] == [
         ("online", 0, None),
         ("online", 1, gateway),

@@ -3,9 +3,9 @@
 //! The rules this crate keeps:
 //!
 //! * A connection's rights are settled once, when it is accepted: its source address picks one rule
-//!   ([`policy`]), and the rule is two tables. A request costs two look-ups.
-//! * All that arrived together is answered together, in order, with one write ([`connection`]). The
-//!   way from request to reply ([`unit_server`]) allocates nothing.
+//!   ([`server::policy`]), and the rule is two tables. A request costs two look-ups.
+//! * All that arrived together is answered together, in order, with one write (`server::connection`). The
+//!   way from request to reply ([`server::unit_server`]) allocates nothing.
 //! * One peer can't hold up another: every buffer has a bound, every wait has a deadline, and no
 //!   code on a worker thread waits for anything but its sockets.
 //! * It says what happened in counters and events, and never waits for whoever reads them.

@@ -86,7 +86,7 @@ class Tracker:
         return None if history is None else self.readings - history.reading
 
     def latest(self, most: int) -> list[tuple[WatchedRange, int, int, History]]:
-        """WatchedRange, address, value and history of what changed last, in order of addresses."""
+        """Range, address, value and history of what changed last, in order of addresses."""
         places = sorted(self.histories, key=lambda place: -self.histories[place].reading)
         found = []
         for index, address in sorted(places[:most]):
