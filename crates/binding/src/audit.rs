@@ -68,15 +68,15 @@ fn packet(
     header: &Header,
     payload: &[u8],
 ) -> PyResult<()> {
-    let area = Area::ALL[usize::from(header.area) - 1];
+    let (area, count) = (header.area, header.count.get());
     let target = if format == Format::V1 { "unit" } else { "memory_id" };
     line.set_item(target, header.target)?;
     line.set_item("area", area.name())?;
     line.set_item("address", header.address)?;
     if payload.is_empty() {
-        return line.set_item("count", header.count);
+        return line.set_item("count", count);
     }
-    let values = if area.is_bits() { bits(payload, header.count) } else { registers(payload) };
+    let values = if area.is_bits() { bits(payload, count) } else { registers(payload) };
     line.set_item("values", values)
 }
 

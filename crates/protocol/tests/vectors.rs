@@ -123,8 +123,13 @@ fn raw_packets_decode_and_encode_as_the_vectors_say() {
         for (format, packet) in raw_packets(&case) {
             let header = format.header(&packet).unwrap().unwrap();
             let payload = format.payload(&header, &packet).unwrap();
-            let mut encoded = Vec::new();
-            format.encode(&header, payload, &mut encoded);
+            let mut encoded = vec![0; format.packet_len(&header)];
+            assert_eq!(
+                format.encode_to_slice(&header, payload, &mut encoded),
+                Ok(packet.len()),
+                "{}",
+                case.name
+            );
             assert_eq!(encoded, packet, "{}", case.name);
             for cut in 0..packet.len() {
                 let header = format.header(&packet[..cut]).unwrap();

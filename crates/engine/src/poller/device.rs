@@ -14,6 +14,7 @@ use std::cell::{Cell, RefCell, RefMut};
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::future::pending;
+use std::num::NonZeroU16;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -642,10 +643,9 @@ impl Device {
             // That it fits was checked when the poller was made.
             let _ = into.write(read.count, bytes);
         }
-        if let Ok(count) = u16::try_from(read.count) {
-            let code = Area::ALL.iter().position(|each| *each == area).unwrap_or_default() + 1;
+        if let Some(count) = u16::try_from(read.count).ok().and_then(NonZeroU16::new) {
             for forward in &self.forwards {
-                forward.offer(index, code as u8, address, count, bytes);
+                forward.offer(index, area, address, count, bytes);
             }
         }
     }

@@ -4,11 +4,13 @@
 use std::cell::{Cell, RefCell};
 use std::collections::{HashMap, VecDeque};
 use std::io;
+use std::num::NonZeroU16;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_protocol::raw_ingest::{DONE, Format, Header};
+use holdfast_memory::Area;
+use holdfast_protocol::raw_ingest::{self, DONE, Format, Header};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
@@ -97,10 +99,24 @@ impl Forward {
     }
 
     /// Takes the bytes of a read, in place of older ones. Never waits.
-    pub(super) fn offer(&self, read: usize, area: u8, address: u16, count: u16, bytes: &[u8]) {
+    pub(super) fn offer(
+        &self,
+        read: usize,
+        area: Area,
+        address: u16,
+        count: NonZeroU16,
+        bytes: &[u8],
+    ) {
+        let area = match area {
+            Area::Coils => raw_ingest::Area::Coils,
+            Area::DiscreteInputs => raw_ingest::Area::DiscreteInputs,
+            Area::HoldingRegisters => raw_ingest::Area::HoldingRegisters,
+            Area::InputRegisters => raw_ingest::Area::InputRegisters,
+        };
         let header = Header { area, target: self.settings.target, address, count };
         let mut packet = Vec::with_capacity(self.settings.format.packet_len(&header));
-        self.settings.format.encode(&header, bytes, &mut packet);
+        let encoded = self.settings.format.encode(&header, bytes, &mut packet);
+        encoded.expect("a read brings as many bytes as its count says");
         if self.waiting.borrow_mut().put(read, packet) {
             self.counters.replaced.add();
         }

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Write};
-use holdfast_protocol::raw_ingest::{DONE, Format, Header, REFUSED, Refusal};
+use holdfast_protocol::raw_ingest::{self, DONE, Format, Header, REFUSED, Refusal};
 use ipnet::IpNet;
 use socket2::SockRef;
 use tokio::net::TcpStream;
@@ -114,7 +114,7 @@ impl RawIngest {
         let span = memory.span(area);
         let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
         let address = u32::from(header.address);
-        if address < start || address + u32::from(header.count) > end {
+        if address < start || address + u32::from(header.count.get()) > end {
             return Err(Refusal::Range);
         }
         match self.format.packet_len(&header).checked_sub(bytes.len()) {
@@ -133,7 +133,7 @@ impl RawIngest {
         peer: SocketAddr,
         (header, memory, payload): (Header, &Memory, &[u8]),
     ) -> Result<(), Refusal> {
-        let Header { address, count, .. } = header;
+        let (address, count) = (header.address, header.count.get());
         let write =
             Write { area: area(&header), address, count: usize::from(count), bytes: payload };
         memory.write(Access::Ingest, write).map_err(|_| Refusal::Range)?;
@@ -276,5 +276,10 @@ fn more_is_there(stream: &TcpStream) -> bool {
 }
 
 fn area(header: &Header) -> Area {
-    Area::ALL[usize::from(header.area) - 1]
+    match header.area {
+        raw_ingest::Area::Coils => Area::Coils,
+        raw_ingest::Area::DiscreteInputs => Area::DiscreteInputs,
+        raw_ingest::Area::HoldingRegisters => Area::HoldingRegisters,
+        raw_ingest::Area::InputRegisters => Area::InputRegisters,
+    }
 }
