@@ -50,6 +50,9 @@ fn frames_encode_and_decode_as_the_vectors_say() {
         let frame = unhex(&case.mbap);
         let header = mbap::header(0x1A2B, unit, pdu.len());
         assert_eq!([&header[..], &pdu].concat(), frame);
+        let mut buffer = [0; mbap::MAX_LEN];
+        let len = mbap::encode(0x1A2B, unit, &pdu, &mut buffer).unwrap();
+        assert_eq!(buffer[..len], frame);
         let expected = mbap::Next::Frame {
             transaction_id: 0x1A2B,
             unit_id: unit,

@@ -1,14 +1,25 @@
 //! ASCII frames (Modbus over Serial Line V1.02, 2.5.2): a colon, unit id, PDU and LRC as pairs of
 //! hexadecimal digits, CR and LF.
+//!
+//! ```
+//! use holdfast_protocol::frame::ascii;
+//!
+//! let mut frame = [0; ascii::MAX_LEN];
+//! let len = ascii::encode(17, &[3, 0, 107, 0, 3], &mut frame).unwrap();
+//! assert_eq!(&frame[..len], b":1103006B00037E\r\n");
+//!
+//! let mut body = [0; ascii::MAX_BODY_LEN];
+//! assert_eq!(ascii::decode(&frame[..len], &mut body), Ok((17, &[3, 0, 107, 0, 3][..])));
+//! ```
 
 use super::{FrameError, split};
 use crate::pdu;
 
 /// The longest frame, in characters.
-pub const MAX_LEN: usize = 1 + 2 * MAX_BODY + 2;
+pub const MAX_LEN: usize = 1 + 2 * MAX_BODY_LEN + 2;
 
-/// The most bytes that the digits stand for: unit id, PDU, LRC.
-const MAX_BODY: usize = 1 + pdu::MAX_LEN + 1;
+/// The most bytes that the digits of a frame stand for: unit id, PDU, LRC.
+pub const MAX_BODY_LEN: usize = 1 + pdu::MAX_LEN + 1;
 
 /// Writes a frame at the start of `frame` and returns its length; `None` for a PDU that is empty or
 /// longer than [`pdu::MAX_LEN`].
@@ -29,14 +40,15 @@ pub fn encode(unit_id: u8, pdu: &[u8], frame: &mut [u8; MAX_LEN]) -> Option<usiz
     Some(len + 2)
 }
 
-/// The unit id and PDU of a whole frame; the bytes are put together in `body`. Digits above 9 may
-/// be capital or small letters.
+/// The unit id and PDU of a whole frame, decoded into `body`. Digits above 9 may be capital or small
+/// letters.
 ///
 /// # Errors
-/// [`FrameError::Length`], [`FrameError::Character`], [`FrameError::CheckSum`].
+/// [`FrameError::Length`] for a frame that is too short or too long, [`FrameError::Character`] when
+/// it is not made of a colon, digits, CR and LF, [`FrameError::CheckSum`] for a wrong LRC.
 pub fn decode<'b>(
     frame: &[u8],
-    body: &'b mut [u8; pdu::MAX_LEN + 2],
+    body: &'b mut [u8; MAX_BODY_LEN],
 ) -> Result<(u8, &'b [u8]), FrameError> {
     let digits = frame.strip_prefix(b":").and_then(|rest| rest.strip_suffix(b"\r\n"));
     let (pairs, rest) = digits.ok_or(FrameError::Character)?.as_chunks::<2>();
@@ -53,6 +65,10 @@ pub fn decode<'b>(
 }
 
 /// The two's complement of the sum of all bytes.
+///
+/// ```
+/// assert_eq!(holdfast_protocol::frame::ascii::lrc(&[17, 3, 0, 107, 0, 3]), 0x7E);
+/// ```
 pub fn lrc(bytes: &[u8]) -> u8 {
     bytes.iter().fold(0u8, |sum, byte| sum.wrapping_sub(*byte))
 }

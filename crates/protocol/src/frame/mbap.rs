@@ -1,5 +1,29 @@
 //! The MBAP header of Modbus TCP and UDP (Messaging on TCP/IP Implementation Guide V1.0b, 3.1.3):
 //! transaction id, protocol id 0, length of all that follows, unit id. Big-endian.
+//!
+//! A stream is read frame by frame. What [`next`] leaves over is the start of a frame, which the
+//! caller keeps until more bytes arrive:
+//!
+//! ```
+//! use holdfast_protocol::frame::mbap::{self, Next};
+//!
+//! let received = [0, 1, 0, 0, 0, 6, 17, 3, 0, 107, 0, 2, 0, 2, 0, 0, 0];
+//! let mut rest = &received[..];
+//! let mut pdus = Vec::new();
+//! loop {
+//!     match mbap::next(rest) {
+//!         Next::Frame { pdu, len, .. } => {
+//!             pdus.push(pdu);
+//!             rest = &rest[len..];
+//!         }
+//!         Next::Foreign { len, .. } => rest = &rest[len..],
+//!         Next::Incomplete => break,
+//!         Next::Broken { .. } => panic!("close the connection"),
+//!     }
+//! }
+//! assert_eq!(pdus, [&[3, 0, 107, 0, 2]]);
+//! assert_eq!(rest, [0, 2, 0, 0, 0]);
+//! ```
 
 use crate::pdu;
 
@@ -9,20 +33,38 @@ pub const HEADER_LEN: usize = 7;
 /// The longest frame, in bytes.
 pub const MAX_LEN: usize = HEADER_LEN + pdu::MAX_LEN;
 
-/// The bytes that the length field does not count.
+/// Bytes that the length field does not count.
 const UNCOUNTED: usize = 6;
 
-/// What stands at the start of received bytes.
-#[derive(Debug, PartialEq, Eq)]
+/// What is at the start of received bytes. A caller must handle each case, so this enum is
+/// exhaustive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Next<'a> {
-    /// Not a whole frame yet.
+    /// The start of a frame: wait for more bytes.
     Incomplete,
-    /// A frame of `len` bytes.
-    Frame { transaction_id: u16, unit_id: u8, pdu: &'a [u8], len: usize },
-    /// A frame of `len` bytes with a protocol id other than 0: to be discarded.
-    Foreign { protocol_id: u16, len: usize },
-    /// A length that no frame has: where the next one starts can't be known.
-    Broken { length: u16 },
+    /// A whole frame.
+    Frame {
+        /// Pairs a response with its request.
+        transaction_id: u16,
+        /// The device behind the address that was connected to.
+        unit_id: u8,
+        /// The PDU, 1 to [`pdu::MAX_LEN`] bytes.
+        pdu: &'a [u8],
+        /// Bytes of the frame.
+        len: usize,
+    },
+    /// A frame of another protocol: discard it.
+    Foreign {
+        /// The protocol id, not 0.
+        protocol_id: u16,
+        /// Bytes of the frame.
+        len: usize,
+    },
+    /// A length that no frame has. The start of the next frame is unknown: close the connection.
+    Broken {
+        /// The length field.
+        length: u16,
+    },
 }
 
 /// Looks at the start of `bytes`, which may end anywhere.
@@ -48,10 +90,39 @@ pub fn next(bytes: &[u8]) -> Next<'_> {
     }
 }
 
-/// The header of a frame whose PDU has `pdu_len` bytes, 1 to [`pdu::MAX_LEN`].
+/// Writes a frame at the start of `frame` and returns its length; `None` for a PDU that is empty or
+/// longer than [`pdu::MAX_LEN`].
+///
+/// ```
+/// use holdfast_protocol::frame::mbap;
+///
+/// let mut frame = [0; mbap::MAX_LEN];
+/// let len = mbap::encode(1, 17, &[3, 0, 107, 0, 2], &mut frame).unwrap();
+/// assert_eq!(frame[..len], [0, 1, 0, 0, 0, 6, 17, 3, 0, 107, 0, 2]);
+/// ```
+pub fn encode(
+    transaction_id: u16,
+    unit_id: u8,
+    pdu: &[u8],
+    frame: &mut [u8; MAX_LEN],
+) -> Option<usize> {
+    if pdu.is_empty() {
+        return None;
+    }
+    let len = HEADER_LEN + pdu.len();
+    frame.get_mut(HEADER_LEN..len)?.copy_from_slice(pdu);
+    frame[..HEADER_LEN].copy_from_slice(&header(transaction_id, unit_id, pdu.len()));
+    Some(len)
+}
+
+/// The header of a frame whose PDU has `pdu_len` bytes: for PDUs that are written in place, behind
+/// the header.
+///
+/// # Panics
+/// Unless `pdu_len` is 1 to [`pdu::MAX_LEN`].
 #[inline]
 pub fn header(transaction_id: u16, unit_id: u8, pdu_len: usize) -> [u8; HEADER_LEN] {
-    debug_assert!((1..=pdu::MAX_LEN).contains(&pdu_len));
+    assert!((1..=pdu::MAX_LEN).contains(&pdu_len), "a PDU has 1 to 253 bytes");
     let [t0, t1] = transaction_id.to_be_bytes();
     let [l0, l1] = (pdu_len as u16 + 1).to_be_bytes();
     [t0, t1, 0, 0, l0, l1, unit_id]

@@ -1,4 +1,11 @@
 //! Frames: a unit id and a PDU, as each transport wraps them.
+//!
+//! | transport | encode | decode |
+//! | --- | --- | --- |
+//! | TCP, UDP | [`mbap::encode`] | [`mbap::next`] |
+//! | serial line, RTU mode | [`rtu::encode`] | [`rtu::decode`] |
+//! | RTU over TCP | [`rtu::encode`] | [`rtu::next_request`], [`rtu::response_len`] |
+//! | serial line, ASCII mode | [`ascii::encode`] | [`ascii::decode`] |
 
 pub mod ascii;
 pub mod mbap;
@@ -6,18 +13,22 @@ pub mod rtu;
 
 use crate::pdu;
 
-/// A frame of a serial line that is not one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+/// Why bytes are not a frame of a serial line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum FrameError {
+    /// The frame is too short or too long.
     #[error("the frame is too short or too long")]
     Length,
+    /// The CRC or LRC does not fit the bytes before it.
     #[error("the check sum is wrong")]
     CheckSum,
+    /// An ASCII frame has no colon, no CR LF, or something other than digits between them.
     #[error("the frame has a character that does not belong there")]
     Character,
 }
 
-/// Unit id and PDU, when there is one of 1 to [`pdu::MAX_LEN`] bytes.
+/// Unit id and PDU, when the PDU has 1 to [`pdu::MAX_LEN`] bytes.
 fn split(body: &[u8]) -> Result<(u8, &[u8]), FrameError> {
     match body.split_first() {
         Some((unit, pdu)) if (1..=pdu::MAX_LEN).contains(&pdu.len()) => Ok((*unit, pdu)),

@@ -1,4 +1,17 @@
 //! RTU frames (Modbus over Serial Line V1.02, 2.5.1): unit id, PDU, CRC-16 low byte first.
+//!
+//! On a serial line a silence ends a frame: the caller measures it and calls [`decode`] with what
+//! arrived before it. In a stream, as RTU over TCP has it, there is no silence: a server calls
+//! [`next_request`], a client [`response_len`].
+//!
+//! ```
+//! use holdfast_protocol::frame::rtu;
+//!
+//! let mut frame = [0; rtu::MAX_LEN];
+//! let len = rtu::encode(17, &[3, 0, 107, 0, 3], &mut frame).unwrap();
+//! assert_eq!(frame[..len], [17, 3, 0, 107, 0, 3, 0x76, 0x87]);
+//! assert_eq!(rtu::decode(&frame[..len]), Ok((17, &[3, 0, 107, 0, 3][..])));
+//! ```
 
 use super::{FrameError, split};
 use crate::pdu;
@@ -23,7 +36,8 @@ pub fn encode(unit_id: u8, pdu: &[u8], frame: &mut [u8; MAX_LEN]) -> Option<usiz
 /// The unit id and PDU of a whole frame.
 ///
 /// # Errors
-/// [`FrameError::Length`] outside 4 to 256 bytes, [`FrameError::CheckSum`].
+/// [`FrameError::Length`] unless the frame has 4 to 256 bytes, [`FrameError::CheckSum`] for a wrong
+/// CRC.
 pub fn decode(frame: &[u8]) -> Result<(u8, &[u8]), FrameError> {
     let (body, sent) = frame.split_last_chunk::<2>().ok_or(FrameError::Length)?;
     let parts = split(body)?;
@@ -31,6 +45,10 @@ pub fn decode(frame: &[u8]) -> Result<(u8, &[u8]), FrameError> {
 }
 
 /// CRC-16/MODBUS: polynomial 0xA001 reflected, start 0xFFFF.
+///
+/// ```
+/// assert_eq!(holdfast_protocol::frame::rtu::crc(b"123456789"), 0x4B37);
+/// ```
 pub fn crc(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0xFFFF, |crc, byte| (crc >> 8) ^ TABLE[usize::from((crc as u8) ^ byte)])
 }
@@ -51,22 +69,42 @@ const TABLE: [u16; 256] = {
     table
 };
 
-/// What stands at the start of a stream of requests, as RTU over TCP carries them.
-#[derive(Debug, PartialEq, Eq)]
+/// What is at the start of a stream of requests, as RTU over TCP carries them. A caller must handle
+/// each case, so this enum is exhaustive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Next<'a> {
-    /// Not a whole frame yet.
+    /// The start of a frame: wait for more bytes.
     Incomplete,
-    /// A frame of `len` bytes.
-    Frame { unit_id: u8, pdu: &'a [u8], len: usize },
-    /// A frame of `len` bytes with a wrong CRC: to be discarded.
-    Damaged { len: usize },
-    /// Longer than any frame: where the next one starts can't be known.
+    /// A whole frame.
+    Frame {
+        /// The device that the request is for.
+        unit_id: u8,
+        /// The PDU, 1 to [`pdu::MAX_LEN`] bytes.
+        pdu: &'a [u8],
+        /// Bytes of the frame.
+        len: usize,
+    },
+    /// A frame with a wrong CRC: discard it.
+    Damaged {
+        /// Bytes of the frame.
+        len: usize,
+    },
+    /// Longer than any frame. The start of the next frame is unknown: close the connection.
     Broken,
 }
 
 /// Looks at the start of `bytes`, which may end anywhere. A stream has no silence between frames:
-/// the length of a request follows from its function code. Of an unknown function it is not known;
-/// there the frame ends where the CRC first fits.
+/// the length of a request follows from its function code. For an unknown function, the frame ends
+/// where the CRC first fits.
+///
+/// ```
+/// use holdfast_protocol::frame::rtu::{self, Next};
+///
+/// let received = [17, 3, 0, 107, 0, 3, 0x76, 0x87, 17, 3];
+/// let pdu = &received[1..6];
+/// assert_eq!(rtu::next_request(&received), Next::Frame { unit_id: 17, pdu, len: 8 });
+/// assert_eq!(rtu::next_request(&received[8..]), Next::Incomplete);
+/// ```
 pub fn next_request(bytes: &[u8]) -> Next<'_> {
     let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
         return Next::Incomplete;
@@ -121,8 +159,8 @@ fn first_fit(bytes: &[u8]) -> Next<'_> {
     let Some(first) = (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) else {
         return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
     };
-    // Where the last byte of the data is the first of the CRC of those before it, the CRC fits one
-    // byte too early, and a 0 is left over: no frame for unit 0 begins with it.
+    // When the last byte of the data is the first byte of the CRC of the bytes before it, the CRC
+    // fits one byte too early. A 0 is left over then, and no frame for unit 0 starts with it.
     let longer = first < longest && bytes[first] == 0 && !is_known_and_whole(&bytes[first..]);
     let len = first + usize::from(longer);
     match decode(&bytes[..len]) {
@@ -131,7 +169,7 @@ fn first_fit(bytes: &[u8]) -> Next<'_> {
     }
 }
 
-/// Whether bytes start with a frame whose function, and so its length, is known.
+/// Whether bytes start with a whole frame of a known function.
 fn is_known_and_whole(bytes: &[u8]) -> bool {
     let [_, function_code, data @ ..] = bytes else {
         return false;
@@ -142,11 +180,19 @@ fn is_known_and_whole(bytes: &[u8]) -> bool {
     }
 }
 
-/// How long the frame at the start of `bytes` is, which answers a request of `request_len` bytes of
-/// PDU: from its function code, as far as that tells. `None` while more bytes are needed.
+/// The length of the frame at the start of `bytes`, as its function code says. The frame answers a
+/// request whose PDU has `request_len` bytes. `None` while more bytes are required.
+///
+/// ```
+/// use holdfast_protocol::frame::rtu;
+///
+/// assert_eq!(rtu::response_len(&[17, 3], 5), Ok(None));
+/// assert_eq!(rtu::response_len(&[17, 3, 6], 5), Ok(Some(11)));
+/// assert_eq!(rtu::response_len(&[17, 0x83], 5), Ok(Some(5)));
+/// ```
 ///
 /// # Errors
-/// [`FrameError::Length`] when no frame can begin so.
+/// [`FrameError::Length`] for a function that is unknown, or a count that no frame has.
 pub fn response_len(bytes: &[u8], request_len: usize) -> Result<Option<usize>, FrameError> {
     let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
         return Ok(None);
