@@ -10,7 +10,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::time::Instant;
 
 use holdfast_protocol::frame::mbap::{self, Next};
-use holdfast_protocol::pdu::{self, Range, Request};
+use holdfast_protocol::pdu::{self, Range, Registers, Request};
 
 use crate::outcome::{Outcome, Period};
 use crate::poller::Poller;
@@ -218,16 +218,18 @@ fn parse(arguments: lexopt::Parser) -> Result<Options, Failure> {
 
 /// One frame: `quantity` items from address 0 of unit 1. What is written is 0, 1, 2, ...
 pub(crate) fn request(kind: &str, quantity: u16) -> Result<Vec<u8>, Failure> {
-    let range = Range { address: 0, quantity };
     let registers: Vec<u8> = (0..quantity).flat_map(u16::to_be_bytes).collect();
     let request = match kind {
-        "read-registers" => Request::ReadHoldingRegisters(range),
-        "read-coils" => Request::ReadCoils(range),
-        "write-registers" => Request::WriteMultipleRegisters { range, registers: &registers },
+        "read-registers" => Request::ReadHoldingRegisters(Range::new(0, quantity)?),
+        "read-coils" => Request::ReadCoils(Range::new(0, quantity)?),
+        "write-registers" => {
+            let registers = Registers::new(&registers)?;
+            Request::WriteMultipleRegisters { address: 0, registers }
+        }
         other => return Err(format!("unknown request {other}").into()),
     };
     let mut buffer = [0; pdu::MAX_LEN];
-    let len = request.encode(&mut buffer).ok_or("the quantity is not one of the function's")?;
+    let len = request.encode(&mut buffer);
     Ok([&mbap::header(TRANSACTION_ID, 1, len)[..], &buffer[..len]].concat())
 }
 

@@ -2,7 +2,7 @@
 
 use holdfast_engine::server::audit::{Record, Written};
 use holdfast_memory::Area;
-use holdfast_protocol::pdu::{ExceptionCode, Range, Request};
+use holdfast_protocol::pdu::{ExceptionCode, Request};
 use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -40,14 +40,14 @@ fn request(line: &Bound<'_, PyDict>, pdu: &[u8]) -> PyResult<()> {
         Ok(Request::WriteSingleRegister { address, value }) => {
             (Area::HoldingRegisters, address, vec![value])
         }
-        Ok(Request::WriteMultipleCoils { range: Range { address, quantity }, bits: packed }) => {
-            (Area::Coils, address, bits(packed, quantity))
+        Ok(Request::WriteMultipleCoils { address, bits }) => {
+            (Area::Coils, address, bits.iter().map(u16::from).collect())
         }
-        Ok(Request::WriteMultipleRegisters { range, registers: packed }) => {
-            (Area::HoldingRegisters, range.address, registers(packed))
+        Ok(Request::WriteMultipleRegisters { address, registers }) => {
+            (Area::HoldingRegisters, address, registers.iter().collect())
         }
-        Ok(Request::ReadWriteMultipleRegisters { write, registers: packed, .. }) => {
-            (Area::HoldingRegisters, write.address, registers(packed))
+        Ok(Request::ReadWriteMultipleRegisters { write_address, registers, .. }) => {
+            (Area::HoldingRegisters, write_address, registers.iter().collect())
         }
         Ok(Request::MaskWriteRegister { address, and_mask, or_mask }) => {
             line.set_item("area", Area::HoldingRegisters.name())?;

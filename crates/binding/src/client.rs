@@ -12,7 +12,8 @@ use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineMode, LineParity, SerialLine};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
-    self, Diagnostics, Range, Request as CoreRequest, Response, ResponseError, SubFunction, limit,
+    self, Bits, Diagnostics, Function, Range, Registers, Request as CoreRequest, RequestError,
+    Response, ResponseError, SubFunction, limit,
 };
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -43,14 +44,18 @@ impl Request {
         #[pyo3(from_py_with = integer)] count: i128,
     ) -> PyResult<Request> {
         let area = crate::memory::named(area)?;
-        let most = if area.is_bits() { limit::READ_BITS } else { limit::READ_REGISTERS };
-        let range = range(address, count, most)?;
-        encoded(&match area {
-            holdfast_memory::Area::Coils => CoreRequest::ReadCoils(range),
-            holdfast_memory::Area::DiscreteInputs => CoreRequest::ReadDiscreteInputs(range),
-            holdfast_memory::Area::HoldingRegisters => CoreRequest::ReadHoldingRegisters(range),
-            holdfast_memory::Area::InputRegisters => CoreRequest::ReadInputRegisters(range),
-        })
+        Ok(encoded(&match area {
+            holdfast_memory::Area::Coils => CoreRequest::ReadCoils(range(address, count)?),
+            holdfast_memory::Area::DiscreteInputs => {
+                CoreRequest::ReadDiscreteInputs(range(address, count)?)
+            }
+            holdfast_memory::Area::HoldingRegisters => {
+                CoreRequest::ReadHoldingRegisters(range(address, count)?)
+            }
+            holdfast_memory::Area::InputRegisters => {
+                CoreRequest::ReadInputRegisters(range(address, count)?)
+            }
+        }))
     }
 
     #[staticmethod]
@@ -60,7 +65,7 @@ impl Request {
     ) -> PyResult<Request> {
         let address = register("address", address)?;
         let value = single(holdfast_memory::Area::Coils, value)? == 1;
-        encoded(&CoreRequest::WriteSingleCoil { address, value })
+        Ok(encoded(&CoreRequest::WriteSingleCoil { address, value }))
     }
 
     #[staticmethod]
@@ -70,7 +75,7 @@ impl Request {
     ) -> PyResult<Request> {
         let address = register("address", address)?;
         let value = single(holdfast_memory::Area::HoldingRegisters, value)?;
-        encoded(&CoreRequest::WriteSingleRegister { address, value })
+        Ok(encoded(&CoreRequest::WriteSingleRegister { address, value }))
     }
 
     #[staticmethod]
@@ -79,12 +84,11 @@ impl Request {
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::Coils, values)?;
-        let range = range(address, values.len() as i128, limit::WRITE_BITS)?;
-        let mut bits = vec![0; values.len().div_ceil(8)];
-        for (index, bit) in values.iter().enumerate() {
-            bits[index / 8] |= (*bit as u8) << (index % 8);
-        }
-        encoded(&CoreRequest::WriteMultipleCoils { range, bits: &bits })
+        let range = range::<{ limit::WRITE_BITS }>(address, values.len() as i128)?;
+        let values: Vec<bool> = values.iter().map(|bit| *bit == 1).collect();
+        let mut room = [0; pdu::MAX_LEN];
+        let bits = Bits::pack(&values, &mut room).map_err(refused)?;
+        Ok(encoded(&CoreRequest::WriteMultipleCoils { address: range.address(), bits }))
     }
 
     #[staticmethod]
@@ -93,9 +97,10 @@ impl Request {
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
-        let range = range(address, values.len() as i128, limit::WRITE_REGISTERS)?;
-        let registers = &packed(&values);
-        encoded(&CoreRequest::WriteMultipleRegisters { range, registers })
+        let range = range::<{ limit::WRITE_REGISTERS }>(address, values.len() as i128)?;
+        let mut room = [0; pdu::MAX_LEN];
+        let registers = Registers::pack(&values, &mut room).map_err(refused)?;
+        Ok(encoded(&CoreRequest::WriteMultipleRegisters { address: range.address(), registers }))
     }
 
     #[staticmethod]
@@ -104,11 +109,11 @@ impl Request {
         #[pyo3(from_py_with = integer)] and_mask: i128,
         #[pyo3(from_py_with = integer)] or_mask: i128,
     ) -> PyResult<Request> {
-        encoded(&CoreRequest::MaskWriteRegister {
+        Ok(encoded(&CoreRequest::MaskWriteRegister {
             address: register("address", address)?,
             and_mask: register("and_mask", and_mask)?,
             or_mask: register("or_mask", or_mask)?,
-        })
+        }))
     }
 
     #[staticmethod]
@@ -119,10 +124,13 @@ impl Request {
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
         let values = numbers(holdfast_memory::Area::HoldingRegisters, values)?;
-        let read = range(read_address, count, limit::READ_REGISTERS)?;
-        let write = range(write_address, values.len() as i128, limit::READ_WRITE_REGISTERS)?;
-        let registers = &packed(&values);
-        encoded(&CoreRequest::ReadWriteMultipleRegisters { read, write, registers })
+        let read = range(read_address, count)?;
+        let written = values.len() as i128;
+        let write_address =
+            range::<{ limit::READ_WRITE_REGISTERS }>(write_address, written)?.address();
+        let mut room = [0; pdu::MAX_LEN];
+        let registers = Registers::pack(&values, &mut room).map_err(refused)?;
+        Ok(encoded(&CoreRequest::ReadWriteMultipleRegisters { read, write_address, registers }))
     }
 
     #[staticmethod]
@@ -134,16 +142,20 @@ impl Request {
         let sub_function = SubFunction::from_code(code).ok_or_else(|| {
             PyValueError::new_err(format!("sub_function {code} is not one of the standard"))
         })?;
-        encoded(&CoreRequest::Diagnostics(Diagnostics { sub_function, data }))
+        let asked = Diagnostics::new(sub_function, data).map_err(|_| {
+            let function = Function::Diagnostics.name();
+            PyValueError::new_err(format!("{function} does not allow these arguments"))
+        })?;
+        Ok(encoded(&CoreRequest::Diagnostics(asked)))
     }
 
     #[staticmethod]
-    fn event_counter() -> PyResult<Request> {
+    fn event_counter() -> Request {
         encoded(&CoreRequest::GetCommEventCounter)
     }
 
     #[staticmethod]
-    fn report_server_id() -> PyResult<Request> {
+    fn report_server_id() -> Request {
         encoded(&CoreRequest::ReportServerId)
     }
 
@@ -155,7 +167,7 @@ impl Request {
         let code = ReadCode::from_code(byte("code", code)?)
             .ok_or_else(|| PyValueError::new_err(format!("code is {code}, allowed are 1 to 4")))?;
         let object_id = byte("object id", object_id)?;
-        encoded(&CoreRequest::ReadDeviceIdentification { code, object_id })
+        Ok(encoded(&CoreRequest::ReadDeviceIdentification { code, object_id }))
     }
 
     #[getter]
@@ -420,8 +432,8 @@ enum Reply {
 impl From<Response<'_>> for Reply {
     fn from(response: Response<'_>) -> Reply {
         match response {
-            Response::Bits(bits) => Reply::Bits(bits.to_vec()),
-            Response::Registers(registers) => Reply::Registers(registers.to_vec()),
+            Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec()),
+            Response::Registers(registers) => Reply::Registers(registers.as_bytes().to_vec()),
             Response::Written => Reply::Written,
             Response::Diagnostics(data) | Response::ServerId(data) => Reply::Bytes(data.to_vec()),
             Response::EventCounter { busy, events } => Reply::EventCounter(busy, events),
@@ -443,7 +455,7 @@ impl Reply {
             Reply::Bits(bits) => {
                 let quantity = match request {
                     CoreRequest::ReadCoils(range) | CoreRequest::ReadDiscreteInputs(range) => {
-                        usize::from(range.quantity)
+                        usize::from(range.quantity())
                     }
                     _ => bits.len() * 8,
                 };
@@ -477,25 +489,24 @@ fn raised(error: ClientError) -> PyErr {
     }
 }
 
-fn encoded(request: &CoreRequest<'_>) -> PyResult<Request> {
+fn encoded(request: &CoreRequest<'_>) -> Request {
     let mut buffer = [0; pdu::MAX_LEN];
-    match request.encode(&mut buffer) {
-        Some(len) => Ok(Request { pdu: buffer[..len].to_vec() }),
-        None => Err(PyValueError::new_err(format!(
-            "{} does not allow these arguments",
-            request.function().name()
-        ))),
-    }
+    let len = request.encode(&mut buffer);
+    Request { pdu: buffer[..len].to_vec() }
 }
 
-fn range(address: i128, count: i128, most: u16) -> PyResult<Range> {
+fn range<const MAX: u16>(address: i128, count: i128) -> PyResult<Range<MAX>> {
     let address = register("address", address)?;
-    let quantity = within("count", count, 1..=usize::from(most))? as u16;
+    let quantity = within("count", count, 1..=usize::from(MAX))? as u16;
     if i128::from(address) + count > ADDRESSES {
         let message = format!("{count} from address {address}: the last address is 65535");
         return Err(PyValueError::new_err(message));
     }
-    Ok(Range { address, quantity })
+    Range::new(address, quantity).map_err(refused)
+}
+
+fn refused(error: RequestError) -> PyErr {
+    PyValueError::new_err(error.to_string())
 }
 
 fn register(what: &str, number: i128) -> PyResult<u16> {
@@ -506,8 +517,4 @@ fn register(what: &str, number: i128) -> PyResult<u16> {
 fn single(area: holdfast_memory::Area, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     let values = PyList::new(value.py(), [value])?;
     Ok(numbers(area, values.as_any())?[0])
-}
-
-fn packed(values: &[u16]) -> Vec<u8> {
-    values.iter().flat_map(|value| value.to_be_bytes()).collect()
 }

@@ -18,7 +18,9 @@
 //! * Bytes from outside cannot cause a panic: every length is checked, every conversion is total.
 //! * The crate does not check what depends on a memory (addresses) or on a policy (units, rights).
 
+#![no_std]
 #![forbid(unsafe_code)]
+#![warn(missing_docs)]
 
 #[cfg(feature = "alloc")]
 extern crate alloc;

@@ -1,122 +1,43 @@
 //! What holds for all bytes and all requests.
 
+mod support;
+
 use holdfast_protocol::frame::{ascii, mbap, rtu};
-use holdfast_protocol::pdu::identification::{Objects, ReadCode};
 use holdfast_protocol::pdu::{
-    self, Diagnostics, ExceptionCode, Function, Range, Request, Response, ResponseError,
-    SubFunction, limit, reply,
+    self, BitRange, Bits, Diagnostics, ExceptionCode, Function, Range, RegisterRange, Registers,
+    Request, RequestError, SubFunction, limit,
 };
 use proptest::prelude::*;
-
-fn a_range(most: u16) -> impl Strategy<Value = Range> {
-    (any::<u16>(), 1..=most).prop_map(|(address, quantity)| Range { address, quantity })
-}
-
-/// A request as parts that own their data.
-#[derive(Debug, Clone)]
-enum Parts {
-    Whole(Request<'static>),
-    Bits(Range, Vec<u8>),
-    Registers(Range, Vec<u8>),
-    ReadWrite(Range, Range, Vec<u8>),
-    Query(Vec<u8>),
-}
-
-impl Parts {
-    fn request(&self) -> Request<'_> {
-        match self {
-            Parts::Whole(request) => *request,
-            Parts::Bits(range, bits) => Request::WriteMultipleCoils { range: *range, bits },
-            Parts::Registers(range, registers) => {
-                Request::WriteMultipleRegisters { range: *range, registers }
-            }
-            Parts::ReadWrite(read, write, registers) => {
-                Request::ReadWriteMultipleRegisters { read: *read, write: *write, registers }
-            }
-            Parts::Query(data) => Request::Diagnostics(Diagnostics {
-                sub_function: SubFunction::ReturnQueryData,
-                data,
-            }),
-        }
-    }
-}
-
-fn data(len: usize) -> impl Strategy<Value = Vec<u8>> {
-    prop::collection::vec(any::<u8>(), len)
-}
-
-fn a_request() -> impl Strategy<Value = Parts> {
-    let code = prop::sample::select(vec![
-        ReadCode::Basic,
-        ReadCode::Regular,
-        ReadCode::Extended,
-        ReadCode::Individual,
-    ]);
-    let whole = prop_oneof![
-        a_range(limit::READ_BITS).prop_map(Request::ReadCoils),
-        a_range(limit::READ_BITS).prop_map(Request::ReadDiscreteInputs),
-        a_range(limit::READ_REGISTERS).prop_map(Request::ReadHoldingRegisters),
-        a_range(limit::READ_REGISTERS).prop_map(Request::ReadInputRegisters),
-        any::<(u16, bool)>()
-            .prop_map(|(address, value)| Request::WriteSingleCoil { address, value }),
-        any::<(u16, u16)>()
-            .prop_map(|(address, value)| Request::WriteSingleRegister { address, value }),
-        any::<(u16, u16, u16)>().prop_map(|(address, and_mask, or_mask)| {
-            Request::MaskWriteRegister { address, and_mask, or_mask }
-        }),
-        (code, any::<u8>())
-            .prop_map(|(code, object_id)| Request::ReadDeviceIdentification { code, object_id }),
-        Just(Request::GetCommEventCounter),
-        Just(Request::ReportServerId),
-    ];
-    prop_oneof![
-        whole.prop_map(Parts::Whole),
-        a_range(limit::WRITE_BITS).prop_flat_map(|range| {
-            data(usize::from(range.quantity).div_ceil(8))
-                .prop_map(move |bits| Parts::Bits(range, bits))
-        }),
-        a_range(limit::WRITE_REGISTERS).prop_flat_map(|range| {
-            data(usize::from(range.quantity) * 2)
-                .prop_map(move |registers| Parts::Registers(range, registers))
-        }),
-        (a_range(limit::READ_REGISTERS), a_range(limit::READ_WRITE_REGISTERS))
-            .prop_flat_map(|(read, write)| data(usize::from(write.quantity) * 2)
-                .prop_map(move |registers| Parts::ReadWrite(read, write, registers))),
-        (1..=124usize).prop_flat_map(|words| data(words * 2).prop_map(Parts::Query)),
-    ]
-}
-
-/// Mostly known functions, so that the checks behind the first byte are reached.
-fn bytes_like_a_pdu() -> impl Strategy<Value = Vec<u8>> {
-    let code = prop_oneof![
-        9 => prop::sample::select(vec![1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43]),
-        1 => any::<u8>()
-    ];
-    (code, prop::collection::vec(prop_oneof![Just(0), any::<u8>()], 0..253))
-        .prop_map(|(code, body)| std::iter::once(code).chain(body).collect())
-}
+use support::{a_request, bytes_like_a_pdu};
 
 proptest! {
     #[test]
     fn what_is_encoded_parses_to_the_same_request(parts in a_request()) {
         let request = parts.request();
         let mut buffer = [0; pdu::MAX_LEN];
-        let len = request.encode(&mut buffer).unwrap();
+        let len = request.encode(&mut buffer);
         prop_assert_eq!(Request::parse(&buffer[..len]), Ok(request));
+        prop_assert!(buffer[len..].iter().all(|byte| *byte == 0), "nothing behind the PDU");
     }
 
     #[test]
     fn a_pdu_cut_or_stretched_is_never_carried_out(parts in a_request(), more in 1..5usize) {
         let mut buffer = [0; pdu::MAX_LEN];
-        let len = parts.request().encode(&mut buffer).unwrap();
+        let request = parts.request();
+        let len = request.encode(&mut buffer);
         let refused = Err(ExceptionCode::IllegalDataValue);
-        let any_even = matches!(parts, Parts::Query(_));
+        // Return Query Data may have any number of words.
+        let any_even = matches!(
+            request,
+            Request::Diagnostics(asked) if asked.sub_function() == SubFunction::ReturnQueryData
+        );
         for cut in 1..len {
             let parsed = Request::parse(&buffer[..cut]);
             prop_assert!(parsed == refused || (any_even && cut > 3 && cut % 2 == 1));
         }
-        if len + more <= buffer.len() && !any_even {
-            prop_assert_eq!(Request::parse(&buffer[..len + more]), refused);
+        if !any_even {
+            let stretched = [&buffer[..len], &vec![0; more]].concat();
+            prop_assert_eq!(Request::parse(&stretched), refused);
         }
     }
 
@@ -127,7 +48,7 @@ proptest! {
         let mut buffer = [0; pdu::MAX_LEN];
         match Request::parse(&bytes) {
             Ok(request) => {
-                let len = request.encode(&mut buffer).unwrap();
+                let len = request.encode(&mut buffer);
                 prop_assert_eq!(&buffer[..len], &bytes[..]);
             }
             Err(code) => {
@@ -140,28 +61,17 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_as_a_response_are_taken_only_when_they_fit_the_request(
-        parts in a_request(),
-        bytes in prop::collection::vec(any::<u8>(), 0..260),
+    fn bytes_of_any_length_parse_without_a_panic(
+        code in prop_oneof![prop::sample::select(Function::ALL).prop_map(Function::code), any::<u8>()],
+        body in prop::collection::vec(any::<u8>(), 0..600),
     ) {
-        let request = parts.request();
-        if request.response(&bytes).is_ok() {
-            prop_assert_eq!(bytes[0], request.function().code());
+        let pdu = [&[code], &body[..]].concat();
+        if let Ok(request) = Request::parse(&pdu) {
+            prop_assert!(pdu.len() <= pdu::MAX_LEN);
+            prop_assert_eq!(request.function().code(), code);
         }
-    }
-
-    #[test]
-    fn the_reply_to_a_read_is_read_back(range in a_range(limit::READ_REGISTERS), seed: u8) {
-        let request = Request::ReadHoldingRegisters(range);
-        let mut buffer = [0; pdu::MAX_LEN];
-        let bytes = range.quantity as u8 * 2;
-        let (payload, len) = reply::counted(request.function(), bytes, &mut buffer);
-        payload.fill(seed);
-        let expected = vec![seed; usize::from(bytes)];
-        prop_assert_eq!(request.response(&buffer[..len]), Ok(Response::Registers(&expected)));
-        let other = Range { quantity: range.quantity % 125 + 1, ..range };
-        let answer = Request::ReadHoldingRegisters(other).response(&buffer[..len]);
-        prop_assert_eq!(answer, Err(ResponseError::Length));
+        let _ = SubFunction::from_pdu(&body);
+        let _ = Request::parse(&body);
     }
 
     #[test]
@@ -170,9 +80,10 @@ proptest! {
     ) {
         match mbap::next(&bytes) {
             mbap::Next::Incomplete => prop_assert!(bytes.len() < mbap::MAX_LEN),
-            mbap::Next::Frame { pdu, len, .. } => {
-                prop_assert_eq!(pdu.len() + mbap::HEADER_LEN, len);
-                prop_assert!(len <= bytes.len());
+            mbap::Next::Frame { transaction_id, unit_id, pdu, len } => {
+                let mut frame = [0; mbap::MAX_LEN];
+                prop_assert_eq!(mbap::encode(transaction_id, unit_id, pdu, &mut frame), Some(len));
+                prop_assert_eq!(&frame[..len], &bytes[..len]);
             }
             mbap::Next::Foreign { protocol_id, len } => {
                 prop_assert_ne!(protocol_id, 0);
@@ -181,16 +92,25 @@ proptest! {
             mbap::Next::Broken { length } => prop_assert!(!(2..=254).contains(&length)),
         }
         let _ = rtu::decode(&bytes);
-        let _ = ascii::decode(&bytes, &mut [0; 255]);
+        let _ = ascii::decode(&bytes, &mut [0; ascii::MAX_BODY_LEN]);
+        if let Ok(Some(len)) = rtu::response_len(&bytes, bytes.len()) {
+            prop_assert!((4..=rtu::MAX_LEN).contains(&len));
+        }
     }
 
     #[test]
-    fn serial_frames_carry_any_pdu_and_lose_no_flipped_bit(
+    fn frames_carry_any_pdu_and_serial_ones_lose_no_flipped_bit(
+        transaction_id: u16,
         unit: u8,
         pdu in prop::collection::vec(any::<u8>(), 1..=pdu::MAX_LEN),
         flip: prop::sample::Index,
         bit in 0..8,
     ) {
+        let mut frame = [0; mbap::MAX_LEN];
+        let len = mbap::encode(transaction_id, unit, &pdu, &mut frame).unwrap();
+        let expected = mbap::Next::Frame { transaction_id, unit_id: unit, pdu: &pdu, len };
+        prop_assert_eq!(mbap::next(&frame), expected);
+
         let mut frame = [0; rtu::MAX_LEN];
         let len = rtu::encode(unit, &pdu, &mut frame).unwrap();
         prop_assert_eq!(rtu::decode(&frame[..len]), Ok((unit, &pdu[..])));
@@ -199,64 +119,108 @@ proptest! {
 
         let mut frame = [0; ascii::MAX_LEN];
         let len = ascii::encode(unit, &pdu, &mut frame).unwrap();
-        let mut body = [0; 255];
+        let mut body = [0; ascii::MAX_BODY_LEN];
         prop_assert_eq!(ascii::decode(&frame[..len], &mut body), Ok((unit, &pdu[..])));
         let digit = 1 + flip.index(len - 3);
         frame[digit] = if frame[digit] == b'0' { b'1' } else { b'0' };
-        prop_assert!(ascii::decode(&frame[..len], &mut [0; 255]).is_err());
+        prop_assert!(ascii::decode(&frame[..len], &mut [0; ascii::MAX_BODY_LEN]).is_err());
     }
 
     #[test]
-    fn a_stream_of_identification_objects_is_read_whole(
-        values in prop::collection::btree_map(
-            prop_oneof![0..7u8, 0x80..=0xFFu8],
-            prop::collection::vec(any::<u8>(), 0..=244),
-            1..20,
-        ),
+    fn packed_values_are_read_back(
+        bits in prop::collection::vec(any::<bool>(), 1..=usize::from(limit::WRITE_BITS)),
+        registers in prop::collection::vec(any::<u16>(), 1..=usize::from(limit::WRITE_REGISTERS)),
     ) {
-        let mut values = values;
-        for id in 0..3 {
-            values.entry(id).or_default();
-        }
-        let objects = values.iter().map(|(id, value)| (*id, value.clone().into_boxed_slice()));
-        let objects = Objects::new(objects).unwrap();
-        let (mut read, mut next) = (Vec::new(), Some(0));
-        while let Some(object_id) = next {
-            let code = ReadCode::Extended;
-            let mut buffer = [0; pdu::MAX_LEN];
-            let len = objects.reply(code, object_id, &mut buffer).unwrap();
-            let request = Request::ReadDeviceIdentification { code, object_id };
-            let Ok(Response::Identification(answer)) = request.response(&buffer[..len]) else {
-                panic!("not an identification");
-            };
-            read.extend(answer.iter().map(|(id, value)| (id, value.to_vec())));
-            next = answer.next;
-        }
-        prop_assert_eq!(read, values.into_iter().collect::<Vec<_>>());
+        let mut room = [0xFF; pdu::MAX_LEN];
+        let packed = Bits::<{ limit::WRITE_BITS }>::pack(&bits, &mut room).unwrap();
+        prop_assert_eq!(packed.iter().collect::<Vec<_>>(), &bits[..]);
+        let each = (0..=packed.quantity()).map_while(|index| packed.get(index));
+        prop_assert_eq!(each.collect::<Vec<_>>(), &bits[..]);
+        prop_assert_eq!(packed.get(u16::MAX), None);
+        let last = *packed.as_bytes().last().unwrap();
+        prop_assert!(u32::from(last) < 1 << ((bits.len() - 1) % 8 + 1), "unused bits are 0");
+
+        let packed = Registers::<{ limit::WRITE_REGISTERS }>::pack(&registers, &mut room).unwrap();
+        prop_assert_eq!(packed.iter().collect::<Vec<_>>(), &registers[..]);
+        let each = (0..=packed.quantity()).map_while(|index| packed.get(index));
+        prop_assert_eq!(each.collect::<Vec<_>>(), &registers[..]);
+        prop_assert_eq!(packed.get(u16::MAX), None);
+    }
+}
+
+/// Each quantity, and whether it makes a range, bits and registers.
+fn is_limited_to<const MAX: u16>() {
+    let bytes = [0; 2 * 65_536];
+    for quantity in 0..=u16::MAX {
+        let allowed = (1..=MAX).contains(&quantity);
+        let refused = RequestError::Quantity { found: quantity.into(), max: MAX };
+        let expected = (!allowed).then_some(refused);
+        assert_eq!(Range::<MAX>::new(65_535, quantity).err(), expected);
+        let packed = &bytes[..usize::from(quantity).div_ceil(8)];
+        assert_eq!(Bits::<MAX>::new(quantity, packed).err(), expected);
+        let words = &bytes[..usize::from(quantity) * 2];
+        assert_eq!(Registers::<MAX>::new(words).err(), expected);
     }
 }
 
 #[test]
-fn a_request_that_a_server_would_refuse_is_not_encoded() {
-    let range = |quantity| Range { address: 0, quantity };
-    let mut buffer = [0; pdu::MAX_LEN];
-    for request in [
-        Request::ReadCoils(range(0)),
-        Request::ReadCoils(range(2001)),
-        Request::ReadHoldingRegisters(range(126)),
-        Request::WriteMultipleRegisters { range: range(2), registers: &[0; 3] },
-        Request::WriteMultipleRegisters { range: range(124), registers: &[0; 248] },
-        Request::WriteMultipleCoils { range: range(9), bits: &[0; 300] },
-    ] {
-        assert_eq!(request.encode(&mut buffer), None);
+fn a_quantity_of_0_or_beyond_the_limit_is_refused() {
+    is_limited_to::<{ limit::READ_BITS }>();
+    is_limited_to::<{ limit::READ_REGISTERS }>();
+    is_limited_to::<{ limit::WRITE_BITS }>();
+    is_limited_to::<{ limit::WRITE_REGISTERS }>();
+    is_limited_to::<{ limit::READ_WRITE_REGISTERS }>();
+}
+
+#[test]
+fn data_that_does_not_agree_with_its_quantity_is_refused() {
+    let length = |found, expected| RequestError::Length { found, expected };
+    assert_eq!(Bits::<2000>::new(9, &[0]), Err(length(1, 2)));
+    assert_eq!(Bits::<2000>::new(8, &[0, 0]), Err(length(2, 1)));
+    assert_eq!(Registers::<125>::new(&[0; 3]), Err(length(3, 4)));
+    let mut room = [0; pdu::MAX_LEN];
+    let quantity = |found, max| RequestError::Quantity { found, max };
+    assert_eq!(Bits::<1968>::pack(&[], &mut room), Err(quantity(0, 1968)));
+    assert_eq!(Bits::<1968>::pack(&[true; 1969], &mut room), Err(quantity(1969, 1968)));
+    assert_eq!(Registers::<123>::pack(&[0; 70_000], &mut room), Err(quantity(70_000, 123)));
+}
+
+#[test]
+fn a_data_field_that_diagnostics_does_not_allow_is_refused() {
+    for sub_function in SubFunction::ALL.iter().copied() {
+        let refused = Err(RequestError::Data(sub_function));
+        for data in [&[][..], &[0], &[0; 3], &[0; 252]] {
+            assert_eq!(Diagnostics::new(sub_function, data), refused);
+        }
+        if sub_function != SubFunction::ReturnQueryData {
+            assert_eq!(Diagnostics::new(sub_function, &[0x80, 0]), refused);
+            assert_eq!(Diagnostics::new(sub_function, &[0; 4]), refused);
+        }
     }
 }
 
 #[test]
-fn identification_without_a_mandatory_object_is_refused() {
-    let objects = |ids: &[u8]| ids.iter().map(|id| (*id, Box::from(&b"x"[..]))).collect::<Vec<_>>();
-    assert!(Objects::new(objects(&[0, 1])).is_err());
-    assert!(Objects::new(objects(&[0, 1, 2, 2])).is_err());
-    assert!(Objects::new(objects(&[0, 1, 2, 7])).is_err());
-    assert!(Objects::new(objects(&[2, 1, 0])).is_ok());
+fn a_range_that_ends_beyond_the_last_address_parses_for_the_memory_to_refuse() {
+    let request = Request::parse(&[3, 0xFF, 0xFF, 0, 125]).unwrap();
+    let Request::ReadHoldingRegisters(range) = request else { panic!("{request:?}") };
+    assert_eq!(range, RegisterRange::new(65_535, 125).unwrap());
+    assert_eq!(range.end(), 65_660);
+    assert_eq!([0u16; 65_536].get(range.indices()), None);
+    assert_eq!(BitRange::new(65_535, 1).unwrap().end(), 65_536);
+}
+
+#[test]
+fn every_code_of_an_enum_is_one_of_all_of_them() {
+    let functions = (0..=u8::MAX).filter_map(Function::from_code).collect::<Vec<_>>();
+    assert_eq!(functions, Function::ALL);
+    let sub_functions = (0..=u16::MAX).filter_map(SubFunction::from_code).collect::<Vec<_>>();
+    assert_eq!(sub_functions, SubFunction::ALL);
+    let codes = (0..=u8::MAX).filter_map(ExceptionCode::from_code).collect::<Vec<_>>();
+    assert_eq!(codes, ExceptionCode::ALL);
+}
+
+#[test]
+#[should_panic(expected = "a PDU has 1 to 253 bytes")]
+fn a_header_of_a_pdu_that_is_too_long_is_not_made() {
+    let _ = mbap::header(1, 1, pdu::MAX_LEN + 1);
 }

@@ -133,7 +133,7 @@ impl BlockingClient {
     /// write is held to be done when it was sent.
     ///
     /// # Errors
-    /// [`ClientError`]; a request that can't be encoded is [`ClientError::Invalid`].
+    /// [`ClientError`].
     pub fn call<T>(
         &self,
         unit_id: u8,
@@ -142,9 +142,7 @@ impl BlockingClient {
         take: impl FnOnce(Response<'_>) -> T,
     ) -> Result<T, ClientError> {
         let mut buffer = [0; pdu::MAX_LEN];
-        let len = request
-            .encode(&mut buffer)
-            .ok_or_else(|| ClientError::Invalid("the request can't be encoded".into()))?;
+        let len = request.encode(&mut buffer);
         let _turn = self.turns.take();
         let deadline = Instant::now() + timeout;
         let call = Call { unit_id, request, pdu: &buffer[..len], timeout, deadline };

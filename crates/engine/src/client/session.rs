@@ -173,11 +173,9 @@ mod tests {
 
     use super::*;
 
-    const READ: Request<'_> = Request::ReadHoldingRegisters(Range { address: 3, quantity: 1 });
-
     fn sent(session: &mut Session, count: usize) -> Vec<u16> {
         let mut pdu = [0; holdfast_protocol::pdu::MAX_LEN];
-        let len = READ.encode(&mut pdu).unwrap();
+        let len = Request::ReadHoldingRegisters(Range::new(3, 1).unwrap()).encode(&mut pdu);
         (0..count).map(|_| session.send(7, &pdu[..len], &mut Vec::new()).unwrap()).collect()
     }
 
@@ -191,7 +189,7 @@ mod tests {
         let mut got = Vec::new();
         let end = session.receive(bytes, |id, response| {
             let registers = response.map(|response| match response {
-                Response::Registers(registers) => registers.to_vec(),
+                Response::Registers(registers) => registers.as_bytes().to_vec(),
                 other => panic!("{other:?}"),
             });
             got.push((id, registers));

@@ -584,15 +584,17 @@ impl Device {
     }
 
     pub(super) async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
-        let range = Range { address: block.address, quantity: block.count };
+        let (address, quantity) = (block.address, block.count);
         let request = match block.area {
-            Area::Coils => Request::ReadCoils(range),
-            Area::DiscreteInputs => Request::ReadDiscreteInputs(range),
-            Area::HoldingRegisters => Request::ReadHoldingRegisters(range),
-            Area::InputRegisters => Request::ReadInputRegisters(range),
+            Area::Coils => Range::new(address, quantity).map(Request::ReadCoils),
+            Area::DiscreteInputs => Range::new(address, quantity).map(Request::ReadDiscreteInputs),
+            Area::HoldingRegisters => {
+                Range::new(address, quantity).map(Request::ReadHoldingRegisters)
+            }
+            Area::InputRegisters => Range::new(address, quantity).map(Request::ReadInputRegisters),
         };
         let mut buffer = [0; pdu::MAX_LEN];
-        let len = request.encode(&mut buffer).ok_or(Fault::Invalid)?;
+        let len = request.or(Err(Fault::Invalid))?.encode(&mut buffer);
         let _turn = self.turn.lock().await;
         let counters = &self.state.counters;
         counters.requests.add();

@@ -355,7 +355,8 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
 /// The bytes that a response carries; the echo of a write was checked, and says no more.
 fn bytes(response: Result<Response<'_>, ResponseError>) -> Answer {
     match response {
-        Ok(Response::Bits(bytes) | Response::Registers(bytes)) => Ok(bytes.to_vec()),
+        Ok(Response::Bits(bits)) => Ok(bits.as_bytes().to_vec()),
+        Ok(Response::Registers(registers)) => Ok(registers.as_bytes().to_vec()),
         Ok(_) => Ok(Vec::new()),
         Err(ResponseError::Exception(code)) => Err(Fault::Exception(code.code())),
         Err(ResponseError::UnknownException(code)) => Err(Fault::Exception(code)),

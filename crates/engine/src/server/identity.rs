@@ -3,12 +3,13 @@
 use std::collections::HashMap;
 
 use holdfast_protocol::pdu::identification::{ObjectError, Objects};
+use holdfast_protocol::pdu::reply::MAX_SERVER_ID_LEN;
 
 /// The object that a unit's own name takes the place of.
 const USER_APPLICATION_NAME: u8 = 0x06;
 
-/// Server id, run indicator and text fit a reply of 251 bytes.
-const MAX_TEXT: usize = 249;
+/// Server id and run indicator take one byte each.
+const MAX_TEXT: usize = MAX_SERVER_ID_LEN - 2;
 
 /// The identification of every unit.
 #[derive(Debug)]

@@ -16,9 +16,6 @@ use super::counters::{Bus, Counters};
 use super::identity::Identity;
 use super::policy::PeerRights;
 
-/// Run indicator "on" of Report Server ID (V1.1b3, 6.13).
-const RUNNING: u8 = 0xFF;
-
 /// The units of one listener.
 #[derive(Debug)]
 pub struct UnitServer {
@@ -128,66 +125,66 @@ impl UnitServer {
         let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
         match request? {
             Request::ReadCoils(range) => {
-                read(memory, Area::Coils, Function::ReadCoils, range, reply)
+                read(memory, Area::Coils, range, reply::read_coils(range, reply))
             }
             Request::ReadDiscreteInputs(range) => {
-                read(memory, Area::DiscreteInputs, Function::ReadDiscreteInputs, range, reply)
+                let room = reply::read_discrete_inputs(range, reply);
+                read(memory, Area::DiscreteInputs, range, room)
             }
             Request::ReadHoldingRegisters(range) => {
-                read(memory, Area::HoldingRegisters, Function::ReadHoldingRegisters, range, reply)
+                let room = reply::read_holding_registers(range, reply);
+                read(memory, Area::HoldingRegisters, range, room)
             }
             Request::ReadInputRegisters(range) => {
-                read(memory, Area::InputRegisters, Function::ReadInputRegisters, range, reply)
+                let room = reply::read_input_registers(range, reply);
+                read(memory, Area::InputRegisters, range, room)
             }
             Request::WriteSingleCoil { address, value } => {
-                let bytes = [u8::from(value)];
-                write(memory, Area::Coils, Range { address, quantity: 1 }, &bytes)?;
-                Ok(reply::echo(pdu, reply))
+                write(memory, writing(Area::Coils, address, 1, &[u8::from(value)]))?;
+                Ok(reply::write_single_coil(address, value, reply))
             }
             Request::WriteSingleRegister { address, value } => {
                 let bytes = value.to_be_bytes();
-                write(memory, Area::HoldingRegisters, Range { address, quantity: 1 }, &bytes)?;
-                Ok(reply::echo(pdu, reply))
+                write(memory, writing(Area::HoldingRegisters, address, 1, &bytes))?;
+                Ok(reply::write_single_register(address, value, reply))
             }
-            Request::WriteMultipleCoils { range, bits } => {
-                write(memory, Area::Coils, range, bits)?;
-                Ok(reply::echo(&pdu[..5], reply))
+            Request::WriteMultipleCoils { address, bits } => {
+                write(memory, writing(Area::Coils, address, bits.quantity(), bits.as_bytes()))?;
+                Ok(reply::write_multiple_coils(address, bits, reply))
             }
-            Request::WriteMultipleRegisters { range, registers } => {
-                write(memory, Area::HoldingRegisters, range, registers)?;
-                Ok(reply::echo(&pdu[..5], reply))
+            Request::WriteMultipleRegisters { address, registers } => {
+                let (count, bytes) = (registers.quantity(), registers.as_bytes());
+                write(memory, writing(Area::HoldingRegisters, address, count, bytes))?;
+                Ok(reply::write_multiple_registers(address, registers, reply))
             }
             Request::MaskWriteRegister { address, and_mask, or_mask } => {
                 let area = Area::HoldingRegisters;
                 let done = memory.mask_write(Access::Client, area, address, and_mask, or_mask);
-                done.map_err(exception).map(|()| reply::echo(pdu, reply))
+                let answered = |()| reply::mask_write_register(address, and_mask, or_mask, reply);
+                done.map_err(exception).map(answered)
             }
-            Request::ReadWriteMultipleRegisters { read, write, registers } => {
+            Request::ReadWriteMultipleRegisters { read, write_address, registers } => {
                 let area = Area::HoldingRegisters;
-                let function = Function::ReadWriteMultipleRegisters;
-                let (out, len) = reply::counted(function, byte_len(area, read), reply);
+                let (count, bytes) = (registers.quantity(), registers.as_bytes());
+                let (out, len) = reply::read_write_multiple_registers(read, reply);
                 let done = memory.write_then_read(
                     Access::Client,
-                    writing(area, write, registers),
+                    writing(area, write_address, count, bytes),
                     reading(area, read, out),
                 );
                 done.map_err(exception).map(|()| len)
             }
             _ if memory.sealed() => Err(ExceptionCode::ServerDeviceBusy),
             Request::Diagnostics(asked) => {
-                return Ok(self.diagnose(unit_id, asked, pdu, reply));
+                return Ok(self.diagnose(unit_id, asked, reply));
             }
             Request::GetCommEventCounter => {
-                Ok(reply::event_counter(self.counters.bus().events as u16, reply))
+                Ok(reply::event_counter(false, self.counters.bus().events as u16, reply))
             }
             Request::ReportServerId => {
                 let text = &self.identity.card(unit_id).text;
-                let (out, len) =
-                    reply::counted(Function::ReportServerId, text.len() as u8 + 2, reply);
-                out[0] = unit_id;
-                out[1] = RUNNING;
-                out[2..].copy_from_slice(text);
-                Ok(len)
+                let len = reply::server_id(&[unit_id], true, text, reply);
+                Ok(len.expect("an identity has no text that is too long"))
             }
             Request::ReadDeviceIdentification { code, object_id } => {
                 self.identity.card(unit_id).objects.reply(code, object_id, reply)
@@ -198,8 +195,8 @@ impl UnitServer {
 
     /// A unit in listen only mode does one thing: it ends that mode, without a reply.
     fn listen(&self, unit_id: u8, request: &Result<Request<'_>, ExceptionCode>) {
-        if let Ok(Request::Diagnostics(Diagnostics { sub_function, .. })) = request
-            && *sub_function == SubFunction::RestartCommunications
+        if let Ok(Request::Diagnostics(asked)) = request
+            && asked.sub_function() == SubFunction::RestartCommunications
         {
             self.silent[usize::from(unit_id)].store(false, Ordering::Relaxed);
             self.counters.clear_bus(Bus { no_response: 1, ..Bus::default() });
@@ -207,31 +204,25 @@ impl UnitServer {
     }
 
     /// Function 8. The counters are the listener's, their low 16 bits are sent.
-    fn diagnose(
-        &self,
-        unit_id: u8,
-        asked: Diagnostics<'_>,
-        pdu: &[u8],
-        reply: &mut Buffer,
-    ) -> Option<usize> {
+    fn diagnose(&self, unit_id: u8, asked: Diagnostics<'_>, reply: &mut Buffer) -> Option<usize> {
         let bus = self.counters.bus();
-        let count = match asked.sub_function {
-            SubFunction::ReturnQueryData => return Some(reply::echo(pdu, reply)),
+        let count = match asked.sub_function() {
+            SubFunction::ReturnQueryData => return Some(reply::diagnostics_echo(asked, reply)),
             SubFunction::ChangeAsciiInputDelimiter => {
-                let delimiter = asked.data.first().copied().unwrap_or(b'\n');
+                let delimiter = asked.data().first().copied().unwrap_or(b'\n');
                 self.ascii_delimiter.store(delimiter, Ordering::Relaxed);
-                return Some(reply::echo(pdu, reply));
+                return Some(reply::diagnostics_echo(asked, reply));
             }
             SubFunction::RestartCommunications | SubFunction::ClearCounters => {
                 self.counters.clear_bus(Bus { events: 1, ..Bus::default() });
-                return Some(reply::echo(pdu, reply));
+                return Some(reply::diagnostics_echo(asked, reply));
             }
             SubFunction::ForceListenOnlyMode => {
                 self.silent[usize::from(unit_id)].store(true, Ordering::Relaxed);
                 return None;
             }
             // Nothing here overruns or refuses with a negative acknowledge.
-            SubFunction::ClearOverrunCounter => return Some(reply::echo(pdu, reply)),
+            SubFunction::ClearOverrunCounter => return Some(reply::diagnostics_echo(asked, reply)),
             SubFunction::ReturnServerNakCount
             | SubFunction::ReturnBusCharacterOverrunCount
             | SubFunction::ReturnDiagnosticRegister => 0,
@@ -242,7 +233,7 @@ impl UnitServer {
             SubFunction::ReturnServerNoResponseCount => bus.no_response,
             SubFunction::ReturnServerBusyCount => bus.busy,
         };
-        Some(reply::diagnostics(asked.sub_function, count as u16, reply))
+        Some(reply::diagnostics(asked.sub_function(), count as u16, reply))
     }
 }
 
@@ -255,36 +246,30 @@ fn denied(rights: &PeerRights, pdu: &[u8], request: &Result<Request<'_>, Excepti
     let diagnostics = pdu.first() == Some(&Function::Diagnostics.code());
     diagnostics
         && rights.read_only()
-        && Diagnostics::sub_function(pdu).is_some_and(SubFunction::changes_state)
+        && SubFunction::from_pdu(pdu).is_some_and(SubFunction::changes_state)
 }
 
-fn byte_len(area: Area, range: Range) -> u8 {
-    area.byte_len(usize::from(range.quantity)) as u8
+fn reading<const MAX: u16>(area: Area, range: Range<MAX>, out: &mut [u8]) -> Read<'_> {
+    Read { area, address: range.address(), count: usize::from(range.quantity()), out }
 }
 
-fn reading(area: Area, range: Range, out: &mut [u8]) -> Read<'_> {
-    Read { area, address: range.address, count: usize::from(range.quantity), out }
-}
-
-fn writing(area: Area, range: Range, bytes: &[u8]) -> Write<'_> {
-    Write { area, address: range.address, count: usize::from(range.quantity), bytes }
+fn writing(area: Area, address: u16, count: u16, bytes: &[u8]) -> Write<'_> {
+    Write { area, address, count: usize::from(count), bytes }
 }
 
 #[inline]
-fn read(
+fn read<const MAX: u16>(
     memory: &Memory,
     area: Area,
-    function: Function,
-    range: Range,
-    reply: &mut Buffer,
+    range: Range<MAX>,
+    (out, len): (&mut [u8], usize),
 ) -> Result<usize, ExceptionCode> {
-    let (out, len) = reply::counted(function, byte_len(area, range), reply);
     memory.read(Access::Client, reading(area, range, out)).map_err(exception).map(|()| len)
 }
 
 #[inline]
-fn write(memory: &Memory, area: Area, range: Range, bytes: &[u8]) -> Result<(), ExceptionCode> {
-    memory.write(Access::Client, writing(area, range, bytes)).map_err(exception)
+fn write(memory: &Memory, write: Write<'_>) -> Result<(), ExceptionCode> {
+    memory.write(Access::Client, write).map_err(exception)
 }
 
 fn exception(refusal: Refusal) -> ExceptionCode {

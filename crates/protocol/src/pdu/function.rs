@@ -4,7 +4,17 @@ use thiserror::Error;
 
 codes! {
     /// A function that this crate can encode and decode.
+    ///
+    /// ```
+    /// use holdfast_protocol::pdu::Function;
+    ///
+    /// let function = Function::from_code(16).unwrap();
+    /// assert_eq!(function, Function::WriteMultipleRegisters);
+    /// assert_eq!(function.name(), "Write Multiple Registers");
+    /// assert!(function.is_write());
+    /// ```
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+    #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
     Function: u8 {
         ReadCoils = 1, "Read Coils";
         ReadDiscreteInputs = 2, "Read Discrete Inputs";
@@ -19,6 +29,7 @@ codes! {
         ReportServerId = 17, "Report Server ID";
         MaskWriteRegister = 22, "Mask Write Register";
         ReadWriteMultipleRegisters = 23, "Read/Write Multiple Registers";
+        /// Only MEI type 14, Read Device Identification.
         EncapsulatedInterface = 43, "Encapsulated Interface Transport";
     }
 }
@@ -40,7 +51,15 @@ impl Function {
 
 codes! {
     /// Why a server refused a request.
+    ///
+    /// ```
+    /// use holdfast_protocol::pdu::ExceptionCode;
+    ///
+    /// let code = ExceptionCode::from_code(2).unwrap();
+    /// assert_eq!(code.to_string(), "exception 0x02 (Illegal Data Address)");
+    /// ```
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
+    #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
     #[error("exception {:#04x} ({})", self.code(), self.name())]
     ExceptionCode: u8 {
         IllegalFunction = 1, "Illegal Function";

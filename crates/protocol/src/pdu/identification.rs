@@ -1,12 +1,16 @@
-//! Function 43 / MEI type 14, Read Device Identification (V1.1b3, 6.21).
+//! Function 43 with MEI type 14, Read Device Identification (V1.1b3, 6.21).
 
-use thiserror::Error;
+#[cfg(feature = "alloc")]
+use alloc::{boxed::Box, vec::Vec};
 
-use super::{Buffer, ExceptionCode, Function};
+use super::ExceptionCode;
+#[cfg(feature = "alloc")]
+use super::{Buffer, Function};
 
 pub(super) const MEI_TYPE: u8 = 14;
 
 /// Individual and stream access to all three categories.
+#[cfg(feature = "alloc")]
 const CONFORMITY_LEVEL: u8 = 0x83;
 
 /// Function, MEI type, read code, conformity, more follows, next object, number of objects.
@@ -16,16 +20,20 @@ const HEAD_LEN: usize = 7;
 pub const MAX_VALUE_LEN: usize = super::MAX_LEN - HEAD_LEN - 2;
 
 codes! {
-    /// Which objects are asked for: those up to 0x02, 0x7F or 0xFF as a stream, or one.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    /// Which objects are asked for: a category as a stream of objects, or one object.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
     ReadCode: u8 {
+        /// Objects 0x00 to 0x02.
         Basic = 1, "basic device identification";
+        /// Objects 0x00 to 0x7F.
         Regular = 2, "regular device identification";
+        /// Objects 0x00 to 0xFF.
         Extended = 3, "extended device identification";
         Individual = 4, "one specific identification object";
     }
 }
 
+#[cfg(feature = "alloc")]
 impl ReadCode {
     const fn last_object(self) -> u8 {
         match self {
@@ -36,24 +44,59 @@ impl ReadCode {
     }
 }
 
-/// Objects that no device can have.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
+/// Why objects cannot be the identification of a device.
+#[cfg(feature = "alloc")]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum ObjectError {
+    /// An id comes twice.
     #[error("object {0:#04x} is named twice")]
     Twice(u8),
+    /// A value is longer than [`MAX_VALUE_LEN`].
     #[error("object {id:#04x} has {len} bytes, at most {MAX_VALUE_LEN} are allowed")]
-    TooLong { id: u8, len: usize },
+    TooLong {
+        /// The object.
+        id: u8,
+        /// The length of its value, in bytes.
+        len: usize,
+    },
+    /// A mandatory object, 0x00 to 0x02, is missing.
     #[error("object {0:#04x} is mandatory")]
     Missing(u8),
+    /// The id is one of 0x07 to 0x7F.
     #[error("object {0:#04x} is reserved")]
     Reserved(u8),
 }
 
-/// The identification of one device: objects by id, 0x00 to 0x02 among them.
+/// The identification of one device: objects by id, the mandatory 0x00 to 0x02 among them. Requires
+/// the feature `alloc`.
+///
+/// ```
+/// use holdfast_protocol::pdu::identification::{Objects, ReadCode};
+/// use holdfast_protocol::pdu::{self, Request, Response};
+///
+/// let objects = [(0x00, "Example Works"), (0x01, "P-12"), (0x02, "1.4")];
+/// let objects = Objects::new(objects.map(|(id, value)| (id, value.as_bytes().into())))?;
+///
+/// // The server answers a request for the basic objects …
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = objects.reply(ReadCode::Basic, 0x00, &mut pdu)?;
+///
+/// // … and the client reads the answer.
+/// let request = Request::ReadDeviceIdentification { code: ReadCode::Basic, object_id: 0x00 };
+/// let Response::Identification(answer) = request.response(&pdu[..len])? else { unreachable!() };
+/// assert_eq!(answer.iter().nth(1), Some((0x01, &b"P-12"[..])));
+/// assert_eq!(answer.next, None);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[cfg(feature = "alloc")]
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Objects(Box<[(u8, Box<[u8]>)]>);
 
+#[cfg(feature = "alloc")]
 impl Objects {
+    /// Objects by id, in any order.
+    ///
     /// # Errors
     /// [`ObjectError`] when an id comes twice, is reserved (0x07 to 0x7F), a mandatory one is
     /// missing or a value is longer than [`MAX_VALUE_LEN`].
@@ -82,15 +125,17 @@ impl Objects {
         Ok(Objects(objects.into_boxed_slice()))
     }
 
+    /// The value of an object.
     pub fn get(&self, id: u8) -> Option<&[u8]> {
         self.0.iter().find(|(known, _)| *known == id).map(|(_, value)| value.as_ref())
     }
 
-    /// Writes the reply. A stream holds as many objects as fit, and says whether and where more
-    /// follow; one that starts at an unknown object starts at the first.
+    /// Writes the reply at the start of `pdu` and returns its length. A stream holds as many objects
+    /// as fit, and the reply says where the rest starts. A stream that is to start at an unknown
+    /// object starts at the first.
     ///
     /// # Errors
-    /// [`ExceptionCode::IllegalDataAddress`] for an individual object that is not there.
+    /// [`ExceptionCode::IllegalDataAddress`] for an individual object that is unknown.
     pub fn reply(
         &self,
         code: ReadCode,
@@ -137,17 +182,18 @@ pub(super) fn parse_request(body: &[u8]) -> Result<(ReadCode, u8), ExceptionCode
     }
 }
 
-/// What a device answered: some of its objects, and where the rest begins.
+/// What a device answered: some of its objects, and where the rest starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Answer<'a> {
+    /// The categories that the device has, 0x01 to 0x03; plus 0x80 with access to single objects.
     pub conformity_level: u8,
-    /// The object to ask for next, when there are more.
+    /// The object to ask for next; `None` after the last.
     pub next: Option<u8>,
     objects: &'a [u8],
 }
 
 impl<'a> Answer<'a> {
-    /// Parses the body of a reply, behind the function code. `None` when it is not well formed.
+    /// Parses the body of a reply, behind the function code. `None` when it is malformed.
     pub(super) fn parse(asked: ReadCode, body: &'a [u8]) -> Option<Answer<'a>> {
         let [MEI_TYPE, code, conformity_level, more, next, count, objects @ ..] = body else {
             return None;
@@ -163,10 +209,10 @@ impl<'a> Answer<'a> {
         (*code == asked.code() && whole && counted).then_some(answer)
     }
 
-    /// The objects: id and value.
+    /// The objects of this answer: id and value.
     pub fn iter(&self) -> impl Iterator<Item = (u8, &'a [u8])> + use<'a> {
         let mut rest = self.objects;
-        std::iter::from_fn(move || {
+        core::iter::from_fn(move || {
             let [id, len, tail @ ..] = rest else { return None };
             let (value, tail) = tail.split_at_checked(usize::from(*len))?;
             rest = tail;

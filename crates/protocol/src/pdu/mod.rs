@@ -1,15 +1,24 @@
 //! Protocol data units: a function code and its data, the same on every transport (V1.1b3, 4).
+//!
+//! | side | in | out |
+//! | --- | --- | --- |
+//! | server | [`Request::parse`] | [`reply`], one function for each kind of reply |
+//! | client | [`Request::response`] | [`Request::encode`] |
 
+mod data;
 mod diagnostics;
 mod function;
 pub mod identification;
+mod range;
 pub mod reply;
 mod request;
 mod response;
 
+pub use data::{Bits, Registers, pack_bits, pack_registers};
 pub use diagnostics::{Diagnostics, SubFunction};
 pub use function::{ExceptionCode, Function};
-pub use request::{Range, Request};
+pub use range::{BitRange, Range, RegisterRange};
+pub use request::{Request, RequestError};
 pub use response::{Response, ResponseError};
 
 /// The longest PDU, in bytes (V1.1b3, 4.1).
@@ -20,10 +29,14 @@ pub type Buffer = [u8; MAX_LEN];
 
 /// The most items of one request (V1.1b3, 6).
 pub mod limit {
+    /// Coils or discrete inputs that functions 1 and 2 read.
     pub const READ_BITS: u16 = 2000;
+    /// Registers that functions 3, 4 and 23 read.
     pub const READ_REGISTERS: u16 = 125;
+    /// Coils that function 15 writes.
     pub const WRITE_BITS: u16 = 1968;
+    /// Registers that function 16 writes.
     pub const WRITE_REGISTERS: u16 = 123;
-    /// Written by function 23, which carries a read beside the write.
+    /// Registers that function 23 writes: its request carries a read beside the write.
     pub const READ_WRITE_REGISTERS: u16 = 121;
 }

@@ -1,43 +1,234 @@
 //! Replies, written by a server at the start of the buffer that is sent. Each function returns the
-//! length of the PDU it wrote.
+//! length of the PDU it wrote. Arguments are the parts of the request that the reply repeats.
 
-use super::{Buffer, ExceptionCode, Function, SubFunction};
+use super::request::{coil, put_words};
+use super::{
+    BitRange, Bits, Buffer, Diagnostics, ExceptionCode, Function, MAX_LEN, RegisterRange,
+    Registers, Request, SubFunction, limit,
+};
 
-/// The function code with its high bit set, and why (V1.1b3, 7).
+/// The most bytes that [`server_id`] takes.
+pub const MAX_SERVER_ID_LEN: usize = MAX_LEN - HEAD_LEN;
+
+/// Function code and byte count.
+const HEAD_LEN: usize = 2;
+
+/// Refuses a request: the function code with its high bit set, and why (V1.1b3, 7).
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, ExceptionCode, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::exception(3, ExceptionCode::IllegalDataAddress, &mut pdu);
+/// assert_eq!(pdu[..len], [0x83, 2]);
+/// ```
 pub fn exception(function_code: u8, code: ExceptionCode, pdu: &mut Buffer) -> usize {
     pdu[0] = function_code | 0x80;
     pdu[1] = code.code();
     2
 }
 
-/// The head of a reply that carries `len` bytes, up to 251, and the place for them, which the
-/// caller fills (functions 1-4, 17, 23).
-pub fn counted(function: Function, len: u8, pdu: &mut Buffer) -> (&mut [u8], usize) {
-    pdu[0] = function.code();
-    pdu[1] = len;
-    let len = usize::from(len).min(pdu.len() - 2);
-    (&mut pdu[2..2 + len], 2 + len)
+/// Answers function 1. Returns the place for the coils, which the caller must fill, and the length
+/// of the reply.
+///
+/// The place has [`BitRange::byte_len`] bytes, and the bytes have no defined value: write all of
+/// them, with unused bits 0. [`pack_bits`](super::pack_bits) does that.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, BitRange, pack_bits, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let (room, len) = reply::read_coils(BitRange::new(0, 3).unwrap(), &mut pdu);
+/// pack_bits(&[true, false, true], room);
+/// assert_eq!(pdu[..len], [1, 1, 0b101]);
+/// ```
+#[inline]
+pub fn read_coils(range: BitRange, pdu: &mut Buffer) -> (&mut [u8], usize) {
+    counted(Function::ReadCoils, range.byte_len(), pdu)
 }
 
-/// The request, or its first bytes, sent back (functions 5, 6, 8, 15, 16, 22).
-pub fn echo(request: &[u8], pdu: &mut Buffer) -> usize {
-    let len = request.len().min(pdu.len());
-    pdu[..len].copy_from_slice(&request[..len]);
-    len
+/// Answers function 2, as [`read_coils`] does function 1.
+#[inline]
+pub fn read_discrete_inputs(range: BitRange, pdu: &mut Buffer) -> (&mut [u8], usize) {
+    counted(Function::ReadDiscreteInputs, range.byte_len(), pdu)
 }
 
-/// A counter or register of Diagnostics (function 8).
+/// Answers function 3. Returns the place for the registers, which the caller must fill, and the
+/// length of the reply.
+///
+/// The place has [`RegisterRange::byte_len`] bytes, two for each register, the high byte first. The
+/// bytes have no defined value: write all of them. [`pack_registers`](super::pack_registers) does
+/// that.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, RegisterRange, pack_registers, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let range = RegisterRange::new(0, 2).unwrap();
+/// let (room, len) = reply::read_holding_registers(range, &mut pdu);
+/// pack_registers(&[10, 258], room);
+/// assert_eq!(pdu[..len], [3, 4, 0, 10, 1, 2]);
+/// ```
+#[inline]
+pub fn read_holding_registers(range: RegisterRange, pdu: &mut Buffer) -> (&mut [u8], usize) {
+    counted(Function::ReadHoldingRegisters, range.byte_len(), pdu)
+}
+
+/// Answers function 4, as [`read_holding_registers`] does function 3.
+#[inline]
+pub fn read_input_registers(range: RegisterRange, pdu: &mut Buffer) -> (&mut [u8], usize) {
+    counted(Function::ReadInputRegisters, range.byte_len(), pdu)
+}
+
+/// Answers function 23, as [`read_holding_registers`] does function 3. `range` is the range to read.
+#[inline]
+pub fn read_write_multiple_registers(range: RegisterRange, pdu: &mut Buffer) -> (&mut [u8], usize) {
+    counted(Function::ReadWriteMultipleRegisters, range.byte_len(), pdu)
+}
+
+/// Answers function 5, whose request has this address and value.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, Request, reply};
+///
+/// let request = [5, 0, 172, 0xFF, 0];
+/// let Ok(Request::WriteSingleCoil { address, value }) = Request::parse(&request) else {
+///     unreachable!()
+/// };
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::write_single_coil(address, value, &mut pdu);
+/// assert_eq!(pdu[..len], request);
+/// ```
+#[inline]
+pub fn write_single_coil(address: u16, value: bool, pdu: &mut Buffer) -> usize {
+    words(Function::WriteSingleCoil, [address, coil(value)], pdu)
+}
+
+/// Answers function 6, whose request has this address and value.
+#[inline]
+pub fn write_single_register(address: u16, value: u16, pdu: &mut Buffer) -> usize {
+    words(Function::WriteSingleRegister, [address, value], pdu)
+}
+
+/// Answers function 15, whose request has this address and these bits.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, Request, reply};
+///
+/// let request = [15, 0, 19, 0, 10, 2, 0xCD, 0x01];
+/// let Ok(Request::WriteMultipleCoils { address, bits }) = Request::parse(&request) else {
+///     unreachable!()
+/// };
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::write_multiple_coils(address, bits, &mut pdu);
+/// assert_eq!(pdu[..len], [15, 0, 19, 0, 10]);
+/// ```
+#[inline]
+pub fn write_multiple_coils(
+    address: u16,
+    bits: Bits<'_, { limit::WRITE_BITS }>,
+    pdu: &mut Buffer,
+) -> usize {
+    words(Function::WriteMultipleCoils, [address, bits.quantity()], pdu)
+}
+
+/// Answers function 16, whose request has this address and these registers.
+#[inline]
+pub fn write_multiple_registers(
+    address: u16,
+    registers: Registers<'_, { limit::WRITE_REGISTERS }>,
+    pdu: &mut Buffer,
+) -> usize {
+    words(Function::WriteMultipleRegisters, [address, registers.quantity()], pdu)
+}
+
+/// Answers function 22, whose request has this address and these masks.
+#[inline]
+pub fn mask_write_register(address: u16, and_mask: u16, or_mask: u16, pdu: &mut Buffer) -> usize {
+    words(Function::MaskWriteRegister, [address, and_mask, or_mask], pdu)
+}
+
+/// Answers a sub-function of Diagnostics that sends the request back (function 8).
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, Request, reply};
+///
+/// let request = [8, 0, 0, 0xA5, 0x37];
+/// let Ok(Request::Diagnostics(asked)) = Request::parse(&request) else { unreachable!() };
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::diagnostics_echo(asked, &mut pdu);
+/// assert_eq!(pdu[..len], request);
+/// ```
+pub fn diagnostics_echo(asked: Diagnostics<'_>, pdu: &mut Buffer) -> usize {
+    Request::Diagnostics(asked).encode(pdu)
+}
+
+/// Answers a sub-function of Diagnostics that reads a counter or register (function 8).
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, SubFunction, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::diagnostics(SubFunction::ReturnBusMessageCount, 258, &mut pdu);
+/// assert_eq!(pdu[..len], [8, 0, 0x0B, 1, 2]);
+/// ```
 pub fn diagnostics(sub_function: SubFunction, data: u16, pdu: &mut Buffer) -> usize {
-    pdu[0] = Function::Diagnostics.code();
-    pdu[1..3].copy_from_slice(&sub_function.code().to_be_bytes());
-    pdu[3..5].copy_from_slice(&data.to_be_bytes());
-    5
+    words(Function::Diagnostics, [sub_function.code(), data], pdu)
 }
 
-/// Status (0: no program command is being processed) and event count (function 11).
-pub fn event_counter(events: u16, pdu: &mut Buffer) -> usize {
-    pdu[0] = Function::GetCommEventCounter.code();
-    pdu[1..3].copy_from_slice(&[0, 0]);
-    pdu[3..5].copy_from_slice(&events.to_be_bytes());
-    5
+/// Answers function 11: status and event count. `busy` says that a program command is still
+/// processed.
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::event_counter(false, 264, &mut pdu);
+/// assert_eq!(pdu[..len], [11, 0, 0, 1, 8]);
+/// ```
+pub fn event_counter(busy: bool, events: u16, pdu: &mut Buffer) -> usize {
+    words(Function::GetCommEventCounter, [if busy { 0xFFFF } else { 0 }, events], pdu)
+}
+
+/// Answers function 17: server id, run indicator and additional data. `None` when `id` and `additional`
+/// together, with one byte for the run indicator, are longer than [`MAX_SERVER_ID_LEN`].
+///
+/// ```
+/// use holdfast_protocol::pdu::{self, reply};
+///
+/// let mut pdu = [0; pdu::MAX_LEN];
+/// let len = reply::server_id(&[7], true, b"pump", &mut pdu).unwrap();
+/// assert_eq!(&pdu[..len], b"\x11\x06\x07\xFFpump");
+/// assert_eq!(reply::server_id(&[7], true, &[0; 250], &mut pdu), None);
+/// ```
+pub fn server_id(id: &[u8], running: bool, additional: &[u8], pdu: &mut Buffer) -> Option<usize> {
+    let count = id.len().checked_add(1)?.checked_add(additional.len())?;
+    if count > MAX_SERVER_ID_LEN {
+        return None;
+    }
+    let (room, len) = counted(Function::ReportServerId, count, pdu);
+    let (before, after) = room.split_at_mut(id.len());
+    before.copy_from_slice(id);
+    if let [indicator, rest @ ..] = after {
+        *indicator = if running { 0xFF } else { 0x00 };
+        rest.copy_from_slice(additional);
+    }
+    Some(len)
+}
+
+/// A reply that is a function code and some words.
+#[inline]
+fn words<const N: usize>(function: Function, words: [u16; N], pdu: &mut Buffer) -> usize {
+    pdu[0] = function.code();
+    put_words(pdu, words)
+}
+
+/// The head of a reply that carries `count` bytes, and the place for them.
+#[inline]
+fn counted(function: Function, count: usize, pdu: &mut Buffer) -> (&mut [u8], usize) {
+    debug_assert!(count <= MAX_SERVER_ID_LEN);
+    let len = HEAD_LEN + count;
+    pdu[0] = function.code();
+    pdu[1] = count as u8;
+    (&mut pdu[HEAD_LEN..len], len)
 }

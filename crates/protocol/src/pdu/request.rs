@@ -1,63 +1,156 @@
 //! Requests: parsed by a server, encoded by a client (V1.1b3, 6).
 //!
-//! Parsing makes the first two checks of the order that the standard draws: the function must be
-//! known (exception 01), then form, quantity and value must be right (exception 03).
+//! Parsing makes the first two checks in the order that the standard draws: the function must be
+//! known (exception 01), then form, quantity and value must be right (exception 03). The types of a
+//! request carry the same checks, so that encoding cannot fail.
+
+use thiserror::Error;
 
 use super::identification::{self, ReadCode};
-use super::{Buffer, Diagnostics, ExceptionCode, Function, limit};
-
-/// `quantity` items from `address`. The quantity is within the limits of its function; the end may
-/// be beyond the last address, which is for the memory to say.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Range {
-    pub address: u16,
-    pub quantity: u16,
-}
+use super::{
+    BitRange, Bits, Buffer, Diagnostics, ExceptionCode, Function, Range, RegisterRange, Registers,
+    SubFunction, limit,
+};
 
 /// One request. Registers are big-endian bytes, bits packed least significant bit first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+///
+/// ```
+/// use holdfast_protocol::pdu::{ExceptionCode, Range, Request, RequestError};
+///
+/// assert_eq!(Request::parse(&[1, 0, 19, 0, 37]), Ok(Request::ReadCoils(Range::new(19, 37)?)));
+/// assert_eq!(Request::parse(&[1, 0, 19, 0, 0]), Err(ExceptionCode::IllegalDataValue));
+/// assert_eq!(Request::parse(&[99]), Err(ExceptionCode::IllegalFunction));
+/// # Ok::<(), RequestError>(())
+/// ```
+///
+/// A server answers [`ExceptionCode::IllegalFunction`] in the wildcard arm of its `match`, for each
+/// function that it does not serve.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum Request<'a> {
-    ReadCoils(Range),
-    ReadDiscreteInputs(Range),
-    ReadHoldingRegisters(Range),
-    ReadInputRegisters(Range),
-    WriteSingleCoil { address: u16, value: bool },
-    WriteSingleRegister { address: u16, value: u16 },
+    /// Function 1.
+    ReadCoils(BitRange),
+    /// Function 2.
+    ReadDiscreteInputs(BitRange),
+    /// Function 3.
+    ReadHoldingRegisters(RegisterRange),
+    /// Function 4.
+    ReadInputRegisters(RegisterRange),
+    /// Function 5.
+    WriteSingleCoil {
+        /// The coil to write.
+        address: u16,
+        /// `true` for `FF00`, `false` for `0000`.
+        value: bool,
+    },
+    /// Function 6.
+    WriteSingleRegister {
+        /// The register to write.
+        address: u16,
+        /// Its new value.
+        value: u16,
+    },
+    /// Function 8.
     Diagnostics(Diagnostics<'a>),
+    /// Function 11.
     GetCommEventCounter,
-    WriteMultipleCoils { range: Range, bits: &'a [u8] },
-    WriteMultipleRegisters { range: Range, registers: &'a [u8] },
+    /// Function 15.
+    WriteMultipleCoils {
+        /// The first coil to write.
+        address: u16,
+        /// New values of this coil and those after it.
+        bits: Bits<'a, { limit::WRITE_BITS }>,
+    },
+    /// Function 16.
+    WriteMultipleRegisters {
+        /// The first register to write.
+        address: u16,
+        /// New values of this register and those after it.
+        registers: Registers<'a, { limit::WRITE_REGISTERS }>,
+    },
+    /// Function 17.
     ReportServerId,
-    MaskWriteRegister { address: u16, and_mask: u16, or_mask: u16 },
-    ReadWriteMultipleRegisters { read: Range, write: Range, registers: &'a [u8] },
-    ReadDeviceIdentification { code: ReadCode, object_id: u8 },
+    /// Function 22: the register becomes `(value & and_mask) | (or_mask & !and_mask)`.
+    MaskWriteRegister {
+        /// The register to change.
+        address: u16,
+        /// Bits that keep their value.
+        and_mask: u16,
+        /// New values of the other bits.
+        or_mask: u16,
+    },
+    /// Function 23. The write comes first.
+    ReadWriteMultipleRegisters {
+        /// The registers to read.
+        read: RegisterRange,
+        /// The first register to write.
+        write_address: u16,
+        /// New values of this register and those after it.
+        registers: Registers<'a, { limit::READ_WRITE_REGISTERS }>,
+    },
+    /// Function 43 with MEI type 14.
+    ReadDeviceIdentification {
+        /// Which objects are asked for.
+        code: ReadCode,
+        /// The object, or the first object of a stream.
+        object_id: u8,
+    },
+}
+
+/// Why a request cannot be made.
+///
+/// ```
+/// use holdfast_protocol::pdu::BitRange;
+///
+/// let error = BitRange::new(0, 2001).unwrap_err();
+/// assert_eq!(error.to_string(), "quantity is 2001, allowed are 1 to 2000");
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
+pub enum RequestError {
+    /// The quantity is 0, or beyond the limit of the function.
+    #[error("quantity is {found}, allowed are 1 to {max}")]
+    Quantity {
+        /// The quantity that was given.
+        found: usize,
+        /// The limit of the function.
+        max: u16,
+    },
+    /// The data has another length than its quantity requires.
+    #[error("data has {found} bytes, {expected} are required")]
+    Length {
+        /// The length that was given, in bytes.
+        found: usize,
+        /// The length that is required, in bytes.
+        expected: usize,
+    },
+    /// The sub-function of Diagnostics does not allow this data field.
+    #[error("{} does not allow this data field", .0.name())]
+    Data(SubFunction),
 }
 
 impl<'a> Request<'a> {
+    /// Parses the PDU of a request.
+    ///
     /// # Errors
-    /// [`ExceptionCode::IllegalFunction`] for a function or sub-function that is not known here,
+    /// [`ExceptionCode::IllegalFunction`] for an unknown function, sub-function or MEI type.
     /// [`ExceptionCode::IllegalDataValue`] for a PDU that is too short or too long, a quantity out
-    /// of its limits, a byte count that does not agree with it, or a value that can't be.
+    /// of its limits, a byte count that does not agree with it, or a value that is not allowed. A
+    /// server sends the code as it is, see [`reply::exception`](super::reply::exception).
     #[inline]
     pub fn parse(pdu: &'a [u8]) -> Result<Request<'a>, ExceptionCode> {
         let (&code, body) = pdu.split_first().ok_or(ExceptionCode::IllegalDataValue)?;
         let function = Function::from_code(code).ok_or(ExceptionCode::IllegalFunction)?;
         Ok(match function {
-            Function::ReadCoils => Request::ReadCoils(range(body, limit::READ_BITS)?),
-            Function::ReadDiscreteInputs => {
-                Request::ReadDiscreteInputs(range(body, limit::READ_BITS)?)
-            }
-            Function::ReadHoldingRegisters => {
-                Request::ReadHoldingRegisters(range(body, limit::READ_REGISTERS)?)
-            }
-            Function::ReadInputRegisters => {
-                Request::ReadInputRegisters(range(body, limit::READ_REGISTERS)?)
-            }
+            Function::ReadCoils => Request::ReadCoils(range(body)?),
+            Function::ReadDiscreteInputs => Request::ReadDiscreteInputs(range(body)?),
+            Function::ReadHoldingRegisters => Request::ReadHoldingRegisters(range(body)?),
+            Function::ReadInputRegisters => Request::ReadInputRegisters(range(body)?),
             Function::WriteSingleCoil => {
                 let [address, value] = words(body)?;
                 let value = match value {
-                    0xFF00 => true,
-                    0x0000 => false,
+                    ON => true,
+                    OFF => false,
                     _ => return Err(ExceptionCode::IllegalDataValue),
                 };
                 Request::WriteSingleCoil { address, value }
@@ -72,16 +165,13 @@ impl<'a> Request<'a> {
                 Request::GetCommEventCounter
             }
             Function::WriteMultipleCoils => {
-                let (head, bits) = counted(body)?;
-                let range = range(head, limit::WRITE_BITS)?;
-                agree(bits, usize::from(range.quantity).div_ceil(8))?;
-                Request::WriteMultipleCoils { range, bits }
+                let ([address, quantity], data) = counted(body)?;
+                let bits = Bits::new(quantity, data).or(Err(ExceptionCode::IllegalDataValue))?;
+                Request::WriteMultipleCoils { address, bits }
             }
             Function::WriteMultipleRegisters => {
-                let (head, registers) = counted(body)?;
-                let range = range(head, limit::WRITE_REGISTERS)?;
-                agree(registers, usize::from(range.quantity) * 2)?;
-                Request::WriteMultipleRegisters { range, registers }
+                let ([address, quantity], data) = counted(body)?;
+                Request::WriteMultipleRegisters { address, registers: registers(quantity, data)? }
             }
             Function::ReportServerId => {
                 empty(body)?;
@@ -94,11 +184,10 @@ impl<'a> Request<'a> {
             Function::ReadWriteMultipleRegisters => {
                 let (read, rest) =
                     body.split_at_checked(4).ok_or(ExceptionCode::IllegalDataValue)?;
-                let (head, registers) = counted(rest)?;
-                let read = range(read, limit::READ_REGISTERS)?;
-                let write = range(head, limit::READ_WRITE_REGISTERS)?;
-                agree(registers, usize::from(write.quantity) * 2)?;
-                Request::ReadWriteMultipleRegisters { read, write, registers }
+                let read = range(read)?;
+                let ([write_address, quantity], data) = counted(rest)?;
+                let registers = registers(quantity, data)?;
+                Request::ReadWriteMultipleRegisters { read, write_address, registers }
             }
             Function::EncapsulatedInterface => {
                 let (code, object_id) = identification::parse_request(body)?;
@@ -108,47 +197,60 @@ impl<'a> Request<'a> {
     }
 
     /// Writes the request at the start of `pdu` and returns its length, 1 to [`super::MAX_LEN`].
-    /// `None` when a quantity is out of the function's limits, or the data does not agree with it.
-    pub fn encode(&self, pdu: &mut Buffer) -> Option<usize> {
-        let mut out = Out { pdu, len: 0 };
-        out.byte(self.function().code())?;
-        match *self {
-            Request::ReadCoils(range)
-            | Request::ReadDiscreteInputs(range)
-            | Request::ReadHoldingRegisters(range)
-            | Request::ReadInputRegisters(range) => out.words(&[range.address, range.quantity])?,
-            Request::WriteSingleCoil { address, value } => {
-                out.words(&[address, if value { 0xFF00 } else { 0x0000 }])?;
+    ///
+    /// [`Request::parse`] accepts every encoded request: a server that follows the standard does not
+    /// refuse it for its form, quantity or value.
+    ///
+    /// ```
+    /// use holdfast_protocol::pdu::{self, Request};
+    ///
+    /// let request = Request::WriteSingleCoil { address: 172, value: true };
+    /// let mut pdu = [0; pdu::MAX_LEN];
+    /// let len = request.encode(&mut pdu);
+    /// assert_eq!(pdu[..len], [5, 0, 172, 0xFF, 0]);
+    /// assert_eq!(Request::parse(&pdu[..len]), Ok(request));
+    /// ```
+    pub fn encode(&self, pdu: &mut Buffer) -> usize {
+        pdu[0] = self.function().code();
+        let len = match *self {
+            Request::ReadCoils(range) | Request::ReadDiscreteInputs(range) => {
+                put_words(pdu, [range.address(), range.quantity()])
             }
-            Request::WriteSingleRegister { address, value } => out.words(&[address, value])?,
-            Request::Diagnostics(Diagnostics { sub_function, data }) => {
-                out.words(&[sub_function.code()])?;
-                out.bytes(data)?;
+            Request::ReadHoldingRegisters(range) | Request::ReadInputRegisters(range) => {
+                put_words(pdu, [range.address(), range.quantity()])
             }
-            Request::GetCommEventCounter | Request::ReportServerId => {}
-            Request::WriteMultipleCoils { range, bits: data }
-            | Request::WriteMultipleRegisters { range, registers: data } => {
-                out.words(&[range.address, range.quantity])?;
-                out.byte(u8::try_from(data.len()).ok()?)?;
-                out.bytes(data)?;
+            Request::WriteSingleCoil { address, value } => put_words(pdu, [address, coil(value)]),
+            Request::WriteSingleRegister { address, value } => put_words(pdu, [address, value]),
+            Request::Diagnostics(asked) => {
+                let head = put_words(pdu, [asked.sub_function().code()]);
+                put(pdu, head, asked.data())
+            }
+            Request::GetCommEventCounter | Request::ReportServerId => 1,
+            Request::WriteMultipleCoils { address, bits } => {
+                let head = put_words(pdu, [address, bits.quantity()]);
+                put_counted(pdu, head, bits.as_bytes())
+            }
+            Request::WriteMultipleRegisters { address, registers } => {
+                let head = put_words(pdu, [address, registers.quantity()]);
+                put_counted(pdu, head, registers.as_bytes())
             }
             Request::MaskWriteRegister { address, and_mask, or_mask } => {
-                out.words(&[address, and_mask, or_mask])?;
+                put_words(pdu, [address, and_mask, or_mask])
             }
-            Request::ReadWriteMultipleRegisters { read, write, registers } => {
-                out.words(&[read.address, read.quantity, write.address, write.quantity])?;
-                out.byte(u8::try_from(registers.len()).ok()?)?;
-                out.bytes(registers)?;
+            Request::ReadWriteMultipleRegisters { read, write_address, registers } => {
+                let words = [read.address(), read.quantity(), write_address, registers.quantity()];
+                let head = put_words(pdu, words);
+                put_counted(pdu, head, registers.as_bytes())
             }
             Request::ReadDeviceIdentification { code, object_id } => {
-                out.bytes(&[identification::MEI_TYPE, code.code(), object_id])?;
+                put(pdu, 1, &[identification::MEI_TYPE, code.code(), object_id])
             }
-        }
-        let len = out.len;
-        // The checks of a server are those of a client: what it would refuse is not sent.
-        (Request::parse(pdu.get(..len)?) == Ok(*self)).then_some(len)
+        };
+        debug_assert_eq!(Request::parse(&pdu[..len]), Ok(*self), "servers accept what is encoded");
+        len
     }
 
+    /// The function of the request.
     pub const fn function(&self) -> Function {
         match self {
             Request::ReadCoils(_) => Function::ReadCoils,
@@ -169,6 +271,16 @@ impl<'a> Request<'a> {
     }
 }
 
+/// A coil that is on, in function 5.
+const ON: u16 = 0xFF00;
+/// A coil that is off, in function 5.
+const OFF: u16 = 0x0000;
+
+/// A coil as function 5 writes it.
+pub(super) const fn coil(value: bool) -> u16 {
+    if value { ON } else { OFF }
+}
+
 /// Exactly `N` big-endian words.
 #[inline]
 fn words<const N: usize>(body: &[u8]) -> Result<[u16; N], ExceptionCode> {
@@ -179,54 +291,61 @@ fn words<const N: usize>(body: &[u8]) -> Result<[u16; N], ExceptionCode> {
     }
 }
 
-/// Exactly an address and a quantity of 1 to `most`.
+/// Exactly an address and a quantity of 1 to `MAX`.
 #[inline]
-fn range(body: &[u8], most: u16) -> Result<Range, ExceptionCode> {
+fn range<const MAX: u16>(body: &[u8]) -> Result<Range<MAX>, ExceptionCode> {
     let [address, quantity] = words(body)?;
-    if (1..=most).contains(&quantity) {
-        Ok(Range { address, quantity })
-    } else {
-        Err(ExceptionCode::IllegalDataValue)
-    }
+    Range::new(address, quantity).or(Err(ExceptionCode::IllegalDataValue))
 }
 
-/// Four bytes of address and quantity, a byte count, and as many bytes as it says.
+/// Address and quantity, a byte count, and as many bytes as it says.
 #[inline]
-fn counted(body: &[u8]) -> Result<(&[u8], &[u8]), ExceptionCode> {
-    match body.split_at_checked(4) {
-        Some((head, [count, data @ ..])) if usize::from(*count) == data.len() => Ok((head, data)),
+fn counted(body: &[u8]) -> Result<([u16; 2], &[u8]), ExceptionCode> {
+    match body {
+        &[a0, a1, q0, q1, count, ref data @ ..] if usize::from(count) == data.len() => {
+            Ok(([u16::from_be_bytes([a0, a1]), u16::from_be_bytes([q0, q1])], data))
+        }
         _ => Err(ExceptionCode::IllegalDataValue),
     }
 }
 
+/// 1 to `MAX` registers, as many as the quantity says.
 #[inline]
-fn agree(data: &[u8], len: usize) -> Result<(), ExceptionCode> {
-    if data.len() == len { Ok(()) } else { Err(ExceptionCode::IllegalDataValue) }
+fn registers<const MAX: u16>(
+    quantity: u16,
+    data: &[u8],
+) -> Result<Registers<'_, MAX>, ExceptionCode> {
+    match Registers::new(data) {
+        Ok(registers) if registers.quantity() == quantity => Ok(registers),
+        _ => Err(ExceptionCode::IllegalDataValue),
+    }
 }
 
 fn empty(body: &[u8]) -> Result<(), ExceptionCode> {
-    agree(body, 0)
+    if body.is_empty() { Ok(()) } else { Err(ExceptionCode::IllegalDataValue) }
 }
 
-/// Appends to a PDU; `None` when it is full.
-struct Out<'b> {
-    pdu: &'b mut Buffer,
-    len: usize,
+/// Writes words behind the function code; the length of the PDU so far.
+#[inline]
+pub(super) fn put_words<const N: usize>(pdu: &mut Buffer, words: [u16; N]) -> usize {
+    let (pairs, _) = pdu[1..].as_chunks_mut::<2>();
+    for (pair, word) in pairs.iter_mut().zip(words) {
+        *pair = word.to_be_bytes();
+    }
+    1 + 2 * N
 }
 
-impl Out<'_> {
-    fn bytes(&mut self, bytes: &[u8]) -> Option<()> {
-        let end = self.len.checked_add(bytes.len())?;
-        self.pdu.get_mut(self.len..end)?.copy_from_slice(bytes);
-        self.len = end;
-        Some(())
-    }
+/// Writes bytes at `at`; the length of the PDU so far.
+#[inline]
+fn put(pdu: &mut Buffer, at: usize, bytes: &[u8]) -> usize {
+    let end = at + bytes.len();
+    pdu[at..end].copy_from_slice(bytes);
+    end
+}
 
-    fn byte(&mut self, byte: u8) -> Option<()> {
-        self.bytes(&[byte])
-    }
-
-    fn words(&mut self, words: &[u16]) -> Option<()> {
-        words.iter().try_for_each(|word| self.bytes(&word.to_be_bytes()))
-    }
+/// Writes a byte count and the bytes at `at`; the length of the PDU so far.
+#[inline]
+fn put_counted(pdu: &mut Buffer, at: usize, bytes: &[u8]) -> usize {
+    pdu[at] = bytes.len() as u8;
+    put(pdu, at + 1, bytes)
 }

@@ -3,38 +3,58 @@
 use thiserror::Error;
 
 use super::identification::Answer;
-use super::{ExceptionCode, Range, Request};
+use super::request::coil;
+use super::{Bits, ExceptionCode, Registers, Request, limit};
 
-/// What a server answered. Registers are big-endian bytes, bits packed least significant bit first;
-/// both have exactly the length that the request asked for.
+/// What a server answered. Bits and registers are exactly as many as the request asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum Response<'a> {
-    Bits(&'a [u8]),
-    Registers(&'a [u8]),
-    /// The write was carried out: the server sent back what the standard asks for.
+    /// Coils or discrete inputs (functions 1 and 2).
+    Bits(Bits<'a, { limit::READ_BITS }>),
+    /// Registers (functions 3, 4 and 23).
+    Registers(Registers<'a, { limit::READ_REGISTERS }>),
+    /// The write was carried out: the server sent back what the standard requires (functions 5, 6,
+    /// 15, 16 and 22).
     Written,
-    /// The data field of Diagnostics.
+    /// The data field of Diagnostics (function 8).
     Diagnostics(&'a [u8]),
+    /// Status and event count (function 11).
     EventCounter {
+        /// Whether the server still processes a program command.
         busy: bool,
+        /// Requests that the server has carried out.
         events: u16,
     },
-    /// Server id, run indicator and additional data: how they are laid out, the device says.
+    /// Server id, run indicator and additional data (function 17). Their layout depends on the
+    /// device.
     ServerId(&'a [u8]),
+    /// Identification objects (function 43 with MEI type 14).
     Identification(Answer<'a>),
 }
 
-/// Why a PDU is not the response to a request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+/// Why a PDU is not a response to a request, or which exception it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum ResponseError {
+    /// The server refused the request.
     #[error("{0}")]
     Exception(ExceptionCode),
+    /// The server refused the request with a code that the standard does not have.
     #[error("exception with the unknown code {0:#04x}")]
     UnknownException(u8),
+    /// The response is one to another function.
     #[error("function code {found:#04x} instead of {expected:#04x}")]
-    Function { expected: u8, found: u8 },
+    Function {
+        /// The function code of the request.
+        expected: u8,
+        /// The function code of the response.
+        found: u8,
+    },
+    /// The response has another length or count than the request requires.
     #[error("the length or a count does not fit the request")]
     Length,
+    /// The server sent back other values than those it was sent.
     #[error("what the server sent back is not what was sent")]
     Echo,
 }
@@ -42,8 +62,21 @@ pub enum ResponseError {
 impl Request<'_> {
     /// Parses the PDU that answers this request.
     ///
+    /// ```
+    /// use holdfast_protocol::pdu::{ExceptionCode, Range, Request, Response, ResponseError};
+    ///
+    /// let request = Request::ReadCoils(Range::new(0, 3)?);
+    /// let Response::Bits(bits) = request.response(&[1, 1, 0b101])? else { unreachable!() };
+    /// assert!(bits.iter().eq([true, false, true]));
+    ///
+    /// let refused = ResponseError::Exception(ExceptionCode::IllegalDataAddress);
+    /// assert_eq!(request.response(&[0x81, 2]), Err(refused));
+    /// assert_eq!(request.response(&[1, 2, 0, 0]), Err(ResponseError::Length));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// # Errors
-    /// [`ResponseError`]: an exception, or why the PDU can't be the answer to this request.
+    /// [`ResponseError`]: an exception, or why the PDU cannot be the answer to this request.
     pub fn response<'p>(&self, pdu: &'p [u8]) -> Result<Response<'p>, ResponseError> {
         let expected = self.function().code();
         let body = match pdu {
@@ -59,27 +92,29 @@ impl Request<'_> {
         };
         match *self {
             Request::ReadCoils(range) | Request::ReadDiscreteInputs(range) => {
-                counted(body, usize::from(range.quantity).div_ceil(8)).map(Response::Bits)
+                let data = counted(body, range.byte_len())?;
+                Ok(Response::Bits(Bits::in_range(range, data)))
             }
             Request::ReadHoldingRegisters(range)
             | Request::ReadInputRegisters(range)
             | Request::ReadWriteMultipleRegisters { read: range, .. } => {
-                counted(body, usize::from(range.quantity) * 2).map(Response::Registers)
+                let data = counted(body, range.byte_len())?;
+                Ok(Response::Registers(Registers::in_range(range, data)))
             }
-            Request::WriteSingleCoil { address, value } => {
-                echoed(body, &[address, if value { 0xFF00 } else { 0x0000 }])
-            }
+            Request::WriteSingleCoil { address, value } => echoed(body, &[address, coil(value)]),
             Request::WriteSingleRegister { address, value } => echoed(body, &[address, value]),
-            Request::WriteMultipleCoils { range: Range { address, quantity }, .. }
-            | Request::WriteMultipleRegisters { range: Range { address, quantity }, .. } => {
-                echoed(body, &[address, quantity])
+            Request::WriteMultipleCoils { address, bits } => {
+                echoed(body, &[address, bits.quantity()])
+            }
+            Request::WriteMultipleRegisters { address, registers } => {
+                echoed(body, &[address, registers.quantity()])
             }
             Request::MaskWriteRegister { address, and_mask, or_mask } => {
                 echoed(body, &[address, and_mask, or_mask])
             }
             Request::Diagnostics(asked) => match body {
-                [high, low, data @ ..] if data.len() == asked.data.len() => {
-                    if u16::from_be_bytes([*high, *low]) == asked.sub_function.code() {
+                [high, low, data @ ..] if data.len() == asked.data().len() => {
+                    if u16::from_be_bytes([*high, *low]) == asked.sub_function().code() {
                         Ok(Response::Diagnostics(data))
                     } else {
                         Err(ResponseError::Echo)

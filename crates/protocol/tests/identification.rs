@@ -1,0 +1,59 @@
+//! Read Device Identification, from the objects of a server to those a client reads.
+#![cfg(feature = "alloc")]
+
+use holdfast_protocol::pdu::identification::{MAX_VALUE_LEN, ObjectError, Objects, ReadCode};
+use holdfast_protocol::pdu::{self, ExceptionCode, Request, Response};
+use proptest::prelude::*;
+
+proptest! {
+    #[test]
+    fn a_stream_of_objects_is_read_whole(
+        values in prop::collection::btree_map(
+            prop_oneof![0..7u8, 0x80..=0xFFu8],
+            prop::collection::vec(any::<u8>(), 0..=MAX_VALUE_LEN),
+            1..20,
+        ),
+    ) {
+        let mut values = values;
+        for id in 0..3 {
+            values.entry(id).or_default();
+        }
+        let objects = values.iter().map(|(id, value)| (*id, value.clone().into_boxed_slice()));
+        let objects = Objects::new(objects).unwrap();
+        let (mut read, mut next) = (Vec::new(), Some(0));
+        while let Some(object_id) = next {
+            let code = ReadCode::Extended;
+            let mut buffer = [0; pdu::MAX_LEN];
+            let len = objects.reply(code, object_id, &mut buffer).unwrap();
+            let request = Request::ReadDeviceIdentification { code, object_id };
+            let Ok(Response::Identification(answer)) = request.response(&buffer[..len]) else {
+                panic!("not an identification");
+            };
+            read.extend(answer.iter().map(|(id, value)| (id, value.to_vec())));
+            next = answer.next;
+        }
+        prop_assert_eq!(read, values.into_iter().collect::<Vec<_>>());
+    }
+}
+
+fn objects(ids: &[u8]) -> Result<Objects, ObjectError> {
+    Objects::new(ids.iter().map(|id| (*id, Box::from(&b"x"[..]))))
+}
+
+#[test]
+fn objects_that_no_device_can_have_are_refused() {
+    assert_eq!(objects(&[0, 1]), Err(ObjectError::Missing(2)));
+    assert_eq!(objects(&[0, 1, 2, 2]), Err(ObjectError::Twice(2)));
+    assert_eq!(objects(&[0, 1, 2, 7]), Err(ObjectError::Reserved(7)));
+    let long = [(0, 1), (1, 1), (2, MAX_VALUE_LEN + 1)];
+    let long = Objects::new(long.map(|(id, len)| (id, vec![0; len].into_boxed_slice())));
+    assert_eq!(long, Err(ObjectError::TooLong { id: 2, len: MAX_VALUE_LEN + 1 }));
+    assert!(objects(&[2, 1, 0]).is_ok());
+}
+
+#[test]
+fn an_individual_object_that_is_unknown_is_an_illegal_address() {
+    let mut pdu = [0; pdu::MAX_LEN];
+    let reply = objects(&[0, 1, 2]).unwrap().reply(ReadCode::Individual, 3, &mut pdu);
+    assert_eq!(reply, Err(ExceptionCode::IllegalDataAddress));
+}

@@ -1,0 +1,194 @@
+//! What a server replies, parsed against the request that it answers.
+
+mod support;
+
+use holdfast_protocol::pdu::{
+    self, ExceptionCode, Function, RegisterRange, Request, Response, ResponseError, SubFunction,
+    reply,
+};
+use proptest::prelude::*;
+use support::a_request;
+
+/// What a server answers whose memory has the same byte everywhere; `None` for Read Device
+/// Identification, which has a test of its own.
+#[allow(unreachable_patterns, reason = "the feature `exhaustive` ends the need for a wildcard")]
+fn a_reply(request: &Request<'_>, byte: u8) -> Option<Vec<u8>> {
+    let mut pdu = [0; pdu::MAX_LEN];
+    let filled = |(room, len): (&mut [u8], usize)| {
+        room.fill(byte);
+        len
+    };
+    let len = match *request {
+        Request::ReadCoils(range) => filled(reply::read_coils(range, &mut pdu)),
+        Request::ReadDiscreteInputs(range) => filled(reply::read_discrete_inputs(range, &mut pdu)),
+        Request::ReadHoldingRegisters(range) => {
+            filled(reply::read_holding_registers(range, &mut pdu))
+        }
+        Request::ReadInputRegisters(range) => filled(reply::read_input_registers(range, &mut pdu)),
+        Request::ReadWriteMultipleRegisters { read, .. } => {
+            filled(reply::read_write_multiple_registers(read, &mut pdu))
+        }
+        Request::WriteSingleCoil { address, value } => {
+            reply::write_single_coil(address, value, &mut pdu)
+        }
+        Request::WriteSingleRegister { address, value } => {
+            reply::write_single_register(address, value, &mut pdu)
+        }
+        Request::WriteMultipleCoils { address, bits } => {
+            reply::write_multiple_coils(address, bits, &mut pdu)
+        }
+        Request::WriteMultipleRegisters { address, registers } => {
+            reply::write_multiple_registers(address, registers, &mut pdu)
+        }
+        Request::MaskWriteRegister { address, and_mask, or_mask } => {
+            reply::mask_write_register(address, and_mask, or_mask, &mut pdu)
+        }
+        Request::Diagnostics(asked) if asked.data().len() > 2 || byte.is_multiple_of(2) => {
+            reply::diagnostics_echo(asked, &mut pdu)
+        }
+        Request::Diagnostics(asked) => {
+            reply::diagnostics(asked.sub_function(), u16::from_be_bytes([byte; 2]), &mut pdu)
+        }
+        Request::GetCommEventCounter => {
+            reply::event_counter(byte.is_multiple_of(2), byte.into(), &mut pdu)
+        }
+        Request::ReportServerId => {
+            let additional = vec![byte; usize::from(byte) % (reply::MAX_SERVER_ID_LEN - 1)];
+            reply::server_id(&[7], true, &additional, &mut pdu).unwrap()
+        }
+        Request::ReadDeviceIdentification { .. } => return None,
+        _ => panic!("no reply to {request:?}"),
+    };
+    Some(pdu[..len].to_vec())
+}
+
+proptest! {
+    #[test]
+    fn a_reply_is_the_response_to_its_request(parts in a_request(), byte: u8) {
+        let request = parts.request();
+        let Some(reply) = a_reply(&request, byte) else { return Ok(()) };
+        match request.response(&reply).unwrap() {
+            Response::Bits(bits) => {
+                prop_assert!(bits.as_bytes().iter().all(|each| *each == byte));
+                prop_assert_eq!(bits.iter().count(), usize::from(bits.quantity()));
+                prop_assert_eq!(bits.as_bytes().len(), usize::from(bits.quantity()).div_ceil(8));
+            }
+            Response::Registers(registers) => {
+                prop_assert!(registers.iter().all(|each| each == u16::from_be_bytes([byte; 2])));
+                prop_assert_eq!(registers.as_bytes().len(), reply.len() - 2);
+            }
+            Response::Written => {
+                let function = request.function();
+                prop_assert!(function.is_write());
+                prop_assert_ne!(function, Function::ReadWriteMultipleRegisters);
+            }
+            Response::Diagnostics(data) => prop_assert_eq!(data, &reply[3..]),
+            Response::EventCounter { busy, events } => {
+                prop_assert_eq!((busy, events), (byte.is_multiple_of(2), u16::from(byte)));
+            }
+            Response::ServerId(id) => prop_assert_eq!(&id[..2], [7, 0xFF]),
+            other => panic!("{other:?} from {request:?}"),
+        }
+    }
+
+    #[test]
+    fn a_reply_cut_or_stretched_is_never_taken(
+        parts in a_request(),
+        byte: u8,
+        more in 1..5usize,
+    ) {
+        let request = parts.request();
+        let Some(reply) = a_reply(&request, byte) else { return Ok(()) };
+        for cut in 0..reply.len() {
+            prop_assert_eq!(request.response(&reply[..cut]), Err(ResponseError::Length));
+        }
+        let stretched = [&reply[..], &vec![0; more]].concat();
+        prop_assert_eq!(request.response(&stretched), Err(ResponseError::Length));
+    }
+
+    #[test]
+    fn a_reply_is_taken_for_another_request_only_where_both_ask_the_same(
+        parts in a_request(),
+        other in a_request(),
+        byte: u8,
+    ) {
+        let (request, other) = (parts.request(), other.request());
+        let Some(reply) = a_reply(&request, byte) else { return Ok(()) };
+        if other.function() != request.function() {
+            let expected = other.function().code();
+            let found = request.function().code();
+            let error = ResponseError::Function { expected, found };
+            prop_assert_eq!(other.response(&reply), Err(error));
+        } else if other.response(&reply).is_ok() {
+            prop_assert_eq!(other.response(&reply), request.response(&reply));
+        }
+    }
+
+    #[test]
+    fn an_exception_is_read_back(parts in a_request(), code: u8) {
+        let request = parts.request();
+        let function_code = request.function().code();
+        let expected = match ExceptionCode::from_code(code) {
+            Some(known) => {
+                let mut pdu = [0; pdu::MAX_LEN];
+                let len = reply::exception(function_code, known, &mut pdu);
+                prop_assert_eq!(&pdu[..len], [function_code | 0x80, code]);
+                ResponseError::Exception(known)
+            }
+            None => ResponseError::UnknownException(code),
+        };
+        let reply = [function_code | 0x80, code];
+        prop_assert_eq!(request.response(&reply), Err(expected));
+    }
+
+    #[test]
+    fn any_bytes_are_taken_only_when_they_fit_the_request(
+        parts in a_request(),
+        same_function: bool,
+        body in prop::collection::vec(prop_oneof![Just(0), Just(2), any::<u8>()], 0..260),
+    ) {
+        let request = parts.request();
+        let code = request.function().code();
+        let bytes = if same_function { [&[code], &body[..]].concat() } else { body };
+        if request.response(&bytes).is_ok() {
+            prop_assert_eq!(bytes[0], code);
+        }
+    }
+}
+
+#[test]
+fn a_write_of_other_values_is_not_the_one_that_was_asked_for() {
+    let request = Request::WriteSingleRegister { address: 1, value: 2 };
+    for reply in [[6, 0, 1, 0, 3], [6, 0, 2, 0, 2]] {
+        assert_eq!(request.response(&reply), Err(ResponseError::Echo));
+    }
+    let request = Request::MaskWriteRegister { address: 4, and_mask: 0xF2, or_mask: 0x25 };
+    let reply = [22, 0, 4, 0, 0xF2, 0, 0x26];
+    assert_eq!(request.response(&reply), Err(ResponseError::Echo));
+}
+
+#[test]
+fn registers_of_another_quantity_are_not_those_that_were_asked_for() {
+    let request = Request::ReadInputRegisters(RegisterRange::new(0, 2).unwrap());
+    for reply in [&[4, 2, 0, 1][..], &[4, 4, 0, 1], &[4, 2, 0, 1, 0, 2], &[4, 6, 0, 1, 0, 2, 0, 3]]
+    {
+        assert_eq!(request.response(reply), Err(ResponseError::Length));
+    }
+}
+
+#[test]
+fn the_answer_of_another_sub_function_is_not_the_one_that_was_asked_for() {
+    let asked = pdu::Diagnostics::new(SubFunction::ReturnBusMessageCount, &[0, 0]).unwrap();
+    let request = Request::Diagnostics(asked);
+    let mut pdu = [0; pdu::MAX_LEN];
+    let len = reply::diagnostics(SubFunction::ReturnServerBusyCount, 1, &mut pdu);
+    assert_eq!(request.response(&pdu[..len]), Err(ResponseError::Echo));
+}
+
+#[test]
+fn a_server_id_that_does_not_fit_is_not_written() {
+    let mut pdu = [0; pdu::MAX_LEN];
+    let longest = [9; reply::MAX_SERVER_ID_LEN - 2];
+    assert_eq!(reply::server_id(&[1], false, &longest, &mut pdu), Some(pdu::MAX_LEN));
+    assert_eq!(reply::server_id(&[1, 2], false, &longest, &mut pdu), None);
+}
