@@ -5,8 +5,11 @@ PYTHON ?= python3
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 RUST := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name Cargo.toml)
 CRATES := --workspace --exclude holdfast-binding
+PROTOCOL := -p holdfast-protocol
+NO_STD := crates/protocol/tests/no_std/Cargo.toml
+BARE_METAL := thumbv7em-none-eabi
 
-.PHONY: run test lint format bench docs lock clean
+.PHONY: run test lint no-std format bench docs lock clean
 .DELETE_ON_ERROR:
 
 run: .venv/core.stamp
@@ -14,18 +17,34 @@ run: .venv/core.stamp
 
 test: .venv/core.stamp .venv/dev.stamp
 	cargo test --locked --quiet $(CRATES)
+	cargo test --locked --quiet $(PROTOCOL) --no-default-features
 	$(BIN)/pytest
 
-lint: .venv/core.stamp .venv/dev.stamp
+lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
+	cargo fmt --check --manifest-path $(NO_STD)
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
+	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
+	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m mypy.stubtest holdfast._core
 
+# Links a program without the standard library with the protocol crate: for this machine, and for a
+# microcontroller if its target is installed (`rustup target add thumbv7em-none-eabi`).
+NO_STD_BUILD := cargo build --locked --quiet --manifest-path $(NO_STD) --target-dir target/no_std
+no-std:
+	$(NO_STD_BUILD)
+	$(NO_STD_BUILD) --features alloc
+	@if [ -d "$$(rustc --print target-libdir --target $(BARE_METAL))" ]; then set -x; \
+	  $(NO_STD_BUILD) --target $(BARE_METAL) && \
+	  $(NO_STD_BUILD) --target $(BARE_METAL) --features alloc; \
+	else echo "$(BARE_METAL) is not installed: built for this machine only"; fi
+
 format: .venv/dev.stamp
 	cargo fmt
+	cargo fmt --manifest-path $(NO_STD)
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
@@ -46,6 +65,7 @@ lock: .venv/dev.stamp
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	cargo update
+	cargo update --manifest-path $(NO_STD)
 
 clean:
 	rm -rf .venv target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
