@@ -26,6 +26,8 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
+	RUSTDOCFLAGS='-D warnings' cargo doc --locked --quiet --no-deps $(PROTOCOL)
+	cargo publish --locked --quiet --dry-run --allow-dirty $(PROTOCOL)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy

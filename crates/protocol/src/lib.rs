@@ -1,4 +1,4 @@
-//! Modbus as bytes in, bytes out: no socket, no clock, no allocation per frame.
+#![doc = include_str!("../README.md")]
 //!
 //! # Modules
 //!
