@@ -722,7 +722,7 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
     nothing = tmp_path / "nothing.pem"
     nothing.write_text("nothing\n")
     locked = party.authority.issue("locked", "DNS:locked", "-passout", "pass:secret")
-    odd = party.authority.issue("odd", "DNS:odd", curve="P-521")
+    odd = party.authority.issue("odd", "DNS:odd", curve="secp256k1")
     ca, key, server = party.authority.ca, party.server.key, party.server.certificate
     cases = [
         ({"cert_file": key}, key, "found no certificate, allowed: a certificate in PEM"),
@@ -740,7 +740,7 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         (
             {"cert_file": odd.certificate, "key_file": odd.key},
             odd.key,
-            "found a key of another kind, allowed: RSA, P-256, P-384, Ed25519",
+            "found a key of another kind, allowed: RSA, P-256, P-384, P-521, Ed25519",
         ),
         ({"ca_file": nothing}, nothing, "found no certificate, allowed: a certificate in PEM"),
         (

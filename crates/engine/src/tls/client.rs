@@ -11,7 +11,7 @@ use std::sync::{Arc, OnceLock};
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::client::{Resumption, verify_server_cert_signed_by_trust_anchor, verify_server_name};
 use rustls::crypto::{
-    CryptoProvider, WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature,
+    CryptoProvider, WebPkiSupportedAlgorithms, verify_tls12_signature, verify_tls13_signature,
 };
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::ParsedCertificate;
@@ -22,6 +22,7 @@ use rustls::{
 use thiserror::Error as ThisError;
 
 use super::files::{FileError, certificates, key};
+use super::provider::provider;
 use super::{Channel, words};
 
 /// What a client's TLS is made from.
@@ -72,7 +73,7 @@ impl ClientTls {
             let found = format!("found {:?} as the name of a certificate", settings.name);
             TlsError::Other(format!("{found}, allowed: a host name or an IP address"))
         })?;
-        let provider = Arc::new(ring::default_provider());
+        let provider = provider();
         let trusted = Arc::new(Trusted {
             certificates: settings
                 .ca
@@ -142,7 +143,8 @@ fn config(
                     Error::InconsistentKeys(_) => {
                         format!("it is not the key of the certificate in {}", file.display())
                     }
-                    _ => "found a key of another kind, allowed: RSA, P-256, P-384, Ed25519".into(),
+                    _ => "found a key of another kind, allowed: RSA, P-256, P-384, P-521, Ed25519"
+                        .into(),
                 };
                 FileError::content(key_file, flaw)
             })?;
@@ -343,7 +345,7 @@ mod tests {
         version: &'static SupportedProtocolVersion,
         asks: Option<&Owner>,
     ) -> Channel {
-        let provider = Arc::new(ring::default_provider());
+        let provider = provider();
         let builder = ServerConfig::builder_with_provider(Arc::clone(&provider))
             .with_protocol_versions(&[version])
             .unwrap();

@@ -5,6 +5,7 @@
 mod certificate;
 pub mod client;
 mod files;
+mod provider;
 pub mod server;
 mod words;
 

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rustls::client::danger::HandshakeSignatureValid;
-use rustls::crypto::{CryptoProvider, ring, verify_tls12_signature, verify_tls13_signature};
+use rustls::crypto::{CryptoProvider, verify_tls12_signature, verify_tls13_signature};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
@@ -21,6 +21,7 @@ use rustls::{
 use super::Channel;
 use super::certificate::Parsed;
 use super::files::{FileError, certificates, key};
+use super::provider::provider;
 
 /// The files of a server, in PEM.
 #[derive(Debug, Clone)]
@@ -45,7 +46,7 @@ impl ServerTls {
     /// # Errors
     /// [`FileError`] for one that can't be used.
     pub fn load(files: &ServerFiles) -> Result<ServerTls, FileError> {
-        let provider = Arc::new(ring::default_provider());
+        let provider = provider();
         let (chain, key) = (certificates(&files.cert_file)?, key(&files.key_file)?);
         let clients = Arc::new(Clients::load(files, &provider)?);
         let config = ServerConfig::builder_with_provider(provider)
@@ -58,7 +59,9 @@ impl ServerTls {
                     let certificate = files.cert_file.display();
                     format!("it is not the key of the certificate in {certificate}")
                 }
-                _ => "found a key of another kind, allowed: RSA, P-256, P-384, Ed25519".into(),
+                _ => {
+                    "found a key of another kind, allowed: RSA, P-256, P-384, P-521, Ed25519".into()
+                }
             };
             FileError::content(&files.key_file, flaw)
         })?;
