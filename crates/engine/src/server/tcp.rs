@@ -17,6 +17,7 @@ use super::policy::{PeerRights, Policy, Rule};
 use super::stream::Stream;
 use super::tls::ServerTlsStream;
 use super::unit_server::UnitServer;
+use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 
 /// How a TCP stream carries Modbus.
@@ -101,7 +102,10 @@ impl ModbusStream {
         };
         let role = match shaken {
             Ok(Ok(())) => stream.role(),
-            Ok(Err(Kind::Closed)) => return context.ended(Kind::TlsFailed("closed"), peer),
+            Ok(Err(Kind::Closed)) => {
+                let reason = TlsFailure::ClosedDuringHandshake.event_reason();
+                return context.ended(Kind::TlsFailed(reason), peer);
+            }
             Ok(Err(end)) => Err(end),
             Err(_) => return context.ended(Kind::TlsFailed("timeout"), peer),
         };

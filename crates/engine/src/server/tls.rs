@@ -15,8 +15,8 @@ use tokio::net::TcpStream;
 
 use super::event::Kind;
 use super::stream::{self, Stream};
-use crate::tls::Channel;
 use crate::tls::server::{self, ServerTls};
+use crate::tls::{Channel, TlsFailure};
 
 /// Bytes taken from a socket at once.
 const INPUT: usize = 4096;
@@ -188,7 +188,7 @@ impl Stream for ServerTlsStream {
 }
 
 fn failed(error: &rustls::Error) -> Kind {
-    Kind::TlsFailed(server::reason(error))
+    Kind::TlsFailed(TlsFailure::from(error).event_reason())
 }
 
 /// Where records begin and end.

@@ -23,7 +23,7 @@ use thiserror::Error as ThisError;
 
 use super::files::{FileError, certificates, key};
 use super::provider::provider;
-use super::{Channel, words};
+use super::{Channel, TlsFailure};
 
 /// What a client's TLS is made from.
 #[derive(Debug, Clone, Copy)]
@@ -131,7 +131,7 @@ fn config(
 ) -> Result<(ClientConfig, Vec<CertificateDer<'static>>), TlsError> {
     let builder = ClientConfig::builder_with_provider(Arc::clone(provider))
         .with_safe_default_protocol_versions()
-        .map_err(|error| TlsError::Other(words(&error)))?
+        .map_err(|error| TlsError::Other(TlsFailure::from(&error).to_string()))?
         .dangerous()
         .with_custom_certificate_verifier(Arc::clone(trusted) as Arc<dyn ServerCertVerifier>);
     let (mut config, own) = match own {
@@ -212,7 +212,7 @@ impl Trusted {
             (Err(Error::InvalidCertificate(CertificateError::UnknownIssuer)), Some(lapsed))
                 if !self.of_system =>
             {
-                let why = words(&lapsed);
+                let why = TlsFailure::from(&lapsed);
                 let text = format!("its issuer is unknown; of those that are trusted, one: {why}");
                 let cause = OtherError(Arc::new(io::Error::other(text)));
                 Err(CertificateError::Other(cause).into())
@@ -382,7 +382,7 @@ mod tests {
             }
             for bytes in std::mem::take(&mut to_client).chunks(piece) {
                 let done = client.receive(bytes, &mut answered, &mut to_server);
-                done.map_err(|error| words(&error))?;
+                done.map_err(|error| TlsFailure::from(&error).to_string())?;
             }
             if !client.is_handshaking() && !greeted {
                 greeted = true;
@@ -436,7 +436,8 @@ mod tests {
         assert_eq!(told(&both, "10.0.0.5", &address), "pong");
         assert_eq!(
             told(&stranger.pem(), "plc", &plc),
-            "the issuer of the certificate is unknown: it is none of those that are trusted"
+            "the issuer of the certificate is unknown: neither the certificate nor an authority \
+             above it is trusted"
         );
         assert_eq!(
             told(&both, "10.0.0.5", &plc),
@@ -466,7 +467,7 @@ mod tests {
         });
         let told_early = told(&authority.pem(), "plc", &early);
         assert!(
-            told_early.starts_with("the certificate is not valid for another "),
+            told_early.starts_with("the certificate is not valid yet: its dates begin in "),
             "{told_early}"
         );
 
@@ -503,7 +504,7 @@ mod tests {
         });
         assert_eq!(
             told(&of_client.pem(), "plc", &of_client),
-            "the certificate is not one for servers"
+            "the certificate is for other purposes: its extendedKeyUsage lacks serverAuth"
         );
     }
 
@@ -545,7 +546,7 @@ mod tests {
         for bytes in [&b"HTTP/1.1 400 Bad Request\r\n\r\n"[..], b"\0\0\0\0\0\x03\x01\x83\x01"] {
             let (mut plain, mut out) = (Vec::new(), Vec::new());
             let error = tls.channel().unwrap().receive(bytes, &mut plain, &mut out).unwrap_err();
-            assert_eq!(words(&error), "the peer does not speak TLS");
+            assert_eq!(TlsFailure::from(&error).to_string(), "the peer does not speak TLS");
             assert!(plain.is_empty());
         }
     }

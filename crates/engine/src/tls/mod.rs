@@ -4,20 +4,25 @@
 
 mod certificate;
 pub mod client;
+mod failure;
 mod files;
 mod provider;
 pub mod server;
-mod words;
 
 use std::io::{Read, Write};
 
 use rustls::{Connection, Error};
 
+pub use failure::TlsFailure;
 pub use files::FileError;
-pub use words::words;
 
 /// Bytes of plain text taken out at once.
 const CHUNK: usize = 4096;
+
+/// Why TLS failed, in words for people.
+pub fn words(error: &Error) -> String {
+    TlsFailure::from(error).to_string()
+}
 
 /// One connection's TLS.
 pub struct Channel(Connection);

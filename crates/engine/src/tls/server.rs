@@ -89,35 +89,6 @@ pub(crate) fn role(channel: &Channel) -> Result<String, Error> {
     Ok(Parsed::new(certificate)?.role()?)
 }
 
-/// Why a connection failed, in a word.
-pub(crate) fn reason(error: &Error) -> &'static str {
-    use CertificateError::{
-        BadEncoding, BadSignature, Expired, ExpiredContext, InvalidPurpose, InvalidPurposeContext,
-        NotValidYet, NotValidYetContext, Revoked, UnhandledCriticalExtension, UnknownIssuer,
-        UnknownRevocationStatus,
-    };
-    match error {
-        Error::NoCertificatesPresented => "no_certificate",
-        Error::InvalidCertificate(error) => match error {
-            UnknownIssuer => "unknown_authority",
-            Expired | ExpiredContext { .. } => "expired",
-            NotValidYet | NotValidYetContext { .. } => "not_valid_yet",
-            Revoked => "revoked",
-            UnknownRevocationStatus => "unknown_revocation",
-            InvalidPurpose | InvalidPurposeContext { .. } => "wrong_purpose",
-            UnhandledCriticalExtension => "unknown_extension",
-            BadEncoding => "bad_certificate",
-            BadSignature => "bad_signature",
-            _ => "untrusted_certificate",
-        },
-        Error::AlertReceived(_) => "refused_by_peer",
-        Error::PeerIncompatible(_) => "incompatible",
-        Error::InvalidMessage(_) => "not_tls",
-        Error::DecryptError => "decrypt_error",
-        _ => "protocol_error",
-    }
-}
-
 /// Judges the certificates of clients.
 #[derive(Debug)]
 struct Clients {

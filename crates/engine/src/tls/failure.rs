@@ -1,0 +1,444 @@
+//! Why TLS failed: a variant a cause, for servers and clients alike. [`TlsFailure::reason`] is for
+//! programs and [`Display`](std::fmt::Display) for people; neither depends on the other.
+
+use std::time::Duration;
+
+use rustls::pki_types::UnixTime;
+use rustls::{
+    AlertDescription, CertificateError, Error, ExtendedKeyPurpose, InvalidMessage, PeerMisbehaved,
+};
+use thiserror::Error as ThisError;
+
+/// Names of a certificate that are listed.
+const MAX_NAMES: usize = 4;
+
+const DAY: u64 = 24 * 60 * 60;
+
+/// Why there is no connection, or not any more.
+///
+/// What comes from a certificate is escaped in the texts: it can't harm a terminal or a log.
+///
+/// ```
+/// use holdfast_engine::tls::TlsFailure;
+/// use rustls::{AlertDescription, Error};
+///
+/// let failure = TlsFailure::from(&Error::AlertReceived(AlertDescription::UnknownCA));
+/// assert_eq!(failure.reason(), "peer_refused_certificate");
+/// assert_eq!(
+///     failure.to_string(),
+///     "the peer refused the certificate: it does not know its issuer"
+/// );
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq, ThisError)]
+#[non_exhaustive]
+pub enum TlsFailure {
+    /// Neither is it trusted itself, nor is an authority above it.
+    #[error(
+        "the issuer of the certificate is unknown: neither the certificate nor an authority above \
+         it is trusted"
+    )]
+    UnknownIssuer,
+    #[error("the certificate expired {} ago", span(*.ago))]
+    Expired { ago: Duration },
+    #[error("the certificate is not valid yet: its dates begin in {}", span(*.begins_in))]
+    NotYetValid { begins_in: Duration },
+    /// An authority above the certificate, trusted or sent by the peer, is out of date.
+    #[error("an authority above the certificate expired {} ago", span(*.ago))]
+    IssuerExpired { ago: Duration },
+    #[error(
+        "an authority above the certificate is not valid yet: its dates begin in {}",
+        span(*.begins_in)
+    )]
+    IssuerNotYetValid { begins_in: Duration },
+    /// The names are as the certificate has them.
+    #[error("{}", wrong_name(.expected, .presented))]
+    WrongName { expected: String, presented: Vec<String> },
+    /// `required` is `serverAuth` or `clientAuth`.
+    #[error("the certificate is for other purposes: its extendedKeyUsage lacks {required}")]
+    WrongPurpose { required: &'static str },
+    #[error("the certificate, or an authority above it, is revoked")]
+    Revoked,
+    #[error("no valid revocation list of an authority above the certificate")]
+    UnknownRevocation,
+    /// Of a certificate, or of the handshake: then the peer does not hold the certificate's key.
+    #[error("a signature of the certificate, or of the handshake with it, is wrong")]
+    BadSignature,
+    /// It is not an X.509 certificate, or its role is malformed.
+    #[error("the certificate can't be read")]
+    BadCertificate,
+    #[error("the certificate has a critical extension that is not supported")]
+    UnsupportedExtension,
+    /// It is readable, but its version, key or signature is not supported.
+    #[error("the certificate is not supported: {flaw}")]
+    UnsupportedCertificate { flaw: String },
+    /// A certificate with `CA:TRUE` that is not trusted itself.
+    #[error(
+        "the peer presented a CA certificate (CA:TRUE); list that exact certificate in `ca`, or \
+         issue one with CA:FALSE"
+    )]
+    CaAsEndEntity,
+    /// A certificate above the peer's own may not sign others.
+    #[error("a certificate above the peer's own is not one of an authority (CA:TRUE, keyCertSign)")]
+    IssuerNotAuthority,
+    /// `pathLenConstraint` or `nameConstraints` of an authority.
+    #[error("an authority above the certificate may not issue it: {constraint}")]
+    ConstraintViolated { constraint: &'static str },
+    #[error("the certificate is not accepted: {flaw}")]
+    UntrustedCertificate { flaw: String },
+    #[error("the peer presented no certificate")]
+    NoCertificate,
+    #[error("the peer asks for a certificate")]
+    PeerRequiresCertificate,
+    #[error("the peer refused the certificate: {}", refusal(*.alert))]
+    PeerRefusedCertificate { alert: AlertDescription },
+    /// The alert has several causes.
+    #[error(
+        "the peer refused the handshake: it may ask for a certificate, or have no cipher suite in \
+         common"
+    )]
+    PeerRefusedHandshake,
+    #[error("the peer ended TLS with alert {alert:?}")]
+    PeerEnded { alert: AlertDescription },
+    /// `by_peer`: the peer found it out.
+    #[error("no TLS version or cipher suite in common; supported: TLS 1.2 and 1.3")]
+    NoCommonVersionOrCipher { by_peer: bool },
+    #[error("the peer does not speak TLS")]
+    NotTls,
+    #[error("a malformed TLS message: {flaw}")]
+    MalformedMessage { flaw: String },
+    #[error("the peer ended the connection instead of agreeing on TLS")]
+    ClosedDuringHandshake,
+    #[error("a TLS record was changed on its way")]
+    BadRecord,
+    #[error("{text}")]
+    Other { text: String },
+}
+
+impl TlsFailure {
+    /// The cause in a word, which stays the same when texts change.
+    pub const fn reason(&self) -> &'static str {
+        match self {
+            TlsFailure::UnknownIssuer => "unknown_issuer",
+            TlsFailure::Expired { .. } => "expired",
+            TlsFailure::NotYetValid { .. } => "not_yet_valid",
+            TlsFailure::IssuerExpired { .. } => "issuer_expired",
+            TlsFailure::IssuerNotYetValid { .. } => "issuer_not_yet_valid",
+            TlsFailure::WrongName { .. } => "wrong_name",
+            TlsFailure::WrongPurpose { .. } => "wrong_purpose",
+            TlsFailure::Revoked => "revoked",
+            TlsFailure::UnknownRevocation => "unknown_revocation",
+            TlsFailure::BadSignature => "bad_signature",
+            TlsFailure::BadCertificate => "bad_certificate",
+            TlsFailure::UnsupportedExtension => "unsupported_extension",
+            TlsFailure::UnsupportedCertificate { .. } => "unsupported_certificate",
+            TlsFailure::CaAsEndEntity => "ca_as_end_entity",
+            TlsFailure::IssuerNotAuthority => "issuer_not_authority",
+            TlsFailure::ConstraintViolated { .. } => "constraint_violated",
+            TlsFailure::UntrustedCertificate { .. } => "untrusted_certificate",
+            TlsFailure::NoCertificate => "no_certificate",
+            TlsFailure::PeerRequiresCertificate => "peer_requires_certificate",
+            TlsFailure::PeerRefusedCertificate { .. } => "peer_refused_certificate",
+            TlsFailure::PeerRefusedHandshake => "peer_refused_handshake",
+            TlsFailure::PeerEnded { .. } => "peer_ended",
+            TlsFailure::NoCommonVersionOrCipher { .. } => "no_common_version_or_cipher",
+            TlsFailure::NotTls => "not_tls",
+            TlsFailure::MalformedMessage { .. } => "malformed_message",
+            TlsFailure::ClosedDuringHandshake => "closed_during_handshake",
+            TlsFailure::BadRecord => "bad_record",
+            TlsFailure::Other { .. } => "other",
+        }
+    }
+
+    /// The `reason` of a listener's event `tls_failed`. Its words are older than those of
+    /// [`TlsFailure::reason`], and fewer.
+    pub const fn event_reason(&self) -> &'static str {
+        match self {
+            TlsFailure::UnknownIssuer => "unknown_authority",
+            TlsFailure::Expired { .. } | TlsFailure::IssuerExpired { .. } => "expired",
+            TlsFailure::NotYetValid { .. } | TlsFailure::IssuerNotYetValid { .. } => {
+                "not_valid_yet"
+            }
+            TlsFailure::WrongPurpose { .. } => "wrong_purpose",
+            TlsFailure::Revoked => "revoked",
+            TlsFailure::UnknownRevocation => "unknown_revocation",
+            TlsFailure::BadSignature => "bad_signature",
+            TlsFailure::BadCertificate => "bad_certificate",
+            TlsFailure::UnsupportedExtension => "unknown_extension",
+            TlsFailure::WrongName { .. }
+            | TlsFailure::UnsupportedCertificate { .. }
+            | TlsFailure::CaAsEndEntity
+            | TlsFailure::IssuerNotAuthority
+            | TlsFailure::ConstraintViolated { .. }
+            | TlsFailure::UntrustedCertificate { .. } => "untrusted_certificate",
+            TlsFailure::NoCertificate => "no_certificate",
+            TlsFailure::PeerRequiresCertificate
+            | TlsFailure::PeerRefusedCertificate { .. }
+            | TlsFailure::PeerRefusedHandshake
+            | TlsFailure::PeerEnded { .. }
+            | TlsFailure::NoCommonVersionOrCipher { by_peer: true } => "refused_by_peer",
+            TlsFailure::NoCommonVersionOrCipher { by_peer: false } => "incompatible",
+            TlsFailure::NotTls | TlsFailure::MalformedMessage { .. } => "not_tls",
+            TlsFailure::ClosedDuringHandshake => "closed",
+            TlsFailure::BadRecord => "decrypt_error",
+            TlsFailure::Other { .. } => "protocol_error",
+        }
+    }
+}
+
+impl From<&Error> for TlsFailure {
+    fn from(error: &Error) -> TlsFailure {
+        match error {
+            Error::InvalidCertificate(flaw) => of_certificate(flaw),
+            Error::NoCertificatesPresented => TlsFailure::NoCertificate,
+            Error::AlertReceived(alert) => of_alert(*alert),
+            Error::InvalidMessage(
+                InvalidMessage::InvalidContentType
+                | InvalidMessage::UnknownProtocolVersion
+                | InvalidMessage::MessageTooLarge,
+            ) => TlsFailure::NotTls,
+            Error::InvalidMessage(flaw) => {
+                TlsFailure::MalformedMessage { flaw: plain(&format!("{flaw:?}")) }
+            }
+            Error::PeerIncompatible(_) => TlsFailure::NoCommonVersionOrCipher { by_peer: false },
+            Error::PeerMisbehaved(PeerMisbehaved::SignedKxWithWrongAlgorithm) => {
+                let flaw = "its key signed TLS 1.2 with an algorithm that is not of its cipher \
+                            suite; RSA-PSS keys require TLS 1.3";
+                TlsFailure::UnsupportedCertificate { flaw: flaw.into() }
+            }
+            Error::DecryptError => TlsFailure::BadRecord,
+            other => TlsFailure::Other { text: plain(&other.to_string()) },
+        }
+    }
+}
+
+impl From<Error> for TlsFailure {
+    fn from(error: Error) -> TlsFailure {
+        TlsFailure::from(&error)
+    }
+}
+
+fn of_certificate(flaw: &CertificateError) -> TlsFailure {
+    match flaw {
+        CertificateError::UnknownIssuer => TlsFailure::UnknownIssuer,
+        CertificateError::ExpiredContext { time, not_after } => {
+            TlsFailure::Expired { ago: between(*not_after, *time) }
+        }
+        CertificateError::NotValidYetContext { time, not_before } => {
+            TlsFailure::NotYetValid { begins_in: between(*time, *not_before) }
+        }
+        CertificateError::NotValidForNameContext { expected, presented } => {
+            let presented = presented.iter().map(|name| bare(name).to_owned()).collect();
+            TlsFailure::WrongName { expected: expected.to_str().into_owned(), presented }
+        }
+        CertificateError::InvalidPurposeContext {
+            required: ExtendedKeyPurpose::ServerAuth,
+            ..
+        } => TlsFailure::WrongPurpose { required: "serverAuth" },
+        CertificateError::InvalidPurposeContext {
+            required: ExtendedKeyPurpose::ClientAuth,
+            ..
+        } => TlsFailure::WrongPurpose { required: "clientAuth" },
+        CertificateError::Revoked => TlsFailure::Revoked,
+        CertificateError::UnknownRevocationStatus => TlsFailure::UnknownRevocation,
+        CertificateError::BadSignature => TlsFailure::BadSignature,
+        CertificateError::BadEncoding => TlsFailure::BadCertificate,
+        CertificateError::UnhandledCriticalExtension => TlsFailure::UnsupportedExtension,
+        CertificateError::Other(other) => match other.0.downcast_ref::<TlsFailure>() {
+            Some(failure) => failure.clone(),
+            None => match other.0.downcast_ref() {
+                Some(webpki::Error::CaUsedAsEndEntity) => TlsFailure::CaAsEndEntity,
+                _ => untrusted(flaw),
+            },
+        },
+        _ => untrusted(flaw),
+    }
+}
+
+fn untrusted(flaw: &CertificateError) -> TlsFailure {
+    TlsFailure::UntrustedCertificate { flaw: plain(&flaw.to_string()) }
+}
+
+fn of_alert(alert: AlertDescription) -> TlsFailure {
+    match alert {
+        AlertDescription::CertificateRequired => TlsFailure::PeerRequiresCertificate,
+        AlertDescription::HandshakeFailure => TlsFailure::PeerRefusedHandshake,
+        AlertDescription::ProtocolVersion | AlertDescription::InsufficientSecurity => {
+            TlsFailure::NoCommonVersionOrCipher { by_peer: true }
+        }
+        AlertDescription::UnknownCA
+        | AlertDescription::CertificateExpired
+        | AlertDescription::CertificateRevoked
+        | AlertDescription::AccessDenied
+        | AlertDescription::UnsupportedCertificate
+        | AlertDescription::BadCertificate
+        | AlertDescription::CertificateUnknown => TlsFailure::PeerRefusedCertificate { alert },
+        alert => TlsFailure::PeerEnded { alert },
+    }
+}
+
+/// What an alert says of the certificate that the peer refused.
+fn refusal(alert: AlertDescription) -> &'static str {
+    match alert {
+        AlertDescription::UnknownCA => "it does not know its issuer",
+        AlertDescription::CertificateExpired => "expired",
+        AlertDescription::CertificateRevoked => "revoked",
+        AlertDescription::AccessDenied => "access denied",
+        AlertDescription::UnsupportedCertificate => "of a kind that it does not take",
+        _ => "bad",
+    }
+}
+
+fn wrong_name(expected: &str, presented: &[String]) -> String {
+    let expected = plain(expected);
+    if presented.is_empty() {
+        return format!("the certificate has no alternative name: it is not for '{expected}'");
+    }
+    let mut listed: Vec<String> =
+        presented.iter().take(MAX_NAMES).map(|name| format!("'{}'", plain(name))).collect();
+    if presented.len() > MAX_NAMES {
+        listed.push(format!("{} more", presented.len() - MAX_NAMES));
+    }
+    format!("the certificate is for {}, not for '{expected}'", listed.join(", "))
+}
+
+/// A name as webpki has it, without its kind.
+fn bare(name: &str) -> &str {
+    let text = name.strip_prefix("DnsName(\"").and_then(|rest| rest.strip_suffix("\")"));
+    let text =
+        text.or_else(|| name.strip_prefix("IpAddress(").and_then(|rest| rest.strip_suffix(')')));
+    text.unwrap_or(name)
+}
+
+/// Text without control characters.
+fn plain(text: &str) -> String {
+    text.escape_debug().to_string()
+}
+
+fn between(from: UnixTime, to: UnixTime) -> Duration {
+    Duration::from_secs(to.as_secs().saturating_sub(from.as_secs()))
+}
+
+fn span(time: Duration) -> String {
+    let seconds = time.as_secs();
+    if seconds < DAY { format!("{seconds} s") } else { format!("{} days", seconds / DAY) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+    use std::sync::Arc;
+
+    use rustls::OtherError;
+    use rustls::pki_types::ServerName;
+
+    use super::*;
+
+    fn of_names(presented: &[&str]) -> TlsFailure {
+        TlsFailure::from(Error::from(CertificateError::NotValidForNameContext {
+            expected: ServerName::try_from("10.0.0.5").unwrap(),
+            presented: presented.iter().map(|name| (*name).to_owned()).collect(),
+        }))
+    }
+
+    #[test]
+    fn names_are_listed_without_what_could_harm_a_terminal() {
+        let told = |presented: &[&str]| of_names(presented).to_string();
+        assert_eq!(
+            told(&["DnsName(\"plc7\")", "IpAddress(10.0.0.7)"]),
+            "the certificate is for 'plc7', '10.0.0.7', not for '10.0.0.5'"
+        );
+        assert_eq!(
+            told(&["DnsName(\"\x1b[2J\n\")"]),
+            "the certificate is for '\\u{1b}[2J\\n', not for '10.0.0.5'"
+        );
+        assert_eq!(
+            told(&["DnsName(\"a\")"; 6]),
+            "the certificate is for 'a', 'a', 'a', 'a', 2 more, not for '10.0.0.5'"
+        );
+        assert_eq!(told(&[]), "the certificate has no alternative name: it is not for '10.0.0.5'");
+        let names = of_names(&["DnsName(\"plc7\")"]);
+        let TlsFailure::WrongName { expected, presented } = names else { panic!("{names:?}") };
+        assert_eq!((expected.as_str(), presented), ("10.0.0.5", vec!["plc7".to_owned()]));
+    }
+
+    #[test]
+    fn text_of_a_peer_can_not_harm_a_terminal() {
+        let harmful = Error::General("\x1b[2J\r\n".into());
+        assert_eq!(TlsFailure::from(harmful).to_string(), "unexpected error: \\u{1b}[2J\\r\\n");
+    }
+
+    #[test]
+    fn what_was_judged_here_is_told_as_it_was() {
+        let failure = TlsFailure::CaAsEndEntity;
+        let carried = CertificateError::Other(OtherError(Arc::new(failure.clone())));
+        assert_eq!(TlsFailure::from(Error::from(carried)), failure);
+    }
+
+    #[test]
+    fn every_cause_has_a_word_of_its_own() {
+        let (ago, begins_in) = (Duration::from_secs(59), Duration::from_secs(3 * DAY));
+        let (flaw, alert) = (String::from("flaw"), AlertDescription::UnknownCA);
+        let causes = [
+            TlsFailure::UnknownIssuer,
+            TlsFailure::Expired { ago },
+            TlsFailure::NotYetValid { begins_in },
+            TlsFailure::IssuerExpired { ago },
+            TlsFailure::IssuerNotYetValid { begins_in },
+            TlsFailure::WrongName { expected: "a".into(), presented: Vec::new() },
+            TlsFailure::WrongPurpose { required: "serverAuth" },
+            TlsFailure::Revoked,
+            TlsFailure::UnknownRevocation,
+            TlsFailure::BadSignature,
+            TlsFailure::BadCertificate,
+            TlsFailure::UnsupportedExtension,
+            TlsFailure::UnsupportedCertificate { flaw: flaw.clone() },
+            TlsFailure::CaAsEndEntity,
+            TlsFailure::IssuerNotAuthority,
+            TlsFailure::ConstraintViolated { constraint: "pathLenConstraint" },
+            TlsFailure::UntrustedCertificate { flaw: flaw.clone() },
+            TlsFailure::NoCertificate,
+            TlsFailure::PeerRequiresCertificate,
+            TlsFailure::PeerRefusedCertificate { alert },
+            TlsFailure::PeerRefusedHandshake,
+            TlsFailure::PeerEnded { alert },
+            TlsFailure::NoCommonVersionOrCipher { by_peer: false },
+            TlsFailure::NotTls,
+            TlsFailure::MalformedMessage { flaw },
+            TlsFailure::ClosedDuringHandshake,
+            TlsFailure::BadRecord,
+            TlsFailure::Other { text: "text".into() },
+        ];
+        let words: HashSet<&str> = causes.iter().map(TlsFailure::reason).collect();
+        let texts: HashSet<String> = causes.iter().map(TlsFailure::to_string).collect();
+        assert_eq!((words.len(), texts.len()), (causes.len(), causes.len()));
+        assert!(texts.contains("the certificate expired 59 s ago"));
+        assert!(texts.contains("the certificate is not valid yet: its dates begin in 3 days"));
+    }
+
+    #[test]
+    fn an_alert_is_told_apart_from_what_was_found_here() {
+        let told = |error: Error| {
+            let failure = TlsFailure::from(error);
+            (failure.reason(), failure.event_reason())
+        };
+        assert_eq!(
+            told(Error::AlertReceived(AlertDescription::ProtocolVersion)),
+            ("no_common_version_or_cipher", "refused_by_peer")
+        );
+        assert_eq!(
+            told(rustls::PeerIncompatible::NoCipherSuitesInCommon.into()),
+            ("no_common_version_or_cipher", "incompatible")
+        );
+        assert_eq!(
+            told(Error::AlertReceived(AlertDescription::CertificateRequired)),
+            ("peer_requires_certificate", "refused_by_peer")
+        );
+        assert_eq!(told(InvalidMessage::InvalidContentType.into()), ("not_tls", "not_tls"));
+        assert_eq!(
+            told(InvalidMessage::UnexpectedMessage("hello").into()),
+            ("malformed_message", "not_tls")
+        );
+        assert_eq!(told(Error::DecryptError), ("bad_record", "decrypt_error"));
+        assert_eq!(told(Error::HandshakeNotComplete), ("other", "protocol_error"));
+    }
+}
