@@ -1,26 +1,96 @@
-//! What is read of an X.509 certificate beyond what verifying it asks for: the role of its owner, and
-//! what it may be trusted as.
+//! What is read of an X.509 certificate: the answers on which trust and roles depend, each given in
+//! one place.
 
 use rustls::pki_types::{CertificateDer, UnixTime};
-use rustls::{CertificateError, DistinguishedName};
-use x509_cert::Certificate;
-use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
-use x509_cert::der::{Decode, Encode};
-use x509_cert::ext::pkix::{BasicConstraints, KeyUsage};
+use rustls::{CertificateError, DistinguishedName, ExtendedKeyPurpose};
+use webpki::KeyPurposeId;
+use x509_cert::certificate::{CertificateInner, Profile};
+use x509_cert::der::asn1::{AnyRef, ObjectIdentifier, UintRef, Utf8StringRef};
+use x509_cert::der::{self, Decode, Encode, Reader, SliceReader};
+use x509_cert::ext::pkix::{BasicConstraints, ExtendedKeyUsage, KeyUsage};
+use x509_cert::serial_number::SerialNumber;
+use x509_cert::spki::SubjectPublicKeyInfoOwned;
+
+use super::failure::TlsFailure;
+use super::provider::KEYS;
 
 /// The extension that holds the role (MB-TCP-Security, 8.4).
 const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");
 
+const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
+const CLIENT_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.2");
+const ANY_PURPOSE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
+
+const RSA: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.113549.1.1.1");
+const ELLIPTIC_CURVE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.10045.2.1");
+const ED25519: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.101.112");
+
+const CURVES: [ObjectIdentifier; 3] = [
+    ObjectIdentifier::new_unwrap("1.2.840.10045.3.1.7"),
+    ObjectIdentifier::new_unwrap("1.3.132.0.34"),
+    ObjectIdentifier::new_unwrap("1.3.132.0.35"),
+];
+
+/// Bits of an RSA key.
+const MIN_RSA_BITS: usize = 2048;
+const MAX_RSA_BITS: usize = 8192;
+
+/// What a peer is, which its certificate has to allow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Purpose {
+    Server,
+    Client,
+}
+
+impl Purpose {
+    /// Whether the purposes that a certificate names include this one. Without any it is for all.
+    ///
+    /// RFC 5280 leaves it to applications whether `anyExtendedKeyUsage` suffices: here it does.
+    pub(super) fn is_among<'n>(self, named: impl IntoIterator<Item = KeyPurposeId<'n>>) -> bool {
+        let oid = match self {
+            Purpose::Server => SERVER_AUTH,
+            Purpose::Client => CLIENT_AUTH,
+        };
+        let suffices = [oid, ANY_PURPOSE];
+        let mut named = named.into_iter().peekable();
+        named.peek().is_none()
+            || named.any(|named| suffices.iter().any(|oid| named == purpose_id(oid)))
+    }
+
+    /// That a certificate does not allow it.
+    pub(super) fn missing(self) -> CertificateError {
+        let required = match self {
+            Purpose::Server => ExtendedKeyPurpose::ServerAuth,
+            Purpose::Client => ExtendedKeyPurpose::ClientAuth,
+        };
+        CertificateError::InvalidPurposeContext { required, presented: Vec::new() }
+    }
+}
+
+fn purpose_id(oid: &ObjectIdentifier) -> KeyPurposeId<'_> {
+    KeyPurposeId::new(oid.as_bytes())
+}
+
+/// Takes serial numbers of any length: nothing depends on them, and some devices make long ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+struct AnySerial;
+
+impl Profile for AnySerial {
+    fn check_serial_number(_: &SerialNumber<AnySerial>) -> der::Result<()> {
+        Ok(())
+    }
+}
+
 /// A certificate that was read.
 #[derive(Debug)]
-pub(super) struct Parsed(Certificate);
+pub(super) struct Parsed(CertificateInner<AnySerial>);
 
 impl Parsed {
     /// # Errors
     /// It is no X.509 certificate.
     pub(super) fn new(certificate: &CertificateDer<'_>) -> Result<Parsed, CertificateError> {
         let parsed =
-            Certificate::from_der(certificate).map_err(|_| CertificateError::BadEncoding)?;
+            CertificateInner::from_der(certificate).map_err(|_| CertificateError::BadEncoding)?;
         Ok(Parsed(parsed))
     }
 
@@ -43,13 +113,27 @@ impl Parsed {
         role.map(|role| role.to_string()).map_err(|_| CertificateError::BadEncoding)
     }
 
-    /// Whether it may sign other certificates.
+    /// Whether it vouches for others: it says `CA:TRUE`, and a `keyUsage`, if there is one, has
+    /// `keyCertSign`.
     pub(super) fn is_authority(&self) -> bool {
-        let certificate = self.0.tbs_certificate();
-        let constraints = certificate.get_extension::<BasicConstraints>();
-        let usage = certificate.get_extension::<KeyUsage>();
-        matches!(constraints, Ok(Some((_, BasicConstraints { ca: true, .. }))))
+        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        self.has_ca_flag()
             && usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.key_cert_sign()))
+    }
+
+    /// Whether it says `CA:TRUE`, be it an authority or not.
+    pub(super) fn has_ca_flag(&self) -> bool {
+        self.constraints().is_some_and(|constraints| constraints.ca)
+    }
+
+    /// How many authorities may stand between it and an end entity.
+    pub(super) fn max_intermediates(&self) -> Option<u8> {
+        self.constraints()?.path_len_constraint
+    }
+
+    fn constraints(&self) -> Option<BasicConstraints> {
+        let found = self.0.tbs_certificate().get_extension();
+        found.ok().flatten().map(|(_, constraints)| constraints)
     }
 
     /// Whether it names itself as who signed it.
@@ -61,20 +145,77 @@ impl Parsed {
     /// `now` is not within its dates.
     pub(super) fn is_valid_at(&self, now: UnixTime) -> Result<(), CertificateError> {
         let validity = self.0.tbs_certificate().validity();
-        let now = now.as_secs();
-        if now < validity.not_before.to_unix_duration().as_secs() {
-            return Err(CertificateError::NotValidYet);
+        let not_before = UnixTime::since_unix_epoch(validity.not_before.to_unix_duration());
+        let not_after = UnixTime::since_unix_epoch(validity.not_after.to_unix_duration());
+        if now < not_before {
+            return Err(CertificateError::NotValidYetContext { time: now, not_before });
         }
-        if now > validity.not_after.to_unix_duration().as_secs() {
-            return Err(CertificateError::Expired);
+        if now > not_after {
+            return Err(CertificateError::ExpiredContext { time: now, not_after });
         }
         Ok(())
+    }
+
+    /// # Errors
+    /// Its `extendedKeyUsage` is for others.
+    pub(super) fn is_for(&self, purpose: Purpose) -> Result<(), CertificateError> {
+        let named = self.0.tbs_certificate().get_extension::<ExtendedKeyUsage>();
+        match named.map_err(|_| CertificateError::BadEncoding)? {
+            Some((_, ExtendedKeyUsage(named))) => {
+                let is_for = !named.is_empty() && purpose.is_among(named.iter().map(purpose_id));
+                if is_for { Ok(()) } else { Err(purpose.missing()) }
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// # Errors
+    /// [`TlsFailure::UnsupportedCertificate`] for a key that no signature is verified with.
+    pub(super) fn has_supported_key(&self) -> Result<(), TlsFailure> {
+        let unsupported = |found: String| {
+            let flaw = format!("found {found}, allowed: {KEYS}");
+            Err(TlsFailure::UnsupportedCertificate { flaw })
+        };
+        let key = self.key();
+        let algorithm = &key.algorithm;
+        if algorithm.oid == RSA {
+            let bits = rsa_bits(key.subject_public_key.raw_bytes());
+            let bits = bits.ok_or(TlsFailure::BadCertificate)?;
+            if !(MIN_RSA_BITS..=MAX_RSA_BITS).contains(&bits) {
+                return unsupported(format!("an RSA key of {bits} bits"));
+            }
+            return Ok(());
+        }
+        if algorithm.oid == ELLIPTIC_CURVE {
+            let curve = algorithm.parameters.as_ref().and_then(|any| any.decode_as().ok());
+            return match curve {
+                Some(curve) if CURVES.contains(&curve) => Ok(()),
+                Some(curve) => unsupported(format!("a key on the curve {curve}")),
+                None => unsupported("a key on a curve without a name".into()),
+            };
+        }
+        if algorithm.oid == ED25519 {
+            return Ok(());
+        }
+        unsupported(format!("a key of the kind {}", algorithm.oid))
+    }
+
+    fn key(&self) -> &SubjectPublicKeyInfoOwned {
+        self.0.tbs_certificate().subject_public_key_info()
     }
 
     /// The name of its owner, as clients are told which certificates are wanted.
     pub(super) fn subject(&self) -> Option<DistinguishedName> {
         self.0.tbs_certificate().subject().to_der().ok().map(DistinguishedName::from)
     }
+}
+
+/// Bits of the modulus of an RSA key in PKCS#1.
+fn rsa_bits(key: &[u8]) -> Option<usize> {
+    let whole = AnyRef::from_der(key).ok()?;
+    let modulus: UintRef<'_> = SliceReader::new(whole.value()).ok()?.decode().ok()?;
+    let first = modulus.as_bytes().first()?;
+    Some(modulus.as_bytes().len() * 8 - first.leading_zeros() as usize)
 }
 
 #[cfg(test)]
@@ -164,10 +305,13 @@ mod tests {
         });
         let at = |seconds: u64| UnixTime::since_unix_epoch(std::time::Duration::from_secs(seconds));
         let (first, last) = (1_577_836_800, 2_840_140_800);
-        assert_eq!(certificate.is_valid_at(at(first - 1)), Err(CertificateError::NotValidYet));
+        let early =
+            CertificateError::NotValidYetContext { time: at(first - 1), not_before: at(first) };
+        let late = CertificateError::ExpiredContext { time: at(last + 1), not_after: at(last) };
+        assert_eq!(certificate.is_valid_at(at(first - 1)), Err(early));
         assert_eq!(certificate.is_valid_at(at(first)), Ok(()));
         assert_eq!(certificate.is_valid_at(at(last)), Ok(()));
-        assert_eq!(certificate.is_valid_at(at(last + 1)), Err(CertificateError::Expired));
+        assert_eq!(certificate.is_valid_at(at(last + 1)), Err(late));
     }
 
     #[test]

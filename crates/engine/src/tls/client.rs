@@ -4,25 +4,22 @@
 //! is valid now is asked when it is used, never when its file is read: the clock of a machine that
 //! has just been switched on may be wrong.
 
-use std::io;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
-use rustls::client::{Resumption, verify_server_cert_signed_by_trust_anchor, verify_server_name};
-use rustls::crypto::{
-    CryptoProvider, WebPkiSupportedAlgorithms, verify_tls12_signature, verify_tls13_signature,
-};
+use rustls::client::{Resumption, verify_server_name};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::ParsedCertificate;
-use rustls::{
-    CertificateError, ClientConfig, ClientConnection, DigitallySignedStruct, Error, OtherError,
-    RootCertStore, SignatureScheme,
-};
+use rustls::sign::SingleCertAndKey;
+use rustls::{ClientConfig, ClientConnection, DigitallySignedStruct, Error, SignatureScheme};
 use thiserror::Error as ThisError;
 
-use super::files::{FileError, certificates, key};
-use super::provider::provider;
+use super::certificate::Purpose;
+use super::files::FileError;
+use super::own::own;
+use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
+use super::trust::{Listed, Trust};
 use super::{Channel, TlsFailure};
 
 /// What a client's TLS is made from.
@@ -56,12 +53,10 @@ pub struct ClientTls {
 /// What makes the TLS of a client what it is.
 #[derive(Debug, PartialEq, Eq, Hash)]
 pub struct Identity {
-    trusted: Certificates,
+    trusted: Arc<[Listed]>,
     own: Vec<CertificateDer<'static>>,
     name: ServerName<'static>,
 }
-
-type Certificates = Arc<[CertificateDer<'static>]>;
 
 impl ClientTls {
     /// Reads the files.
@@ -73,17 +68,24 @@ impl ClientTls {
             let found = format!("found {:?} as the name of a certificate", settings.name);
             TlsError::Other(format!("{found}, allowed: a host name or an IP address"))
         })?;
-        let provider = provider();
-        let trusted = Arc::new(Trusted {
-            certificates: settings
-                .ca
-                .map_or_else(of_system, |file| Ok(certificates(file)?.into()))?,
-            of_system: settings.ca.is_none(),
-            algorithms: provider.signature_verification_algorithms,
-        });
-        let (config, own) = config(&provider, &trusted, settings.own)?;
-        let trusted = Arc::clone(&trusted.certificates);
-        let identity = Arc::new(Identity { trusted, own, name });
+        let trusted = match settings.ca {
+            Some(file) => Listed::of_file(file)?,
+            None => of_system()?,
+        };
+        let own = settings.own.map(|(file, key_file)| own(file, key_file)).transpose()?;
+        let shown = own.as_ref().map_or_else(Vec::new, |own| own.cert.clone());
+        let verifier = Arc::new(Servers(Trust::new(Arc::clone(&trusted), Vec::new())));
+        let builder = ClientConfig::builder_with_provider(provider())
+            .with_safe_default_protocol_versions()
+            .map_err(|error| TlsError::Other(TlsFailure::from(error).to_string()))?
+            .dangerous()
+            .with_custom_certificate_verifier(verifier);
+        let mut config = match own {
+            None => builder.with_no_client_auth(),
+            Some(own) => builder.with_client_cert_resolver(Arc::new(SingleCertAndKey::from(own))),
+        };
+        config.resumption = Resumption::disabled();
+        let identity = Arc::new(Identity { trusted, own: shown, name });
         Ok(ClientTls { config: Arc::new(config), identity })
     }
 
@@ -110,8 +112,8 @@ impl PartialEq for ClientTls {
 impl Eq for ClientTls {}
 
 /// The certificates that the system trusts, the same for all.
-fn of_system() -> Result<Certificates, TlsError> {
-    static FOUND: OnceLock<Certificates> = OnceLock::new();
+fn of_system() -> Result<Arc<[Listed]>, TlsError> {
+    static FOUND: OnceLock<Arc<[Listed]>> = OnceLock::new();
     if let Some(found) = FOUND.get() {
         return Ok(Arc::clone(found));
     }
@@ -121,108 +123,16 @@ fn of_system() -> Result<Certificates, TlsError> {
         let text = format!("the system has no authorities{why}; ca has to say who is trusted");
         return Err(TlsError::Other(text));
     }
-    Ok(Arc::clone(FOUND.get_or_init(|| found.certs.into())))
+    // What can't be read is nobody's here.
+    let listed = || found.certs.into_iter().filter_map(|each| Listed::new(each).ok()).collect();
+    Ok(Arc::clone(FOUND.get_or_init(listed)))
 }
 
-fn config(
-    provider: &Arc<CryptoProvider>,
-    trusted: &Arc<Trusted>,
-    own: Option<(&Path, &Path)>,
-) -> Result<(ClientConfig, Vec<CertificateDer<'static>>), TlsError> {
-    let builder = ClientConfig::builder_with_provider(Arc::clone(provider))
-        .with_safe_default_protocol_versions()
-        .map_err(|error| TlsError::Other(TlsFailure::from(&error).to_string()))?
-        .dangerous()
-        .with_custom_certificate_verifier(Arc::clone(trusted) as Arc<dyn ServerCertVerifier>);
-    let (mut config, own) = match own {
-        None => (builder.with_no_client_auth(), Vec::new()),
-        Some((file, key_file)) => {
-            let (chain, key) = (certificates(file)?, key(key_file)?);
-            let config = builder.with_client_auth_cert(chain.clone(), key).map_err(|error| {
-                let flaw = match error {
-                    Error::InconsistentKeys(_) => {
-                        format!("it is not the key of the certificate in {}", file.display())
-                    }
-                    _ => "found a key of another kind, allowed: RSA, P-256, P-384, P-521, Ed25519"
-                        .into(),
-                };
-                FileError::content(key_file, flaw)
-            })?;
-            (config, chain)
-        }
-    };
-    config.resumption = Resumption::disabled();
-    Ok((config, own))
-}
-
-/// Judges the certificate of a peer.
+/// Judges the certificates of servers.
 #[derive(Debug)]
-struct Trusted {
-    certificates: Certificates,
-    of_system: bool,
-    algorithms: WebPkiSupportedAlgorithms,
-}
+struct Servers(Trust);
 
-impl Trusted {
-    /// Whether a certificate, looked at by itself, is one of an authority.
-    ///
-    /// # Errors
-    /// It is not valid now, or not for servers.
-    fn is_authority(&self, of: &CertificateDer<'_>, now: UnixTime) -> Result<bool, Error> {
-        let parsed = ParsedCertificate::try_from(of)?;
-        let nobody = RootCertStore::empty();
-        let all = self.algorithms.all;
-        match verify_server_cert_signed_by_trust_anchor(&parsed, &nobody, &[], now, all) {
-            Err(Error::InvalidCertificate(CertificateError::UnknownIssuer)) => Ok(false),
-            Err(Error::InvalidCertificate(CertificateError::Other(OtherError(why))))
-                if why.downcast_ref() == Some(&webpki::Error::CaUsedAsEndEntity) =>
-            {
-                Ok(true)
-            }
-            other => other.map(|()| false),
-        }
-    }
-
-    /// Looks for an authority that vouches for a certificate. One that is trusted for itself is not
-    /// one, whatever its key has signed.
-    fn vouch(
-        &self,
-        parsed: &ParsedCertificate<'_>,
-        intermediates: &[CertificateDer<'_>],
-        now: UnixTime,
-    ) -> Result<(), Error> {
-        let mut authorities = RootCertStore::empty();
-        let mut lapsed = None;
-        for each in self.certificates.iter() {
-            match self.is_authority(each, now) {
-                Ok(true) => authorities.add(each.clone())?,
-                Ok(false) => {}
-                Err(error) => lapsed = lapsed.or(Some(error)),
-            }
-        }
-        let all = self.algorithms.all;
-        let found = verify_server_cert_signed_by_trust_anchor(
-            parsed,
-            &authorities,
-            intermediates,
-            now,
-            all,
-        );
-        match (found, lapsed) {
-            (Err(Error::InvalidCertificate(CertificateError::UnknownIssuer)), Some(lapsed))
-                if !self.of_system =>
-            {
-                let why = TlsFailure::from(&lapsed);
-                let text = format!("its issuer is unknown; of those that are trusted, one: {why}");
-                let cause = OtherError(Arc::new(io::Error::other(text)));
-                Err(CertificateError::Other(cause).into())
-            }
-            (found, _) => found,
-        }
-    }
-}
-
-impl ServerCertVerifier for Trusted {
+impl ServerCertVerifier for Servers {
     fn verify_server_cert(
         &self,
         end_entity: &CertificateDer<'_>,
@@ -231,13 +141,8 @@ impl ServerCertVerifier for Trusted {
         _ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        let parsed = ParsedCertificate::try_from(end_entity)?;
-        if self.certificates.contains(end_entity) {
-            self.is_authority(end_entity, now)?;
-        } else {
-            self.vouch(&parsed, intermediates, now)?;
-        }
-        verify_server_name(&parsed, server_name)?;
+        self.0.judge(end_entity, intermediates, Purpose::Server, now)?;
+        verify_server_name(&ParsedCertificate::try_from(end_entity)?, server_name)?;
         Ok(ServerCertVerified::assertion())
     }
 
@@ -247,7 +152,7 @@ impl ServerCertVerifier for Trusted {
         certificate: &CertificateDer<'_>,
         signed: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls12_signature(message, certificate, signed, &self.algorithms)
+        verify_tls12(message, certificate, signed)
     }
 
     fn verify_tls13_signature(
@@ -256,11 +161,11 @@ impl ServerCertVerifier for Trusted {
         certificate: &CertificateDer<'_>,
         signed: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls13_signature(message, certificate, signed, &self.algorithms)
+        verify_tls13(message, certificate, signed)
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.algorithms.supported_schemes()
+        ALGORITHMS.supported_schemes()
     }
 }
 
@@ -274,6 +179,7 @@ mod tests {
         BasicConstraints, Certificate, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer,
         KeyPair, date_time_ymd,
     };
+    use rustls::RootCertStore;
     use rustls::pki_types::PrivateKeyDer;
     use rustls::server::WebPkiClientVerifier;
     use rustls::version::{TLS12, TLS13};
@@ -477,8 +383,7 @@ mod tests {
         });
         let plc = Owner::new("plc", IsCa::NoCa, Some(&former));
         let why = told(&former.pem(), "plc", &plc);
-        assert!(why.contains("its issuer is unknown"), "{why}");
-        assert!(why.contains("of those that are trusted, one: the certificate expired"), "{why}");
+        assert!(why.starts_with("an authority above the certificate expired "), "{why}");
         // One that has expired harms no other.
         let third = Owner::new("plc", IsCa::NoCa, Some(&authority));
         assert_eq!(told(&(former.pem() + &authority.pem()), "plc", &third), "pong");

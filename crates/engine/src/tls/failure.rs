@@ -245,10 +245,7 @@ fn of_certificate(flaw: &CertificateError) -> TlsFailure {
         CertificateError::UnhandledCriticalExtension => TlsFailure::UnsupportedExtension,
         CertificateError::Other(other) => match other.0.downcast_ref::<TlsFailure>() {
             Some(failure) => failure.clone(),
-            None => match other.0.downcast_ref() {
-                Some(webpki::Error::CaUsedAsEndEntity) => TlsFailure::CaAsEndEntity,
-                _ => untrusted(flaw),
-            },
+            None => untrusted(flaw),
         },
         _ => untrusted(flaw),
     }
@@ -314,7 +311,7 @@ fn plain(text: &str) -> String {
     text.escape_debug().to_string()
 }
 
-fn between(from: UnixTime, to: UnixTime) -> Duration {
+pub(super) fn between(from: UnixTime, to: UnixTime) -> Duration {
     Duration::from_secs(to.as_secs().saturating_sub(from.as_secs()))
 }
 

@@ -6,8 +6,10 @@ mod certificate;
 pub mod client;
 mod failure;
 mod files;
+mod own;
 mod provider;
 pub mod server;
+mod trust;
 
 use std::io::{Read, Write};
 

@@ -1,9 +1,77 @@
-//! The algorithms of TLS, the same for servers and clients.
+//! The algorithms of TLS, the same for servers and clients: what may sign a certificate or a
+//! handshake, and how keys are agreed on.
 
 use std::sync::{Arc, LazyLock};
 
-use rustls::crypto::CryptoProvider;
+use rustls::client::danger::HandshakeSignatureValid;
 use rustls::crypto::aws_lc_rs::{self, kx_group};
+use rustls::crypto::{
+    CryptoProvider, WebPkiSupportedAlgorithms, verify_tls12_signature, verify_tls13_signature,
+};
+use rustls::pki_types::CertificateDer;
+use rustls::{DigitallySignedStruct, Error, SignatureScheme};
+use webpki::aws_lc_rs as algorithm;
+
+/// Keys that certificates may have.
+pub(super) const KEYS: &str = "RSA of 2048 to 8192 bits, P-256, P-384, P-521, Ed25519";
+
+/// With TLS 1.2 a scheme names the hash alone, with TLS 1.3 the curve too: the first of each row.
+pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorithms {
+    all: &[
+        algorithm::ECDSA_P256_SHA256,
+        algorithm::ECDSA_P256_SHA384,
+        algorithm::ECDSA_P256_SHA512,
+        algorithm::ECDSA_P384_SHA256,
+        algorithm::ECDSA_P384_SHA384,
+        algorithm::ECDSA_P384_SHA512,
+        algorithm::ECDSA_P521_SHA256,
+        algorithm::ECDSA_P521_SHA384,
+        algorithm::ECDSA_P521_SHA512,
+        algorithm::ED25519,
+        algorithm::RSA_PKCS1_2048_8192_SHA256,
+        algorithm::RSA_PKCS1_2048_8192_SHA384,
+        algorithm::RSA_PKCS1_2048_8192_SHA512,
+        algorithm::RSA_PKCS1_2048_8192_SHA256_ABSENT_PARAMS,
+        algorithm::RSA_PKCS1_2048_8192_SHA384_ABSENT_PARAMS,
+        algorithm::RSA_PKCS1_2048_8192_SHA512_ABSENT_PARAMS,
+        algorithm::RSA_PSS_2048_8192_SHA256_LEGACY_KEY,
+        algorithm::RSA_PSS_2048_8192_SHA384_LEGACY_KEY,
+        algorithm::RSA_PSS_2048_8192_SHA512_LEGACY_KEY,
+    ],
+    mapping: &[
+        (
+            SignatureScheme::ECDSA_NISTP384_SHA384,
+            &[
+                algorithm::ECDSA_P384_SHA384,
+                algorithm::ECDSA_P256_SHA384,
+                algorithm::ECDSA_P521_SHA384,
+            ],
+        ),
+        (
+            SignatureScheme::ECDSA_NISTP256_SHA256,
+            &[
+                algorithm::ECDSA_P256_SHA256,
+                algorithm::ECDSA_P384_SHA256,
+                algorithm::ECDSA_P521_SHA256,
+            ],
+        ),
+        (
+            SignatureScheme::ECDSA_NISTP521_SHA512,
+            &[
+                algorithm::ECDSA_P521_SHA512,
+                algorithm::ECDSA_P384_SHA512,
+                algorithm::ECDSA_P256_SHA512,
+            ],
+        ),
+        (SignatureScheme::ED25519, &[algorithm::ED25519]),
+        (SignatureScheme::RSA_PSS_SHA512, &[algorithm::RSA_PSS_2048_8192_SHA512_LEGACY_KEY]),
+        (SignatureScheme::RSA_PSS_SHA384, &[algorithm::RSA_PSS_2048_8192_SHA384_LEGACY_KEY]),
+        (SignatureScheme::RSA_PSS_SHA256, &[algorithm::RSA_PSS_2048_8192_SHA256_LEGACY_KEY]),
+        (SignatureScheme::RSA_PKCS1_SHA512, &[algorithm::RSA_PKCS1_2048_8192_SHA512]),
+        (SignatureScheme::RSA_PKCS1_SHA384, &[algorithm::RSA_PKCS1_2048_8192_SHA384]),
+        (SignatureScheme::RSA_PKCS1_SHA256, &[algorithm::RSA_PKCS1_2048_8192_SHA256]),
+    ],
+};
 
 /// What TLS is done with.
 pub(super) fn provider() -> Arc<CryptoProvider> {
@@ -11,8 +79,27 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
         Arc::new(CryptoProvider {
             // Post-quantum groups would make a ClientHello longer than some devices take.
             kx_groups: vec![kx_group::X25519, kx_group::SECP256R1, kx_group::SECP384R1],
+            signature_verification_algorithms: ALGORITHMS,
             ..aws_lc_rs::default_provider()
         })
     });
     Arc::clone(&PROVIDER)
+}
+
+/// Whether the peer holds the key of its certificate, as TLS 1.2 proves it.
+pub(super) fn verify_tls12(
+    message: &[u8],
+    certificate: &CertificateDer<'_>,
+    signed: &DigitallySignedStruct,
+) -> Result<HandshakeSignatureValid, Error> {
+    verify_tls12_signature(message, certificate, signed, &ALGORITHMS)
+}
+
+/// Whether the peer holds the key of its certificate, as TLS 1.3 proves it.
+pub(super) fn verify_tls13(
+    message: &[u8],
+    certificate: &CertificateDer<'_>,
+    signed: &DigitallySignedStruct,
+) -> Result<HandshakeSignatureValid, Error> {
+    verify_tls13_signature(message, certificate, signed, &ALGORITHMS)
 }

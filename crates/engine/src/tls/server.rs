@@ -8,20 +8,23 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rustls::client::danger::HandshakeSignatureValid;
-use rustls::crypto::{CryptoProvider, verify_tls12_signature, verify_tls13_signature};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, UnixTime};
+use rustls::server::NoServerSessionStorage;
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
-use rustls::server::{NoServerSessionStorage, VerifierBuilderError, WebPkiClientVerifier};
+use rustls::sign::SingleCertAndKey;
 use rustls::{
-    CertificateError, DigitallySignedStruct, DistinguishedName, Error, RootCertStore, ServerConfig,
-    ServerConnection, SignatureScheme,
+    DigitallySignedStruct, DistinguishedName, Error, ServerConfig, ServerConnection,
+    SignatureScheme,
 };
+use webpki::{CertRevocationList, OwnedCertRevocationList};
 
 use super::Channel;
-use super::certificate::Parsed;
-use super::files::{FileError, certificates, key};
-use super::provider::provider;
+use super::certificate::{Parsed, Purpose};
+use super::files::FileError;
+use super::own::own;
+use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
+use super::trust::{Listed, Trust};
 
 /// The files of a server, in PEM.
 #[derive(Debug, Clone)]
@@ -46,25 +49,14 @@ impl ServerTls {
     /// # Errors
     /// [`FileError`] for one that can't be used.
     pub fn load(files: &ServerFiles) -> Result<ServerTls, FileError> {
-        let provider = provider();
-        let (chain, key) = (certificates(&files.cert_file)?, key(&files.key_file)?);
-        let clients = Arc::new(Clients::load(files, &provider)?);
-        let config = ServerConfig::builder_with_provider(provider)
+        let own = own(&files.cert_file, &files.key_file)?;
+        let clients = Arc::new(Clients::load(files)?);
+        let config = ServerConfig::builder_with_provider(provider())
             .with_safe_default_protocol_versions()
             .map_err(|error| FileError::content(&files.cert_file, error.to_string()))?;
-        let config = config.with_client_cert_verifier(clients).with_single_cert(chain, key);
-        let mut config = config.map_err(|error| {
-            let flaw = match error {
-                Error::InconsistentKeys(_) => {
-                    let certificate = files.cert_file.display();
-                    format!("it is not the key of the certificate in {certificate}")
-                }
-                _ => {
-                    "found a key of another kind, allowed: RSA, P-256, P-384, P-521, Ed25519".into()
-                }
-            };
-            FileError::content(&files.key_file, flaw)
-        })?;
+        let mut config = config
+            .with_client_cert_verifier(clients)
+            .with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
         config.session_storage = Arc::new(NoServerSessionStorage {});
         config.send_tls13_tickets = 0;
         Ok(ServerTls(Arc::new(config)))
@@ -92,73 +84,40 @@ pub(crate) fn role(channel: &Channel) -> Result<String, Error> {
 /// Judges the certificates of clients.
 #[derive(Debug)]
 struct Clients {
-    /// By the authorities, where there are any.
-    signed: Option<Arc<dyn ClientCertVerifier>>,
-    /// Self-signed certificates that are trusted as they are.
-    pinned: Vec<CertificateDer<'static>>,
+    trust: Trust,
     subjects: Vec<DistinguishedName>,
-    provider: Arc<CryptoProvider>,
 }
 
 impl Clients {
-    fn load(files: &ServerFiles, provider: &Arc<CryptoProvider>) -> Result<Clients, FileError> {
-        let (mut roots, mut pinned) = (RootCertStore::empty(), Vec::new());
-        let mut subjects = Vec::new();
-        for (index, certificate) in certificates(&files.ca_file)?.into_iter().enumerate() {
-            let wrong = |what: String| {
-                FileError::content(&files.ca_file, format!("certificate {}: {what}", index + 1))
-            };
-            let parsed = Parsed::new(&certificate).map_err(|error| wrong(error.to_string()))?;
-            // One that is no authority vouches for nobody but itself.
-            let (is_authority, is_self_signed) = (parsed.is_authority(), parsed.is_self_signed());
-            if is_authority {
-                roots.add(certificate.clone()).map_err(|error| wrong(error.to_string()))?;
-            } else if !is_self_signed {
-                let allowed = "allowed: authorities (CA:TRUE) and self-signed certificates";
-                return Err(wrong(format!("found neither of both, {allowed}")));
-            }
-            if is_self_signed {
-                pinned.push(certificate);
-            }
-            subjects.extend(parsed.subject());
-        }
-        let crl_file = files.crl_file.as_deref();
-        let signed = match crl_file {
-            Some(file) if roots.is_empty() => {
+    fn load(files: &ServerFiles) -> Result<Clients, FileError> {
+        let listed = listed(&files.ca_file)?;
+        let subjects = listed.iter().filter_map(Listed::subject).collect();
+        let revoked = match &files.crl_file {
+            Some(file) if !listed.iter().any(Listed::is_authority) => {
                 let flaw = "found beside a ca_file without authorities, allowed: beside some";
                 return Err(FileError::content(file, flaw));
             }
-            None if roots.is_empty() => None,
-            _ => Some(authorities(roots, crl_file, provider)?),
+            Some(file) => revocations(file)?,
+            None => Vec::new(),
         };
-        Ok(Clients { signed, pinned, subjects, provider: Arc::clone(provider) })
+        Ok(Clients { trust: Trust::new(listed, revoked), subjects })
     }
 }
 
-/// What judges certificates that authorities have signed.
-fn authorities(
-    roots: RootCertStore,
-    crl_file: Option<&Path>,
-    provider: &Arc<CryptoProvider>,
-) -> Result<Arc<dyn ClientCertVerifier>, FileError> {
-    let builder =
-        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(provider));
-    let file = crl_file.unwrap_or(Path::new(""));
-    let builder = match crl_file {
-        Some(file) => builder.with_crls(revocations(file)?),
-        None => builder,
-    };
-    builder.build().map_err(|error| {
-        let flaw = match error {
-            VerifierBuilderError::InvalidCrl(error) => format!("{error:?}"),
-            error => error.to_string(),
-        };
-        FileError::content(file, format!("a list can't be read: {flaw}"))
-    })
+/// Authorities and self-signed certificates: any other is in the file by mistake.
+fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
+    let listed = Listed::of_file(file)?;
+    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.is_self_signed();
+    if let Some(index) = listed.iter().position(is_mistake) {
+        let allowed = "allowed: authorities (CA:TRUE) and self-signed certificates";
+        let flaw = format!("certificate {}: found neither of both, {allowed}", index + 1);
+        return Err(FileError::content(file, flaw));
+    }
+    Ok(listed)
 }
 
 /// All lists of revoked certificates of a file, at least one.
-fn revocations(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, FileError> {
+fn revocations(file: &Path) -> Result<Vec<CertRevocationList<'static>>, FileError> {
     let text = std::fs::read(file)
         .map_err(|error| FileError::Unreadable { file: file.display().to_string(), error })?;
     let found: Result<Vec<_>, _> = CertificateRevocationListDer::pem_slice_iter(&text).collect();
@@ -167,7 +126,9 @@ fn revocations(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>
         let flaw = "found no list of revoked certificates, allowed: X509 CRL in PEM";
         return Err(FileError::content(file, flaw));
     }
-    Ok(found)
+    let read = found.iter().map(|list| OwnedCertRevocationList::from_der(list).map(Into::into));
+    let read: Result<Vec<_>, _> = read.collect();
+    read.map_err(|error| FileError::content(file, format!("a list can't be read: {error}")))
 }
 
 impl ClientCertVerifier for Clients {
@@ -181,14 +142,8 @@ impl ClientCertVerifier for Clients {
         intermediates: &[CertificateDer<'_>],
         now: UnixTime,
     ) -> Result<ClientCertVerified, Error> {
-        let parsed = Parsed::new(end_entity)?;
-        parsed.role()?;
-        if self.pinned.contains(end_entity) {
-            parsed.is_valid_at(now)?;
-        } else {
-            let signed = self.signed.as_ref().ok_or(CertificateError::UnknownIssuer)?;
-            signed.verify_client_cert(end_entity, intermediates, now)?;
-        }
+        Parsed::new(end_entity)?.role()?;
+        self.trust.judge(end_entity, intermediates, Purpose::Client, now)?;
         Ok(ClientCertVerified::assertion())
     }
 
@@ -196,23 +151,21 @@ impl ClientCertVerifier for Clients {
         &self,
         message: &[u8],
         certificate: &CertificateDer<'_>,
-        signature: &DigitallySignedStruct,
+        signed: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error> {
-        let algorithms = &self.provider.signature_verification_algorithms;
-        verify_tls12_signature(message, certificate, signature, algorithms)
+        verify_tls12(message, certificate, signed)
     }
 
     fn verify_tls13_signature(
         &self,
         message: &[u8],
         certificate: &CertificateDer<'_>,
-        signature: &DigitallySignedStruct,
+        signed: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error> {
-        let algorithms = &self.provider.signature_verification_algorithms;
-        verify_tls13_signature(message, certificate, signature, algorithms)
+        verify_tls13(message, certificate, signed)
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.provider.signature_verification_algorithms.supported_schemes()
+        ALGORITHMS.supported_schemes()
     }
 }

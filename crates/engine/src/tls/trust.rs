@@ -1,0 +1,490 @@
+//! The one judgement of certificates, for servers and clients alike.
+//!
+//! * A certificate that is listed is trusted as itself, whatever its `CA` flag and its `keyUsage`.
+//! * A listed authority ([`Parsed::is_authority`]) vouches for others, while it is within its dates.
+//! * Whoever presents a certificate with `CA:TRUE` is trusted only if it is listed.
+//! * Dates and purpose of the presented certificate count in every case.
+//!
+//! Signatures, and the constraints along a path, are the business of webpki. Whether a certificate is
+//! valid now is asked when it is used, never when its file is read: the clock of a machine that has
+//! just been switched on may be wrong.
+
+use std::hash::{Hash, Hasher};
+use std::path;
+use std::sync::Arc;
+
+use rustls::pki_types::{CertificateDer, Der, TrustAnchor, UnixTime};
+use rustls::{CertificateError, DistinguishedName, Error, OtherError};
+use webpki::{
+    CertRevocationList, EndEntityCert, ExpirationPolicy, ExtendedKeyUsageValidator,
+    KeyPurposeIdIter, RevocationOptions, RevocationOptionsBuilder, UnknownStatusPolicy,
+    VerifiedPath,
+};
+use x509_cert::der::asn1::ObjectIdentifier;
+use x509_cert::der::{Reader, SliceReader};
+
+use super::certificate::{Parsed, Purpose};
+use super::failure::{TlsFailure, between};
+use super::files::{FileError, certificates};
+use super::provider::ALGORITHMS;
+
+/// A certificate that is listed as trusted.
+#[derive(Debug)]
+pub(super) struct Listed {
+    certificate: CertificateDer<'static>,
+    parsed: Parsed,
+    /// Of an authority: its name and key.
+    anchor: Option<TrustAnchor<'static>>,
+}
+
+impl Listed {
+    /// # Errors
+    /// It can't be read.
+    pub(super) fn new(certificate: CertificateDer<'static>) -> Result<Listed, CertificateError> {
+        let parsed = Parsed::new(&certificate)?;
+        let anchor = match parsed.is_authority() {
+            true => {
+                let anchor = webpki::anchor_from_trusted_cert(&certificate);
+                Some(anchor.map_err(|_| CertificateError::BadEncoding)?.to_owned())
+            }
+            false => None,
+        };
+        Ok(Listed { certificate, parsed, anchor })
+    }
+
+    /// All certificates of a file, at least one.
+    ///
+    /// # Errors
+    /// [`FileError`]
+    pub(super) fn of_file(file: &path::Path) -> Result<Arc<[Listed]>, FileError> {
+        let numbered = certificates(file)?.into_iter().enumerate();
+        let listed = numbered.map(|(index, certificate)| {
+            let flaw = || format!("certificate {} can't be read", index + 1);
+            Listed::new(certificate).map_err(|_| FileError::content(file, flaw()))
+        });
+        listed.collect()
+    }
+
+    pub(super) fn is_authority(&self) -> bool {
+        self.anchor.is_some()
+    }
+
+    pub(super) fn is_self_signed(&self) -> bool {
+        self.parsed.is_self_signed()
+    }
+
+    pub(super) fn subject(&self) -> Option<DistinguishedName> {
+        self.parsed.subject()
+    }
+}
+
+impl PartialEq for Listed {
+    fn eq(&self, other: &Listed) -> bool {
+        self.certificate == other.certificate
+    }
+}
+
+impl Eq for Listed {}
+
+impl Hash for Listed {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.certificate.hash(state);
+    }
+}
+
+/// Who is trusted.
+#[derive(Debug)]
+pub(super) struct Trust {
+    listed: Arc<[Listed]>,
+    /// Lists of revoked certificates; where there are any, there is one of every authority.
+    revoked: Vec<CertRevocationList<'static>>,
+}
+
+impl Trust {
+    pub(super) fn new(listed: Arc<[Listed]>, revoked: Vec<CertRevocationList<'static>>) -> Trust {
+        Trust { listed, revoked }
+    }
+
+    /// Whether a peer with this certificate is who the certificate says, and may be what it is. The
+    /// name of the peer is not looked at.
+    ///
+    /// # Errors
+    /// Why not; [`TlsFailure`] tells it apart.
+    pub(super) fn judge(
+        &self,
+        presented: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        purpose: Purpose,
+        now: UnixTime,
+    ) -> Result<(), Error> {
+        let parsed = Parsed::new(presented)?;
+        let end_entity = EndEntityCert::try_from(presented).map_err(refused)?;
+        parsed.has_supported_key().map_err(told)?;
+        parsed.is_valid_at(now)?;
+        parsed.is_for(purpose)?;
+        if self.listed.iter().any(|listed| listed.certificate == *presented) {
+            return Ok(());
+        }
+        if parsed.has_ca_flag() {
+            return Err(told(TlsFailure::CaAsEndEntity));
+        }
+        self.vouch(&Path { end_entity: &end_entity, intermediates, purpose, now })
+    }
+
+    /// Looks for an authority that vouches for a certificate.
+    fn vouch(&self, path: &Path<'_>) -> Result<(), Error> {
+        let authorities = self.listed.iter().filter(|listed| listed.is_authority());
+        let (valid, lapsed): (Vec<_>, Vec<_>) =
+            authorities.partition(|listed| listed.parsed.is_valid_at(path.now).is_ok());
+        match self.leads_to(path, &valid) {
+            Err(webpki::Error::UnknownIssuer) => {
+                let due = lapsed.iter().find(|each| self.leads_to(path, &[**each]).is_ok());
+                let due = due.map_or(Ok(()), |due| due.parsed.is_valid_at(path.now));
+                due.map_err(|flaw| told(of_issuer(flaw)))?;
+                Err(CertificateError::UnknownIssuer.into())
+            }
+            found => found.map_err(refused),
+        }
+    }
+
+    /// Whether there is a path to one of the authorities.
+    fn leads_to(&self, path: &Path<'_>, authorities: &[&Listed]) -> Result<(), webpki::Error> {
+        let anchors = authorities.iter().filter_map(|listed| listed.anchor.as_ref());
+        let anchors: Vec<TrustAnchor<'_>> = anchors.map(borrowed).collect();
+        let check = |verified: &VerifiedPath<'_>| is_allowed(verified, authorities);
+        let lists: Vec<&CertRevocationList<'_>> = self.revoked.iter().collect();
+        path.end_entity.verify_for_usage(
+            ALGORITHMS.all,
+            &anchors,
+            path.intermediates,
+            path.now,
+            path.purpose,
+            revocation(&lists),
+            Some(&check),
+        )?;
+        Ok(())
+    }
+}
+
+/// What leads from a peer's certificate to an authority, if anything does.
+struct Path<'p> {
+    end_entity: &'p EndEntityCert<'p>,
+    intermediates: &'p [CertificateDer<'p>],
+    purpose: Purpose,
+    now: UnixTime,
+}
+
+impl ExtendedKeyUsageValidator for Purpose {
+    fn validate(&self, named: KeyPurposeIdIter<'_, '_>) -> Result<(), webpki::Error> {
+        let named: Vec<_> = named.collect::<Result<_, _>>()?;
+        match self.is_among(named) {
+            true => Ok(()),
+            false => Err(webpki::Error::ExtensionValueInvalid),
+        }
+    }
+}
+
+fn borrowed<'a>(anchor: &'a TrustAnchor<'static>) -> TrustAnchor<'a> {
+    TrustAnchor {
+        subject: Der::from_slice(&anchor.subject),
+        subject_public_key_info: Der::from_slice(&anchor.subject_public_key_info),
+        name_constraints: anchor.name_constraints.as_deref().map(Der::from_slice),
+    }
+}
+
+/// The rules along a path that webpki leaves open: who is an authority, and the `pathLenConstraint`
+/// of a listed one.
+fn is_allowed(path: &VerifiedPath<'_>, authorities: &[&Listed]) -> Result<(), webpki::Error> {
+    let mut len = 0;
+    for intermediate in path.intermediate_certificates() {
+        let parsed = Parsed::new(&intermediate.der()).map_err(|_| webpki::Error::BadDer)?;
+        if !parsed.is_authority() {
+            return Err(webpki::Error::EndEntityUsedAsCa);
+        }
+        len += usize::from(!parsed.is_self_signed());
+    }
+    let (name, key) = (&path.anchor().subject, &path.anchor().subject_public_key_info);
+    let is_anchor = |listed: &&&Listed| {
+        let anchor = listed.anchor.as_ref();
+        anchor
+            .is_some_and(|anchor| anchor.subject == *name && anchor.subject_public_key_info == *key)
+    };
+    let fits = |listed: &&Listed| {
+        listed.parsed.max_intermediates().is_none_or(|most| len <= usize::from(most))
+    };
+    match authorities.iter().filter(is_anchor).any(fits) {
+        true => Ok(()),
+        false => Err(webpki::Error::PathLenConstraintViolated),
+    }
+}
+
+/// Every authority of a path needs a list; how old one is does not matter.
+fn revocation<'l>(lists: &'l [&'l CertRevocationList<'l>]) -> Option<RevocationOptions<'l>> {
+    let options = RevocationOptionsBuilder::new(lists).ok()?;
+    let options = options
+        .with_depth(webpki::RevocationCheckDepth::Chain)
+        .with_status_policy(UnknownStatusPolicy::Deny)
+        .with_expiration_policy(ExpirationPolicy::Ignore);
+    Some(options.build())
+}
+
+/// What webpki found, once the presented certificate itself was looked at: dates and purposes are
+/// those of one above it.
+fn refused(error: webpki::Error) -> Error {
+    use webpki::Error as Found;
+    match error {
+        Found::UnknownIssuer => CertificateError::UnknownIssuer.into(),
+        Found::CertRevoked => CertificateError::Revoked.into(),
+        Found::UnknownRevocationStatus
+        | Found::InvalidCrlSignatureForPublicKey
+        | Found::IssuerNotCrlSigner
+        | Found::UnsupportedCrlSignatureAlgorithmContext(_)
+        | Found::UnsupportedCrlSignatureAlgorithmForPublicKeyContext(_) => {
+            CertificateError::UnknownRevocationStatus.into()
+        }
+        Found::InvalidSignatureForPublicKey => CertificateError::BadSignature.into(),
+        Found::BadDer | Found::BadDerTime | Found::TrailingData(_) => {
+            CertificateError::BadEncoding.into()
+        }
+        Found::UnsupportedCriticalExtension => CertificateError::UnhandledCriticalExtension.into(),
+        Found::CertExpired { time, not_after } => {
+            told(of_issuer(CertificateError::ExpiredContext { time, not_after }))
+        }
+        Found::CertNotValidYet { time, not_before } => {
+            told(of_issuer(CertificateError::NotValidYetContext { time, not_before }))
+        }
+        Found::UnsupportedSignatureAlgorithmContext(context) => {
+            told(unsupported(&context.signature_algorithm_id))
+        }
+        Found::UnsupportedSignatureAlgorithmForPublicKeyContext(context) => {
+            told(unsupported(&context.signature_algorithm_id))
+        }
+        Found::UnsupportedCertVersion => {
+            let flaw = "found X.509 version 1 or 2, allowed: version 3".into();
+            told(TlsFailure::UnsupportedCertificate { flaw })
+        }
+        Found::EndEntityUsedAsCa => told(TlsFailure::IssuerNotAuthority),
+        Found::PathLenConstraintViolated => violated("pathLenConstraint"),
+        Found::NameConstraintViolation => violated("nameConstraints"),
+        Found::ExtensionValueInvalid | Found::EmptyEkuExtension => violated("extendedKeyUsage"),
+        other => {
+            let flaw = other.to_string();
+            told(TlsFailure::UntrustedCertificate { flaw })
+        }
+    }
+}
+
+fn violated(constraint: &'static str) -> Error {
+    told(TlsFailure::ConstraintViolated { constraint })
+}
+
+/// What a date is of, if it is not of the presented certificate.
+fn of_issuer(flaw: CertificateError) -> TlsFailure {
+    match flaw {
+        CertificateError::ExpiredContext { time, not_after } => {
+            TlsFailure::IssuerExpired { ago: between(not_after, time) }
+        }
+        CertificateError::NotValidYetContext { time, not_before } => {
+            TlsFailure::IssuerNotYetValid { begins_in: between(time, not_before) }
+        }
+        other => TlsFailure::from(&Error::from(other)),
+    }
+}
+
+/// A signature in the path with an algorithm that is not supported.
+fn unsupported(algorithm: &[u8]) -> TlsFailure {
+    let oid = SliceReader::new(algorithm).and_then(|mut reader| reader.decode());
+    let found = match oid.map(|oid: ObjectIdentifier| oid.to_string()).as_deref() {
+        Ok("1.2.840.113549.1.1.10") => "RSASSA-PSS with other parameters".into(),
+        Ok("1.2.840.113549.1.1.4") => "MD5 with RSA".into(),
+        Ok("1.2.840.113549.1.1.5") => "SHA-1 with RSA".into(),
+        Ok("1.2.840.10045.4.1") => "SHA-1 with ECDSA".into(),
+        Ok(other) => format!("algorithm {other}"),
+        Err(_) => return TlsFailure::BadCertificate,
+    };
+    let flaw = format!(
+        "found a signature by {found}, allowed: SHA-256, SHA-384 or SHA-512; for RSASSA-PSS the \
+         same hash in the mask, and a salt as long as the hash"
+    );
+    TlsFailure::UnsupportedCertificate { flaw }
+}
+
+/// A failure that rustls carries through.
+fn told(failure: TlsFailure) -> Error {
+    CertificateError::Other(OtherError(Arc::new(failure))).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use rcgen::{
+        BasicConstraints, Certificate, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa,
+        Issuer, KeyPair, KeyUsagePurpose, date_time_ymd,
+    };
+
+    use super::*;
+
+    const CA: IsCa = IsCa::Ca(BasicConstraints::Unconstrained);
+    const YEAR: u64 = 31_557_600;
+
+    struct Owner {
+        certificate: Certificate,
+        params: CertificateParams,
+        key: KeyPair,
+    }
+
+    impl Owner {
+        /// Valid from 2000 to 2100, unless `with` says otherwise.
+        fn new(name: &str, by: Option<&Owner>, with: impl Fn(&mut CertificateParams)) -> Owner {
+            let mut params = CertificateParams::new([name.to_owned()]).unwrap();
+            params.distinguished_name.push(DnType::CommonName, name);
+            (params.not_before, params.not_after) =
+                (date_time_ymd(2000, 1, 1), date_time_ymd(2100, 1, 1));
+            with(&mut params);
+            let key = KeyPair::generate().unwrap();
+            let certificate = match by {
+                None => params.self_signed(&key),
+                Some(by) => params.signed_by(&key, &Issuer::from_params(&by.params, &by.key)),
+            };
+            Owner { certificate: certificate.unwrap(), params, key }
+        }
+
+        fn authority(name: &str, by: Option<&Owner>) -> Owner {
+            Owner::new(name, by, |params| params.is_ca = CA)
+        }
+    }
+
+    fn trust(listed: &[&Owner]) -> Trust {
+        let listed = listed.iter().map(|owner| Listed::new(owner.certificate.der().clone()));
+        Trust::new(listed.collect::<Result<_, _>>().unwrap(), Vec::new())
+    }
+
+    /// Why the first of a chain is not trusted in that year, or nothing.
+    fn judged(trust: &Trust, chain: &[&Owner], purpose: Purpose, year: u64) -> &'static str {
+        let ders: Vec<_> = chain.iter().map(|owner| owner.certificate.der().clone()).collect();
+        let now = UnixTime::since_unix_epoch(Duration::from_secs((year - 1970) * YEAR + YEAR / 2));
+        match trust.judge(&ders[0], &ders[1..], purpose, now) {
+            Ok(()) => "",
+            Err(error) => TlsFailure::from(error).reason(),
+        }
+    }
+
+    #[test]
+    fn dates_count_of_every_certificate_of_a_path() {
+        let valid = |from, to| {
+            move |params: &mut CertificateParams| {
+                params.is_ca = CA;
+                (params.not_before, params.not_after) =
+                    (date_time_ymd(from, 1, 1), date_time_ymd(to, 1, 1));
+            }
+        };
+        let root = Owner::new("root", None, valid(2010, 2050));
+        let between = Owner::new("between", Some(&root), valid(2020, 2040));
+        let leaf = Owner::new("leaf", Some(&between), |_| {});
+        let trust = trust(&[&root]);
+        let told = |year| judged(&trust, &[&leaf, &between], Purpose::Server, year);
+        assert_eq!(told(1999), "not_yet_valid");
+        assert_eq!(told(2005), "issuer_not_yet_valid");
+        assert_eq!(told(2015), "issuer_not_yet_valid");
+        assert_eq!(told(2030), "");
+        assert_eq!(told(2045), "issuer_expired");
+        assert_eq!(told(2055), "issuer_expired");
+        assert_eq!(told(2100), "expired");
+    }
+
+    #[test]
+    fn an_authority_that_expired_harms_nobody_whom_another_vouches_for() {
+        let former = Owner::new("root", None, |params| {
+            params.is_ca = CA;
+            params.not_after = date_time_ymd(2020, 1, 1);
+        });
+        // Renewed with the same name and key.
+        let params = Owner::authority("root", None).params;
+        let key = KeyPair::from_pem(&former.key.serialize_pem()).unwrap();
+        let renewed = Owner { certificate: params.self_signed(&key).unwrap(), params, key };
+        let leaf = Owner::new("leaf", Some(&former), |_| {});
+        for listed in [[&former, &renewed], [&renewed, &former]] {
+            assert_eq!(judged(&trust(&listed), &[&leaf], Purpose::Server, 2026), "");
+        }
+        assert_eq!(judged(&trust(&[&former]), &[&leaf], Purpose::Server, 2026), "issuer_expired");
+        let stranger = Owner::new("leaf", Some(&Owner::authority("other", None)), |_| {});
+        let told = judged(&trust(&[&former]), &[&stranger], Purpose::Server, 2026);
+        assert_eq!(told, "unknown_issuer");
+    }
+
+    #[test]
+    fn the_same_answer_is_given_to_servers_and_to_clients() {
+        let root = Owner::authority("root", None);
+        let server = [ExtendedKeyUsagePurpose::ServerAuth];
+        let any = [ExtendedKeyUsagePurpose::Any];
+        let others = [ExtendedKeyUsagePurpose::CodeSigning, ExtendedKeyUsagePurpose::ServerAuth];
+        for (named, is_client) in [(&server[..], false), (&any[..], true), (&others[..], false)] {
+            for by in [None, Some(&root)] {
+                let leaf = Owner::new("leaf", by, |params| {
+                    params.is_ca = IsCa::ExplicitNoCa;
+                    params.extended_key_usages = named.to_vec();
+                });
+                let trust = trust(&[&root, &leaf]);
+                assert_eq!(judged(&trust, &[&leaf], Purpose::Server, 2026), "");
+                let as_client = if is_client { "" } else { "wrong_purpose" };
+                assert_eq!(judged(&trust, &[&leaf], Purpose::Client, 2026), as_client);
+            }
+        }
+    }
+
+    #[test]
+    fn who_may_not_sign_is_no_authority_wherever_it_is() {
+        let root = Owner::authority("root", None);
+        let no_signer = |params: &mut CertificateParams| {
+            params.is_ca = CA;
+            params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        };
+        let between = Owner::new("between", Some(&root), no_signer);
+        let leaf = Owner::new("leaf", Some(&between), |_| {});
+        let told = |listed: &[&Owner], chain: &[&Owner]| {
+            [Purpose::Server, Purpose::Client]
+                .map(|purpose| judged(&trust(listed), chain, purpose, 2026))
+        };
+        assert_eq!(told(&[&root], &[&leaf, &between]), ["issuer_not_authority"; 2]);
+        assert_eq!(told(&[&between], &[&leaf]), ["unknown_issuer"; 2]);
+        assert_eq!(told(&[&between], &[&between]), [""; 2]);
+        assert_eq!(told(&[&root], &[&between]), ["ca_as_end_entity"; 2]);
+    }
+
+    #[test]
+    fn a_listed_authority_vouches_only_as_far_as_its_path_may_be() {
+        let root = Owner::new("root", None, |params| {
+            params.is_ca = IsCa::Ca(BasicConstraints::Constrained(1));
+        });
+        let one = Owner::authority("one", Some(&root));
+        let two = Owner::authority("two", Some(&one));
+        let below_one = Owner::new("leaf", Some(&one), |_| {});
+        let below_two = Owner::new("leaf", Some(&two), |_| {});
+        let trust = trust(&[&root]);
+        assert_eq!(judged(&trust, &[&below_one, &one], Purpose::Server, 2026), "");
+        let told = judged(&trust, &[&below_two, &two, &one], Purpose::Server, 2026);
+        assert_eq!(told, "constraint_violated");
+    }
+
+    #[test]
+    fn a_certificate_that_was_changed_is_refused() {
+        let root = Owner::authority("root", None);
+        let leaf = Owner::new("leaf", Some(&root), |_| {});
+        let (trust, good) = (trust(&[&root]), leaf.certificate.der().to_vec());
+        let now = UnixTime::since_unix_epoch(Duration::from_secs(50 * YEAR));
+        let judge = |der: &[u8]| {
+            let der = CertificateDer::from_slice(der);
+            trust.judge(&der, &[], Purpose::Server, now).is_ok()
+        };
+        assert!(judge(&good));
+        for at in 0..good.len() {
+            assert!(!judge(&good[..at]), "the first {at} bytes");
+            for bit in [0x01, 0x80] {
+                let mut changed = good.clone();
+                changed[at] ^= bit;
+                assert!(!judge(&changed), "byte {at} with bit {bit:#x}");
+            }
+        }
+    }
+}
