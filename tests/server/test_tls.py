@@ -740,8 +740,8 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         (
             {"cert_file": odd.certificate, "key_file": odd.key},
             odd.key,
-            "found a key of another kind, allowed: RSA of 2048 to 8192 bits, P-256, P-384, "
-            "P-521, Ed25519",
+            "found a key of another kind, allowed: RSA or RSA-PSS of 2048 to 8192 bits, P-256, "
+            "P-384, P-521, Ed25519",
         ),
         ({"ca_file": nothing}, nothing, "found no certificate, allowed: a certificate in PEM"),
         (

@@ -13,6 +13,7 @@ use x509_cert::spki::SubjectPublicKeyInfoOwned;
 
 use super::failure::TlsFailure;
 use super::provider::KEYS;
+use super::rsa_pss;
 
 /// The extension that holds the role (MB-TCP-Security, 8.4).
 const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");
@@ -178,11 +179,17 @@ impl Parsed {
         };
         let key = self.key();
         let algorithm = &key.algorithm;
-        if algorithm.oid == RSA {
+        let is_pss = algorithm.oid == rsa_pss::ID_RSASSA_PSS;
+        if algorithm.oid == RSA || is_pss {
             let bits = rsa_bits(key.subject_public_key.raw_bytes());
             let bits = bits.ok_or(TlsFailure::BadCertificate)?;
             if !(MIN_RSA_BITS..=MAX_RSA_BITS).contains(&bits) {
                 return unsupported(format!("an RSA key of {bits} bits"));
+            }
+            if is_pss && !self.key_algorithm().is_some_and(|der| rsa_pss::is_supported(&der)) {
+                let found = "an RSA-PSS key with other parameters than SHA-256, SHA-384 or SHA-512 \
+                             for hash and mask";
+                return unsupported(found.into());
             }
             return Ok(());
         }
@@ -200,8 +207,19 @@ impl Parsed {
         unsupported(format!("a key of the kind {}", algorithm.oid))
     }
 
+    /// Of a certificate with an RSA-PSS key: what identifies its algorithm, without its header.
+    pub(super) fn pss_algorithm(&self) -> Option<Vec<u8>> {
+        let is_pss = self.key().algorithm.oid == rsa_pss::ID_RSASSA_PSS;
+        self.key_algorithm().filter(|_| is_pss)
+    }
+
     fn key(&self) -> &SubjectPublicKeyInfoOwned {
         self.0.tbs_certificate().subject_public_key_info()
+    }
+
+    fn key_algorithm(&self) -> Option<Vec<u8>> {
+        let der = self.key().algorithm.to_der().ok()?;
+        AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
     }
 
     /// The name of its owner, as clients are told which certificates are wanted.

@@ -8,6 +8,7 @@ mod failure;
 mod files;
 mod own;
 mod provider;
+mod rsa_pss;
 pub mod server;
 mod trust;
 

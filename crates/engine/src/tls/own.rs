@@ -3,11 +3,14 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use rustls::sign::CertifiedKey;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::sign::{CertifiedKey, SigningKey};
 use rustls::{Error, InconsistentKeys};
 
+use super::certificate::Parsed;
 use super::files::{FileError, certificates, key};
 use super::provider::{KEYS, provider};
+use super::rsa_pss::PssKey;
 
 /// Reads a certificate, with those between it and the root, and its key.
 ///
@@ -16,8 +19,11 @@ use super::provider::{KEYS, provider};
 pub(super) fn own(cert_file: &Path, key_file: &Path) -> Result<Arc<CertifiedKey>, FileError> {
     let (chain, key) = (certificates(cert_file)?, key(key_file)?);
     let wrong = |flaw: String| FileError::content(key_file, flaw);
-    let key = provider().key_provider.load_private_key(key);
-    let key = key.map_err(|_| wrong(format!("found a key of another kind, allowed: {KEYS}")))?;
+    let [end_entity, ..] = chain.as_slice() else {
+        return Err(FileError::content(cert_file, "found no certificate"));
+    };
+    let key = signing_key(key, end_entity)
+        .ok_or_else(|| wrong(format!("found a key of another kind, allowed: {KEYS}")))?;
     let own = CertifiedKey::new(chain, key);
     match own.keys_match() {
         Ok(()) => Ok(Arc::new(own)),
@@ -25,5 +31,17 @@ pub(super) fn own(cert_file: &Path, key_file: &Path) -> Result<Arc<CertifiedKey>
             Err(wrong(format!("it is not the key of the certificate in {}", cert_file.display())))
         }
         Err(error) => Err(wrong(error.to_string())),
+    }
+}
+
+/// `None` for a key of a kind that is not supported.
+fn signing_key(
+    key: PrivateKeyDer<'static>,
+    of: &CertificateDer<'_>,
+) -> Option<Arc<dyn SigningKey>> {
+    // What an RSA key may sign is up to the certificate.
+    match Parsed::new(of).ok()?.pss_algorithm() {
+        Some(algorithm) => Some(Arc::new(PssKey::new(&key, &algorithm)?)),
+        None => provider().key_provider.load_private_key(key).ok(),
     }
 }

@@ -9,11 +9,13 @@ use rustls::crypto::{
     CryptoProvider, WebPkiSupportedAlgorithms, verify_tls12_signature, verify_tls13_signature,
 };
 use rustls::pki_types::CertificateDer;
-use rustls::{DigitallySignedStruct, Error, SignatureScheme};
+use rustls::{CertificateError, DigitallySignedStruct, Error, SignatureScheme};
 use webpki::aws_lc_rs as algorithm;
 
+use super::rsa_pss;
+
 /// Keys that certificates may have.
-pub(super) const KEYS: &str = "RSA of 2048 to 8192 bits, P-256, P-384, P-521, Ed25519";
+pub(super) const KEYS: &str = "RSA or RSA-PSS of 2048 to 8192 bits, P-256, P-384, P-521, Ed25519";
 
 /// With TLS 1.2 a scheme names the hash alone, with TLS 1.3 the curve too: the first of each row.
 pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorithms {
@@ -37,6 +39,15 @@ pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorit
         algorithm::RSA_PSS_2048_8192_SHA256_LEGACY_KEY,
         algorithm::RSA_PSS_2048_8192_SHA384_LEGACY_KEY,
         algorithm::RSA_PSS_2048_8192_SHA512_LEGACY_KEY,
+        rsa_pss::SHA256[0],
+        rsa_pss::SHA256[1],
+        rsa_pss::SHA256[2],
+        rsa_pss::SHA384[0],
+        rsa_pss::SHA384[1],
+        rsa_pss::SHA384[2],
+        rsa_pss::SHA512[0],
+        rsa_pss::SHA512[1],
+        rsa_pss::SHA512[2],
     ],
     mapping: &[
         (
@@ -67,6 +78,9 @@ pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorit
         (SignatureScheme::RSA_PSS_SHA512, &[algorithm::RSA_PSS_2048_8192_SHA512_LEGACY_KEY]),
         (SignatureScheme::RSA_PSS_SHA384, &[algorithm::RSA_PSS_2048_8192_SHA384_LEGACY_KEY]),
         (SignatureScheme::RSA_PSS_SHA256, &[algorithm::RSA_PSS_2048_8192_SHA256_LEGACY_KEY]),
+        (rsa_pss::SCHEME_SHA512, &rsa_pss::SHA512),
+        (rsa_pss::SCHEME_SHA384, &rsa_pss::SHA384),
+        (rsa_pss::SCHEME_SHA256, &rsa_pss::SHA256),
         (SignatureScheme::RSA_PKCS1_SHA512, &[algorithm::RSA_PKCS1_2048_8192_SHA512]),
         (SignatureScheme::RSA_PKCS1_SHA384, &[algorithm::RSA_PKCS1_2048_8192_SHA384]),
         (SignatureScheme::RSA_PKCS1_SHA256, &[algorithm::RSA_PKCS1_2048_8192_SHA256]),
@@ -101,5 +115,15 @@ pub(super) fn verify_tls13(
     certificate: &CertificateDer<'_>,
     signed: &DigitallySignedStruct,
 ) -> Result<HandshakeSignatureValid, Error> {
-    verify_tls13_signature(message, certificate, signed, &ALGORITHMS)
+    let Some(candidates) = rsa_pss::of_scheme(signed.scheme) else {
+        return verify_tls13_signature(message, certificate, signed, &ALGORITHMS);
+    };
+    // One scheme stands for keys whose parameters are written differently.
+    let unreadable = |_| Error::from(CertificateError::BadEncoding);
+    let certificate = webpki::EndEntityCert::try_from(certificate).map_err(unreadable)?;
+    let holds = |each| certificate.verify_signature(each, message, signed.signature()).is_ok();
+    match candidates.iter().any(|each| holds(*each)) {
+        true => Ok(HandshakeSignatureValid::assertion()),
+        false => Err(CertificateError::BadSignature.into()),
+    }
 }
