@@ -7,6 +7,7 @@ pub mod client;
 mod failure;
 mod files;
 mod own;
+mod p521;
 mod provider;
 mod rsa_pss;
 pub mod server;

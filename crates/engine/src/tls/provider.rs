@@ -12,6 +12,7 @@ use rustls::pki_types::CertificateDer;
 use rustls::{CertificateError, DigitallySignedStruct, Error, SignatureScheme};
 use webpki::aws_lc_rs as algorithm;
 
+use super::p521::P521;
 use super::rsa_pss;
 
 /// Keys that certificates may have.
@@ -92,7 +93,7 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
     static PROVIDER: LazyLock<Arc<CryptoProvider>> = LazyLock::new(|| {
         Arc::new(CryptoProvider {
             // Post-quantum groups would make a ClientHello longer than some devices take.
-            kx_groups: vec![kx_group::X25519, kx_group::SECP256R1, kx_group::SECP384R1],
+            kx_groups: vec![kx_group::X25519, kx_group::SECP256R1, kx_group::SECP384R1, &P521],
             signature_verification_algorithms: ALGORITHMS,
             ..aws_lc_rs::default_provider()
         })
