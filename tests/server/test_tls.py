@@ -30,15 +30,24 @@ from support.certificates import (
     self_signed,
 )
 from support.machine import resident, tool
-from support.tls_peer import Peer, Refused, address, configuration, connections, context
+from support.tls_peer import (
+    READ,
+    ZERO,
+    Peer,
+    Refused,
+    address,
+    configuration,
+    connections,
+    context,
+    reasons,
+    verdict,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from support.running import Run
 
-READ = bytes.fromhex("0300000001")
-ZERO = bytes.fromhex("03020000")
 WRITE = bytes.fromhex("0600070001")
 FORBIDDEN = bytes.fromhex("8601")
 MAX_READ = struct.pack(">BHH", 3, 0, 125)
@@ -104,31 +113,6 @@ def secure(run: Run, party: Party) -> Appliance:
 
 def peer(appliance: Appliance, trust: ssl.SSLContext, **options: Any) -> Peer:
     return Peer(address(appliance), trust, **options)
-
-
-def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
-    """`served`, or how the server refused; over TLS 1.3 it does so when the client is done."""
-    with peer(appliance, trust) as client:
-        try:
-            return "served" if client.shake().ask(READ) == ZERO else "answered"
-        except Refused as refused:
-            return str(refused)
-
-
-def reasons(appliance: Appliance, caplog: pytest.LogCaptureFixture, count: int = 1) -> list[str]:
-    """Why TLS failed, as the log says, when it has said it so often."""
-    wire.until(lambda: connections(appliance)["tls_failed"] >= count, "failures are counted")
-
-    def told() -> list[Any]:
-        appliance.log_events(0.0)
-        return [
-            record.fields["reason"]  # type: ignore[attr-defined]
-            for record in caplog.records
-            if record.message == "tls_failed"
-        ]
-
-    wire.until(lambda: len(told()) >= count, "failures are logged")
-    return told()
 
 
 # Roles

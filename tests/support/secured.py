@@ -89,9 +89,16 @@ class Authority(Certificates):
         return [self._folder / f"{self._name}-{name}.{end}" for end in ends]
 
 
-def context(owner: Owner, version: str = "TLS 1.3", asks: Path | None = None) -> ssl.SSLContext:
-    """A server's TLS of one version; it asks for certificates of the authority `asks`."""
+def context(
+    owner: Owner, version: str = "TLS 1.3", asks: Path | None = None, *, weak: bool = False
+) -> ssl.SSLContext:
+    """A server's TLS of one version; it asks for certificates of the authority `asks`.
+
+    With `weak` it shows certificates whatever OpenSSL thinks of them.
+    """
     made = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    if weak:
+        made.set_ciphers("DEFAULT:@SECLEVEL=0")
     made.load_cert_chain(*owner)
     made.minimum_version = made.maximum_version = VERSIONS[version]
     if asks is not None:

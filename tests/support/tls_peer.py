@@ -16,15 +16,23 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    import pytest
+
     from holdfast.appliance import Appliance
     from support.certificates import Issued
 
+READ = bytes.fromhex("0300000001")
+ZERO = bytes.fromhex("03020000")
 VERSIONS = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
 
 
-def context(ca: Path, issued: Issued | None = None, version: str | None = None) -> ssl.SSLContext:
-    """Trusts `ca`, and shows what was issued."""
+def context(
+    ca: Path, issued: Issued | None = None, version: str | None = None, *, weak: bool = False
+) -> ssl.SSLContext:
+    """Trusts `ca`, and shows what was issued, with `weak` whatever OpenSSL thinks of it."""
     made = ssl.create_default_context(cafile=str(ca))
+    if weak:
+        made.set_ciphers("DEFAULT:@SECLEVEL=0")
     if issued is not None:
         made.load_cert_chain(issued.certificate, issued.key)
     if version is not None:
@@ -198,3 +206,28 @@ def connections(appliance: Appliance) -> dict[str, int]:
 
 def address(appliance: Appliance) -> tuple[str, int]:
     return endpoint(appliance, "secure")
+
+
+def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
+    """`served`, or how the server refused; over TLS 1.3 it does so when the client is done."""
+    with Peer(address(appliance), trust) as client:
+        try:
+            return "served" if client.shake().ask(READ) == ZERO else "answered"
+        except Refused as refused:
+            return str(refused)
+
+
+def reasons(appliance: Appliance, caplog: pytest.LogCaptureFixture, count: int = 1) -> list[str]:
+    """Why TLS failed, as the log says, when it has said it so often."""
+    wire.until(lambda: connections(appliance)["tls_failed"] >= count, "failures are counted")
+
+    def told() -> list[Any]:
+        appliance.log_events(0.0)
+        return [
+            record.fields["reason"]  # type: ignore[attr-defined]
+            for record in caplog.records
+            if record.message == "tls_failed"
+        ]
+
+    wire.until(lambda: len(told()) >= count, "failures are logged")
+    return told()

@@ -1,0 +1,306 @@
+"""One judgement of certificates: every face gives the same answer to every certificate.
+
+Devices show them to the blocking client, the asyncio client and the native poller; clients show
+them to the listener. The right answers are in the table of `support/certificate_cases.py`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast import _core, logs
+from holdfast.client.endpoint import endpoint
+from holdfast.client.target import parse
+from support import wire
+from support.certificate_cases import ACCEPTED, CASES, KEYS, OWN_KEYS, SERVED, Mint
+from support.certificates import Issued, openssl
+from support.faces import FACES
+from support.secured import Relay, context
+from support.tls_peer import configuration, reasons, verdict
+from support.tls_peer import context as peer_context
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.certificate_cases import Case, Shown
+    from support.running import Run
+
+    Address = tuple[str, int]
+
+ANYONE: list[dict[str, Any]] = [{"sources": ["127.0.0.1"], "access": "read-only"}]
+REFUSED = 0x8002
+
+ASYNCIO_DIFFERS = {
+    "signed by RSA-PSS with the longest salt",
+    "own, CA:TRUE and keyCertSign",
+    "CA:TRUE",
+    "CA:TRUE without keyCertSign",
+    "keyUsage nonRepudiation",
+    "keyUsage keyCertSign",
+    "for any purpose",
+}
+"""Cases that the asyncio client, which uses OpenSSL, answers otherwise than every other face."""
+
+WORDED = {"sync"}
+"""Faces whose errors are in the words of the core."""
+
+SAYS = {
+    "unknown_issuer": "the issuer of the certificate is unknown: ",
+    "expired": "the certificate expired ",
+    "not_yet_valid": "the certificate is not valid yet: ",
+    "issuer_expired": "an authority above the certificate expired ",
+    "wrong_name": "not for '127.0.0.1'",
+    "wrong_purpose": "its extendedKeyUsage lacks serverAuth",
+    "bad_signature": "a signature of the certificate, or of the handshake with it, is wrong",
+    "unsupported_certificate": "the certificate is not supported: found ",
+    "unsupported_extension": "the certificate has a critical extension that is not supported",
+    "ca_as_end_entity": r"the peer presented a CA certificate \(CA:TRUE\); list that exact ",
+    "issuer_not_authority": "a certificate above the peer's own is not one of an authority",
+    "constraint_violated": "an authority above the certificate may not issue it: ",
+}
+"""What a client says of a device, by the reason."""
+
+
+OPENSSL_REFUSES_WITH_TLS_1_2 = {
+    "own, CA:TRUE and keyCertSign",
+    "keyUsage nonRepudiation",
+    "keyUsage keyCertSign",
+}
+"""A device with OpenSSL does not use these certificates of its own."""
+
+
+@pytest.fixture(autouse=True)
+def every_refusal_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
+@pytest.fixture(scope="module")
+def mint(tmp_path_factory: pytest.TempPathFactory) -> Mint:
+    return Mint(tmp_path_factory.mktemp("mint"))
+
+
+@pytest.fixture(scope="module")
+def shown() -> dict[str, Shown]:
+    """What was made so far: all faces see the same certificates."""
+    return {}
+
+
+def made(case: Case, mint: Mint, shown: dict[str, Shown]) -> Shown:
+    if case.name not in shown:
+        shown[case.name] = case.show(mint)
+    return shown[case.name]
+
+
+def faces() -> list[Any]:
+    """Every certificate with every client."""
+    differs = pytest.mark.xfail(raises=AssertionError, reason="OpenSSL judges otherwise")
+    return [
+        pytest.param(
+            case,
+            face,
+            id=f"{case}-{face}",
+            marks=[differs] if face == "asyncio" and case.name in ASYNCIO_DIFFERS else [],
+        )
+        for case in CASES
+        for face in (*FACES, "poller")
+    ]
+
+
+def read(face: str, url: str) -> str:
+    """The answer of a client: `accepted`, or what it says of the device."""
+    if face == "poller":
+        return polled(url)
+    client: Any = FACES[face](url, timeout=wire.DEADLINE)
+    try:
+        assert client.read_holding_registers(0, 1) == [7]
+    except holdfast.ConnectionLost as lost:
+        return str(lost)
+    finally:
+        client.end() if face == "asyncio" else client.close()
+    return ACCEPTED
+
+
+def polled(url: str) -> str:
+    reads: Any = [("holding_registers", 0, 1, None)]
+    options: dict[str, Any] = {"interval": 60, "timeout": wire.DEADLINE, "start_within": 0}
+    device = _core.PolledDevice(
+        "plc", endpoint(parse(url)), unit=1, reads=reads, report=True, **options
+    )
+    poller = _core.Poller([device])
+    try:
+        taken = poller.results(2 * wire.DEADLINE)
+        assert taken is not None
+        [(_, _, [(_, _, _, data, fault, _)])], _ = taken
+    finally:
+        poller.stop()
+    if data is not None:
+        assert data == b"\0\7"
+        return ACCEPTED
+    assert fault == REFUSED
+    return "refused"
+
+
+@pytest.fixture
+def device(server: holdfast.Server, memory: holdfast.Memory) -> Address:
+    """What is behind the TLS: a server of ours."""
+    memory.write("holding_registers", 0, [7])
+    return server.address
+
+
+def expect(face: str, answer: str, reason: str) -> None:
+    if reason == ACCEPTED or face not in WORDED:
+        assert (answer == ACCEPTED) == (reason == ACCEPTED), answer
+    else:
+        assert re.search(SAYS[reason], answer), answer
+
+
+# Devices
+
+
+@pytest.mark.parametrize(("case", "face"), faces())
+def test_a_device_is_judged_alike_by_every_client(
+    case: Case, face: str, mint: Mint, shown: dict[str, Shown], device: Address
+) -> None:
+    show = made(case, mint, shown)
+    with Relay(device, context((show.chain, show.key), weak=True)) as relay:
+        expect(face, read(face, relay.url(ca=show.trusted)), case.device)
+
+
+def test_the_cases_that_differ_are_in_the_table() -> None:
+    assert {case.name for case in CASES} >= ASYNCIO_DIFFERS | OPENSSL_REFUSES_WITH_TLS_1_2
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        case
+        for case in CASES
+        if "RSA-PSS" not in case.name and case.name not in OPENSSL_REFUSES_WITH_TLS_1_2
+    ],
+    ids=str,
+)
+def test_a_device_is_judged_alike_with_tls_1_2(
+    case: Case, mint: Mint, shown: dict[str, Shown], device: Address
+) -> None:
+    show = made(case, mint, shown)
+    with Relay(device, context((show.chain, show.key), "TLS 1.2", weak=True)) as relay:
+        expect("sync", read("sync", relay.url(ca=show.trusted)), case.device)
+
+
+def test_rsa_pss_keys_need_tls_1_3(mint: Mint, device: Address) -> None:
+    show = mint.signed(key="RSA-PSS")
+    with Relay(device, context((show.chain, show.key), "TLS 1.2")) as relay:
+        answer = read("sync", relay.url(ca=show.trusted))
+    assert "the certificate is not supported" in answer
+    assert answer.endswith("RSA-PSS keys require TLS 1.3")
+
+
+def test_the_salt_of_a_signature_is_told(mint: Mint, device: Address) -> None:
+    [case] = [case for case in CASES if case.name == "signed by RSA-PSS with the longest salt"]
+    show = case.show(mint)
+    with Relay(device, context((show.chain, show.key))) as relay:
+        answer = read("sync", relay.url(ca=show.trusted))
+    assert "RSASSA-PSS" in answer
+    assert answer.endswith("a salt as long as the hash")
+
+
+# Clients
+
+
+@pytest.fixture(scope="module")
+def own(mint: Mint) -> Shown:
+    """What the listener shows."""
+    leaf = mint.make(by=mint.authority, extensions=["subjectAltName=DNS:localhost"])
+    return mint.shown([leaf], [mint.authority])
+
+
+def listener(own: Shown, trusted: Path) -> str:
+    files = {"cert_file": own.chain, "key_file": own.key, "ca_file": trusted}
+    return configuration(files, ANYONE)
+
+
+def listener_cases(version: str) -> list[Any]:
+    return [
+        pytest.param(case, version, id=f"{case}-{version}")
+        for case in CASES
+        if case.client is not None and (version == "1.3" or "RSA-PSS" not in case.name)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("case", "version"), [each for version in ("1.2", "1.3") for each in listener_cases(version)]
+)
+def test_a_client_is_judged_alike_by_the_listener(
+    case: Case,
+    version: str,
+    mint: Mint,
+    shown: dict[str, Shown],
+    own: Shown,
+    run: Run,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    show = made(case, mint, shown)
+    appliance = run(listener(own, show.trusted))
+    client = Issued(show.chain, show.key)
+    answer = verdict(appliance, peer_context(own.trusted, client, version, weak=True))
+    if case.client == SERVED:
+        assert answer == SERVED
+    else:
+        assert answer != SERVED
+        assert reasons(appliance, caplog) == [case.client]
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.client is None], ids=str)
+def test_a_listener_refuses_a_file_with_certificates_that_others_vouch_for(
+    case: Case, mint: Mint, shown: dict[str, Shown], own: Shown, run: Run
+) -> None:
+    with pytest.raises(ValueError, match="certificate 1: found neither of both, allowed: "):
+        run(listener(own, made(case, mint, shown).trusted))
+
+
+# What this side shows
+
+
+@pytest.mark.parametrize("kind", OWN_KEYS)
+@pytest.mark.parametrize("face", [*FACES, "poller"])
+def test_a_client_shows_a_key_of_any_kind(
+    face: str, kind: str, mint: Mint, device: Address
+) -> None:
+    plc, own = mint.signed(), mint.signed(key=kind)
+    asking = context((plc.chain, plc.key), asks=mint.authority.certificate)
+    with Relay(device, asking) as relay:
+        url = relay.url(ca=plc.trusted, cert=own.chain, key=own.key)
+        assert read(face, url) == ACCEPTED
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.3"])
+@pytest.mark.parametrize("kind", OWN_KEYS)
+def test_a_listener_shows_a_key_of_any_kind(kind: str, version: str, mint: Mint, run: Run) -> None:
+    own = mint.signed("subjectAltName=DNS:localhost", key=kind)
+    appliance = run(listener(own, own.trusted))
+    client = peer_context(own.trusted, Issued(own.chain, own.key), version)
+    if version == "1.2" and kind.startswith("RSA-PSS"):
+        assert "ALERT" in verdict(appliance, client)
+    else:
+        assert verdict(appliance, client) == SERVED
+
+
+@pytest.mark.parametrize("kind", OWN_KEYS)
+def test_the_key_of_another_certificate_is_told(kind: str, mint: Mint, tmp_path: Path) -> None:
+    own = mint.signed(key=kind)
+    other = tmp_path / "other.key"
+    algorithm, *options = KEYS[kind]
+    openssl("genpkey", "-algorithm", algorithm, *options, "-out", other)
+    for key, says in (
+        (other, f"it is not the key of the certificate in {own.chain}"),
+        (
+            mint.root(key="P-256" if kind != "P-256" else "RSA").key,
+            "it is not the key of|a key of ",
+        ),
+    ):
+        with pytest.raises(ValueError, match=f"{key}: {says}"):
+            holdfast.SyncClient(f"tls://plc?cert={own.chain}&key={key}")
