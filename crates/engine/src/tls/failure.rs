@@ -99,7 +99,7 @@ pub enum TlsFailure {
     PeerRefusedHandshake,
     #[error("the peer ended TLS with alert {alert:?}")]
     PeerEnded { alert: AlertDescription },
-    /// `by_peer`: the peer found it out.
+    /// With `by_peer` the peer reported it by an alert.
     #[error("no TLS version or cipher suite in common; supported: TLS 1.2 and 1.3")]
     NoCommonVersionOrCipher { by_peer: bool },
     #[error("the peer does not speak TLS")]
