@@ -13,16 +13,19 @@ from holdfast import raw_ingest, values
 from holdfast._core import Memory, OutOfRange, Rule, __version__
 from holdfast.client import Client, SyncClient
 from holdfast.errors import (
+    ConnectFailed,
     ConnectionLost,
     InvalidResponse,
     ModbusError,
     ModbusException,
     RequestTimeout,
+    TlsFailed,
 )
 from holdfast.server import Server
 
 __all__ = [
     "Client",
+    "ConnectFailed",
     "ConnectionLost",
     "InvalidResponse",
     "Memory",
@@ -33,6 +36,7 @@ __all__ = [
     "Rule",
     "Server",
     "SyncClient",
+    "TlsFailed",
     "__version__",
     "raw_ingest",
     "values",

@@ -6,10 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from typing import Any, Literal, final
 
+from holdfast.errors import ModbusError
 from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
 
 __all__ = [
     "BlockingClient",
+    "Connection",
     "Endpoint",
     "Engine",
     "Listener",
@@ -21,7 +23,6 @@ __all__ = [
     "Request",
     "Rule",
     "ServerTls",
-    "Session",
     "__version__",
     "plan_blocks",
     "write_across",
@@ -374,28 +375,46 @@ class BlockingClient:
         """Replies that came after their requests had been given up."""
 
 @final
-class Session:
-    """The requests in flight on one Modbus TCP connection, without its socket."""
+class Connection:
+    """A TCP connection of a client, with TLS or not, for whoever owns its socket.
 
-    def __new__(cls) -> Session: ...
-    def send(self, request: Request, unit: int) -> int | None:
-        """Queues a request; its transaction id, or `None` when all are in use."""
+    Times are those of the owner's clock, in seconds. Completed requests are tickets, each with a
+    result or a `ModbusError`.
+    """
+
+    def __new__(cls, endpoint: Endpoint) -> Connection: ...
+    @property
+    def is_ready(self) -> bool:
+        """Whether requests can be sent: TLS, if there is any, is agreed on."""
+
+    def send(self, request: Request, unit: int, timeout: float, now: float) -> int:
+        """Queues a request; its ticket. Raises why the connection has ended."""
 
     def outgoing(self) -> bytes:
-        """What is to be sent now."""
+        """The bytes to send now."""
 
-    def receive(self, data: bytes) -> tuple[list[tuple[int, Any]], str | None]:
-        """What received bytes complete: transaction ids, each with a result or a `ModbusError`.
+    def receive(self, data: bytes, now: float) -> list[tuple[int, Any]]:
+        """Takes received bytes; the requests that they complete."""
 
-        And why the connection is to be closed, if it is.
-        """
-
-    def give_up(self, id: int) -> None:
-        """Gives a request up: its reply, should it come, is dropped and counted."""
+    def advance(self, now: float) -> list[tuple[int, Any]]:
+        """Ends the requests whose time is over."""
 
     @property
-    def is_amid_reply(self) -> bool:
-        """Whether the last bytes received were the beginning of a reply."""
+    def deadline(self) -> float | None:
+        """When `advance` is to be called."""
+
+    def cancel(self, ticket: int) -> None:
+        """Drops a request: its reply, should it come, is counted."""
+
+    def close(self) -> list[tuple[int, Any]]:
+        """Ends the connection, and with it all requests. Bytes may be left to send."""
+
+    def lost(self, error: str | None = None) -> list[tuple[int, Any]]:
+        """The network has ended the connection; `error` is why, unless that was its regular end."""
+
+    @property
+    def closed(self) -> ModbusError | None:
+        """Why it has ended; `None` while it has not."""
 
     @property
     def late(self) -> int:

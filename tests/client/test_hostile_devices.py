@@ -130,20 +130,20 @@ WRONG_PDUS = {
 TCP_ONLY: dict[str, tuple[Behaviour, str]] = {
     "another transaction id": (
         lambda asked: asked.answer(transaction=asked.transaction ^ 1),
-        "a reply with transaction id",
+        "transaction id . matches no request",
     ),
     "another unit": (lambda asked: asked.answer(unit=2), "from unit 2 to a request to unit 1"),
-    "protocol id 1": (header(protocol=1), "a header with protocol id 1"),
-    "length 0": (header(length=0), "a header with length 0"),
-    "length 1": (header(length=1), "a header with length 1"),
-    "length 255": (header(length=255), "a header with length 255"),
-    "length 65535": (header(length=65535), "a header with length 65535"),
+    "protocol id 1": (header(protocol=1), "protocol id 1, expected 0"),
+    "length 0": (header(length=0), "length 0"),
+    "length 1": (header(length=1), "length 1"),
+    "length 255": (header(length=255), "length 255"),
+    "length 65535": (header(length=65535), "length 65535"),
     "length too small": (header(length=4), "length"),
     "another protocol": (lambda asked: asked.send(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "header"),
-    "without an end": (lambda asked: asked.send(b"\0" * 1_000_000), "a header with length 0"),
+    "without an end": (lambda asked: asked.send(b"\0" * 1_000_000), "length 0"),
     "a good reply too late": (
         lambda asked: asked.send(asked.frame(transaction=9) + asked.frame()),
-        "a reply with transaction id 9",
+        "transaction id 9",
     ),
 }
 
@@ -609,7 +609,7 @@ def test_a_late_reply_that_comes_twice_ends_the_connection(make: Make, dial: Dia
         client.read_holding_registers(7, 1)
     client.timeout = wire.DEADLINE
 
-    with pytest.raises(holdfast.InvalidResponse, match="a reply with transaction id"):
+    with pytest.raises(holdfast.InvalidResponse, match=r"transaction id . matches no request"):
         client.read_holding_registers(8, 1)
     assert client.read_holding_registers(9, 1) == [9]
     assert (client.late, connections(device), len(device.asked)) == (1, 2, 3)
@@ -786,7 +786,7 @@ def test_a_line_that_is_gone_is_opened_again(kind: str, make: Make, dial: Dial) 
     moved = path.rename(path.with_name("moved"))
     client.close()
 
-    with pytest.raises(holdfast.ConnectionLost, match=f"can't connect to {path}"):
+    with pytest.raises(holdfast.ConnectionLost, match=f"can't connect to [a-z]+://{path}"):
         client.read_holding_registers(7, 1)
     moved.rename(path)
     assert client.read_holding_registers(7, 1) == [7]
@@ -870,7 +870,9 @@ def test_a_datagram_with_another_id_is_passed_over(
     ids=["empty", "a byte", "zeros", "a byte too many", "huge"],
 )
 def test_a_datagram_that_is_no_frame_is_refused(datagram: bytes, make: Make, dial: Dial) -> None:
-    invalid_then_good(make("udp", lambda asked: asked.send(datagram)), dial, "no frame")
+    invalid_then_good(
+        make("udp", lambda asked: asked.send(datagram)), dial, "the datagram is not one frame"
+    )
 
 
 @pytest.mark.parametrize("lie", WRONG_PDUS)
@@ -1018,7 +1020,7 @@ def test_calls_that_wait_for_a_connection_are_all_told_that_there_is_none() -> N
             url = f"tcp://127.0.0.1:{nobody.getsockname()[1]}"
             async with holdfast.Client(url, timeout=wire.DEADLINE, max_in_flight=2) as plc:
                 results = await asyncio.gather(*read_all(plc, 6), return_exceptions=True)
-                assert {type(result) for result in results} == {holdfast.ConnectionLost}
+                assert {type(result) for result in results} == {holdfast.ConnectFailed}
                 assert len({id(result) for result in results}) == 6
 
     run(main)
@@ -1082,7 +1084,7 @@ def test_whatever_comes_is_a_reply_only_if_it_is_one(
             )
         (asked.drip if drip and kind != "udp" else asked.send)(sent)
         # Whatever that was, nothing better comes.
-        asked.send(b"no frame") if kind == "udp" else close(asked)
+        asked.send(b"the datagram is not one frame") if kind == "udp" else close(asked)
 
     if not hasattr(make, "device"):
         make.device = make(kind)  # type: ignore[attr-defined]

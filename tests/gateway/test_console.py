@@ -244,7 +244,7 @@ def test_a_device_with_tls_is_connected_to_and_read(
         expect(port).to_have_value("1502")
         view.connect(port=relay.address[1])
         view.says("TLS was not agreed on.")
-        view.says("the certificate is not for '127.0.0.1'")
+        view.says("the certificate is for 'drive-7', not for '127.0.0.1'")
         view.check()
         name.fill("drive-7")
         view.button("Connect").click()

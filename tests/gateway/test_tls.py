@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 HOST = "IP:127.0.0.1"
 TARGET = {"host": "127.0.0.1", "transport": "tls"}
 READ = {"functionCode": 3, "address": 0, "quantity": 3}
-UNKNOWN = "the issuer of the certificate is unknown: it is none of those that are trusted"
+UNKNOWN = (
+    "the issuer of the certificate is unknown: neither the certificate nor an authority above it is "
+    "trusted"
+)
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +188,7 @@ def test_a_certificate_for_another_name_is_told(device: Relay, trust: Tls) -> No
     with gateways.running(tls=trust, resolve=names) as running:
         assert failure(running.ask("/read", at(device, host=PLC))) == (
             "tls_failed",
-            f"can't connect to {PLC}:{device.address[1]}: the certificate is not for '{PLC}'",
+            f"can't connect to {PLC}:{device.address[1]}: the certificate is for '127.0.0.1', not for '{PLC}'",
         )
 
 

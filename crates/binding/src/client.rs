@@ -1,19 +1,18 @@
-//! `Request`, `BlockingClient` and `Session`: requests in, values or exceptions out.
+//! `Request`, `Endpoint` and `BlockingClient`: requests in, values or exceptions out.
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use holdfast_engine::client::{
-    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Session as CoreSession,
-    exception_name,
+    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, exception_name,
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineMode, LineParity, SerialLine};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
-    self, Bits, Diagnostics, Function, Range, Registers, Request as CoreRequest, RequestError,
-    Response, ResponseError, SubFunction, limit,
+    self, Bits, Diagnostics, EncodedRequest, Function, Range, Registers, Request as CoreRequest,
+    RequestError, Response, SubFunction, limit,
 };
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -23,16 +22,18 @@ use crate::arguments::{byte, seconds, within, word};
 use crate::memory::{integer, numbers};
 
 pyo3::import_exception!(holdfast.errors, ModbusException);
+pyo3::import_exception!(holdfast.errors, ConnectFailed);
 pyo3::import_exception!(holdfast.errors, ConnectionLost);
 pyo3::import_exception!(holdfast.errors, RequestTimeout);
 pyo3::import_exception!(holdfast.errors, InvalidResponse);
+pyo3::import_exception!(holdfast.errors, TlsFailed);
 
 /// Addresses of an area.
 const ADDRESSES: i128 = 65_536;
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Request {
-    pub(crate) pdu: Vec<u8>,
+    pub(crate) encoded: EncodedRequest,
 }
 
 #[pymethods]
@@ -172,14 +173,7 @@ impl Request {
 
     #[getter]
     fn pdu<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, &self.pdu)
-    }
-}
-
-impl Request {
-    /// What was encoded.
-    fn core(&self) -> PyResult<CoreRequest<'_>> {
-        CoreRequest::parse(&self.pdu).map_err(|code| PyValueError::new_err(code.to_string()))
+        PyBytes::new(py, self.encoded.pdu())
     }
 }
 
@@ -266,11 +260,8 @@ impl BlockingClient {
     ) -> PyResult<Bound<'py, PyAny>> {
         let unit = byte("unit", unit)?;
         let timeout = seconds("timeout", timeout)?;
-        let core = request.core()?;
-        let result = py.detach(|| {
-            self.core.call(unit, &core, timeout, |response: Response<'_>| Reply::from(response))
-        });
-        result.map_err(raised)?.into_python(py, &core)
+        let result = py.detach(|| self.core.call(unit, &request.encoded, timeout, Reply::new));
+        result.map_err(raised)?.into_python(py)
     }
 
     fn close(&self, py: Python<'_>) {
@@ -324,104 +315,10 @@ pub fn line(
     })
 }
 
-#[pyclass(module = "holdfast")]
-pub struct Session {
-    state: Mutex<State>,
-}
-
-#[derive(Default)]
-struct State {
-    core: CoreSession,
-    requests: std::collections::HashMap<u16, Py<Request>>,
-    out: Vec<u8>,
-}
-
-/// Transaction id, and a result or an exception.
-type Completed<'py> = (u16, Bound<'py, PyAny>);
-
-#[pymethods]
-impl Session {
-    #[new]
-    fn new() -> Session {
-        Session { state: Mutex::default() }
-    }
-
-    /// Queues a request; its transaction id, or `None` when all are in use.
-    fn send(&self, request: Py<Request>, unit: i128) -> PyResult<Option<u16>> {
-        let unit = byte("unit", unit)?;
-        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let id = state.core.send(unit, &request.get().pdu, &mut state.out);
-        if let Some(id) = id {
-            state.requests.insert(id, request);
-        }
-        Ok(id)
-    }
-
-    /// The bytes to send now.
-    fn outgoing<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let bytes = PyBytes::new(py, &state.out);
-        state.out.clear();
-        bytes
-    }
-
-    /// What received bytes complete, and why the connection is to be closed.
-    fn receive<'py>(
-        &self,
-        py: Python<'py>,
-        data: &[u8],
-    ) -> PyResult<(Vec<Completed<'py>>, Option<String>)> {
-        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let requests = &mut state.requests;
-        let mut completed = Vec::new();
-        let mut failed = None;
-        let received = state.core.receive(data, |id, response| {
-            let Some(request) = requests.remove(&id) else { return };
-            match completion(py, request.get(), response) {
-                Ok(value) => completed.push((id, value)),
-                Err(error) => failed = Some(error),
-            }
-        });
-        match failed {
-            Some(error) => Err(error),
-            None => Ok((completed, received.err().map(|broken| broken.to_string()))),
-        }
-    }
-
-    /// Gives a request up: its reply, should it come, is dropped and counted.
-    fn give_up(&self, id: u16) {
-        let state = &mut *self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        state.core.give_up(id);
-        state.requests.remove(&id);
-    }
-
-    /// Whether the last bytes received were the beginning of a reply.
-    #[getter]
-    fn is_amid_reply(&self) -> bool {
-        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner).core.is_amid_reply()
-    }
-
-    #[getter]
-    fn late(&self) -> u64 {
-        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner).core.late()
-    }
-}
-
-/// A result, or the exception that it is.
-fn completion<'py>(
-    py: Python<'py>,
-    request: &Request,
-    response: Result<Response<'_>, ResponseError>,
-) -> PyResult<Bound<'py, PyAny>> {
-    match response {
-        Ok(response) => Reply::from(response).into_python(py, &request.core()?),
-        Err(error) => Ok(raised(error.into()).into_value(py).into_bound(py).into_any()),
-    }
-}
-
 /// A response without the buffer that it borrows from.
-enum Reply {
-    Bits(Vec<u8>),
+pub(crate) enum Reply {
+    /// Packed bits, and how many.
+    Bits(Vec<u8>, usize),
     Registers(Vec<u8>),
     Written,
     Bytes(Vec<u8>),
@@ -429,10 +326,10 @@ enum Reply {
     Identification(u8, Option<u8>, Vec<(u8, Vec<u8>)>),
 }
 
-impl From<Response<'_>> for Reply {
-    fn from(response: Response<'_>) -> Reply {
+impl Reply {
+    pub(crate) fn new(response: Response<'_>) -> Reply {
         match response {
-            Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec()),
+            Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec(), bits.quantity().into()),
             Response::Registers(registers) => Reply::Registers(registers.as_bytes().to_vec()),
             Response::Written => Reply::Written,
             Response::Diagnostics(data) | Response::ServerId(data) => Reply::Bytes(data.to_vec()),
@@ -443,22 +340,10 @@ impl From<Response<'_>> for Reply {
             }
         }
     }
-}
 
-impl Reply {
-    fn into_python<'py>(
-        self,
-        py: Python<'py>,
-        request: &CoreRequest<'_>,
-    ) -> PyResult<Bound<'py, PyAny>> {
+    pub(crate) fn into_python<'py>(self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         Ok(match self {
-            Reply::Bits(bits) => {
-                let quantity = match request {
-                    CoreRequest::ReadCoils(range) | CoreRequest::ReadDiscreteInputs(range) => {
-                        usize::from(range.quantity())
-                    }
-                    _ => bits.len() * 8,
-                };
+            Reply::Bits(bits, quantity) => {
                 let bit = |index: usize| bits[index / 8] >> (index % 8) & 1 == 1;
                 PyList::new(py, (0..quantity).map(bit))?.into_any()
             }
@@ -478,21 +363,25 @@ impl Reply {
     }
 }
 
-fn raised(error: ClientError) -> PyErr {
+/// The Python exception that an error is.
+pub(crate) fn raised(error: ClientError) -> PyErr {
+    let text = error.to_string();
     match error {
         ClientError::Exception(code) => ModbusException::new_err((code, exception_name(code))),
-        ClientError::Timeout(_) => RequestTimeout::new_err(error.to_string()),
-        ClientError::Connect { .. } | ClientError::Lost(_) => {
-            ConnectionLost::new_err(error.to_string())
+        ClientError::Timeout(_) | ClientError::ConnectTimeout { .. } => {
+            RequestTimeout::new_err(text)
         }
-        ClientError::Invalid(_) => InvalidResponse::new_err(error.to_string()),
+        ClientError::Connect { to, error } => ConnectFailed::new_err((to, told(&error))),
+        ClientError::Tls { to, failure, maybe_sent } => {
+            TlsFailed::new_err((failure.reason(), to, failure.to_string(), maybe_sent))
+        }
+        ClientError::Lost(_) => ConnectionLost::new_err(text),
+        ClientError::Invalid(invalid) => InvalidResponse::new_err((text, invalid.reason())),
     }
 }
 
 fn encoded(request: &CoreRequest<'_>) -> Request {
-    let mut buffer = [0; pdu::MAX_LEN];
-    let len = request.encode(&mut buffer);
-    Request { pdu: buffer[..len].to_vec() }
+    Request { encoded: EncodedRequest::new(request) }
 }
 
 fn range<const MAX: u16>(address: i128, count: i128) -> PyResult<Range<MAX>> {

@@ -6,6 +6,7 @@
 mod arguments;
 mod audit;
 mod client;
+mod connection;
 mod engine;
 mod listener;
 mod memory;
@@ -18,7 +19,9 @@ mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult};
 
     #[pymodule_export]
-    use super::client::{BlockingClient, Endpoint, Request, Session};
+    use super::client::{BlockingClient, Endpoint, Request};
+    #[pymodule_export]
+    use super::connection::Connection;
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]

@@ -126,7 +126,7 @@ impl Poller {
 
     fn write(&self, name: &str, request: PyRef<'_, Request>) -> PyResult<u64> {
         self.core
-            .write(name, request.pdu.clone())
+            .write(name, Box::new(request.encoded.clone()))
             .map_err(|error| PyValueError::new_err(error.to_string()))
     }
 

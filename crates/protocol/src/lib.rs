@@ -7,6 +7,8 @@
 //! * [`frame`]: what each transport puts around a PDU. [`frame::mbap`] for TCP and UDP,
 //!   [`frame::rtu`] for serial lines and RTU over TCP, [`frame::ascii`] for serial lines.
 //! * [`raw_ingest`]: Raw Ingest packets.
+//! * `client`: a connection of a client: requests in flight, timeouts and late replies, without I/O
+//!   (feature `alloc`).
 //!
 //! # Rules that this crate keeps
 //!
@@ -70,6 +72,8 @@ macro_rules! codes {
     };
 }
 
+#[cfg(feature = "alloc")]
+pub mod client;
 pub mod frame;
 pub mod pdu;
 pub mod raw_ingest;

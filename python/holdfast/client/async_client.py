@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Self
 from holdfast._core import Request
 from holdfast.client import requests
 from holdfast.client.base import BaseClient
-from holdfast.client.connection import Link
-from holdfast.client.endpoint import context
+from holdfast.client.connection import AsyncConnection
+from holdfast.client.endpoint import endpoint
 from holdfast.client.one_at_a_time import OneAtATime
 from holdfast.client.target import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ModbusException
@@ -46,9 +46,9 @@ class Client(BaseClient):
             raise ValueError(
                 f"max_in_flight is {max_in_flight!r}, allowed are 1 to {MAX_IN_FLIGHT}"
             )
-        self._transport: Link | OneAtATime
+        self._transport: AsyncConnection | OneAtATime
         if isinstance(self.target, NetworkTarget) and self.target.transport in IN_FLIGHT:
-            self._transport = Link(self.target, max_in_flight, context(self.target))
+            self._transport = AsyncConnection(self.target, endpoint(self.target), max_in_flight)
         else:
             self._transport = OneAtATime(self.target)
 

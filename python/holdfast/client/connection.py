@@ -1,48 +1,42 @@
 """Modbus TCP in asyncio, with TLS or not: many requests in flight on one connection, in no thread.
 
-The native session frames requests and matches replies; here are the socket, the deadlines and the
-futures. Requests that are made in one turn of the event loop leave with one write, replies that
-arrive together are handed out together: a busy connection costs few wake-ups.
+The native connection frames requests, matches replies, keeps the deadlines and speaks TLS; here are
+the socket, one alarm and the futures. Requests that are made in one turn of the event loop leave
+with one write, replies that arrive together are handed out together: a busy connection costs few
+wake-ups.
 """
 
 from __future__ import annotations
 
 import asyncio
-from bisect import insort
+import copy
+import os
+import socket
 from collections import deque
 from math import inf
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
-from holdfast._core import Session
-from holdfast.client import tls
-from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, RequestTimeout
+from holdfast._core import Connection
+from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
-    from ssl import SSLContext
 
-    from holdfast._core import Request
+    from holdfast._core import Endpoint, Request
     from holdfast.client.target import NetworkTarget
 
 CLOSED = "connection lost: closed by this side"
 
-MAX_CONSECUTIVE_TIMEOUTS = 3
-"""Timeouts one after the other, without a byte between them, after which a connection is given up:
-the other side may have gone without a word."""
 
-
-class Link:
+class AsyncConnection:
     """The connection of a client, in one event loop at a time."""
 
-    def __init__(
-        self, target: NetworkTarget, max_in_flight: int, context: SSLContext | None = None
-    ) -> None:
+    def __init__(self, target: NetworkTarget, endpoint: Endpoint, max_in_flight: int) -> None:
         self._target = target
+        self._endpoint = endpoint
         self._max_in_flight = max_in_flight
-        self._context = context
         self._late = 0
-        self._here: _LoopLink | None = None
+        self._here: _LoopConnection | None = None
 
     def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
         """Sends a request when there is room for it, and waits for the result.
@@ -68,34 +62,34 @@ class Link:
         """Replies that came after their requests had been given up."""
         return self._late + (0 if self._here is None else self._here.late)
 
-    def _move(self, loop: asyncio.AbstractEventLoop) -> _LoopLink:
+    def _move(self, loop: asyncio.AbstractEventLoop) -> _LoopConnection:
         """Begins anew in another loop: what was left behind in one that is closed is gone."""
         old = self._here
         if old is not None:
             if old.in_use and not old.loop.is_closed():
                 raise RuntimeError("the client is in use in another event loop: close it there")
             self._late += old.late
-        self._here = here = _LoopLink(self._target, self._max_in_flight, self._context, loop)
+        self._here = here = _LoopConnection(self._target, self._endpoint, self._max_in_flight, loop)
         return here
 
 
-class _LoopLink:
+class _LoopConnection:
     """A connection in its loop, made when it is needed, and again after it was lost."""
 
     def __init__(
         self,
         target: NetworkTarget,
+        endpoint: Endpoint,
         max_in_flight: int,
-        context: SSLContext | None,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
         self.loop = loop
         self._target = target
-        self._context = context
+        self._endpoint = endpoint
         self._max_in_flight = self._free = max_in_flight
         self._queue: deque[asyncio.Future[None]] = deque()
-        self._connection: _Connection | None = None
-        self._connecting: asyncio.Task[_Connection] | None = None
+        self._open: _Protocol | None = None
+        self._connecting: asyncio.Task[_Protocol] | None = None
         self._late = 0
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
@@ -105,14 +99,14 @@ class _LoopLink:
             await self._turn()
         try:
             deadline = self.loop.time() + timeout
-            connection = self._connection
+            connection = self._open
             if connection is None:
                 connection = await self._connected(deadline, timeout)
-            number, future = connection.send(request, unit, deadline, timeout)
+            ticket, future = connection.send(request, unit, deadline, timeout)
             try:
                 return await future
             except asyncio.CancelledError:
-                connection.give_up(number)
+                connection.cancel(ticket)
                 raise
         finally:
             if self._queue:
@@ -128,20 +122,20 @@ class _LoopLink:
         if self._connecting is not None:
             self._connecting.cancel()
             await asyncio.wait([self._connecting])
-        if self._connection is not None:
-            closed = self._connection.closed
-            self._connection.end(ConnectionLost(CLOSED))
-            await closed
+        if self._open is not None:
+            ended = self._open.ended
+            self._open.close()
+            await ended
 
     @property
     def in_use(self) -> bool:
         """Whether there is a connection, or a call that wants one."""
-        connected = self._connection is not None or self._connecting is not None
+        connected = self._open is not None or self._connecting is not None
         return connected or self._free < self._max_in_flight
 
     @property
     def late(self) -> int:
-        return self._late + (0 if self._connection is None else self._connection.session.late)
+        return self._late + (0 if self._open is None else self._open.core.late)
 
     async def _turn(self) -> None:
         """Waits for one of the places in flight, first come first served."""
@@ -163,7 +157,7 @@ class _LoopLink:
                 return
         self._free += 1
 
-    async def _connected(self, deadline: float, timeout: float) -> _Connection:
+    async def _connected(self, deadline: float, timeout: float) -> _Protocol:
         """The connection, made if need be; several calls may wait for the same one."""
         if self._connecting is None:
             self._connecting = self.loop.create_task(self._connect(timeout))
@@ -176,153 +170,145 @@ class _LoopLink:
             raise ConnectionLost(CLOSED)
         failure = connecting.exception()
         if isinstance(failure, ModbusError):
-            raise _again(failure) from failure.__cause__
+            raise copy.copy(failure) from failure.__cause__
         return connecting.result()
 
-    async def _connect(self, timeout: float) -> _Connection:
-        target, context = self._target, self._context
+    async def _connect(self, timeout: float) -> _Protocol:
+        target, protocol = self._target, _Protocol(self, Connection(self._endpoint))
         try:
             async with asyncio.timeout(timeout):
-                _, connection = await self.loop.create_connection(
-                    lambda: _Connection(self),
-                    target.host,
-                    target.port,
-                    ssl=context,
-                    server_hostname=self._name if context is not None else None,
-                )
+                try:
+                    await self.loop.create_connection(lambda: protocol, target.host, target.port)
+                except (OSError, UnicodeError) as error:
+                    raise ConnectFailed(str(target), explained(error)) from error
+                await protocol.ready
         except TimeoutError:
             raise self._not_in_time(timeout) from None
-        except (OSError, UnicodeError) as error:
-            told = str(error) if context is None else tls.not_agreed(error, self._name)
-            raise ConnectionLost(f"can't connect to {target}: {told}") from error
-        return connection
-
-    @property
-    def secure(self) -> bool:
-        """Whether it is by TLS."""
-        return self._context is not None
-
-    @property
-    def _name(self) -> str:
-        """What the certificate of the device is for."""
-        return self._target.tls.name or self._target.host
+        finally:
+            if not protocol.is_ready:
+                protocol.close()
+        return protocol
 
     def _not_in_time(self, timeout: float) -> RequestTimeout:
         return RequestTimeout(f"no connection to {self._target} within {timeout:g} s")
 
-    def _connect_ended(self, task: asyncio.Task[_Connection]) -> None:
+    def _connect_ended(self, task: asyncio.Task[_Protocol]) -> None:
         self._connecting = None
         # It may be lost already.
-        if not task.cancelled() and task.exception() is None and task.result().ended is None:
-            self._connection = task.result()
+        if not task.cancelled() and task.exception() is None and task.result().is_ready:
+            self._open = task.result()
 
-    def lost(self, connection: _Connection) -> None:
+    def lost(self, connection: _Protocol) -> None:
         """The connection has ended: the next call makes a new one."""
-        self._late += connection.session.late
-        if self._connection is connection:
-            self._connection = None
+        self._late += connection.core.late
+        if self._open is connection:
+            self._open = None
 
 
-class _Connection(asyncio.Protocol):
+class _Protocol(asyncio.Protocol):
     """One connection: requests out, replies in."""
 
-    def __init__(self, here: _LoopLink) -> None:
-        self.session = Session()
-        self.ended: ModbusError | None = None
-        """Why it is over."""
+    def __init__(self, here: _LoopConnection, core: Connection) -> None:
+        self.core = core
         self._here = here
         self._loop = here.loop
-        self.closed: asyncio.Future[None] = self._loop.create_future()
-        self._heard = not here.secure
+        self.ready: asyncio.Future[None] = self._loop.create_future()
+        """Requests can be sent."""
+        self.ended: asyncio.Future[None] = self._loop.create_future()
+        """Its socket is closed."""
         self._futures: dict[int, asyncio.Future[Any]] = {}
-        self._by_deadline: deque[tuple[float, int, asyncio.Future[Any], float]] = deque()
-        """The earliest first: deadline, transaction id, future, and the timeout that it had."""
         self._alarm: asyncio.TimerHandle | None = None
         self._alarm_at = inf
         self._flushing = False
-        self._timeouts = 0
-        self._timed_out = -inf
-        """Timeouts since something came, and when the last of them was."""
-        self._transport: asyncio.Transport
+        self._transport: asyncio.Transport | None = None
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether requests can be sent."""
+        return self._transport is not None and self.core.is_ready
 
     def send(
         self, request: Request, unit: int, deadline: float, timeout: float
     ) -> tuple[int, asyncio.Future[Any]]:
         """Sends a request: alone at once, beside others with those of this turn of the loop.
 
-        Returns its transaction id, and what will have the result.
+        Returns its ticket, and what will have the result.
         """
-        if self.ended is not None:
-            raise _again(self.ended)
-        number = self.session.send(request, unit)
-        if number is None:
-            self.end(ConnectionLost("connection lost: no transaction id is free"))
-            raise ConnectionLost("connection lost: no transaction id is free")
+        ticket = self.core.send(request, unit, timeout, deadline - timeout)
         if not self._futures:
-            self._transport.write(self.session.outgoing())
+            self._flush()
         elif not self._flushing:
             self._flushing = True
             self._loop.call_soon(self._flush)
-        future = self._futures[number] = self._loop.create_future()
-        queue = self._by_deadline
-        if queue and deadline < queue[-1][0]:
-            insort(queue, (deadline, number, future, timeout), key=itemgetter(0))
-        else:
-            queue.append((deadline, number, future, timeout))
+        future = self._futures[ticket] = self._loop.create_future()
         if deadline < self._alarm_at:
             self._set_alarm(deadline)
-        return number, future
+        return ticket, future
 
-    def give_up(self, number: int) -> None:
+    def cancel(self, ticket: int) -> None:
         """Nobody waits for the reply any more."""
-        if self._futures.pop(number, None) is not None:
-            self.session.give_up(number)
+        if self._futures.pop(ticket, None) is not None:
+            self.core.cancel(ticket)
 
-    def end(self, error: ModbusError) -> None:
-        """Closes the connection; whoever waits for a reply gets the error."""
-        if self.ended is not None:
-            return
-        self.ended = error
-        if self._alarm is not None:
-            self._alarm.cancel()
-        self._here.lost(self)
-        self._transport.abort()
-        for future in self._futures.values():
-            if not future.done():
-                future.set_exception(_again(error))
-        self._futures.clear()
-        self._by_deadline.clear()
+    def close(self) -> None:
+        """Ends the connection; whoever waits for a reply gets `ConnectionLost`."""
+        self._settle(self.core.close())
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
+        self._settle([])
 
     def data_received(self, data: bytes) -> None:
-        self._heard = True
-        self._timeouts = 0
-        completed, broken = self.session.receive(data)
-        for number, result in completed:
-            future = self._futures.pop(number)
+        self._settle(self.core.receive(data, self._loop.time()))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._settle(self.core.lost(None if exc is None else explained(exc)))
+        self.ended.set_result(None)
+
+    def _settle(self, completed: list[tuple[int, Any]]) -> None:
+        """Hands results out, sends what is to be sent, and ends what has ended."""
+        for ticket, result in completed:
+            future = self._futures.pop(ticket)
             if future.done():
                 continue
             if isinstance(result, ModbusError):
                 future.set_exception(result)
             else:
                 future.set_result(result)
-        while self._by_deadline and self._by_deadline[0][2].done():
-            self._by_deadline.popleft()
-        if broken is not None:
-            self.end(InvalidResponse(f"invalid response: {broken}"))
+        if not self.ready.done():
+            self._greet()
+        closed = self.core.closed
+        if closed is not None:
+            self._end(closed)
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        why = "closed by the peer" if exc is None else tls.told(exc, heard=self._heard)
-        self.end(ConnectionLost(f"connection lost: {why}"))
-        self.closed.set_result(None)
+    def _greet(self) -> None:
+        """Goes on with what comes before the first request."""
+        self._flush()
+        if self.core.is_ready:
+            self.ready.set_result(None)
+
+    def _end(self, why: ModbusError) -> None:
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+        if not self.ready.done():
+            self.ready.set_exception(why)
+            self.ready.exception()  # Whoever wanted it may be gone.
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            self._here.lost(self)
+            outgoing = self.core.outgoing()
+            if outgoing and not transport.is_closing():
+                transport.write(outgoing)
+            transport.abort()
 
     def _flush(self) -> None:
         self._flushing = False
-        if self.ended is None:
-            self._transport.write(self.session.outgoing())
+        if self._transport is not None:
+            outgoing = self.core.outgoing()
+            if outgoing:
+                self._transport.write(outgoing)
 
     def _set_alarm(self, at: float) -> None:
         if self._alarm is not None:
@@ -333,28 +319,16 @@ class _Connection(asyncio.Protocol):
     def _look_at_deadlines(self) -> None:
         """Ends the calls whose time is over, and sets the alarm for the next."""
         self._alarm, self._alarm_at = None, inf
-        now = self._loop.time()
-        timed_out = False
-        while self._by_deadline:
-            deadline, number, future, timeout = self._by_deadline[0]
-            if not future.done():
-                if deadline > now:
-                    self._set_alarm(deadline)
-                    break
-                self.give_up(number)
-                future.set_exception(RequestTimeout(f"no reply within {timeout:g} s"))
-                timed_out = True
-                # Requests that were under way together count as one.
-                if deadline - timeout >= self._timed_out:
-                    self._timeouts += 1
-                    self._timed_out = now
-            self._by_deadline.popleft()
-        if timed_out and self.session.is_amid_reply:
-            self.end(ConnectionLost("connection lost: a reply broke off"))
-        elif self._timeouts >= MAX_CONSECUTIVE_TIMEOUTS and not self._futures:
-            self.end(ConnectionLost("connection lost: nothing came any more"))
+        self._settle(self.core.advance(self._loop.time()))
+        deadline = self.core.deadline
+        if deadline is not None and self._transport is not None:
+            self._set_alarm(deadline)
 
 
-def _again(error: ModbusError) -> ModbusError:
-    """The same error for another caller: a traceback belongs to one."""
-    return type(error)(*error.args)
+def explained(error: Exception) -> str:
+    """What the system calls an error, without the address that asyncio adds."""
+    if isinstance(error, socket.gaierror):
+        return error.strerror or str(error)
+    if isinstance(error, OSError) and error.errno is not None:
+        return os.strerror(error.errno)
+    return str(error)

@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
-from holdfast.client import tls as asyncio_tls
 from holdfast.client.target import TLS_PORT, NetworkTarget, SerialTarget
 
 if TYPE_CHECKING:
-    from ssl import SSLContext
-
     from holdfast.client.target import Target, Tls
 
 
@@ -38,14 +35,6 @@ def endpoint(target: Target) -> Endpoint:
     return Endpoint.network(target.transport, target.host, target.port)
 
 
-def context(target: NetworkTarget) -> SSLContext | None:
-    """What asyncio needs to know of TLS, if the target has it."""
-    if target.transport != "tls":
-        return None
-    endpoint(target)  # It says what is wrong with files and names, as in the other client.
-    return asyncio_tls.context(target.tls)
-
-
 def check_files(tls: Tls) -> None:
     """Raises `OSError` and `ValueError` for files that can't be used."""
-    context(NetworkTarget("tls", "localhost", TLS_PORT, tls))
+    endpoint(NetworkTarget("tls", "localhost", TLS_PORT, tls))

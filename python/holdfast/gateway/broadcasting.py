@@ -7,8 +7,9 @@ import contextlib
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast.client import Client
+from holdfast.client.connection import explained
 from holdfast.client.target import NetworkTarget
-from holdfast.errors import ConnectionLost, InvalidResponse
+from holdfast.errors import ConnectFailed, ConnectionLost, InvalidResponse
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -49,7 +50,7 @@ class _Broadcaster(Client):
         try:
             reader, writer = await asyncio.open_connection(target.host, target.port)
         except OSError as error:
-            raise ConnectionLost(f"can't connect to {target}: {error}") from error
+            raise ConnectFailed(str(target), explained(error)) from error
         try:
             body = bytes([unit]) + request.pdu
             writer.write(body + crc(body))

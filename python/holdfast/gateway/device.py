@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import ssl
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast import logs
-from holdfast.client import tls
 from holdfast.client.target import PORT, TLS_PORT
-from holdfast.errors import ConnectionLost, InvalidResponse, ModbusException, RequestTimeout
+from holdfast.errors import (
+    ConnectFailed,
+    ConnectionLost,
+    InvalidResponse,
+    ModbusException,
+    RequestTimeout,
+    TlsFailed,
+)
 from holdfast.gateway.broadcasting import broadcast
 from holdfast.gateway.egress import NoSuchName, Refused
 from holdfast.gateway.fields import malformed
-from holdfast.gateway.pool import Full, Unusable, could_not_connect
+from holdfast.gateway.pool import Full, Unusable
 from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
@@ -37,8 +41,6 @@ NO_BROADCAST = (
     "allowed are writes by functions 5, 6, 15, 16 and 22"
 )
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which nobody answers"
-NOT_AGREED = (tls.ENDED, tls.REFUSES, *tls.REASONS.values())
-"""What is told of a connection that ended because of TLS, beside flaws of certificates."""
 
 
 class Failed(Exception):
@@ -98,7 +100,7 @@ class RequestedDevice:
         except RequestTimeout:
             raise Failed("timeout", self._timed_out()) from None
         except ConnectionLost as error:
-            if could_not_connect(error):
+            if not error.maybe_sent:
                 self.asked = False
             raise Failed(self._reason(error), self._explained(error)) from None
         except InvalidResponse as error:
@@ -144,20 +146,15 @@ class RequestedDevice:
 
     def _reason(self, error: ConnectionLost) -> str:
         """Why a connection could not be made or ended, in a word."""
-        told = str(error)
-        if isinstance(error.__cause__, ssl.SSLError) or any(each in told for each in NOT_AGREED):
+        if isinstance(error, TlsFailed):
             return "tls_failed"
-        return "no_connection" if could_not_connect(error) else "connection_lost"
+        return "connection_lost" if error.maybe_sent else "no_connection"
 
     def _explained(self, error: ConnectionLost) -> str:
         """The same in a sentence, which has the host as the caller named it."""
-        cause = error.__cause__
-        if not isinstance(cause, OSError):
-            return str(error)
-        told = str(error).partition(": ")[2]
-        if told == str(cause) and cause.errno is not None and not isinstance(cause, ssl.SSLError):
-            told = os.strerror(cause.errno)
-        return f"can't connect to {self.host}:{self.port}: {told}"
+        if isinstance(error, ConnectFailed | TlsFailed) and not error.maybe_sent:
+            return f"can't connect to {self.host}:{self.port}: {error.detail}"
+        return str(error)
 
 
 def exception_name(error: ModbusException) -> str:

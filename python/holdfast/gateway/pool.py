@@ -124,7 +124,7 @@ class Pool:
             try:
                 return await self._run(key, timeout, call, repeat=repeat)
             except ConnectionLost as error:
-                if not could_not_connect(error):
+                if error.maybe_sent:
                     raise
         return await self._run(keys[-1], timeout, call, repeat=repeat)
 
@@ -159,7 +159,7 @@ class Pool:
             try:
                 result = await call(entry.client)
             except ConnectionLost as error:
-                if not (repeat and before) or could_not_connect(error):
+                if not (repeat and before and error.maybe_sent):
                     raise
                 result = await call(entry.client)
         except ModbusException:
@@ -244,8 +244,3 @@ class Pool:
             if entry.users == 0 and (entry.doubtful or entry.used < latest):
                 del self._entries[key]
                 await entry.client.close()
-
-
-def could_not_connect(error: ConnectionLost) -> bool:
-    """Whether nothing was sent, because no connection could be made."""
-    return str(error).startswith("can't connect")

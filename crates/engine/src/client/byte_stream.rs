@@ -1,28 +1,80 @@
-//! Streams of bytes with deadlines: a TCP connection, a serial port.
+//! What bytes travel on, with deadlines: a TCP connection, datagrams, a serial port.
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
+
+use super::Endpoint;
+use super::tls_stream::TlsStream;
+use crate::tls::TlsFailure;
 
 /// The shortest time that a system waits for.
 const MIN_TIMEOUT: Duration = Duration::from_micros(1);
 
+/// Why nothing was received, or sent.
+#[derive(Debug)]
+pub(super) enum StreamError {
+    /// The deadline came first.
+    TimedOut,
+    /// The peer has ended the stream.
+    Ended,
+    Io(io::Error),
+    Tls(TlsFailure),
+}
+
 pub(super) trait ByteStream: Send {
-    /// Reads what is there, at least one byte.
-    ///
-    /// # Errors
-    /// `TimedOut` when nothing comes before the deadline, `UnexpectedEof` when nothing will.
-    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize>;
+    /// Reads what is there, at least one byte; of datagrams, one.
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError>;
 
-    /// # Errors
-    /// `TimedOut` when the line does not take all of it before the deadline.
-    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()>;
+    /// Reads what is there already.
+    fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError>;
 
-    /// Throws away what is there; whether there was something.
-    fn discard(&mut self) -> io::Result<bool>;
+    /// Sends all of it; of datagrams, one.
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError>;
 
-    /// Whether the peer is there, and has sent nothing; a line that can be silenced always is.
-    fn is_quiet(&self) -> bool;
+    /// Whether the peer has ended it; what else it sent is kept.
+    fn has_ended(&mut self) -> bool {
+        false
+    }
+
+    /// Whether the peer is there, and has sent nothing.
+    fn is_quiet(&self) -> bool {
+        true
+    }
+}
+
+/// Opens a stream to an endpoint.
+pub(super) fn connect(
+    endpoint: &Endpoint,
+    deadline: Instant,
+) -> Result<Box<dyn ByteStream>, StreamError> {
+    Ok(match endpoint {
+        Endpoint::Tcp { host, port, tls: None } | Endpoint::RtuOverTcp { host, port } => {
+            Box::new(TcpByteStream::connect(host, *port, deadline)?)
+        }
+        Endpoint::Tcp { host, port, tls: Some(tls) } => {
+            let stream = TcpByteStream::connect(host, *port, deadline)?;
+            Box::new(TlsStream::agree(stream, tls, deadline)?)
+        }
+        Endpoint::Udp { host, port } => Box::new(first(host, *port, |address| {
+            let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
+            let socket = UdpSocket::bind(any)?;
+            socket.connect(address)?;
+            Ok(socket)
+        })?),
+        Endpoint::Serial { line, .. } => Box::new(line.open_blocking()?),
+    })
+}
+
+impl From<io::Error> for StreamError {
+    /// The same of an end, and of a time that ran out, on every system.
+    fn from(error: io::Error) -> StreamError {
+        match error.kind() {
+            ErrorKind::TimedOut | ErrorKind::WouldBlock => StreamError::TimedOut,
+            ErrorKind::UnexpectedEof => StreamError::Ended,
+            _ => StreamError::Io(error),
+        }
+    }
 }
 
 /// What is left until a deadline, for a system that knows no time of 0.
@@ -31,16 +83,28 @@ fn left(deadline: Instant) -> io::Result<Duration> {
     if left.is_zero() { Err(ErrorKind::TimedOut.into()) } else { Ok(left.max(MIN_TIMEOUT)) }
 }
 
-/// Reads until nothing interrupts it; says the same of an end and of a time that ran out on every
-/// system.
-fn read(mut once: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
+/// The same in whole milliseconds, the last one begun.
+fn millis(deadline: Instant) -> io::Result<Duration> {
+    let micros = left(deadline)?.as_micros();
+    Ok(Duration::from_millis(u64::try_from(micros.div_ceil(1000)).unwrap_or(u64::MAX)))
+}
+
+/// Reads until nothing interrupts it.
+fn read(mut once: impl FnMut() -> io::Result<usize>) -> Result<usize, StreamError> {
     loop {
         return match once() {
-            Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
+            Ok(0) => Err(StreamError::Ended),
             Err(error) if error.kind() == ErrorKind::Interrupted => continue,
-            Err(error) if error.kind() == ErrorKind::WouldBlock => Err(ErrorKind::TimedOut.into()),
-            other => other,
+            other => Ok(other?),
         };
+    }
+}
+
+/// Nothing there is no error where nobody waits.
+fn at_once(received: Result<usize, StreamError>) -> Result<Option<usize>, StreamError> {
+    match received {
+        Err(StreamError::TimedOut) => Ok(None),
+        other => other.map(Some),
     }
 }
 
@@ -54,49 +118,31 @@ pub(super) struct TcpByteStream {
 
 impl TcpByteStream {
     /// Connects to the first address of a name that takes the connection before the deadline.
-    pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpByteStream> {
+    fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpByteStream> {
         let socket =
             first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
         socket.set_nodelay(true)?;
         Ok(TcpByteStream { socket, read_timeout: Duration::ZERO, write_timeout: Duration::ZERO })
     }
 
-    /// Whether the peer has ended it.
-    pub(super) fn has_ended(&self) -> bool {
-        match self.peek() {
-            Ok(len) => len == 0,
-            Err(error) => error.kind() != ErrorKind::WouldBlock,
-        }
-    }
-
     /// Does something with the socket that is not to wait.
     pub(super) fn at_once<T>(
-        &mut self,
-        work: impl FnOnce(&mut TcpStream) -> io::Result<T>,
+        &self,
+        work: impl FnOnce(&TcpStream) -> io::Result<T>,
     ) -> io::Result<T> {
         self.socket.set_nonblocking(true)?;
-        let done = work(&mut self.socket);
+        let done = work(&self.socket);
         self.socket.set_nonblocking(false)?;
         done
     }
 
-    /// Looks whether there is something to read, without waiting for it.
     fn peek(&self) -> io::Result<usize> {
-        self.socket.set_nonblocking(true)?;
-        let found = self.socket.peek(&mut [0]);
-        self.socket.set_nonblocking(false)?;
-        found
+        self.at_once(|socket| socket.peek(&mut [0]))
     }
 }
 
-/// What is left until a deadline, in whole milliseconds, the last one begun.
-fn millis(deadline: Instant) -> io::Result<Duration> {
-    let micros = left(deadline)?.as_micros();
-    Ok(Duration::from_millis(u64::try_from(micros.div_ceil(1000)).unwrap_or(u64::MAX)))
-}
-
 impl ByteStream for TcpByteStream {
-    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
         read(|| {
             let timeout = millis(deadline)?;
             if timeout != self.read_timeout {
@@ -107,30 +153,57 @@ impl ByteStream for TcpByteStream {
         })
     }
 
-    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
+    fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
+        at_once(read(|| self.at_once(|mut socket| socket.read(buffer))))
+    }
+
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError> {
         let timeout = millis(deadline)?;
         if timeout != self.write_timeout {
             self.socket.set_write_timeout(Some(timeout))?;
             self.write_timeout = timeout;
         }
-        self.socket.write_all(bytes).map_err(|error| match error.kind() {
-            ErrorKind::WouldBlock => ErrorKind::TimedOut.into(),
-            _ => error,
-        })
+        Ok(self.socket.write_all(bytes)?)
     }
 
-    fn discard(&mut self) -> io::Result<bool> {
-        Ok(false)
+    fn has_ended(&mut self) -> bool {
+        match self.peek() {
+            Ok(len) => len == 0,
+            Err(error) => error.kind() != ErrorKind::WouldBlock,
+        }
     }
 
     fn is_quiet(&self) -> bool {
-        let waits = |error: io::Error| error.kind() == ErrorKind::WouldBlock;
-        self.peek().is_err_and(waits)
+        self.peek().is_err_and(|error| error.kind() == ErrorKind::WouldBlock)
+    }
+}
+
+impl ByteStream for UdpSocket {
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
+        loop {
+            self.set_read_timeout(Some(left(deadline)?))?;
+            match self.recv(buffer) {
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                other => return Ok(other?),
+            }
+        }
+    }
+
+    fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
+        self.set_nonblocking(true)?;
+        let received = self.recv(buffer);
+        self.set_nonblocking(false)?;
+        at_once(received.map_err(StreamError::from))
+    }
+
+    fn send(&mut self, bytes: &[u8], _deadline: Instant) -> Result<(), StreamError> {
+        UdpSocket::send(self, bytes)?;
+        Ok(())
     }
 }
 
 impl ByteStream for serial2::SerialPort {
-    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
         read(|| {
             // A port leaves away what is no whole millisecond.
             self.set_read_timeout(millis(deadline)?)?;
@@ -138,31 +211,19 @@ impl ByteStream for serial2::SerialPort {
         })
     }
 
-    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
-        self.set_write_timeout(millis(deadline)?)?;
-        Write::write_all(self, bytes)
-    }
-
-    fn discard(&mut self) -> io::Result<bool> {
+    fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
         self.set_read_timeout(Duration::ZERO)?;
-        match read(|| Read::read(self, &mut [0; 4096])) {
-            Ok(_) => Ok(true),
-            Err(error) if error.kind() == ErrorKind::TimedOut => Ok(false),
-            Err(error) => Err(error),
-        }
+        at_once(read(|| Read::read(self, buffer)))
     }
 
-    fn is_quiet(&self) -> bool {
-        true
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError> {
+        self.set_write_timeout(millis(deadline)?)?;
+        Ok(Write::write_all(self, bytes)?)
     }
 }
 
 /// The first address of a name that `open` succeeds with.
-pub(super) fn first<T>(
-    host: &str,
-    port: u16,
-    open: impl Fn(SocketAddr) -> io::Result<T>,
-) -> io::Result<T> {
+fn first<T>(host: &str, port: u16, open: impl Fn(SocketAddr) -> io::Result<T>) -> io::Result<T> {
     let mut failure = io::Error::new(ErrorKind::NotFound, "the name has no address");
     for address in (host, port).to_socket_addrs()? {
         match open(address) {

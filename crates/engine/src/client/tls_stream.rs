@@ -1,11 +1,11 @@
 //! TLS over a TCP connection with deadlines.
 
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{ErrorKind, Write};
 use std::time::Instant;
 
-use super::byte_stream::{ByteStream, TcpByteStream};
+use super::byte_stream::{ByteStream, StreamError, TcpByteStream};
 use crate::tls::client::ClientTls;
-use crate::tls::{Channel, words};
+use crate::tls::{Channel, TlsFailure};
 
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 4096;
@@ -20,65 +20,53 @@ pub(super) struct TlsStream {
     plain: Vec<u8>,
     /// What is to be sent.
     out: Vec<u8>,
+    /// Whether anything came after the handshake.
+    heard: bool,
     /// Why nothing more can come.
-    broken: Option<String>,
+    broken: Option<TlsFailure>,
 }
 
 impl TlsStream {
     /// Agrees with the peer on TLS before the deadline.
-    ///
-    /// # Errors
-    /// `TimedOut`, or what went wrong, in words.
     pub(super) fn agree(
         stream: TcpByteStream,
         tls: &ClientTls,
         deadline: Instant,
-    ) -> io::Result<TlsStream> {
-        let channel = tls.channel().map_err(|error| io::Error::other(words(&error)))?;
+    ) -> Result<TlsStream, StreamError> {
+        let channel = tls.channel().map_err(|error| StreamError::Tls((&error).into()))?;
         let (plain, out) = (Vec::new(), Vec::new());
-        let mut secure = TlsStream { stream, channel, plain, out, broken: None };
-        secure.send(&[], deadline).and_then(|()| secure.shake_hands(deadline)).map_err(
-            |error| match error.kind() {
-                ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset | ErrorKind::BrokenPipe => {
-                    io::Error::other("the peer ended the connection instead of agreeing on TLS")
-                }
-                _ => error,
-            },
-        )?;
+        let mut secure = TlsStream { stream, channel, plain, out, heard: false, broken: None };
+        secure.send(&[], deadline).and_then(|()| secure.shake_hands(deadline)).map_err(ended)?;
         Ok(secure)
     }
 
-    fn shake_hands(&mut self, deadline: Instant) -> io::Result<()> {
+    fn shake_hands(&mut self, deadline: Instant) -> Result<(), StreamError> {
         while self.channel.is_handshaking() {
             self.take(deadline)?;
-            if let Some(why) = &self.broken {
-                return Err(io::Error::other(why.clone()));
-            }
+            self.intact()?;
         }
         Ok(())
     }
 
-    /// Whether the peer has ended it; what else came is kept.
-    pub(super) fn has_ended(&mut self) -> bool {
-        let ended = self.look();
-        ended || self.broken.is_some() || self.channel.has_ended()
+    fn intact(&self) -> Result<(), StreamError> {
+        self.broken.clone().map_or(Ok(()), |failure| Err(StreamError::Tls(failure)))
     }
 
     /// Takes what is there without waiting for it; whether that was the end of the connection.
     fn look(&mut self) -> bool {
         let mut chunk = [0; CHUNK];
         for _ in 0..READS {
-            match self.stream.at_once(|socket| socket.read(&mut chunk)) {
-                Ok(0) => return true,
-                Ok(len) => self.feed(&chunk[..len]),
-                Err(error) => return error.kind() != ErrorKind::WouldBlock,
+            match self.stream.receive_now(&mut chunk) {
+                Ok(None) => return false,
+                Ok(Some(len)) => self.feed(&chunk[..len]),
+                Err(_) => return true,
             }
         }
         false
     }
 
     /// Takes what comes before the deadline.
-    fn take(&mut self, deadline: Instant) -> io::Result<()> {
+    fn take(&mut self, deadline: Instant) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK];
         let len = self.stream.receive(&mut chunk, deadline)?;
         self.feed(&chunk[..len]);
@@ -89,11 +77,12 @@ impl TlsStream {
 
     fn feed(&mut self, bytes: &[u8]) {
         if let Err(error) = self.channel.receive(bytes, &mut self.plain, &mut self.out) {
-            self.broken = Some(words(&error));
+            self.broken = Some((&error).into());
         }
+        self.heard |= !self.plain.is_empty();
     }
 
-    fn flush(&mut self, deadline: Instant) -> io::Result<()> {
+    fn flush(&mut self, deadline: Instant) -> Result<(), StreamError> {
         if self.out.is_empty() {
             return Ok(());
         }
@@ -101,18 +90,45 @@ impl TlsStream {
         self.out.clear();
         sent
     }
+
+    /// What the end of the connection means: a peer may refuse a certificate without a word.
+    fn unheard(&self, error: StreamError) -> StreamError {
+        match error {
+            StreamError::Io(error)
+                if !self.heard
+                    && matches!(
+                        error.kind(),
+                        ErrorKind::ConnectionReset | ErrorKind::BrokenPipe
+                    ) =>
+            {
+                StreamError::Tls(TlsFailure::ClosedBeforeReply)
+            }
+            other => other,
+        }
+    }
+}
+
+/// A connection that ends during the handshake.
+fn ended(error: StreamError) -> StreamError {
+    match error {
+        StreamError::Ended => StreamError::Tls(TlsFailure::ClosedDuringHandshake),
+        StreamError::Io(error)
+            if matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe) =>
+        {
+            StreamError::Tls(TlsFailure::ClosedDuringHandshake)
+        }
+        other => other,
+    }
 }
 
 impl ByteStream for TlsStream {
-    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
+    fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
         while self.plain.is_empty() {
-            if let Some(why) = &self.broken {
-                return Err(io::Error::other(why.clone()));
-            }
+            self.intact()?;
             if self.channel.has_ended() {
-                return Err(ErrorKind::UnexpectedEof.into());
+                return Err(StreamError::Ended);
             }
-            self.take(deadline)?;
+            self.take(deadline).map_err(|error| self.unheard(error))?;
         }
         let len = self.plain.len().min(buffer.len());
         buffer[..len].copy_from_slice(&self.plain[..len]);
@@ -120,17 +136,28 @@ impl ByteStream for TlsStream {
         Ok(len)
     }
 
-    fn send(&mut self, bytes: &[u8], deadline: Instant) -> io::Result<()> {
+    fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
+        if self.plain.is_empty() && self.look() && self.plain.is_empty() {
+            return Err(StreamError::Ended);
+        }
+        let len = self.plain.len().min(buffer.len());
+        buffer[..len].copy_from_slice(&self.plain[..len]);
+        self.plain.drain(..len);
+        Ok((len > 0).then_some(len))
+    }
+
+    fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError> {
         self.channel.send(bytes, &mut self.out);
         self.flush(deadline).map_err(|error| {
             // A peer that has ended the connection may have said why.
             self.look();
-            self.broken.clone().map_or(error, io::Error::other)
+            self.broken.clone().map_or(self.unheard(error), StreamError::Tls)
         })
     }
 
-    fn discard(&mut self) -> io::Result<bool> {
-        Ok(false)
+    fn has_ended(&mut self) -> bool {
+        let ended = self.look();
+        ended || self.broken.is_some() || self.channel.has_ended()
     }
 
     fn is_quiet(&self) -> bool {
@@ -141,6 +168,6 @@ impl ByteStream for TlsStream {
 impl Drop for TlsStream {
     fn drop(&mut self) {
         self.channel.end(&mut self.out);
-        let _ = self.stream.at_once(|socket| socket.write(&self.out));
+        let _ = self.stream.at_once(|mut socket| socket.write(&self.out));
     }
 }

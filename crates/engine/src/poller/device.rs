@@ -21,7 +21,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use holdfast_memory::Area;
-use holdfast_protocol::pdu::{self, Range, Request};
+use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
@@ -593,15 +593,14 @@ impl Device {
             }
             Area::InputRegisters => Range::new(address, quantity).map(Request::ReadInputRegisters),
         };
-        let mut buffer = [0; pdu::MAX_LEN];
-        let len = request.or(Err(Fault::Invalid))?.encode(&mut buffer);
+        let request = EncodedRequest::new(&request.or(Err(Fault::Invalid))?);
         let _turn = self.turn.lock().await;
         let counters = &self.state.counters;
         counters.requests.add();
         let began = Instant::now();
         let priority = if self.silent.get() > 0 { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
-        let answer = self.link.call(*unit_id, &buffer[..len], *timeout, priority).await;
+        let answer = self.link.call(*unit_id, &request, *timeout, priority).await;
         match &answer {
             Ok(_) => {
                 let took = began.elapsed();

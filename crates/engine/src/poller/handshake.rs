@@ -6,7 +6,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use crate::tls::client::ClientTls;
-use crate::tls::{Channel, words};
+use crate::tls::{Channel, TlsFailure};
 
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 4096;
@@ -14,7 +14,7 @@ const CHUNK: usize = 4096;
 /// # Errors
 /// The connection is to be closed; the peer was told why.
 pub(super) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result<Channel> {
-    let failed = |error| io::Error::other(words(&error));
+    let failed = |error| io::Error::other(TlsFailure::from(&error));
     let mut channel = tls.channel().map_err(failed)?;
     let (mut plain, mut out) = (Vec::new(), Vec::new());
     let mut chunk = vec![0; CHUNK];

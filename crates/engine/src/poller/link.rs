@@ -2,8 +2,8 @@
 //!
 //! Over Modbus TCP several requests are in flight, so that a unit that is dead does not hold up the
 //! others behind the same gateway. All other transports carry one request at a time, in a thread of
-//! their own. A link that can't be connected fails at once until its pause is over. A connection
-//! that has gone silent, or is left in the middle of a reply, is made anew.
+//! their own. A link that can't be connected fails at once until its pause is over. What ends a
+//! connection is decided by [`Connection`]; the next request makes a new one.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -12,7 +12,8 @@ use std::rc::Rc;
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
-use holdfast_protocol::pdu::{Request, Response, ResponseError};
+use holdfast_protocol::client::{Closed, Connection, Done, Failure, Ticket, Transport};
+use holdfast_protocol::pdu::{EncodedRequest, Response};
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, Semaphore, oneshot};
@@ -22,7 +23,7 @@ use tokio::time::{Instant, timeout_at};
 use super::backoff;
 use super::handshake;
 use super::status::Fault;
-use crate::client::{BlockingClient, ClientError, Endpoint, Session};
+use crate::client::{BlockingClient, ClientError, Endpoint};
 use crate::tls::Channel;
 use crate::tls::client::ClientTls;
 
@@ -31,9 +32,6 @@ const IN_FLIGHT: usize = 8;
 
 /// Of these, doubtful ones.
 const DOUBTFUL: usize = 4;
-
-/// Timeouts one after the other, without a byte between them, after which a connection is given up.
-const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
 
 /// Bytes taken from a socket at once.
 const CHUNK: usize = 16 * 1024;
@@ -70,13 +68,13 @@ impl Link {
     pub(super) async fn call(
         &self,
         unit_id: u8,
-        pdu: &[u8],
+        request: &EncodedRequest,
         timeout: Duration,
         priority: Priority,
     ) -> Answer {
         match self {
-            Link::Tcp(link) => link.call(unit_id, pdu, timeout, priority).await,
-            Link::Blocking(link) => link.call(unit_id, pdu, timeout, priority).await,
+            Link::Tcp(link) => link.call(unit_id, request, timeout, priority).await,
+            Link::Blocking(link) => link.call(unit_id, request, timeout, priority).await,
         }
     }
 }
@@ -122,15 +120,14 @@ pub(super) struct TcpLink {
 
 /// A connection that is open.
 struct Open {
-    session: Session,
-    waiting: HashMap<u16, oneshot::Sender<Answer>>,
+    connection: Connection,
+    /// The zero of the connection's clock.
+    epoch: Instant,
+    waiting: HashMap<Ticket, oneshot::Sender<Answer>>,
     writer: tokio::net::tcp::OwnedWriteHalf,
     tls: Option<Channel>,
     /// What the socket did not take yet.
     unsent: Vec<u8>,
-    /// Timeouts since something came, and when the last of them was.
-    timeouts: u32,
-    timed_out: Instant,
     reader: Option<AbortHandle>,
 }
 
@@ -149,7 +146,13 @@ impl TcpLink {
         }
     }
 
-    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, priority: Priority) -> Answer {
+    async fn call(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        priority: Priority,
+    ) -> Answer {
         let doubtful = priority == Priority::Doubtful;
         let _doubtful = if doubtful { self.doubtful.acquire().await.ok() } else { None };
         let Ok(_place) = self.places.acquire().await else { return Err(Fault::Reset) };
@@ -157,17 +160,11 @@ impl TcpLink {
         if self.open.borrow().is_none() {
             self.connect(deadline, priority).await?;
         }
-        let (id, answer) = self.send(unit_id, pdu)?;
-        let sent = Instant::now();
-        match timeout_at(deadline, answer).await {
-            Ok(Ok(answer)) => answer,
-            Ok(Err(_)) => Err(Fault::Reset),
-            Err(_) => {
-                let mut open = self.open.borrow_mut();
-                if open.as_mut().is_some_and(|open| !open.outlives(id, sent)) {
-                    *open = None;
-                }
-                Err(Fault::Timeout)
+        let (ticket, mut answer) = self.send(unit_id, request, deadline)?;
+        loop {
+            match timeout_at(deadline, &mut answer).await {
+                Ok(answer) => return answer.unwrap_or(Err(Fault::Reset)),
+                Err(_) => self.advance(ticket),
             }
         }
     }
@@ -213,13 +210,12 @@ impl TcpLink {
         let _ = stream.set_nodelay(true);
         let (reader, writer) = stream.into_split();
         let open = Open {
-            session: Session::default(),
+            connection: Connection::new(Transport::Tcp),
+            epoch: Instant::now(),
             waiting: HashMap::new(),
             writer,
             tls,
             unsent: Vec::new(),
-            timeouts: 0,
-            timed_out: Instant::now(),
             reader: None,
         };
         *self.open.borrow_mut() = Some(open);
@@ -229,23 +225,48 @@ impl TcpLink {
         }
     }
 
-    fn send(&self, unit_id: u8, pdu: &[u8]) -> Result<(u16, oneshot::Receiver<Answer>), Fault> {
+    fn send(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        deadline: Instant,
+    ) -> Result<(Ticket, oneshot::Receiver<Answer>), Fault> {
         let mut open = self.open.borrow_mut();
-        let connection = open.as_mut().ok_or(Fault::Reset)?;
-        let mut frame = Vec::with_capacity(16);
-        let id = connection.session.send(unit_id, pdu, &mut frame);
-        let sent = id.is_some() && connection.write(&frame);
-        match id {
-            Some(id) if sent => {
+        let found = open.as_mut().ok_or(Fault::Reset)?;
+        let now = Instant::now();
+        let timeout = deadline.saturating_duration_since(now);
+        let ticket = found.connection.send(unit_id, request, timeout, now - found.epoch);
+        match ticket {
+            Ok(ticket) if found.write() => {
                 let (sender, receiver) = oneshot::channel();
-                connection.waiting.insert(id, sender);
-                Ok((id, receiver))
+                found.waiting.insert(ticket, sender);
+                Ok((ticket, receiver))
             }
             _ => {
                 *open = None;
                 Err(Fault::Reset)
             }
         }
+    }
+
+    /// Ends the requests whose time is over, and the connection if that was too much.
+    fn advance(&self, ticket: Ticket) {
+        let mut open = self.open.borrow_mut();
+        let Some(found) = open.as_mut() else { return };
+        let Open { connection, waiting, .. } = found;
+        connection.advance(found.epoch.elapsed(), |done| hand_on(waiting, &done));
+        debug_assert!(!connection.is_waiting_for(ticket), "its time is over");
+        if connection.closed().is_some() {
+            *open = None;
+        }
+    }
+}
+
+/// Gives a result to who waits for it.
+fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Answer>>, done: &Done<'_>) {
+    if let Some(sender) = waiting.remove(&done.ticket) {
+        // A device that was stopped does not wait any more.
+        let _ = sender.send(answer(done.outcome));
     }
 }
 
@@ -257,27 +278,16 @@ impl Drop for TcpLink {
 }
 
 impl Open {
-    /// Gives a request up that was not answered in time; whether the connection can be trusted
-    /// after that. Requests that were under way together count as one, and as long as another one
-    /// waits, it is left to that.
-    fn outlives(&mut self, id: u16, sent: Instant) -> bool {
-        self.waiting.remove(&id);
-        self.session.give_up(id);
-        if sent >= self.timed_out {
-            self.timeouts += 1;
-            self.timed_out = Instant::now();
-        }
-        let doubtful = self.timeouts >= MAX_CONSECUTIVE_TIMEOUTS || self.session.is_amid_reply();
-        !(doubtful && self.waiting.is_empty())
-    }
-
     /// Sends without waiting; what the socket does not take goes with the next. Whether the
     /// connection still works.
-    fn write(&mut self, frame: &[u8]) -> bool {
+    fn write(&mut self) -> bool {
+        let frames = self.connection.outgoing();
         match &mut self.tls {
-            None => self.unsent.extend_from_slice(frame),
-            Some(tls) => tls.send(frame, &mut self.unsent),
+            None => self.unsent.extend_from_slice(frames),
+            Some(tls) => tls.send(frames, &mut self.unsent),
         }
+        let len = frames.len();
+        self.connection.sent(len);
         match self.writer.try_write(&self.unsent) {
             Ok(len) => {
                 self.unsent.drain(..len);
@@ -311,15 +321,13 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
             Err(error) => Err(error),
         };
         let mut open = link.borrow_mut();
-        let Some(connection) = open.as_mut() else { return };
-        let fault = match read {
-            Ok(0) => Fault::Reset,
+        let Some(found) = open.as_mut() else { return };
+        let Open { connection, waiting, tls, unsent, .. } = found;
+        let intact = match read {
             Err(error) if error.kind() == ErrorKind::WouldBlock => continue,
-            Err(_) => Fault::Reset,
+            Ok(0) | Err(_) => false,
             Ok(len) => {
-                connection.timeouts = 0;
-                let Open { session, waiting, tls, unsent, .. } = connection;
-                let (came, lasts) = match tls {
+                let (received, lasts) = match tls {
                     None => (&chunk[..len], true),
                     Some(tls) => {
                         plain.clear();
@@ -327,41 +335,43 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
                         (&plain[..], intact && !tls.has_ended())
                     }
                 };
-                let received = session.receive(came, |id, response| {
-                    if let Some(sender) = waiting.remove(&id) {
-                        let _ = sender.send(bytes(response));
-                    }
-                });
-                let valid = received.is_ok();
-                // What the socket did not take earlier, it may take now.
-                if valid && lasts && (connection.unsent.is_empty() || connection.write(&[])) {
-                    continue;
-                }
-                if valid && !lasts { Fault::Reset } else { Fault::Invalid }
+                let now = found.epoch.elapsed();
+                connection.receive(received, now, |done| hand_on(waiting, &done));
+                lasts && connection.closed().is_none()
             }
         };
+        // What the socket did not take earlier, it may take now.
+        if intact && (found.unsent.is_empty() || found.write()) {
+            continue;
+        }
         let lost = open.take();
         drop(open);
         if let Some(mut lost) = lost {
+            // This task is the reader: it ends by itself.
             lost.reader = None;
-            for (_, sender) in lost.waiting.drain() {
-                let _ = sender.send(Err(fault));
-            }
+            let Open { connection, waiting, .. } = &mut lost;
+            connection.close(Closed::ByPeer, |done| hand_on(waiting, &done));
         }
         return;
     }
 }
 
 /// The bytes that a response carries; the echo of a write was checked, and says no more.
-fn bytes(response: Result<Response<'_>, ResponseError>) -> Answer {
+fn bytes(response: Response<'_>) -> Vec<u8> {
     match response {
-        Ok(Response::Bits(bits)) => Ok(bits.as_bytes().to_vec()),
-        Ok(Response::Registers(registers)) => Ok(registers.as_bytes().to_vec()),
-        Ok(_) => Ok(Vec::new()),
-        Err(ResponseError::Exception(code)) => Err(Fault::Exception(code.code())),
-        Err(ResponseError::UnknownException(code)) => Err(Fault::Exception(code)),
-        Err(_) => Err(Fault::Invalid),
+        Response::Bits(bits) => bits.as_bytes().to_vec(),
+        Response::Registers(registers) => registers.as_bytes().to_vec(),
+        _ => Vec::new(),
     }
+}
+
+fn answer(outcome: Result<Response<'_>, Failure>) -> Answer {
+    outcome.map(bytes).map_err(|failure| match failure {
+        Failure::Exception(code) => Fault::Exception(code),
+        Failure::Timeout => Fault::Timeout,
+        Failure::Invalid(_) => Fault::Invalid,
+        _ => Fault::Reset,
+    })
 }
 
 /// One request at a time, by blocking calls in a thread that ends with the link.
@@ -381,7 +391,7 @@ enum Job {
 
 struct Call {
     unit_id: u8,
-    pdu: Vec<u8>,
+    request: Box<EncodedRequest>,
     timeout: Duration,
     urgent: bool,
     /// And when an endpoint that could not be opened is tried again.
@@ -416,10 +426,17 @@ impl BlockingLink {
         BlockingLink { jobs, urgent, retry_at: Cell::new(None) }
     }
 
-    async fn call(&self, unit_id: u8, pdu: &[u8], timeout: Duration, priority: Priority) -> Answer {
+    async fn call(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        priority: Priority,
+    ) -> Answer {
         let (answer, answered) = oneshot::channel();
         let urgent = priority == Priority::Urgent;
-        let call = Call { unit_id, pdu: pdu.to_vec(), timeout, urgent, answer };
+        let request = Box::new(request.clone());
+        let call = Call { unit_id, request, timeout, urgent, answer };
         let job = if urgent {
             self.urgent.send(call).or(Err(Fault::Reset))?;
             Job::Look
@@ -442,23 +459,18 @@ fn carried_out(
     if !call.urgent && retry_at.is_some_and(|time| Instant::now() < time) {
         return Err(Fault::Refused);
     }
-    let request = Request::parse(&call.pdu).or(Err(Fault::Invalid))?;
-    let answer = client.call(call.unit_id, &request, call.timeout, |response| bytes(Ok(response)));
-    match answer {
-        Err(ClientError::Connect { .. }) => {
+    let answer = client.call(call.unit_id, &call.request, call.timeout, bytes);
+    let fault = match &answer {
+        Err(ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. }) => {
             *failures = failures.saturating_add(1);
             *retry_at = Some(Instant::now() + backoff::pause(*failures, backoff::MAX_PAUSE));
-            Err(Fault::Refused)
+            return Err(Fault::Refused);
         }
-        other => {
-            (*failures, *retry_at) = (0, None);
-            match other {
-                Ok(bytes) => bytes,
-                Err(ClientError::Exception(code)) => Err(Fault::Exception(code)),
-                Err(ClientError::Timeout(_)) => Err(Fault::Timeout),
-                Err(ClientError::Invalid(_)) => Err(Fault::Invalid),
-                Err(_) => Err(Fault::Reset),
-            }
-        }
-    }
+        Err(ClientError::Exception(code)) => Fault::Exception(*code),
+        Err(ClientError::Timeout(_) | ClientError::ConnectTimeout { .. }) => Fault::Timeout,
+        Err(ClientError::Invalid(_)) => Fault::Invalid,
+        Ok(_) | Err(ClientError::Lost(_) | ClientError::Tls { .. }) => Fault::Reset,
+    };
+    (*failures, *retry_at) = (0, None);
+    answer.or(Err(fault))
 }

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use holdfast_protocol::pdu::Function;
+use holdfast_protocol::pdu::EncodedRequest;
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
@@ -82,7 +82,7 @@ enum Order {
     Write {
         device: String,
         ticket: u64,
-        pdu: Vec<u8>,
+        request: Box<EncodedRequest>,
     },
     Stop,
 }
@@ -170,21 +170,24 @@ impl Poller {
         Ok(())
     }
 
-    /// Sends a write, given as a PDU, to a device by its own connection. What becomes of it comes by
+    /// Sends a write to a device by its own connection. What becomes of it comes by
     /// [`Poller::results`] under the number that is returned.
     ///
     /// # Errors
-    /// [`PollerError`] for a device that is not there, or a PDU that is no write.
-    pub fn write(&self, name: &str, pdu: Vec<u8>) -> Result<u64, PollerError> {
-        let function = pdu.first().copied().unwrap_or_default();
-        if !Function::from_code(function).is_some_and(Function::is_write) {
-            return Err(PollerError::NoWrite { device: name.to_owned(), function });
+    /// [`PollerError`] for a device that is not there, or a request that is no write.
+    pub fn write(&self, name: &str, request: Box<EncodedRequest>) -> Result<u64, PollerError> {
+        let function = request.request().function();
+        if !function.is_write() {
+            return Err(PollerError::NoWrite {
+                device: name.to_owned(),
+                function: function.code(),
+            });
         }
         if !self.polled().iter().any(|device| device.name == name) {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
-        let _ = self.orders.send(Order::Write { device: name.to_owned(), ticket, pdu });
+        let _ = self.orders.send(Order::Write { device: name.to_owned(), ticket, request });
         Ok(ticket)
     }
 
@@ -275,8 +278,8 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                 }
                 links.retain(|_, link| link.strong_count() > 0);
             }
-            Order::Write { device, ticket, pdu } => match running.get(&device) {
-                Some(device) => device.write(ticket, pdu, &results),
+            Order::Write { device, ticket, request } => match running.get(&device) {
+                Some(device) => device.write(ticket, request, &results),
                 None => results.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
             },
         }
@@ -321,14 +324,14 @@ impl Running {
     }
 
     /// Writes between two reads, as soon as it can; the end of the device does not break it off.
-    fn write(&self, ticket: u64, pdu: Vec<u8>, results: &Arc<Results>) {
+    fn write(&self, ticket: u64, request: Box<EncodedRequest>, results: &Arc<Results>) {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
         let results = Arc::clone(results);
         let Running { unit_id, timeout, release, .. } = *self;
         spawn_local(async move {
             let turn = turn.lock().await;
-            let answer = link.call(unit_id, &pdu, timeout, Priority::Urgent).await;
+            let answer = link.call(unit_id, &request, timeout, Priority::Urgent).await;
             drop(turn);
             if release {
                 link.release();

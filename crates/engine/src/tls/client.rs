@@ -4,8 +4,9 @@
 //! is valid now is asked when it is used, never when its file is read: the clock of a machine that
 //! has just been switched on may be wrong.
 
+use std::ffi::OsString;
 use std::path::Path;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::client::{Resumption, verify_server_name};
@@ -111,10 +112,16 @@ impl PartialEq for ClientTls {
 
 impl Eq for ClientTls {}
 
-/// The certificates that the system trusts, the same for all.
+/// The certificates that the system trusts, the same for all while the variables that name them
+/// stay the same.
 fn of_system() -> Result<Arc<[Listed]>, TlsError> {
-    static FOUND: OnceLock<Arc<[Listed]>> = OnceLock::new();
-    if let Some(found) = FOUND.get() {
+    type Variables = [Option<OsString>; 2];
+    static FOUND: Mutex<Option<(Variables, Arc<[Listed]>)>> = Mutex::new(None);
+    let variables = ["SSL_CERT_FILE", "SSL_CERT_DIR"].map(std::env::var_os);
+    let mut known = FOUND.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some((of, found)) = &*known
+        && *of == variables
+    {
         return Ok(Arc::clone(found));
     }
     let found = rustls_native_certs::load_native_certs();
@@ -124,8 +131,10 @@ fn of_system() -> Result<Arc<[Listed]>, TlsError> {
         return Err(TlsError::Other(text));
     }
     // What can't be read is nobody's here.
-    let listed = || found.certs.into_iter().filter_map(|each| Listed::new(each).ok()).collect();
-    Ok(Arc::clone(FOUND.get_or_init(listed)))
+    let listed: Arc<[Listed]> =
+        found.certs.into_iter().filter_map(|each| Listed::new(each).ok()).collect();
+    *known = Some((variables, Arc::clone(&listed)));
+    Ok(listed)
 }
 
 /// Judges the certificates of servers.

@@ -108,6 +108,9 @@ pub enum TlsFailure {
     MalformedMessage { flaw: String },
     #[error("the peer ended the connection instead of agreeing on TLS")]
     ClosedDuringHandshake,
+    /// A peer that refuses a certificate may reset the connection: the alert that says so is lost.
+    #[error("the peer ended the connection before any reply; it may have refused the certificate")]
+    ClosedBeforeReply,
     #[error("a TLS record was changed on its way")]
     BadRecord,
     #[error("{text}")]
@@ -144,6 +147,7 @@ impl TlsFailure {
             TlsFailure::NotTls => "not_tls",
             TlsFailure::MalformedMessage { .. } => "malformed_message",
             TlsFailure::ClosedDuringHandshake => "closed_during_handshake",
+            TlsFailure::ClosedBeforeReply => "closed_before_reply",
             TlsFailure::BadRecord => "bad_record",
             TlsFailure::Other { .. } => "other",
         }
@@ -178,10 +182,25 @@ impl TlsFailure {
             | TlsFailure::NoCommonVersionOrCipher { by_peer: true } => "refused_by_peer",
             TlsFailure::NoCommonVersionOrCipher { by_peer: false } => "incompatible",
             TlsFailure::NotTls | TlsFailure::MalformedMessage { .. } => "not_tls",
-            TlsFailure::ClosedDuringHandshake => "closed",
+            TlsFailure::ClosedDuringHandshake | TlsFailure::ClosedBeforeReply => "closed",
             TlsFailure::BadRecord => "decrypt_error",
             TlsFailure::Other { .. } => "protocol_error",
         }
+    }
+}
+
+impl TlsFailure {
+    /// Whether the peer has not agreed on TLS, even if this side has: then it has carried out
+    /// nothing that was sent.
+    pub const fn refuses_connection(&self) -> bool {
+        matches!(
+            self,
+            TlsFailure::PeerRequiresCertificate
+                | TlsFailure::PeerRefusedCertificate { .. }
+                | TlsFailure::PeerRefusedHandshake
+                | TlsFailure::NoCommonVersionOrCipher { .. }
+                | TlsFailure::ClosedDuringHandshake
+        )
     }
 }
 

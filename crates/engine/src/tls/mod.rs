@@ -23,11 +23,6 @@ pub use files::FileError;
 /// Bytes of plain text taken out at once.
 const CHUNK: usize = 4096;
 
-/// Why TLS failed, in words for people.
-pub fn words(error: &Error) -> String {
-    TlsFailure::from(error).to_string()
-}
-
 /// One connection's TLS.
 pub struct Channel(Connection);
 

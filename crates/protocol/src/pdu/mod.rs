@@ -7,6 +7,7 @@
 
 mod data;
 mod diagnostics;
+mod encoded;
 mod function;
 pub mod identification;
 mod range;
@@ -16,6 +17,7 @@ mod response;
 
 pub use data::{Bits, Registers, pack_bits, pack_registers};
 pub use diagnostics::{Diagnostics, SubFunction};
+pub use encoded::EncodedRequest;
 pub use function::{ExceptionCode, Function};
 pub use range::{BitRange, Range, RegisterRange};
 pub use request::{Request, RequestError};

@@ -250,6 +250,11 @@ impl<'a> Request<'a> {
         len
     }
 
+    /// Whether it only reads: carrying it out twice changes nothing.
+    pub const fn is_read(&self) -> bool {
+        !self.function().is_write() && !matches!(self, Request::Diagnostics(_))
+    }
+
     /// The function of the request.
     pub const fn function(&self) -> Function {
         match self {

@@ -1,0 +1,261 @@
+//! `Connection`: a TCP connection of a client, with TLS or not, for whoever owns the socket.
+
+use std::io;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use holdfast_engine::client::{ClientError, Endpoint as CoreEndpoint, Lost};
+use holdfast_engine::tls::client::ClientTls;
+use holdfast_engine::tls::{Channel, TlsFailure};
+use holdfast_protocol::client::{Closed, Connection as Core, Done, Failure, Ticket, Transport};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::arguments::{byte, seconds};
+use crate::client::{Endpoint, Reply, Request, raised};
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Connection {
+    state: Mutex<State>,
+    /// The URL of the peer.
+    to: String,
+}
+
+struct State {
+    core: Core,
+    tls: Option<Tls>,
+    /// Why I/O or TLS ended the connection.
+    ending: Option<Ending>,
+}
+
+struct Tls {
+    channel: Channel,
+    plain: Vec<u8>,
+    out: Vec<u8>,
+    /// Whether the handshake has ended well.
+    agreed: bool,
+    /// Whether anything came after the handshake.
+    heard: bool,
+}
+
+enum Ending {
+    /// And whether a request may have been carried out.
+    Tls(TlsFailure, bool),
+    Io(String),
+}
+
+/// Tickets, each with a result or an exception.
+type Completed<'py> = Vec<(u64, Bound<'py, PyAny>)>;
+
+#[pymethods]
+impl Connection {
+    #[new]
+    fn new(endpoint: PyRef<'_, Endpoint>) -> PyResult<Connection> {
+        let CoreEndpoint::Tcp { tls, .. } = &endpoint.core else {
+            return Err(PyValueError::new_err("endpoint is not one of TCP or TLS"));
+        };
+        let to = endpoint.core.to_string();
+        let tls = match tls {
+            None => None,
+            Some(tls) => Some(Tls::new(tls).map_err(|failure| {
+                raised(ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
+            })?),
+        };
+        let core = Core::new(Transport::Tcp);
+        Ok(Connection { state: Mutex::new(State { core, tls, ending: None }), to })
+    }
+
+    /// Whether requests can be sent: TLS, if there is any, is agreed on.
+    #[getter]
+    fn is_ready(&self) -> bool {
+        let state = self.state();
+        let agreed = state.tls.as_ref().is_none_or(|tls| !tls.channel.is_handshaking());
+        agreed && state.core.closed().is_none()
+    }
+
+    /// Queues a request; its ticket.
+    fn send(
+        &self,
+        request: PyRef<'_, Request>,
+        unit: i128,
+        timeout: f64,
+        now: f64,
+    ) -> PyResult<u64> {
+        let (unit, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
+        let mut state = self.state();
+        match state.core.send(unit, &request.encoded, timeout, clock(now)?) {
+            Ok(ticket) => Ok(ticket.0),
+            Err(why) => Err(raised(self.error(&state.ending, why.failure(), timeout))),
+        }
+    }
+
+    /// The bytes to send now.
+    fn outgoing<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        let State { core, tls, .. } = &mut *self.state();
+        let plain = core.outgoing();
+        let bytes = match tls {
+            None => PyBytes::new(py, plain),
+            Some(tls) => {
+                tls.channel.send(plain, &mut tls.out);
+                let bytes = PyBytes::new(py, &tls.out);
+                tls.out.clear();
+                bytes
+            }
+        };
+        let len = plain.len();
+        core.sent(len);
+        bytes
+    }
+
+    /// Takes received bytes; the requests that they complete.
+    fn receive<'py>(&self, py: Python<'py>, data: &[u8], now: f64) -> PyResult<Completed<'py>> {
+        let now = clock(now)?;
+        let State { core, tls, ending } = &mut *self.state();
+        let mut completed = Completions::new(py);
+        let Some(tls) = tls else {
+            core.receive(data, now, |done| completed.add(self, ending, done));
+            return completed.all;
+        };
+        tls.plain.clear();
+        let received = tls.channel.receive(data, &mut tls.plain, &mut tls.out);
+        tls.agreed |= !tls.channel.is_handshaking();
+        tls.heard |= !tls.plain.is_empty();
+        core.receive(&tls.plain, now, |done| completed.add(self, ending, done));
+        if received.is_err() || tls.channel.has_ended() {
+            *ending = received.err().map(|error| {
+                let failure = TlsFailure::from(&error);
+                let maybe_sent = tls.agreed && !failure.refuses_connection();
+                Ending::Tls(failure, maybe_sent)
+            });
+            core.close(Closed::ByPeer, |done| completed.add(self, ending, done));
+        }
+        completed.all
+    }
+
+    /// Ends the requests whose time is over.
+    fn advance<'py>(&self, py: Python<'py>, now: f64) -> PyResult<Completed<'py>> {
+        let State { core, ending, .. } = &mut *self.state();
+        let mut completed = Completions::new(py);
+        core.advance(clock(now)?, |done| completed.add(self, ending, done));
+        completed.all
+    }
+
+    /// When `advance` is to be called.
+    #[getter]
+    fn deadline(&self) -> Option<f64> {
+        self.state().core.deadline().map(|deadline| deadline.as_secs_f64())
+    }
+
+    /// Drops a request: its reply, should it come, is counted.
+    fn cancel(&self, ticket: u64) {
+        self.state().core.cancel(Ticket(ticket));
+    }
+
+    /// Ends the connection, and with it all requests. Bytes may be left to send.
+    fn close<'py>(&self, py: Python<'py>) -> PyResult<Completed<'py>> {
+        let State { core, tls, ending } = &mut *self.state();
+        let mut completed = Completions::new(py);
+        core.close(Closed::BySelf, |done| completed.add(self, ending, done));
+        if let Some(tls) = tls {
+            tls.channel.end(&mut tls.out);
+        }
+        completed.all
+    }
+
+    /// The network has ended the connection; `error` is why, unless that was its regular end.
+    #[pyo3(signature = (error=None))]
+    fn lost<'py>(&self, py: Python<'py>, error: Option<String>) -> PyResult<Completed<'py>> {
+        let State { core, tls, ending } = &mut *self.state();
+        let mut completed = Completions::new(py);
+        if core.closed().is_none() {
+            *ending = match tls {
+                Some(tls) if tls.channel.is_handshaking() => {
+                    Some(Ending::Tls(TlsFailure::ClosedDuringHandshake, false))
+                }
+                Some(tls) if error.is_some() && !tls.heard => {
+                    Some(Ending::Tls(TlsFailure::ClosedBeforeReply, true))
+                }
+                _ => error.map(Ending::Io),
+            };
+        }
+        core.close(Closed::ByPeer, |done| completed.add(self, ending, done));
+        completed.all
+    }
+
+    /// Why it has ended, as an exception; `None` while it has not.
+    #[getter]
+    fn closed<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyAny>> {
+        let state = self.state();
+        let failure = state.core.closed()?.failure();
+        Some(exception(py, self.error(&state.ending, failure, Duration::ZERO)))
+    }
+
+    /// Replies that came after their requests had been given up.
+    #[getter]
+    fn late(&self) -> u64 {
+        self.state().core.late()
+    }
+}
+
+impl Connection {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn error(&self, ending: &Option<Ending>, failure: Failure, timeout: Duration) -> ClientError {
+        match (failure, ending) {
+            (Failure::Closed(Closed::ByPeer), Some(Ending::Tls(failure, maybe_sent))) => {
+                let (to, failure) = (self.to.clone(), failure.clone());
+                ClientError::Tls { to, failure, maybe_sent: *maybe_sent }
+            }
+            (Failure::Closed(Closed::ByPeer), Some(Ending::Io(error))) => {
+                ClientError::Lost(Lost::Io(io::Error::other(error.clone())))
+            }
+            (failure, _) => ClientError::new(failure, timeout),
+        }
+    }
+}
+
+impl Tls {
+    /// TLS that has something to send: its greeting.
+    fn new(tls: &ClientTls) -> Result<Tls, TlsFailure> {
+        let mut channel = tls.channel().map_err(|error| TlsFailure::from(&error))?;
+        let mut out = Vec::new();
+        channel.send(&[], &mut out);
+        Ok(Tls { channel, plain: Vec::new(), out, agreed: false, heard: false })
+    }
+}
+
+/// Requests that got their results.
+struct Completions<'py> {
+    py: Python<'py>,
+    all: PyResult<Completed<'py>>,
+}
+
+impl<'py> Completions<'py> {
+    fn new(py: Python<'py>) -> Completions<'py> {
+        Completions { py, all: Ok(Vec::new()) }
+    }
+
+    fn add(&mut self, connection: &Connection, ending: &Option<Ending>, done: Done<'_>) {
+        let value = match done.outcome {
+            Ok(response) => Reply::new(response).into_python(self.py),
+            Err(failure) => Ok(exception(self.py, connection.error(ending, failure, done.timeout))),
+        };
+        match (&mut self.all, value) {
+            (Ok(all), Ok(value)) => all.push((done.ticket.0, value)),
+            (all, Err(error)) => *all = Err(error),
+            (Err(_), Ok(_)) => {}
+        }
+    }
+}
+
+fn exception(py: Python<'_>, error: ClientError) -> Bound<'_, PyAny> {
+    raised(error).into_value(py).into_bound(py).into_any()
+}
+
+/// The time of an event loop.
+fn clock(now: f64) -> PyResult<Duration> {
+    Duration::try_from_secs_f64(now).map_err(|error| PyValueError::new_err(error.to_string()))
+}

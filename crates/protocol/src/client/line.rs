@@ -1,0 +1,293 @@
+//! RTU and ASCII frames, on a serial line or in a stream: one request at a time, and no transaction
+//! ids. What keeps replies apart is silence: on a serial line, bytes that nobody asked for are
+//! thrown away, and a request waits until the line is silent. A stream can't be silenced: there, such
+//! bytes, and a timeout, end the connection.
+
+use alloc::vec::Vec;
+use core::time::Duration;
+
+use super::flights::{Done, Flights, Ticket};
+use super::{Closed, Failure, InvalidResponse, Line, TURNAROUND, Time};
+use crate::frame::{FrameError, ascii, rtu};
+use crate::pdu::{self, EncodedRequest, Response};
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Framing {
+    Rtu,
+    Ascii,
+}
+
+#[derive(Debug)]
+pub(super) struct OneAtATime {
+    framing: Framing,
+    /// The silence between frames of a serial line; `None` for a stream.
+    silence: Option<Duration>,
+    /// The adapter hands back what is sent.
+    echo: bool,
+    state: State,
+    /// When the line was used last.
+    used: Time,
+    /// The frame that is to be sent, or was.
+    frame: Vec<u8>,
+    received: Vec<u8>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    Idle,
+    /// A request waits for silence.
+    Quieting {
+        until: Time,
+    },
+    /// The request was sent; `echoed` says whether it has come back already.
+    Sent {
+        echoed: bool,
+    },
+    /// A broadcast was sent.
+    Turnaround {
+        until: Time,
+    },
+}
+
+impl OneAtATime {
+    pub(super) fn new(framing: Framing, line: Option<Line>) -> OneAtATime {
+        OneAtATime {
+            framing,
+            silence: line.map(|line| line.silence),
+            echo: line.is_some_and(|line| line.echo),
+            state: State::Idle,
+            used: Time::ZERO,
+            frame: Vec::new(),
+            received: Vec::new(),
+        }
+    }
+
+    /// Bytes of the longest reply, with an echo before it.
+    fn max_received(&self) -> usize {
+        2 * match self.framing {
+            Framing::Rtu => rtu::MAX_LEN,
+            Framing::Ascii => ascii::MAX_LEN,
+        }
+    }
+
+    pub(super) fn send(
+        &mut self,
+        flights: &mut Flights,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        now: Time,
+    ) -> Ticket {
+        self.frame.clear();
+        match self.framing {
+            Framing::Rtu => encode(&mut self.frame, [0; rtu::MAX_LEN], |frame| {
+                rtu::encode(unit_id, request.pdu(), frame)
+            }),
+            Framing::Ascii => encode(&mut self.frame, [0; ascii::MAX_LEN], |frame| {
+                ascii::encode(unit_id, request.pdu(), frame)
+            }),
+        }
+        self.received.clear();
+        let ticket = flights.push(unit_id, request, 0, now, timeout);
+        self.state = State::Quieting { until: self.silence.map_or(now, |time| self.used + time) };
+        self.transmit(flights, now);
+        ticket
+    }
+
+    /// When something is to be done.
+    pub(super) fn deadline(&self, flights: &Flights) -> Option<Time> {
+        match self.state {
+            State::Turnaround { until } => Some(until),
+            State::Quieting { until } => flights.deadline().map(|deadline| deadline.min(until)),
+            State::Idle | State::Sent { .. } => flights.deadline(),
+        }
+    }
+
+    /// Sends the request if the line has been silent for long enough.
+    fn transmit(&mut self, flights: &mut Flights, now: Time) {
+        if let State::Quieting { until } = self.state
+            && until <= now
+        {
+            flights.out.extend_from_slice(&self.frame);
+            let broadcast = flights.first().is_some_and(|flight| flight.unit_id == 0);
+            self.state = if broadcast && self.silence.is_some() {
+                State::Turnaround { until: now + TURNAROUND }
+            } else {
+                State::Sent { echoed: false }
+            };
+        }
+    }
+
+    pub(super) fn receive(
+        &mut self,
+        flights: &mut Flights,
+        bytes: &[u8],
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        let State::Sent { mut echoed } = self.state else {
+            return self.unrequested(flights, now, sink);
+        };
+        let room = self.max_received().saturating_sub(self.received.len());
+        let (bytes, surplus) = bytes.split_at(bytes.len().min(room));
+        self.received.extend_from_slice(bytes);
+        let found = match self.framing {
+            Framing::Rtu => self.rtu(flights, &mut echoed),
+            Framing::Ascii => self.ascii(flights, &mut echoed),
+        };
+        self.state = State::Sent { echoed };
+        match found {
+            Ok(Some(Reply { unit_id, pdu })) => self.replied(flights, unit_id, &pdu, now, sink),
+            Ok(None) if surplus.is_empty() && room > bytes.len() => {}
+            Ok(None) => self.invalid(flights, InvalidResponse::TooLong, now, sink),
+            Err(error) => self.invalid(flights, InvalidResponse::Frame(error), now, sink),
+        }
+    }
+
+    /// Bytes that nobody waits for: too late, or of somebody else.
+    fn unrequested(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
+        match self.silence {
+            None => flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink),
+            Some(silence) => {
+                self.used = now;
+                if let State::Quieting { .. } = self.state {
+                    self.state = State::Quieting { until: now + silence };
+                }
+            }
+        }
+    }
+
+    fn replied(
+        &mut self,
+        flights: &mut Flights,
+        found: u8,
+        pdu: &[u8],
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        let expected = flights.first().map_or(found, |flight| flight.unit_id);
+        if found != expected {
+            let invalid = InvalidResponse::UnitId { expected, found };
+            return self.invalid(flights, invalid, now, sink);
+        }
+        self.rest(now);
+        if let Some(invalid) = flights.answer(0, pdu, sink)
+            && self.silence.is_none()
+        {
+            flights.close(Closed::Invalid(invalid), sink);
+        }
+    }
+
+    fn invalid(
+        &mut self,
+        flights: &mut Flights,
+        invalid: InvalidResponse,
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        self.rest(now);
+        flights.finish(Err(Failure::Invalid(invalid)), sink);
+        if self.silence.is_none() {
+            flights.close(Closed::Invalid(invalid), sink);
+        }
+    }
+
+    fn rest(&mut self, now: Time) {
+        self.state = State::Idle;
+        self.used = now;
+    }
+
+    pub(super) fn advance(
+        &mut self,
+        flights: &mut Flights,
+        now: Time,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        if let State::Turnaround { until } = self.state {
+            if until <= now {
+                self.rest(now);
+                flights.finish(Ok(Response::Written), sink);
+            }
+            return;
+        }
+        if let Some(flight) = flights.expired(now) {
+            let sent = !matches!(self.state, State::Quieting { .. });
+            self.rest(now);
+            flight.end(Err(Failure::Timeout), sink);
+            if sent && self.silence.is_none() {
+                flights.close(Closed::TimedOut, sink);
+            }
+            return;
+        }
+        self.transmit(flights, now);
+    }
+
+    /// The reply at the start of what was received; `None` while more bytes are needed.
+    fn rtu(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
+        let Some(flight) = flights.first() else { return Ok(None) };
+        let may_be_echo = !*echoed
+            && (self.echo || (self.silence.is_some() && flight.request.request().is_read()));
+        if may_be_echo && self.received.starts_with(&self.frame) {
+            self.received.drain(..self.frame.len());
+            (*echoed, self.echo) = (true, true);
+        }
+        if self.echo && !*echoed {
+            return Ok(None);
+        }
+        // The beginning of an echo is no damaged reply.
+        let echo_begun = may_be_echo && !*echoed && self.frame.starts_with(&self.received);
+        let len = rtu::response_len(&self.received, flight.request.pdu().len());
+        let reply = len.and_then(|len| {
+            len.and_then(|len| self.received.get(..len)).map(rtu::decode).transpose()
+        });
+        match reply {
+            Err(_) if echo_begun => Ok(None),
+            Err(error) => Err(error),
+            Ok(reply) => Ok(reply.map(Reply::new)),
+        }
+    }
+
+    /// The reply in what was received; `None` while more characters are needed.
+    fn ascii(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
+        let Some(flight) = flights.first() else { return Ok(None) };
+        while let Some(end) = self.received.windows(2).position(|pair| pair == b"\r\n") {
+            let line: Vec<u8> = self.received.drain(..end + 2).collect();
+            let start = line.iter().rposition(|byte| *byte == b':').unwrap_or(0);
+            let line = &line[start..];
+            let may_be_echo = !*echoed && (self.echo || flight.request.request().is_read());
+            if may_be_echo && line == self.frame {
+                (*echoed, self.echo) = (true, true);
+                continue;
+            }
+            let mut body = [0; pdu::MAX_LEN + 2];
+            return ascii::decode(line, &mut body).map(|parts| Some(Reply::new(parts)));
+        }
+        Ok(None)
+    }
+}
+
+/// A reply that was taken out of its frame.
+struct Reply {
+    unit_id: u8,
+    pdu: Vec<u8>,
+}
+
+impl Reply {
+    fn new((unit_id, pdu): (u8, &[u8])) -> Reply {
+        Reply { unit_id, pdu: pdu.to_vec() }
+    }
+}
+
+/// Appends what `write` makes in a buffer.
+fn encode<const N: usize>(
+    frame: &mut Vec<u8>,
+    mut buffer: [u8; N],
+    write: impl FnOnce(&mut [u8; N]) -> Option<usize>,
+) {
+    match write(&mut buffer) {
+        Some(len) => frame.extend_from_slice(&buffer[..len]),
+        None => {
+            unreachable!("an encoded request has 1 to 253 bytes, which every frame has room for")
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! One connection of a client, without I/O: requests in, bytes out; bytes in, results out.
+//!
+//! A [`Connection`] is driven by whoever owns the socket, blocking or not. The driver hands it
+//! requests, received bytes and the time, sends what [`Connection::outgoing`] holds, and calls
+//! [`Connection::advance`] when [`Connection::deadline`] has come. Each of these calls hands results
+//! to a closure, as a [`Done`] each. The same machine serves every [`Transport`].
+//!
+//! The rules it keeps:
+//!
+//! * A reply counts only when transaction id (where there is one), unit id, function and length are
+//!   those of the request. On a stream, anything else ends the connection: the two sides no longer
+//!   mean the same thing.
+//! * A request that timed out is given up. Its late reply is dropped and counted where transaction
+//!   ids tell it apart; where they do not, the connection ends, and a serial line is silenced first.
+//! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
+//!   the other side may have gone without a word.
+//! * Only reads are ever sent twice, and only as datagrams.
+//!
+//! A connection that has ended stays so: the driver makes a new one.
+
+mod connection;
+mod datagram;
+mod flights;
+mod line;
+mod stream;
+
+pub use connection::Connection;
+pub use flights::{Done, Ticket};
+
+use core::time::Duration;
+
+use thiserror::Error;
+
+use crate::frame::FrameError;
+use crate::pdu::ResponseError;
+
+/// The driver's clock: the time since any fixed moment. It never runs backwards.
+pub type Time = Duration;
+
+/// Timeouts one after the other, without a byte between them, after which a connection ends.
+/// Requests that were under way together count as one.
+pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
+
+/// How often a read is sent over UDP within its timeout.
+pub const UDP_ATTEMPTS: u32 = 3;
+
+/// How long the units of a serial line have to carry out a broadcast (Modbus over Serial Line
+/// V1.02, 2.4.1).
+pub const TURNAROUND: Duration = Duration::from_millis(100);
+
+/// How requests travel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Transport {
+    /// MBAP frames in a stream: TCP, with TLS or without.
+    Tcp,
+    /// One MBAP frame a datagram. One request at a time.
+    Udp,
+    /// RTU frames in a stream. One request at a time.
+    RtuOverTcp,
+    /// RTU frames on a serial line. One request at a time.
+    SerialRtu(Line),
+    /// ASCII frames on a serial line. One request at a time.
+    SerialAscii(Line),
+}
+
+/// What is known of a serial line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Line {
+    /// What separates two frames.
+    pub silence: Duration,
+    /// The adapter hands back what is sent. One that does is also noticed by itself.
+    pub echo: bool,
+}
+
+/// Why a request has no response.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum Failure {
+    /// The device answered with an exception: its code.
+    #[error("exception {0:#04x}")]
+    Exception(u8),
+    /// No reply within the request's timeout.
+    #[error("no reply in time")]
+    Timeout,
+    /// A reply that can't be the reply to the request.
+    #[error("invalid response: {0}")]
+    Invalid(InvalidResponse),
+    /// The connection ended before the reply.
+    #[error("connection lost: {0}")]
+    Closed(Closed),
+}
+
+/// What is wrong with received bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum InvalidResponse {
+    /// A header with a protocol id other than 0.
+    #[error("protocol id {0}, expected 0")]
+    ProtocolId(u16),
+    /// A header with a length that no frame has.
+    #[error("length {0} in the header, expected 2 to 254")]
+    Length(u16),
+    /// A transaction id that no request in flight has.
+    #[error("transaction id {0} matches no request")]
+    TransactionId(u16),
+    /// A reply from another unit.
+    #[error("reply from unit {found} to a request to unit {expected}")]
+    UnitId {
+        /// The unit that was asked.
+        expected: u8,
+        /// The unit that replied.
+        found: u8,
+    },
+    /// A PDU that does not answer the request.
+    #[error("{0}")]
+    Pdu(ResponseError),
+    /// A damaged frame.
+    #[error("{0}")]
+    Frame(FrameError),
+    /// A datagram that is not exactly one frame.
+    #[error("the datagram is not one frame")]
+    Datagram,
+    /// More bytes than any reply has.
+    #[error("more bytes than a reply can have")]
+    TooLong,
+    /// Bytes that no request asked for.
+    #[error("bytes without a request")]
+    Unrequested,
+}
+
+impl InvalidResponse {
+    /// What is wrong, in a word for programs.
+    pub const fn reason(self) -> &'static str {
+        match self {
+            InvalidResponse::ProtocolId(_) => "protocol_id",
+            InvalidResponse::Length(_) => "length",
+            InvalidResponse::TransactionId(_) => "transaction_id",
+            InvalidResponse::UnitId { .. } => "unit_id",
+            InvalidResponse::Pdu(error) => match error {
+                ResponseError::Function { .. } => "function",
+                ResponseError::Echo => "echo",
+                _ => "length",
+            },
+            InvalidResponse::Frame(FrameError::CheckSum) => "checksum",
+            InvalidResponse::Frame(_) => "frame",
+            InvalidResponse::Datagram => "datagram",
+            InvalidResponse::TooLong => "too_long",
+            InvalidResponse::Unrequested => "unrequested",
+        }
+    }
+}
+
+/// Why a connection has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum Closed {
+    /// The driver said so: the peer closed it, or I/O failed.
+    #[error("closed by the peer")]
+    ByPeer,
+    /// The driver said so: nobody needs it any more.
+    #[error("closed by this side")]
+    BySelf,
+    /// Received bytes can't be trusted.
+    #[error("invalid response: {0}")]
+    Invalid(InvalidResponse),
+    /// Several requests timed out, and no byte was received meanwhile.
+    #[error("no byte received during {MAX_CONSECUTIVE_TIMEOUTS} timeouts")]
+    Silent,
+    /// A request timed out in the middle of its reply.
+    #[error("a reply broke off")]
+    BrokenOff,
+    /// A request timed out where a late reply could be taken for the next one's.
+    #[error("a request timed out, and its reply may still come")]
+    TimedOut,
+    /// All transaction ids are in use.
+    #[error("no transaction id is free")]
+    NoTransactionId,
+}
+
+impl Closed {
+    /// What the end of the connection means to a request.
+    pub const fn failure(self) -> Failure {
+        match self {
+            Closed::Invalid(invalid) => Failure::Invalid(invalid),
+            other => Failure::Closed(other),
+        }
+    }
+}
