@@ -1,0 +1,101 @@
+"""IP addresses and networks of them.
+
+An IPv4 address that is mapped into IPv6 (`::ffff:10.0.0.7`) is that IPv4 address, everywhere: it is
+`unmapped` before it is compared with anything.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
+from typing import TYPE_CHECKING, TypeAlias, overload
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+Address: TypeAlias = IPv4Address | IPv6Address
+Network: TypeAlias = IPv4Network | IPv6Network
+
+LAST_PORT = 65535
+
+LOOPBACK: tuple[Network, ...] = (IPv4Network("127.0.0.0/8"), IPv6Network("::1/128"))
+"""This machine."""
+
+MAPPED = IPv6Network("::ffff:0:0/96")
+"""The IPv4 addresses in IPv6."""
+
+
+@overload
+def unmapped(found: Address) -> Address: ...
+
+
+@overload
+def unmapped(found: Network) -> Network: ...
+
+
+def unmapped(found: Address | Network) -> Address | Network:
+    """The IPv4 form of an address, or a network, that is mapped into IPv6; any other as it is."""
+    if isinstance(found, IPv6Address):
+        return found.ipv4_mapped or found
+    if isinstance(found, IPv6Network) and found.subnet_of(MAPPED):
+        low = int(found.network_address) & 0xFFFF_FFFF
+        return IPv4Network((low, found.prefixlen - MAPPED.prefixlen))
+    return found
+
+
+def parse_address(text: str) -> Address:
+    """An address. Raises `ValueError`."""
+    return unmapped(ipaddress.ip_address(text))
+
+
+def address_in(host: str) -> Address | None:
+    """The address that a host is, with or without the brackets that IPv6 has in a URL; `None` for
+    a name.
+    """
+    try:
+        return parse_address(unbracketed(host))
+    except ValueError:
+        return None
+
+
+def holds(networks: Iterable[Network], address: Address) -> bool:
+    """Whether one of the networks has an address."""
+    plain = unmapped(address)
+    return any(plain in network for network in networks)
+
+
+def covers(networks: Iterable[Network], network: Network) -> bool:
+    """Whether all addresses of `network` are in some of `networks`."""
+    if isinstance(network, IPv4Network):
+        four = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
+        return any(network.subnet_of(wider) for wider in four)
+    six = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv6Network))
+    return any(network.subnet_of(wider) for wider in six)
+
+
+def bracketed(host: str) -> str:
+    """A host as a URL has it: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def unbracketed(host: str) -> str:
+    """A host without the brackets of a URL."""
+    return host.removeprefix("[").removesuffix("]")
+
+
+def joined(host: str, port: int) -> str:
+    """`10.0.0.9:502`, `[fd00::9]:502` or `plc.local:502`."""
+    return f"{bracketed(host)}:{port}"
+
+
+def reachable(host: str) -> str:
+    """The address that a client on this machine connects to, of one that is listened on."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+
+
+def certificate_name(host: str) -> str:
+    """What a certificate has for a host: an address without brackets, a name in lower case."""
+    address = address_in(host)
+    if address is not None:
+        return str(address)
+    return unbracketed(host).lower().removesuffix(".")

@@ -1,0 +1,124 @@
+"""Whom a service may connect to: a list of networks with ports, and of serial devices.
+
+A name is resolved once. What is judged is each address that it has, and the connection is made to
+one that was allowed, never to the name: what it means to a name server a moment later does not
+matter. Multicast and unspecified addresses are in no list, as they lead to everybody or to nobody.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+from holdfast.net.addresses import (
+    LAST_PORT,
+    Network,
+    address_in,
+    bracketed,
+    holds,
+    parse_address,
+    unmapped,
+)
+from holdfast.protocol import PORT, usual_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.net.addresses import Address
+    from holdfast.net.resolver import Resolve
+    from holdfast.types import Transport
+
+ALL_PORTS = (1, LAST_PORT)
+
+
+@dataclass(frozen=True, slots=True)
+class AllowedNetwork:
+    """A network and the ports in it."""
+
+    network: Network
+    ports: tuple[int, int] | None = None
+    """The first and the last; without them it is 502 over every transport, and 802 over TLS."""
+
+    def holds(self, address: Address, port: int, transport: Transport) -> bool:
+        """Whether a connection to this port of this address is one of them."""
+        if self.ports is None:
+            fits = port in (PORT, usual_port(transport))
+        else:
+            fits = self.ports[0] <= port <= self.ports[1]
+        return fits and holds((self.network,), address)
+
+    def __str__(self) -> str:
+        """`NETWORK[:PORTS]`, as the gateway's list has it."""
+        network = self.network
+        whole = network.prefixlen == network.max_prefixlen
+        prefix = "" if whole else f"/{network.prefixlen}"
+        return f"{bracketed(str(network.network_address))}{prefix}{self._ports}"
+
+    @property
+    def _ports(self) -> str:
+        if self.ports is None:
+            return ""
+        first, last = self.ports
+        if self.ports == ALL_PORTS:
+            return ":*"
+        return f":{first}" if first == last else f":{first}-{last}"
+
+
+@dataclass(frozen=True, slots=True)
+class AllowedDevice:
+    """A serial device, by the path that callers name."""
+
+    path: str
+
+    def __str__(self) -> str:
+        return self.path
+
+
+AllowEntry: TypeAlias = AllowedNetwork | AllowedDevice
+
+
+class NotAllowed(Exception):
+    """None of the addresses of a host is in the list."""
+
+    def __init__(self, host: str, found: tuple[str, ...]) -> None:
+        self.host = host
+        self.found = found
+        """The addresses of a name; none where the host is an address."""
+        super().__init__(f"{host} is not allowed")
+
+
+class AllowList:
+    """What may be connected to."""
+
+    def __init__(self, entries: Iterable[AllowEntry]) -> None:
+        self.entries = tuple(entries)
+        self.networks = tuple(each for each in self.entries if isinstance(each, AllowedNetwork))
+        self._devices = {each.path for each in self.entries if isinstance(each, AllowedDevice)}
+
+    def allows(self, address: Address, port: int, transport: Transport) -> bool:
+        """Whether this port of this address may be connected to."""
+        plain = unmapped(address)
+        if plain.is_multicast or plain.is_unspecified:
+            return False
+        return any(entry.holds(plain, port, transport) for entry in self.networks)
+
+    def allows_device(self, path: str) -> bool:
+        """Whether this serial device may be opened."""
+        return path in self._devices
+
+    async def addresses(
+        self, host: str, port: int, transport: Transport, resolve: Resolve
+    ) -> tuple[str, ...]:
+        """The addresses of a host that may be connected to, at least one; IPv4 first, because a
+        device that has both seldom answers Modbus on IPv6.
+
+        Raises `NotAllowed`, and what `resolve` raises.
+        """
+        literal = address_in(host)
+        named = [] if literal is not None else await resolve(host)
+        found = [literal] if literal is not None else list(map(parse_address, named))
+        allowed = [each for each in found if self.allows(each, port, transport)]
+        if not allowed:
+            raise NotAllowed(host, tuple(named))
+        allowed.sort(key=lambda each: each.version)
+        return tuple(dict.fromkeys(map(str, allowed)))
