@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
-from typing import Any, Literal, final
+from typing import Any, Final, Literal, final
 
 from holdfast.errors import ModbusError
 from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
 
 __all__ = [
+    "ADDRESSES",
+    "AREAS",
+    "EXCEPTIONS",
+    "FAULTS",
+    "FUNCTIONS",
+    "MAX_PDU",
+    "SUB_FUNCTIONS",
     "BlockingClient",
     "Connection",
     "Endpoint",
@@ -24,11 +31,35 @@ __all__ = [
     "Rule",
     "ServerTls",
     "__version__",
+    "encode_raw_ingest",
+    "pack_raw_ingest",
     "plan_blocks",
     "write_across",
 ]
 
 __version__: str
+
+ADDRESSES: Final[int]
+"""How many addresses an area can have."""
+
+MAX_PDU: Final[int]
+"""Bytes of the longest request or reply, without what a transport puts around it."""
+
+AREAS: Final[tuple[Area, ...]]
+"""The areas, in the order of their functions."""
+
+FUNCTIONS: Final[tuple[tuple[int, str, bool, Area | None, int, int], ...]]
+"""Each function: its code, its name, whether it writes, the area it is for, and how many bits or
+registers it reads and writes at most."""
+
+SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
+"""Each sub-function of function 8: its code, its name, and whether it changes the device."""
+
+EXCEPTIONS: Final[dict[int, str]]
+"""The names of exceptions by their codes."""
+
+FAULTS: Final[dict[str, int]]
+"""Why a device did not answer, as a word: the codes that status blocks and the poller have."""
 
 class OutOfRange(IndexError):
     """A range that is not inside its area; nothing was read or written."""
@@ -518,6 +549,29 @@ class Poller:
 
     def stop(self) -> None:
         """Stops polling. From any thread."""
+
+def pack_raw_ingest(area: Area, values: list[int]) -> bytes:
+    """The payload of a Raw Ingest packet.
+
+    Raises `ValueError` for a value too large and an unknown area, `TypeError` for one of another
+    type.
+    """
+
+def encode_raw_ingest(
+    payload: bytes,
+    *,
+    area: Area,
+    address: int,
+    count: int,
+    target: int,
+    format: Literal["v1", "crc"],
+    crc: Literal["required", "none"],
+) -> bytes:
+    """A Raw Ingest packet; `target` is a unit id (v1) or a memory id (crc).
+
+    Raises `ValueError` for a payload that is not that of `count` values, `OverflowError` for a
+    number beyond 65535.
+    """
 
 def plan_blocks(
     fields: Sequence[tuple[Area, int, int]],

@@ -7,7 +7,15 @@ from typing import Literal, TypeAlias, TypedDict, get_args
 Access: TypeAlias = Literal["read-only", "read-write"]
 Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
 AREAS: tuple[Area, ...] = get_args(Area)
-BIT_AREAS = AREAS[:2]
+BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
+RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
+BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
+REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
+
+Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp"]
+"""How a device with an address is talked to."""
+
+TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
 
 WhenFull: TypeAlias = Literal["refuse", "evict"]
 

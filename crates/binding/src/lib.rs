@@ -8,15 +8,17 @@ mod audit;
 mod client;
 mod connection;
 mod engine;
+mod limits;
 mod listener;
 mod memory;
 mod poller;
+mod raw_ingest;
 
 use pyo3::prelude::*;
 
 #[pymodule(gil_used = false)]
 mod _core {
-    use super::{Bound, PyModule, PyModuleMethods, PyResult};
+    use super::{Bound, PyModule, PyModuleMethods, PyResult, limits};
 
     #[pymodule_export]
     use super::client::{BlockingClient, Endpoint, Request};
@@ -30,9 +32,12 @@ mod _core {
     use super::memory::{Memory, OutOfRange, write_across};
     #[pymodule_export]
     use super::poller::{PolledDevice, Poller, plan_blocks};
+    #[pymodule_export]
+    use super::raw_ingest::{encode_raw_ingest, pack_raw_ingest};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        limits::add(module)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

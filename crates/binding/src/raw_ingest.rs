@@ -1,0 +1,92 @@
+//! Raw Ingest packets: values to a payload, a payload to a packet.
+
+use holdfast_memory::Area;
+use holdfast_protocol::raw_ingest::{Format, Header};
+use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBool, PyBytes, PyInt, PyList};
+
+use crate::arguments::word;
+use crate::memory::{integer, named};
+
+/// The payload that bits or registers make. Nothing is converted: a value is an integer, and a
+/// truth only of bits.
+#[pyfunction]
+pub fn pack_raw_ingest<'py>(
+    py: Python<'py>,
+    area: &str,
+    values: &Bound<'py, PyList>,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let area = named(area)?;
+    let mut payload = vec![0; area.byte_len(values.len())];
+    if area.is_bits() {
+        for (index, value) in values.iter().enumerate() {
+            let bit = item(area, index, &value)? as u8;
+            if let Some(byte) = payload.get_mut(index / 8) {
+                *byte |= bit << (index % 8);
+            }
+        }
+    } else {
+        for ((index, value), pair) in values.iter().enumerate().zip(payload.chunks_exact_mut(2)) {
+            pair.copy_from_slice(&item(area, index, &value)?.to_be_bytes());
+        }
+    }
+    Ok(PyBytes::new(py, &payload))
+}
+
+/// One packet. `target` is a unit id (v1) or a memory id (crc).
+#[pyfunction]
+#[pyo3(signature = (payload, *, area, address, count, target, format, crc))]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+pub fn encode_raw_ingest<'py>(
+    py: Python<'py>,
+    payload: &[u8],
+    area: &str,
+    address: u16,
+    count: u16,
+    target: u16,
+    format: &str,
+    crc: &str,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let required = word("crc", crc, &[("required", true), ("none", false)])?;
+    let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
+    let format = word("format", format, &formats)?;
+    let area = named(area)?;
+    let (code, _) = (1..)
+        .zip(Area::ALL)
+        .find(|(_, each)| *each == area)
+        .ok_or_else(|| PyRuntimeError::new_err("an area that packets can't name"))?;
+    let header = Header { area: code, target, address, count };
+    if count == 0 || payload.len() != header.payload_len() {
+        let (len, expected) = (payload.len(), header.payload_len());
+        let message =
+            format!("the payload has {len} bytes, {count} {} have {expected}", area.name());
+        return Err(PyValueError::new_err(message));
+    }
+    let len = format.packet_len(&header);
+    let mut packet = Vec::with_capacity(len);
+    format.encode(&header, payload, &mut packet);
+    Ok(PyBytes::new(py, &packet))
+}
+
+fn item(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
+    if !area.is_bits()
+        && let Ok(register) = value.cast_exact::<PyInt>()
+        && let Ok(register) = register.extract::<u16>()
+    {
+        return Ok(register);
+    }
+    let (most, allowed) =
+        if area.is_bits() { (1, "0, 1, False, True") } else { (u16::MAX, "integers 0 to 65535") };
+    let is_bool = value.is_instance_of::<PyBool>();
+    let is_integer = value.is_instance_of::<PyInt>() && (area.is_bits() || !is_bool);
+    if is_integer
+        && let Ok(number) = u16::try_from(integer(value)?)
+        && number <= most
+    {
+        return Ok(number);
+    }
+    let shown = value.py().import("reprlib")?.call_method1("repr", (value,))?;
+    let message = format!("values[{index}] is {shown}, allowed are {allowed}");
+    Err(if is_integer { PyValueError::new_err(message) } else { PyTypeError::new_err(message) })
+}
