@@ -14,17 +14,20 @@ import os
 import reprlib
 import selectors
 import socket
-import struct
 import time
-import zlib
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict
 
+from holdfast._core import encode_raw_ingest, pack_raw_ingest
+from holdfast.net.addresses import joined
+from holdfast.net.resolver import Resolver
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from typing import Unpack
 
+    from holdfast.net.resolver import SocketAddress
     from holdfast.types import Area
 
 __all__ = [
@@ -42,11 +45,10 @@ Format: TypeAlias = Literal["v1", "crc"]
 Crc: TypeAlias = Literal["required", "none"]
 Data: TypeAlias = bytes | bytearray | memoryview
 
-_Found: TypeAlias = tuple[int, int, int, str, Any]
-
 TIMEOUT = 5.0
-MAX_FIELD = 0xFFFF
+MAX_FIELD = MAX_WORD
 DONE, REFUSED = b"\x00", b"\x01"
+_RESOLVER = Resolver()
 
 
 class RawError(Exception):
@@ -106,25 +108,30 @@ def encode(
         raise ValueError(f"area is {reprlib.repr(area)}, allowed are {', '.join(AREAS)}")
     if (unit is None) == (memory_id is None):
         raise TypeError("a packet has either a unit (format v1) or a memory_id (format crc)")
-    layout = "crc" if unit is None else "v1"
+    layout: Format = "crc" if unit is None else "v1"
     if format not in (None, layout):
         raise ValueError(f"format is {format!r}, but the packet is of format {layout}")
     if crc not in (None, "required", "none"):
         raise ValueError(f"crc is {crc!r}, allowed are 'required' and 'none'")
     if crc is not None and layout == "v1":
         raise ValueError("crc is for format crc, a packet of format v1 never has one")
-    _check("address", address)
+    _checked_field("address", address)
     payload, items = _payload(area, values, data, count)
-    if address + items > MAX_FIELD + 1:
-        raise ValueError(f"{area}: {items} from address {address}, the last address is {MAX_FIELD}")
-    code = AREAS.index(area) + 1
-    if unit is not None:
-        _check("unit", unit)
-        return struct.pack(">2sBBHHH", b"RI", 1, code, unit, address, items) + payload
-    _check("memory_id", memory_id)
-    head = struct.pack(">2sBBBBHHH", b"RI", 1, 0, code, 0, memory_id, address, items)
-    body = head + payload
-    return body if crc == "none" else body + struct.pack(">I", zlib.crc32(body))
+    if address + items > ADDRESSES:
+        last = f"the last address is {LAST_ADDRESS}"
+        raise ValueError(f"{area}: {items} from address {address}, {last}")
+    target = (
+        _checked_field("memory_id", memory_id) if unit is None else _checked_field("unit", unit)
+    )
+    return encode_raw_ingest(
+        payload,
+        area=area,
+        address=address,
+        count=items,
+        target=target,
+        format=layout,
+        crc=crc or "required",
+    )
 
 
 async def send(
@@ -178,10 +185,7 @@ async def send_packet(host: str, port: int, packet: bytes, *, timeout: float = T
 
 
 def send_packet_sync(host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT) -> None:
-    """As `send_packet`, without an event loop.
-
-    Only the look-up of a host's name is not bound by the timeout: the system has its own for it.
-    """
+    """As `send_packet`, without an event loop."""
     attempt = _Attempt(host, port, timeout)
     deadline = time.monotonic() + timeout
     try:
@@ -196,7 +200,7 @@ class _Attempt:
     """How far one packet has come, and what becomes of that."""
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
-        _check("port", port, least=1)
+        _checked_field("port", port, least=1)
         if not 0 < timeout < math.inf:
             raise ValueError(f"timeout is {timeout}, allowed are seconds above 0")
         try:
@@ -204,7 +208,7 @@ class _Attempt:
                 raise UnicodeError
         except UnicodeError:
             raise ValueError(f"{reprlib.repr(host)} is no name of a host") from None
-        self.peer = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        self.peer = joined(host, port)
         self.timeout = timeout
         self.connected = False
         self.sent = False
@@ -240,8 +244,8 @@ async def _connected(host: str, port: int, deadline: float) -> socket.socket:
     Each address has its share of the time that is left, so that a dead one does not use up all.
     """
     loop = asyncio.get_running_loop()
-    found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    for others, (family, _, _, _, address) in _countdown(found):
+    found = await asyncio.wrap_future(_RESOLVER.look_up(host, port))
+    for others, (family, address) in _countdown(found):
         try:
             connection = socket.socket(family)
             try:
@@ -260,8 +264,8 @@ async def _connected(host: str, port: int, deadline: float) -> socket.socket:
 
 def _connected_sync(host: str, port: int, deadline: float) -> socket.socket:
     """As `_connected`."""
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    for others, (family, _, _, _, address) in _countdown(found):
+    found = _RESOLVER.wait_for(host, port, _left(deadline))
+    for others, (family, address) in _countdown(found):
         try:
             connection = socket.socket(family)
             try:
@@ -279,7 +283,7 @@ def _connected_sync(host: str, port: int, deadline: float) -> socket.socket:
     raise OSError("the host has no address")
 
 
-def _countdown(found: Sequence[_Found]) -> Iterator[tuple[int, _Found]]:
+def _countdown(found: Sequence[SocketAddress]) -> Iterator[tuple[int, SocketAddress]]:
     """The addresses, each with how many come after it."""
     return zip(reversed(range(len(found))), found, strict=True)
 
@@ -345,7 +349,7 @@ def _payload(
     if (values is None) == (data is None):
         raise TypeError("a packet has either values or data")
     if count is not None:
-        _check("count", count, least=1)
+        _checked_field("count", count, least=1)
     if data is not None:
         return _checked(area, data, count)
     if isinstance(values, Data):
@@ -355,19 +359,7 @@ def _payload(
         raise ValueError(f"values are {len(items)}, allowed are 1 to {MAX_FIELD}")
     if count not in (None, len(items)):
         raise ValueError(f"count is {count}, but values are {len(items)}")
-    bits = area in BIT_AREAS
-    most, allowed = (1, "0, 1, False, True") if bits else (MAX_FIELD, f"integers 0 to {MAX_FIELD}")
-    for index, item in enumerate(items):
-        if not isinstance(item, int) or (isinstance(item, bool) and not bits):
-            found = f"values[{index}] is {reprlib.repr(item)}"
-            raise TypeError(f"{found}, allowed are {allowed}")
-        if not 0 <= item <= most:
-            found = f"values[{index}] is {reprlib.repr(item)}"
-            raise ValueError(f"{found}, allowed are {allowed}")
-    if not bits:
-        return struct.pack(f">{len(items)}H", *items), len(items)
-    packed = int("".join("1" if item else "0" for item in reversed(items)), 2)
-    return packed.to_bytes((len(items) + 7) // 8, "little"), len(items)
+    return pack_raw_ingest(area, items), len(items)
 
 
 def _checked(area: Area, data: Data, count: int | None) -> tuple[bytes, int]:
@@ -392,10 +384,11 @@ def _checked(area: Area, data: Data, count: int | None) -> tuple[bytes, int]:
     return payload, len(payload) // 2
 
 
-def _check(name: str, value: object, least: int = 0) -> None:
+def _checked_field(name: str, value: object, least: int = 0) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(
             f"{name} is {reprlib.repr(value)}, allowed are integers {least} to {MAX_FIELD}"
         )
     if not least <= value <= MAX_FIELD:
         raise ValueError(f"{name} is {value}, allowed are {least} to {MAX_FIELD}")
+    return value

@@ -11,9 +11,8 @@ import click
 
 from holdfast import raw_ingest
 from holdfast.cli.places import number
+from holdfast.protocol import MAX_WORD
 from holdfast.types import AREAS, Area
-
-MAX_FIELD = 0xFFFF
 
 # Everything that may stand between two values of a file.
 SEPARATORS = re.compile(r"[\s,;]+")
@@ -28,8 +27,8 @@ def _integer(text: str) -> int:
 
 def _word(text: str) -> int:
     found = _integer(text)
-    if found > MAX_FIELD:
-        raise click.BadParameter(f"{text} is outside 0 to {MAX_FIELD}.")
+    if found > MAX_WORD:
+        raise click.BadParameter(f"{text} is outside 0 to {MAX_WORD}.")
     return found
 
 
@@ -43,8 +42,8 @@ def _receiver(text: str) -> tuple[str, int]:
     port = number(digits)
     if not host or port is None:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
-    if not 1 <= port <= MAX_FIELD:
-        raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MAX_FIELD}.")
+    if not 1 <= port <= MAX_WORD:
+        raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MAX_WORD}.")
     return host, port
 
 
@@ -160,8 +159,8 @@ def _values(file: IO[str]) -> list[int]:
                     found = f"{file.name}:{line}: {item[:40]!r} is not an integer"
                     raise ValueError(f"{found}, decimal or 0x")
                 values.append(value)
-            if len(values) > MAX_FIELD:
-                raise ValueError(f"{file.name} has more than {MAX_FIELD} values")
+            if len(values) > MAX_WORD:
+                raise ValueError(f"{file.name} has more than {MAX_WORD} values")
     except UnicodeDecodeError:
         raise ValueError(f"{file.name} is not text in UTF-8") from None
     return values
