@@ -10,7 +10,7 @@ which is a `ValueError`; an argument that is no data at all raises `TypeError`.
 
 from __future__ import annotations
 
-from holdfast.values.codec import decode, encode, register_count
+from holdfast.values.codec import codec_for, decode, encode, register_count
 from holdfast.values.errors import (
     ConversionError,
     DoesNotFit,
@@ -20,6 +20,7 @@ from holdfast.values.errors import (
     UnknownEncoding,
     UnknownOrder,
     UnknownType,
+    WrongArea,
     WrongLength,
 )
 from holdfast.values.layout import Field, Layout
@@ -37,7 +38,9 @@ __all__ = [
     "UnknownEncoding",
     "UnknownOrder",
     "UnknownType",
+    "WrongArea",
     "WrongLength",
+    "codec_for",
     "decode",
     "encode",
     "register_count",

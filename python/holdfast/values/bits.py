@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.protocol import MAX_WORD
 from holdfast.values.errors import DoesNotFit, shown
 from holdfast.values.kinds import Kind
 
@@ -54,7 +55,7 @@ class Bit(Kind):
 
     def pack_one(self, value: Any) -> bytes:
         """The mask. Raises `DoesNotFit`."""
-        register = self._mask if _truth(value, self.name) else 0xFFFF ^ self._mask
+        register = self._mask if _truth(value, self.name) else MAX_WORD ^ self._mask
         return self.arrange(register.to_bytes(2))
 
 

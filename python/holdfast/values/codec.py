@@ -6,9 +6,17 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from holdfast.types import BIT_AREAS
 from holdfast.values.bcd import Bcd
 from holdfast.values.bits import Bit, Bool
-from holdfast.values.errors import DoesNotFit, UnknownEncoding, WrongLength, counted, shown
+from holdfast.values.errors import (
+    DoesNotFit,
+    UnknownEncoding,
+    WrongArea,
+    WrongLength,
+    counted,
+    shown,
+)
 from holdfast.values.numeric import INTEGERS, Float, Integer
 from holdfast.values.orders import FOUR, order_of, swap_registers
 from holdfast.values.registers import RegisterBlock
@@ -16,6 +24,7 @@ from holdfast.values.text import Bytes, Text
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
+    from holdfast.types import Area
     from holdfast.values.kinds import Kind
     from holdfast.values.orders import Order
     from holdfast.values.registers import Registers
@@ -118,6 +127,17 @@ def codec_of(name: str, order: str, encoding: str | None) -> Codec:
     return Codec(
         type, bytes_order, _kind(type, bytes_order, "ascii" if encoding is None else encoding)
     )
+
+
+def codec_for(area: Area, name: str, order: str = "ABCD", encoding: str | None = None) -> Codec:
+    """The codec of a type in an area: whatever a typed value is asked for with, checked together.
+
+    Raises as `codec_of`, and `WrongArea`.
+    """
+    codec = codec_of(name, order, encoding)
+    if area in BIT_AREAS and codec.type.base != "bool":
+        raise WrongArea(f"type is {name!r}, {area} hold only bool")
+    return codec
 
 
 def _kind(type: Type, order: Order, encoding: str) -> Kind:

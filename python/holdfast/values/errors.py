@@ -31,6 +31,10 @@ class UnknownEncoding(ConversionError):
     """A text encoding that does not exist, or not for this type."""
 
 
+class WrongArea(ConversionError):
+    """A type that an area of bits does not hold, which is any but `bool`."""
+
+
 class WrongLength(ConversionError):
     """Too few or too many registers or values."""
 

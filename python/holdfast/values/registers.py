@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias, cast
 
+from holdfast.protocol import MAX_WORD
 from holdfast.values.errors import InvalidRegister, WrongLength, counted, is_integer, shown
 from holdfast.values.orders import swap_registers
 
@@ -62,8 +63,8 @@ class RegisterBlock:
             found = f"registers[{index}]: {shown(register)}"
             if not is_integer(register) and not (self._bits and isinstance(register, bool)):
                 return InvalidRegister(f"{found} is no integer")
-            if not 0 <= register <= 65535:
-                return InvalidRegister(f"{found} is outside 0 to 65535")
+            if not 0 <= register <= MAX_WORD:
+                return InvalidRegister(f"{found} is outside 0 to {MAX_WORD}")
         raise AssertionError("registers without a flaw were refused")
 
     def _wrong_length(self, found: str, also: str = "") -> WrongLength:

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
+from holdfast.protocol import ADDRESSES
 from holdfast.values.errors import UnknownType, shown
 
 FIXED = {
@@ -25,7 +26,7 @@ FIXED = {
 """Types whose name says all: the bytes that an element takes in registers."""
 
 ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays as float32[10]"
-MAX_REGISTERS = 65536
+MAX_REGISTERS = ADDRESSES
 
 _NUMBER = r"(0|[1-9][0-9]{0,5})"
 _NAME = re.compile(rf"(([a-z]+[0-9]*)(?::{_NUMBER})?)(?:\[{_NUMBER}\])?")
