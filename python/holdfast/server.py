@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Self, cast
 
 from holdfast import _core
 from holdfast._core import __version__
+from holdfast.net.addresses import LOOPBACK
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.types import Access, ModbusCounters, WhenFull
 
 MAX_WORKERS = 64
-LOOPBACK = ("127.0.0.0/8", "::1/128")
+SOURCES = tuple(map(str, LOOPBACK))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +85,7 @@ class Server:
         *,
         bind: str,
         access: Access | None = None,
-        sources: Sequence[str] = LOOPBACK,
+        sources: Sequence[str] = SOURCES,
         functions: Collection[int] | None = None,
         deny: Collection[int] | None = None,
         rules: Sequence[Rule] | None = None,

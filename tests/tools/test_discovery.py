@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import holdfast
-from holdfast.client.requests import READ_LIMITS
+from holdfast.protocol import READ_LIMITS
 from holdfast.tools import discovery
 from holdfast.tools.discovery import DeviceSilent, Survey
 from holdfast.types import AREAS

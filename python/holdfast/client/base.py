@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from holdfast._core import Request
 from holdfast.client.target import SerialTarget, parse
+from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
 
 MAX_TIMEOUT = 86_400.0
-
-BROADCASTS = (5, 6, 15, 16, 22)
-"""The functions that may be sent to all units of a serial line (V1.02, 2.1)."""
 
 
 class BaseClient:
@@ -24,7 +22,7 @@ class BaseClient:
         unit = self.unit if unit is None else _unit(unit)
         if unit == 0 and isinstance(self.target, SerialTarget):
             code = request.pdu[0]
-            if code not in BROADCASTS:
+            if code not in BROADCAST_CODES:
                 raise ValueError(
                     f"unit 0 of a serial line is the broadcast, not for function {code}"
                 )
@@ -32,8 +30,8 @@ class BaseClient:
 
 
 def _unit(unit: int) -> int:
-    if type(unit) is not int or not 0 <= unit <= 255:
-        raise ValueError(f"unit is {unit!r}, allowed are 0 to 255")
+    if type(unit) is not int or not 0 <= unit <= MAX_UNIT:
+        raise ValueError(f"unit is {unit!r}, allowed are 0 to {MAX_UNIT}")
     return unit
 
 

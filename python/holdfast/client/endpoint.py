@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
-from holdfast.client.target import TLS_PORT, NetworkTarget, SerialTarget
+from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.protocol import TLS_PORT
 
 if TYPE_CHECKING:
     from holdfast.client.target import Target, Tls

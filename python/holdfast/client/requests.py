@@ -13,31 +13,27 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from holdfast._core import Request
 from holdfast.errors import InvalidResponse, ModbusException
+from holdfast.protocol import (
+    ADDRESSES,
+    ILLEGAL_VALUE,
+    LAST_ADDRESS,
+    MAX_WORD,
+    READ_LIMITS,
+    WRITE_LIMITS,
+)
 from holdfast.types import BIT_AREAS
-from holdfast.values.codec import codec_of
+from holdfast.values.codec import codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.types import Area
-    from holdfast.values.codec import Codec
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Request, Any, Result]
 Plan: TypeAlias = Request | Steps[Result]
 """One request whose result is that of the whole, or steps."""
 
-ADDRESSES = 65536
-READ_LIMITS: dict[str, int] = {
-    "coils": 2000,
-    "discrete_inputs": 2000,
-    "holding_registers": 125,
-    "input_registers": 125,
-}
-WRITE_LIMITS = {"coils": 1968, "holding_registers": 123}
-"""The most values of one request (V1.1b3, 6)."""
-
-ILLEGAL_VALUE = 3
 OBJECT_NAMES = (
     "vendor_name",
     "product_code",
@@ -132,7 +128,7 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
     """A typed value, or an array of them."""
-    codec = _codec(area, kind, order, encoding)
+    codec = codec_for(area, kind, order, encoding)
     plan = read_range(area, address, codec.type.registers)
     raw = (yield plan) if isinstance(plan, Request) else (yield from plan)
     return codec.unpack(codec.to_bytes(raw))
@@ -153,26 +149,19 @@ def write_typed(
     """
     if area not in WRITE_LIMITS:
         raise ValueError(f"area is {area!r}, only {' and '.join(WRITE_LIMITS)} can be written")
-    codec = _codec(area, kind, order, encoding)
+    codec = codec_for(area, kind, order, encoding)
     raw = codec.encode(value)
     if codec.type.base == "bit":
         if codec.type.count is not None:
             raise ValueError(f"{kind} is bits of several registers, only one bit can be written")
         [mask] = raw
-        yield Request.mask_write(address, *((0xFFFF ^ mask, mask) if value else (mask, 0)))
+        yield Request.mask_write(address, *((MAX_WORD ^ mask, mask) if value else (mask, 0)))
     elif len(raw) > 1:
         yield from write_range(area, address, raw, split=split)
     elif area in BIT_AREAS:
         yield Request.write_coil(address, bool(raw[0]))
     else:
         yield Request.write_register(address, raw[0])
-
-
-def _codec(area: Area, kind: str, order: str, encoding: str | None) -> Codec:
-    codec = codec_of(kind, order, encoding)
-    if area in BIT_AREAS and codec.type.base != "bool":
-        raise ValueError(f"type is {kind!r}, {area} hold only bool")
-    return codec
 
 
 def identify() -> Steps[Identification]:
@@ -210,8 +199,8 @@ def _stream(code: int, objects: dict[int, bytes]) -> Steps[int]:
 def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
     """Function 8: data words out and in."""
     for word in data:
-        if type(word) is not int or not 0 <= word <= 0xFFFF:
-            raise ValueError(f"data holds {word!r}, allowed are words 0 to 65535")
+        if type(word) is not int or not 0 <= word <= MAX_WORD:
+            raise ValueError(f"data holds {word!r}, allowed are words 0 to {MAX_WORD}")
     sent = b"".join(word.to_bytes(2, "big") for word in data)
     came: bytes = yield Request.diagnostics(sub_function, sent)
     return [int.from_bytes(came[at : at + 2], "big") for at in range(0, len(came), 2)]
@@ -219,5 +208,5 @@ def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
 
 def _starts(address: int, count: int, limit: int) -> range:
     if not 0 <= address < ADDRESSES or address + count > ADDRESSES:
-        raise ValueError(f"{count} from address {address}: the last address is 65535")
+        raise ValueError(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
     return range(address, address + count, limit)

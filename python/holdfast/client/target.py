@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
-from urllib.parse import parse_qsl, quote, unquote, urlsplit
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from holdfast.net.addresses import LAST_PORT, joined
+from holdfast.net.tls import NO_FILES
+from holdfast.net.tls import Tls as Tls
+from holdfast.protocol import usual_port
+from holdfast.types import TRANSPORTS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
-Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp"]
+    from holdfast.types import Transport
+
 Mode: TypeAlias = Literal["rtu", "ascii"]
 Parity: TypeAlias = Literal["none", "even", "odd"]
-
-PORT = 502
-"""The port of Modbus over TCP and UDP."""
-
-TLS_PORT = 802
-"""The port of Modbus over TLS."""
 
 IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
 """The transports that carry many requests at once."""
@@ -31,43 +32,17 @@ FORMS = (
 
 
 @dataclass(frozen=True)
-class Tls:
-    """Who is trusted, and what is shown; the files are in PEM."""
-
-    ca: str | None = None
-    """Certificates of authorities, or of the device itself; `None` for the system's."""
-    cert: str | None = None
-    key: str | None = None
-    name: str | None = None
-    """The name that the device's certificate has, if that is not its host."""
-
-    @property
-    def query(self) -> str:
-        """It in a URL, behind the question mark."""
-        given = {key: value for key, value in asdict(self).items() if value is not None}
-        return "&".join(f"{key}={quote(value)}" for key, value in given.items())
-
-    def files(self) -> Iterator[tuple[str, str]]:
-        """The files that are given, with their keys."""
-        for key in ("ca", "cert", "key"):
-            file: str | None = getattr(self, key)
-            if file is not None:
-                yield key, file
-
-
-@dataclass(frozen=True)
 class NetworkTarget:
     """A device, or a gateway, behind an address."""
 
     transport: Transport
     host: str
     port: int
-    tls: Tls = Tls()
+    tls: Tls = NO_FILES
     """Of transport `tls`."""
 
     def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.transport}://{host}:{self.port}"
+        return f"{self.transport}://{joined(self.host, self.port)}"
 
 
 @dataclass(frozen=True)
@@ -104,17 +79,15 @@ def parse(url: str) -> Target:
     scheme = parts.scheme
     if parts.fragment or parts.username is not None:
         raise ValueError(f"{url!r} has a user or a fragment; allowed are {FORMS}")
-    if scheme in ("tcp", "tls", "udp", "rtu+tcp"):
+    if scheme in TRANSPORTS:
         query = parts.query and scheme != "tls"
         if not parts.hostname or parts.path not in ("", "/") or query:
             raise ValueError(f"{url!r} is no address of a device; allowed are {FORMS}")
         if port == 0:
-            raise ValueError(f"{url!r}: port 0, allowed are 1 to 65535")
-        host = unquote(parts.hostname)
-        if scheme == "tls":
-            tls = _tls(url, parts.query)
-            return NetworkTarget("tls", host, TLS_PORT if port is None else port, tls)
-        return NetworkTarget(cast("Transport", scheme), host, PORT if port is None else port)
+            raise ValueError(f"{url!r}: port 0, allowed are 1 to {LAST_PORT}")
+        port = usual_port(scheme) if port is None else port
+        tls = _tls(url, parts.query) if scheme == "tls" else NO_FILES
+        return NetworkTarget(scheme, unquote(parts.hostname), port, tls)
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
     raise ValueError(f"{url!r} is no URL of a device; allowed are {FORMS}")
@@ -125,7 +98,7 @@ def in_folder(url: str, folder: Path) -> str:
     target = parse(url)
     if not isinstance(target, NetworkTarget) or target.transport != "tls":
         return url
-    tls = replace(target.tls, **{key: str(folder / file) for key, file in target.tls.files()})
+    tls = target.tls.in_folder(folder)
     if tls == target.tls:
         return url
     return f"{url.partition('?')[0]}?{tls.query}"
@@ -200,11 +173,11 @@ def _chosen(url: str, scheme: str, query: str) -> dict[str, Any]:
 
 
 def _tls(url: str, query: str) -> Tls:
-    tls = Tls(**_chosen(url, "tls", query))
-    if (tls.cert is None) != (tls.key is None):
-        alone = "cert" if tls.key is None else "key"
-        raise ValueError(f"{url!r}: {alone} is alone, allowed are cert and key, or none of both")
-    return tls
+    chosen = _chosen(url, "tls", query)
+    try:
+        return Tls(**chosen)
+    except ValueError as error:
+        raise ValueError(f"{url!r}: {error}") from None
 
 
 def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:

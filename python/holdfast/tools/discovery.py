@@ -18,8 +18,15 @@ from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
-from holdfast.client.requests import ADDRESSES, READ_LIMITS
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, ModbusException
+from holdfast.protocol import (
+    ADDRESSES,
+    BUSY,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    LAST_ADDRESS,
+    READ_LIMITS,
+)
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -27,10 +34,6 @@ if TYPE_CHECKING:
 
     from holdfast.client import Client, SyncClient
     from holdfast.types import Area
-
-ILLEGAL_FUNCTION = 1
-OUTSIDE = 2
-BUSY = 6
 
 STEP = 256
 """Addresses between two samples."""
@@ -98,7 +101,7 @@ class AreaMap:
 
     def failed(self, address: int, failure: Failure) -> None:
         """Notes that an address could not be read, and why."""
-        if failure != OUTSIDE:
+        if failure != ILLEGAL_ADDRESS:
             _add(self.failures.setdefault(failure, []), address, 1)
 
 
@@ -124,7 +127,7 @@ class Survey:
         if step < 1:
             raise ValueError(f"step is {step}, allowed are 1 and more")
         if span.step != 1 or not 0 <= span.start < span.stop <= ADDRESSES:
-            raise ValueError(f"span is {span}, allowed are 0 to {ADDRESSES - 1}")
+            raise ValueError(f"span is {span}, allowed are 0 to {LAST_ADDRESS}")
         self.span = span
         self.exact = exact
         self.areas = [AreaMap(area) for area in areas]
@@ -238,8 +241,8 @@ class _Search:
     def _hopeless(self, samples: Sequence[int]) -> Steps[Outcome]:
         """Whether the area as a whole fails: as its first sample did, so do some others afar."""
         failure = self._failures[samples[0]]
-        if failure in (OUTSIDE, ILLEGAL_FUNCTION):
-            return None if failure == OUTSIDE else failure
+        if failure in (ILLEGAL_ADDRESS, ILLEGAL_FUNCTION):
+            return None if failure == ILLEGAL_ADDRESS else failure
         last = len(samples) - 1
         for index in {last * part // (GIVE_UP - 1) for part in range(1, GIVE_UP)}:
             yield from self._first_hit([samples[index]])

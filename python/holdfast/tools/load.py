@@ -15,7 +15,6 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from holdfast.client import Client
-from holdfast.client.requests import ADDRESSES, READ_LIMITS
 from holdfast.client.target import IN_FLIGHT, NetworkTarget, SerialTarget, parse
 from holdfast.errors import (
     ConnectionLost,
@@ -23,6 +22,7 @@ from holdfast.errors import (
     ModbusError,
     RequestTimeout,
 )
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -109,7 +109,7 @@ class Load:
         if not 1 <= count <= READ_LIMITS[area]:
             raise ValueError(f"count is {count}, one read returns 1 to {READ_LIMITS[area]}")
         if not 0 <= address <= ADDRESSES - count:
-            raise ValueError(f"{count} from address {address}: the last address is 65535")
+            raise ValueError(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
         if not 1 <= connections <= MAX_CONNECTIONS:
             raise ValueError(f"connections is {connections}, allowed are 1 to {MAX_CONNECTIONS}")
         if isinstance(target, SerialTarget) and connections > 1:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict
 
 from holdfast._core import plan_blocks
+from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -22,8 +23,6 @@ Field: TypeAlias = "tuple[Area, int, int]"
 
 Preset: TypeAlias = Literal["none", "max_insert"]
 
-MAX_REGISTERS = 125
-MAX_BITS = 2000
 BITS = 16
 """Bits that take the room of a register."""
 
@@ -142,8 +141,8 @@ def _stretches(ranges: Sequence[RangeConfig]) -> list[tuple[Area, int, int]]:
 
 def _most(area: Area, rules: Rules) -> int:
     if area in BIT_AREAS:
-        return rules.get("max_bits", MAX_BITS)
-    return rules.get("max_registers", MAX_REGISTERS)
+        return rules.get("max_bits", READ_BITS)
+    return rules.get("max_registers", READ_REGISTERS)
 
 
 def _parts(read: Field, rules: Rules) -> Iterator[Field]:
