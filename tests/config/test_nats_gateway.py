@@ -8,8 +8,9 @@ import pytest
 
 from holdfast.appliance import assembly
 from holdfast.client.target import Tls
+from holdfast.config.scanning import written_pollable
 from holdfast.gateway import GatewayLimits
-from holdfast.scanner import DeviceTls, ScannerLimits, Servers
+from holdfast.scanner import ScannerLimits, Servers
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
@@ -99,14 +100,13 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
         ("nats://a", "tls://[fd00::1]:4443"),
         user="scanner",
         password_file=tmp_path / "secret",
-        ca_file=file,
-        cert_file=file,
-        key_file=file,
+        tls=Tls(str(file), str(file), str(file)),
     )
-    assert settings.allow == ("10.0.0.7/32", "fd00::/8", "/dev/ttyUSB0", "COM3")
+    written = [written_pollable(entry) for entry in settings.allow]
+    assert written == ["10.0.0.7/32", "fd00::/8", "/dev/ttyUSB0", "COM3"]
     assert settings.prefix == "plant.modbus-1"
     assert settings.limits == ScannerLimits(devices=7, tags=8)
-    assert settings.device_tls == DeviceTls(tmp_path / "ca.pem", file, tmp_path / "secret")
+    assert settings.device_tls == Tls(str(tmp_path / "ca.pem"), str(file), str(tmp_path / "secret"))
     assert "s3cret" not in repr(nats) + repr(settings)
 
 
@@ -122,7 +122,7 @@ def test_the_scanner_has_the_documented_defaults(folder: Folder) -> None:
     assert (nats.prefix, nats.limits.devices, nats.limits.tags) == ("modbus", 5000, 500_000)
     assert (nats.username, nats.tls) == (None, None)
     assert assembly.scanner(nats).limits == ScannerLimits()
-    assert assembly.scanner(nats).device_tls == DeviceTls()
+    assert assembly.scanner(nats).device_tls == Tls()
 
 
 def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) -> None:

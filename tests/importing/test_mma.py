@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from holdfast.cli import main
 from holdfast.config import load
 from holdfast.config.dump import to_yaml
-from holdfast.config.scalars import AREAS
 from holdfast.config.source import parse
 from holdfast.importing import NotImportable, read_mma
 from holdfast.importing.filters import read_filter
@@ -28,6 +27,7 @@ from holdfast.importing.notes import Desk
 from holdfast.importing.peers import EVERYBODY, Peers, parse_network
 from holdfast.importing.policies import Merger, Policy
 from holdfast.importing.sections import Section
+from holdfast.types import AREAS
 from support.paths import DATA, DOCS
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
     from click.testing import Result
 
-    from holdfast.config.addresses import Address, Network
     from holdfast.importing import Imported
+    from holdfast.net.addresses import Address, Network
 
     Import = Callable[[str], Imported]
 

@@ -1,13 +1,13 @@
 """The configuration of an appliance: one YAML file, checked as a whole before anything starts.
 
 `load` is the way in. It returns a `Config` that is right in every respect, or raises a
-`ConfigError` that holds every problem of the file at once. This room must never start anything,
-open a socket or import the native core.
+`ConfigError` that holds every problem of the file at once. This room must never start anything or
+open a socket; of the native core it knows the constants.
 """
 
 from __future__ import annotations
 
-from holdfast.config.addresses import Bind, Network
+from holdfast.config.addresses import Bind
 from holdfast.config.devices import (
     CostConfig,
     DestinationConfig,
@@ -44,7 +44,7 @@ from holdfast.config.schema import json_schema
 from holdfast.config.services import (
     AdapterConfig,
     AuditConfig,
-    BrokerTlsConfig,
+    ClientTlsConfig,
     GatewayConfig,
     GatewayTokenConfig,
     MetricsConfig,
@@ -55,13 +55,14 @@ from holdfast.config.services import (
     SubscriptionConfig,
     TokenConfig,
 )
+from holdfast.net.addresses import Network
 
 __all__ = [
     "AdapterConfig",
     "AsciiSerialConfig",
     "AuditConfig",
     "Bind",
-    "BrokerTlsConfig",
+    "ClientTlsConfig",
     "Config",
     "ConfigError",
     "CostConfig",

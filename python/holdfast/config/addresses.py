@@ -10,21 +10,14 @@ import ipaddress
 import re
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
-from typing import TYPE_CHECKING, TypeAlias
 
 from holdfast.config.words import show
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-Address: TypeAlias = IPv4Address | IPv6Address
-Network: TypeAlias = IPv4Network | IPv6Network
+from holdfast.net.addresses import LAST_PORT, Address, Network, joined, unmapped
 
 BIND_FORM = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
 SOURCE_FORM = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 
 _BIND = re.compile(r"(?:\[(?P<six>[^\]]*)\]|(?P<four>[^:\[\]]*)):(?P<port>[0-9]{1,5})", re.ASCII)
-_MAPPED = IPv6Network("::ffff:0:0/96")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +33,7 @@ class Bind:
         return str(self.address)
 
     def __str__(self) -> str:
-        return (
-            f"[{self.address}]:{self.port}"
-            if self.address.version == 6
-            else f"{self.host}:{self.port}"
-        )
+        return joined(self.host, self.port)
 
     def overlaps(self, other: Bind) -> bool:
         """Whether both can't be open at once: `[::]` takes IPv4 connections too."""
@@ -62,7 +51,7 @@ def parse_bind(text: object) -> Bind:
     if isinstance(text, Bind):
         return text
     match = _BIND.fullmatch(text) if isinstance(text, str) else None
-    if match is None or int(match["port"]) > 65535:
+    if match is None or int(match["port"]) > LAST_PORT:
         raise ValueError(f"found {show(text)}, allowed: {BIND_FORM}")
     try:
         address: Address = (
@@ -71,8 +60,9 @@ def parse_bind(text: object) -> Bind:
     except ValueError:
         raise ValueError(f"found {show(text)}, allowed: {BIND_FORM}") from None
     if isinstance(address, IPv6Address):
-        if address.ipv4_mapped is not None:
-            form = f"{address.ipv4_mapped}:{match['port']}"
+        four = unmapped(address)
+        if four != address:
+            form = joined(str(four), int(match["port"]))
             raise ValueError(f"found {show(text)}, write its IPv4 form {form}")
         if address.scope_id is not None and not re.fullmatch("[0-9]{1,9}", address.scope_id):
             raise ValueError(f"found {show(text)}, allowed behind '%': the number of an interface")
@@ -89,25 +79,9 @@ def parse_source(text: object) -> Network:
         network = ipaddress.ip_network(text, strict=False)
     except ValueError:
         raise ValueError(f"found {show(text)}, allowed: {SOURCE_FORM}") from None
-    four = _unmapped(network)
-    if four is not None:
+    four = unmapped(network)
+    if four != network:
         raise ValueError(f"found {show(text)}, write its IPv4 form {four}")
     if str(network.network_address) != str(ipaddress.ip_address(text.partition("/")[0])):
         raise ValueError(f"found {show(text)}, which has host bits set: the network is {network}")
     return network
-
-
-def _unmapped(network: Network) -> IPv4Network | None:
-    if isinstance(network, IPv4Network) or not network.subnet_of(_MAPPED):
-        return None
-    low = int(network.network_address) & 0xFFFF_FFFF
-    return IPv4Network((low, network.prefixlen - 96))
-
-
-def covers(networks: Iterable[Network], network: Network) -> bool:
-    """Whether all addresses of `network` are in some of `networks`."""
-    if isinstance(network, IPv4Network):
-        four = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
-        return any(network.subnet_of(wider) for wider in four)
-    six = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv6Network))
-    return any(network.subnet_of(wider) for wider in six)

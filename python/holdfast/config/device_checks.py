@@ -10,21 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.client.target import SerialTarget, parse
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
-from holdfast.config.files import unreadable
+from holdfast.config.files import check_readable
 from holdfast.config.initial import extent
 from holdfast.config.listeners import SERIAL_TYPES
 from holdfast.config.memory_checks import addresses
-from holdfast.config.scalars import (
-    AREAS,
-    BIT_AREAS,
-    NOT_ON_A_LINE,
-    REGISTER_AREAS,
-    Area,
-    parse_url,
-)
+from holdfast.config.scalars import NOT_ON_A_LINE, parse_url
 from holdfast.config.scanning import parse_pollable
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.words import choice, listing, show
+from holdfast.net.allow_list import AllowedDevice
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
+from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, Area
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,8 +30,7 @@ if TYPE_CHECKING:
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
 
-LAST = 65535
-MAX_OF_A_PACKET = 65535
+MAX_OF_A_PACKET = MAX_WORD
 """The most values of one raw ingest packet."""
 
 _NAMING = {"v1": "unit", "crc": "memory_id"}
@@ -84,10 +79,8 @@ class DeviceChecks:
             self._line(path, target, device.get("unit"), taken)
         elif target is not None:
             for key, file in target.tls.files():
-                reason = unreadable(self.folder / file)
-                if reason:
-                    message = f"found {key}={show(file)}, which can't be read: {reason}"
-                    self.report.add((*path, "url"), message)
+                where, shown = (*path, "url"), f"{key}={show(file)}"
+                check_readable(where, file, self.folder, self.report, shown=shown)
         if "max_gap" in device and "cost" in device:
             message = "found beside max_gap, allowed: one of both"
             self.report.add((*path, "cost"), message, of_key=True)
@@ -109,9 +102,11 @@ class DeviceChecks:
         self, path: KeyPath, target: SerialTarget, unit: object, taken: dict[str, KeyPath]
     ) -> None:
         """A serial line: it belongs to devices that drive it alike, and to no listener."""
-        number = integer(unit, 0, 255)
-        if number is not None and not 1 <= number <= 247:
-            allowed = f"allowed on a serial line: a unit id from 1 to 247{NOT_ON_A_LINE}"
+        number = integer(unit, 0, MAX_UNIT)
+        if number is not None and not 1 <= number <= MAX_SERIAL_UNIT:
+            allowed = (
+                f"allowed on a serial line: a unit id from 1 to {MAX_SERIAL_UNIT}{NOT_ON_A_LINE}"
+            )
             self.report.add((*path, "unit"), f"found {number}, {allowed}")
         port = os.path.realpath(target.device)
         if port in taken:
@@ -125,9 +120,10 @@ class DeviceChecks:
         """The serial lines among those that subscribers may have polled."""
         lines = {port: path for port, (path, _) in self._lines.items()} | taken
         for index, device in enumerate(devices):
-            pollable = parsed(parse_pollable, device)
-            if isinstance(pollable, str) and os.path.realpath(pollable) in lines:
-                self._taken(("nats", "devices", index), pollable, lines[os.path.realpath(pollable)])
+            entry = parsed(parse_pollable, device)
+            port = os.path.realpath(entry.path) if isinstance(entry, AllowedDevice) else None
+            if port in lines:
+                self._taken(("nats", "devices", index), str(entry), lines[port])
 
     def _taken(self, path: KeyPath, device: str, owner: KeyPath) -> None:
         of = self._named(owner)
@@ -154,10 +150,10 @@ class DeviceChecks:
         return found
 
     def _range(self, path: KeyPath, each: dict[Any, Any]) -> range | None:
-        start = integer(each.get("start"), 0, LAST)
+        start = integer(each.get("start"), 0, LAST_ADDRESS)
         if "count" in each:
             return self._sum(path, start, each["count"], "start")
-        end = integer(each["end"], 0, LAST)
+        end = integer(each["end"], 0, LAST_ADDRESS)
         if start is None or end is None:
             return None
         if end < start:
@@ -168,11 +164,11 @@ class DeviceChecks:
 
     def _sum(self, path: KeyPath, first: int | None, count: object, key: str) -> range | None:
         """So many addresses from the first on, if there are that many."""
-        number = integer(count, 1, LAST + 1)
+        number = integer(count, 1, ADDRESSES)
         if first is None or number is None:
             return None
-        if first + number > LAST + 1:
-            message = f"found {key} {first} and count {number}, allowed: a sum up to 65536"
+        if first + number > ADDRESSES:
+            message = f"found {key} {first} and count {number}, allowed: a sum up to {ADDRESSES}"
             self.report.add((*path, "count"), message)
             return None
         return range(first, first + number)
@@ -186,7 +182,7 @@ class DeviceChecks:
             return
         needed, other = _NAMING[form], _NAMING["v1" if form == "crc" else "crc"]
         if needed not in forward:
-            message = f"missing beside format {form}, allowed: an integer from 0 to 65535"
+            message = f"missing beside format {form}, allowed: an integer from 0 to {MAX_WORD}"
             self.report.add((*path, needed), message, of_key=True)
         if other in forward:
             message = f"found beside format {form}, allowed: {needed}"
@@ -201,15 +197,15 @@ class DeviceChecks:
         forwarded: bool,
     ) -> None:
         area = read.get("area")
-        address = integer(read.get("address"), 0, LAST)
+        address = integer(read.get("address"), 0, LAST_ADDRESS)
         asked = self._sum(path, address, read.get("count"), "address")
-        count = integer(read.get("count"), 1, LAST + 1)
+        count = integer(read.get("count"), 1, ADDRESSES)
         for where, of, span in forbidden:
             if asked is not None and of == area and _meet(asked, span):
                 message = f"found {extent(asked)}, which meets {extent(span)} of {_last(where)}"
                 line = f"in line {self.report.line(where)}"
                 self.report.add(path, f"{message} {line}, allowed: other addresses", of_key=True)
-        if forwarded and count == LAST + 1:
+        if forwarded and count == ADDRESSES:
             allowed = f"allowed beside forward: up to {MAX_OF_A_PACKET}, which one packet holds"
             self.report.add((*path, "count"), f"found {count}, {allowed}")
         if isinstance(read.get("into"), dict):
@@ -223,7 +219,7 @@ class DeviceChecks:
         self, path: KeyPath, into: dict[Any, Any], of: object, count: int | None
     ) -> None:
         self.grants.memory((*path, "memory"), into.get("memory"))
-        area, address = into.get("area"), integer(into.get("address"), 0, LAST)
+        area, address = into.get("area"), integer(into.get("address"), 0, LAST_ADDRESS)
         if area not in AREAS or (of in AREAS and (area in BIT_AREAS) != (of in BIT_AREAS)):
             if area in AREAS:
                 kin = BIT_AREAS if of in BIT_AREAS else REGISTER_AREAS

@@ -12,22 +12,22 @@ from holdfast.config.memories import Register, Size
 from holdfast.config.receiver import Receiver, parse_receiver
 from holdfast.config.scalars import (
     MAX_TIME,
-    Area,
     DeviceUrl,
     Duration,
     Milliseconds,
     Name,
     NotNull,
     ReceiverUrl,
-    RegisterArea,
     UnitId,
     whole_number,
 )
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
+from holdfast.types import Area, RegisterArea
 
 MIN_INTERVAL = 0.01
 STATUS_BLOCK = 30
 """Registers of a status block."""
-LAST_SLOT = 65536 // STATUS_BLOCK - 1
+LAST_SLOT = ADDRESSES // STATUS_BLOCK - 1
 
 
 class DestinationConfig(Model):
@@ -157,13 +157,13 @@ class DeviceConfig(Model):
     """What is read."""
     cost: Annotated[CostConfig | None, NotNull()] = None
     """Reads holes between reads where that is cheaper; in place of max_gap."""
-    max_gap: Annotated[Annotated[int, Field(ge=0, le=65535)] | None, NotNull()] = Field(
+    max_gap: Annotated[Annotated[int, Field(ge=0, le=LAST_ADDRESS)] | None, NotNull()] = Field(
         default_factory=_max_gap
     )
     """Reads holes between reads of up to so many bits or registers; 0 when left out."""
-    max_registers: Annotated[int, Field(ge=1, le=125)] = 125
+    max_registers: Annotated[int, Field(ge=1, le=READ_REGISTERS)] = READ_REGISTERS
     """The most registers of one request."""
-    max_bits: Annotated[int, Field(ge=1, le=2000)] = 2000
+    max_bits: Annotated[int, Field(ge=1, le=READ_BITS)] = READ_BITS
     """The most bits of one request."""
     readable: Annotated[tuple[RangeConfig, ...], Strict(False)] = ()
     """Holes are read only inside these, in the areas that have some."""

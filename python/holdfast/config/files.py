@@ -7,8 +7,13 @@ import os
 import stat
 from typing import TYPE_CHECKING
 
+from holdfast.config.words import show
+
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from holdfast.config.problems import Report
+    from holdfast.config.source import KeyPath
 
 
 def unreadable(path: Path) -> str:
@@ -20,3 +25,16 @@ def unreadable(path: Path) -> str:
     if stat.S_ISDIR(mode):
         return os.strerror(errno.EISDIR)
     return "" if os.access(path, os.R_OK) else os.strerror(errno.EACCES)
+
+
+def check_readable(
+    path: KeyPath, file: object, folder: Path, report: Report, *, shown: str | None = None
+) -> None:
+    """Reports a file, relative to `folder`, that can't be read; what names no file is passed over.
+
+    `shown` is what was found, where that is more than the name of the file.
+    """
+    if isinstance(file, str) and file and "\0" not in file:
+        reason = unreadable(folder / file)
+        if reason:
+            report.add(path, f"found {shown or show(file)}, which can't be read: {reason}")

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from holdfast.config.memories import Seal
     from holdfast.config.model import Config
     from holdfast.config.problems import Report
-    from holdfast.config.scalars import Area
     from holdfast.config.source import KeyPath
+    from holdfast.types import Area
 
 
 @dataclass

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from holdfast.config import source
 from holdfast.config.problems import ConfigError, Problem
-from holdfast.config.scalars import AREAS, BIT_AREAS, Area
 from holdfast.config.words import guess, listing, show
+from holdfast.protocol import ADDRESSES, MAX_WORD
+from holdfast.types import AREAS, BIT_AREAS, Area
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -99,7 +100,7 @@ class _Judge:
             near = "" if lacking else guess(given.area, AREAS)
             allowed = f"allowed: {listing(self.areas)}{near}"
             raise ValueError(f"found area {show(given.area)}{lacking}, {allowed}")
-        addresses, address = self.areas[area] or range(65536), given.address
+        addresses, address = self.areas[area] or range(ADDRESSES), given.address
         if not isinstance(address, int) or address not in addresses:
             allowed = f"allowed in {area}: {extent(addresses)}"
             raise ValueError(f"found address {show(address)}, {allowed}")
@@ -110,7 +111,7 @@ class _Judge:
         return area, address, value
 
     def _value(self, area: Area, address: int, value: object) -> int:
-        most, to = (1, "or") if area in BIT_AREAS else (65535, "to")
+        most, to = (1, "or") if area in BIT_AREAS else (MAX_WORD, "to")
         if type(value) is not int or not 0 <= value <= most:
             raise ValueError(f"found {show(value)}, allowed in {area}: 0 {to} {most}")
         if (area, address) == self.gate and value == 1:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.addresses import Network, covers, parse_source
+from holdfast.config.addresses import parse_source
 from holdfast.config.allowed import allowed
-from holdfast.config.files import unreadable
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
-from holdfast.config.scalars import WRITES
+from holdfast.config.tls_checks import check_server_tls
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.unique import refuse_repeats
 from holdfast.config.words import show
+from holdfast.net.addresses import Network, covers
+from holdfast.protocol import WRITING_CODES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -65,7 +66,8 @@ class ListenerChecks:
             if kind == "raw-ingest":
                 self._raw(path, listener)
             if kind == "modbus-tls":
-                self._certificates((*path, "tls"), mapping(listener.get("tls")))
+                tls = mapping(listener.get("tls"))
+                check_server_tls((*path, "tls"), tls, self.folder, self.report)
             for rule_path, rule in self._rules(path, listener):
                 if kind == "raw-ingest":
                     self._raw_rule(rule_path, rule, listener.get("format", "v1"))
@@ -91,15 +93,6 @@ class ListenerChecks:
         if most is not None and of_source is not None and of_source > most:
             message = f"{of_source} has no effect: max_connections is {most}"
             self.report.doubt((*path, "max_connections_per_source"), message)
-
-    def _certificates(self, path: KeyPath, tls: dict[Any, Any]) -> None:
-        for key in ("cert_file", "key_file", "ca_file", "crl_file"):
-            file = tls.get(key)
-            if isinstance(file, str) and file and "\0" not in file:
-                reason = unreadable(self.folder / file)
-                if reason:
-                    message = f"found {show(file)}, which can't be read: {reason}"
-                    self.report.add((*path, key), message)
 
     def _line(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         for rule_path, rule in self._rules(path, listener):
@@ -187,6 +180,6 @@ class RuleCheck:
 
     def _writes(self) -> None:
         for index, code in enumerate(entries(self.rule.get("functions"))):
-            if integer(code, 0, 255) in WRITES:
+            if integer(code, 0, 255) in WRITING_CODES:
                 message = f"{code} has no effect: it writes, and access is read-only"
                 self.report.doubt((*self.path, "functions", index), message)

@@ -15,7 +15,6 @@ from holdfast.config.scalars import (
     RAW_UNIT_KEYS,
     SERIAL_UNIT_KEYS,
     UNIT_KEYS,
-    Access,
     Areas,
     BindAddress,
     Codes,
@@ -36,6 +35,7 @@ from holdfast.config.scalars import (
     StopBits,
     UnitId,
 )
+from holdfast.types import Access
 
 FunctionList: TypeAlias = Annotated[Annotated[Codes, Field(min_length=1)] | None, NotNull()]
 DenyList: TypeAlias = Annotated[Codes | None, NotNull()]

@@ -9,10 +9,12 @@ from pydantic import BeforeValidator, Field, PrivateAttr
 
 from holdfast.config.base import Model
 from holdfast.config.initial import InitialRun
-from holdfast.config.scalars import AREAS, Area, BitArea, FilePath, NotNull
+from holdfast.config.scalars import FilePath, NotNull
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS
+from holdfast.types import AREAS, Area, BitArea
 
-Size = Annotated[int, Field(ge=1, le=65536)]
-Register = Annotated[int, Field(ge=0, le=65535)]
+Size = Annotated[int, Field(ge=1, le=ADDRESSES)]
+Register = Annotated[int, Field(ge=0, le=LAST_ADDRESS)]
 
 
 class Span(Model):

@@ -11,10 +11,11 @@ from pydantic import TypeAdapter
 from holdfast.config import initial, source
 from holdfast.config.memories import Extent, Span
 from holdfast.config.problems import ConfigError
-from holdfast.config.scalars import AREAS, BIT_AREAS, Area
 from holdfast.config.tolerance import fitting, integer, mapping
 from holdfast.config.unique import Owners
 from holdfast.config.words import listing, show
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
+from holdfast.types import AREAS, BIT_AREAS, Area
 
 if TYPE_CHECKING:
     from holdfast.config.problems import Problem, Report
@@ -29,7 +30,7 @@ Layout: TypeAlias = dict[Area, range | None]
 def addresses(extent: object) -> range | None:
     """The addresses of an area as it is written; `None` when they can't be told."""
     span = fitting(_EXTENT, extent)
-    return None if span is None or span.start + span.size > 65536 else span.addresses
+    return None if span is None or span.start + span.size > ADDRESSES else span.addresses
 
 
 @dataclass
@@ -65,14 +66,14 @@ class MemoryChecks:
         span = fitting(_EXTENT, extent)
         if span is None:
             return None
-        if span.start + span.size <= 65536:
+        if span.start + span.size <= ADDRESSES:
             return span.addresses
-        message = f"found start {span.start} and size {span.size}, allowed: a sum up to 65536"
+        message = f"found start {span.start} and size {span.size}, allowed: a sum up to {ADDRESSES}"
         self.report.add(path, message)
         return None
 
     def _gate(self, path: KeyPath, seal: dict[Any, Any], layout: Layout) -> initial.Cell | None:
-        area, address = seal.get("area"), integer(seal.get("address"), 0, 65535)
+        area, address = seal.get("area"), integer(seal.get("address"), 0, LAST_ADDRESS)
         if area not in BIT_AREAS:
             return None
         if area not in layout:
@@ -109,6 +110,6 @@ class MemoryChecks:
         owners = Owners(self.report, "id")
         for name, memory in memories.items():
             path: KeyPath = ("memories", name)
-            number = integer(mapping(memory).get("id"), 0, 65535)
+            number = integer(mapping(memory).get("id"), 0, MAX_WORD)
             if number is not None:
                 owners.claim((*path, "id"), number, str(number), path)

@@ -10,6 +10,7 @@ from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.config.words import shape
+from holdfast.net.addresses import LAST_PORT, joined
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,8 +29,7 @@ class Remote(NamedTuple):
     port: int
 
     def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.scheme}://{host}:{self.port}"
+        return f"{self.scheme}://{joined(self.host, self.port)}"
 
 
 def parse_remote(
@@ -53,8 +53,8 @@ def parse_remote(
         raise ValueError(f"found more than host and port, allowed: {form}")
     match = _HOST.fullmatch(rest)
     port = int(match["port"] or ports[scheme]) if match else 0
-    if match is None or not _is_host(match) or not least_port <= port <= 65535:
-        port_form = f"a port from {least_port} to 65535"
+    if match is None or not _is_host(match) or not least_port <= port <= LAST_PORT:
+        port_form = f"a port from {least_port} to {LAST_PORT}"
         allowed = f"allowed: a host name or an address, IPv6 in brackets, and {port_form}"
         raise ValueError(f"found a host or port that can't be, {allowed}")
     return Remote(scheme, match["name"] or match["six"], port)

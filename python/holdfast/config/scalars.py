@@ -10,7 +10,7 @@ import re
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias, TypeGuard, get_args
+from typing import Annotated, Literal, TypeGuard
 from urllib.parse import unquote
 
 from pydantic import (
@@ -29,12 +29,22 @@ from pydantic.json_schema import JsonSchemaValue, WithJsonSchema
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from holdfast.client.target import FORMS, in_folder, parse
-from holdfast.config.addresses import Bind, Network, parse_bind, parse_source
+from holdfast.config.addresses import Bind, parse_bind, parse_source
 from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
-from holdfast.config.egress import Allowed, parse_allowed
+from holdfast.config.egress import parse_allowed
 from holdfast.config.receiver import parse_receiver
-from holdfast.config.scanning import PREFIX, Pollable, parse_pollable, parse_prefix, parse_server
+from holdfast.config.scanning import (
+    PREFIX,
+    parse_pollable,
+    parse_prefix,
+    parse_server,
+    written_pollable,
+)
 from holdfast.config.words import choice, shape, show
+from holdfast.net.addresses import Network
+from holdfast.net.allow_list import AllowedNetwork, AllowEntry
+from holdfast.protocol import CODES, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
+from holdfast.types import Area
 
 MAX_BYTES = 244
 MAX_DEVICE = 4095
@@ -42,7 +52,7 @@ MAX_ROLE = 255
 MAX_TIME = 31_622_400
 MIN_TIME = 0.001
 
-NOT_ON_A_LINE = "; 0 is the broadcast, 248 to 255 are reserved"
+NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
 _BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
@@ -50,16 +60,6 @@ _HIGH_BYTE = r"(12[89]|1[3-9][0-9]|2[0-4][0-9]|25[0-5])"
 _SERIAL = r"([1-9]|[1-9][0-9]|1[0-9][0-9]|2[0-3][0-9]|24[0-7])"
 _WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5]))))"
 
-Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
-BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
-RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
-Access: TypeAlias = Literal["read-only", "read-write"]
-
-AREAS: tuple[Area, ...] = get_args(Area)
-BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
-REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
-FUNCTIONS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43)
-WRITES = (5, 6, 15, 16, 22, 23)
 RESERVED = ("rest", "mqtt", "nats", "gateway", "metrics")
 """Names that adapters can't have, because the appliance's own parts have them."""
 
@@ -163,9 +163,9 @@ def _in_folder(value: object, info: ValidationInfo) -> object:
 
 
 def _function(value: object) -> int:
-    if type(value) is int and value in FUNCTIONS:
+    if type(value) is int and value in CODES:
         return value
-    raise ValueError(f"found {show(value)}, allowed: {choice(FUNCTIONS)}")
+    raise ValueError(f"found {show(value)}, allowed: {choice(CODES)}")
 
 
 def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
@@ -237,16 +237,16 @@ AdapterName = Annotated[
 OptionName = Annotated[str, PlainValidator(_option_name), WithJsonSchema({"type": "string"})]
 UnitId = Annotated[
     int,
-    PlainValidator(_id_of("a unit id", 0, 255)),
-    WithJsonSchema({"type": "integer", "minimum": 0, "maximum": 255}),
+    PlainValidator(_id_of("a unit id", 0, MAX_UNIT)),
+    WithJsonSchema({"type": "integer", "minimum": 0, "maximum": MAX_UNIT}),
 ]
 SerialUnitId = Annotated[
     int,
-    PlainValidator(_id_of("a unit id", 1, 247, NOT_ON_A_LINE)),
+    PlainValidator(_id_of("a unit id", 1, MAX_SERIAL_UNIT, NOT_ON_A_LINE)),
     WithJsonSchema({"type": "integer"}),
 ]
 RawUnitId = Annotated[
-    int, PlainValidator(_id_of("a unit id", 0, 65535)), WithJsonSchema({"type": "integer"})
+    int, PlainValidator(_id_of("a unit id", 0, MAX_WORD)), WithJsonSchema({"type": "integer"})
 ]
 ObjectId = Annotated[
     int, PlainValidator(_id_of("an object id", 128, 255)), WithJsonSchema({"type": "integer"})
@@ -295,13 +295,13 @@ SubjectPrefix = Annotated[
     WithJsonSchema({"type": "string", "examples": [PREFIX, "plant.modbus"]}),
 ]
 PollableEntry = Annotated[
-    Pollable,
+    AllowEntry,
     PlainValidator(parse_pollable),
-    PlainSerializer(str, return_type=str),
+    PlainSerializer(written_pollable, return_type=str),
     WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7", "/dev/ttyUSB0"]}),
 ]
 EgressEntry = Annotated[
-    Allowed,
+    AllowedNetwork,
     PlainValidator(parse_allowed),
     PlainSerializer(str, return_type=str),
     WithJsonSchema({"type": "string", "examples": ["10.0.0.0/24", "10.0.0.7:5020", "[fd00::]/64"]}),
@@ -357,7 +357,7 @@ DurationOrZero = Annotated[
 FunctionCode = Annotated[
     int,
     PlainValidator(_function),
-    WithJsonSchema({"type": "integer", "enum": list(FUNCTIONS)}),
+    WithJsonSchema({"type": "integer", "enum": list(CODES)}),
 ]
 Codes = Annotated[
     tuple[FunctionCode, ...], Strict(False), Field(json_schema_extra={"uniqueItems": True})

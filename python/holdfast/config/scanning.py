@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import re
 from ipaddress import IPv4Network, IPv6Network
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-from holdfast.config.addresses import SOURCE_FORM, Network, parse_source
+from holdfast.config.addresses import SOURCE_FORM, parse_source
 from holdfast.config.remote import parse_remote
 from holdfast.config.words import show
+from holdfast.net.allow_list import ALL_PORTS, AllowedDevice, AllowedNetwork
 
 if TYPE_CHECKING:
     from holdfast.config.remote import Remote
-
-Pollable: TypeAlias = Network | str
-"""A network of devices, or the path of a serial device."""
+    from holdfast.net.allow_list import AllowEntry
 
 SERVER_FORM = "nats://host:port or tls://host:port"
 SERVER_PORT = 4222
@@ -44,11 +43,21 @@ def parse_prefix(text: object) -> str:
     raise ValueError(f"found {show(text)}, allowed: {PREFIX_FORM}")
 
 
-def parse_pollable(text: object) -> Pollable:
-    """Raises `ValueError` for anything but a network, an address or a serial device."""
-    if isinstance(text, str) and _SERIAL.fullmatch(text):
+def parse_pollable(text: object) -> AllowEntry:
+    """An entry of the list: a network or an address with all its ports, or a serial device.
+
+    Raises `ValueError` for anything else.
+    """
+    if isinstance(text, AllowedNetwork | AllowedDevice):
         return text
+    if isinstance(text, str) and _SERIAL.fullmatch(text):
+        return AllowedDevice(text)
     is_number = isinstance(text, str) and _NUMBER.fullmatch(text)
     if is_number or isinstance(text, IPv4Network | IPv6Network):
-        return parse_source(text)
+        return AllowedNetwork(parse_source(text), ALL_PORTS)
     raise ValueError(f"found {show(text)}, allowed: {POLLABLE_FORM}")
+
+
+def written_pollable(entry: AllowEntry) -> str:
+    """An entry as `parse_pollable` takes it: of a network always all ports are meant."""
+    return str(entry.network) if isinstance(entry, AllowedNetwork) else entry.path

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.broker import parse_broker, parse_topic_filter
-from holdfast.config.files import unreadable
+from holdfast.config.files import check_readable
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.scanning import parse_server
+from holdfast.config.tls_checks import check_client_tls
 from holdfast.config.tolerance import entries, mapping, parsed
 from holdfast.config.unique import Owners
 from holdfast.config.words import choice, show
@@ -66,7 +67,7 @@ class ServiceChecks:
 
     def _gateway(self, gateway: dict[Any, Any]) -> None:
         self._tokens("gateway", gateway)
-        self._certificates(("gateway", "tls"), mapping(gateway.get("tls")))
+        self._tls(("gateway", "tls"), gateway.get("tls"))
         if gateway.get("tokens") != "none":
             return
         for index, source in enumerate(entries(gateway.get("sources"))):
@@ -97,7 +98,7 @@ class ServiceChecks:
         if "tls" in mqtt and broker is not None and not broker.secure:
             message = "found beside a url that begins with mqtt://, allowed: beside mqtts:// only"
             self.report.add(("mqtt", "tls"), message, of_key=True)
-        self._certificates(("mqtt", "tls"), mapping(mqtt.get("tls")))
+        self._tls(("mqtt", "tls"), mqtt.get("tls"))
         topics = Owners(self.report, "topic")
         for index, subscription in enumerate(entries(mqtt.get("subscriptions"))):
             path: KeyPath = ("mqtt", "subscriptions", index)
@@ -118,8 +119,8 @@ class ServiceChecks:
         if "tls" in nats and servers and all(each and each.scheme == "nats" for each in servers):
             message = "found beside servers that begin with nats://, allowed: beside tls:// only"
             self.report.add(("nats", "tls"), message, of_key=True)
-        self._certificates(("nats", "tls"), mapping(nats.get("tls")))
-        self._certificates(("nats", "device_tls"), mapping(nats.get("device_tls")))
+        self._tls(("nats", "tls"), nats.get("tls"))
+        self._tls(("nats", "device_tls"), nats.get("device_tls"))
 
     def _password(self, section: str, settings: dict[Any, Any]) -> None:
         if "password_file" in settings and "username" not in settings:
@@ -127,19 +128,11 @@ class ServiceChecks:
             self.report.add((section, "password_file"), message, of_key=True)
         self._readable((section, "password_file"), settings.get("password_file"))
 
-    def _certificates(self, section: KeyPath, tls: dict[Any, Any]) -> None:
-        for key, other in (("cert_file", "key_file"), ("key_file", "cert_file")):
-            if key in tls and other not in tls:
-                message = f"found without {other}, allowed: both or none"
-                self.report.add((*section, key), message, of_key=True)
-        for key in ("ca_file", "cert_file", "key_file"):
-            self._readable((*section, key), tls.get(key))
+    def _tls(self, path: KeyPath, tls: object) -> None:
+        check_client_tls(path, mapping(tls), self.folder, self.report)
 
     def _readable(self, path: KeyPath, file: object) -> None:
-        if isinstance(file, str) and file and "\0" not in file:
-            reason = unreadable(self.folder / file)
-            if reason:
-                self.report.add(path, f"found {show(file)}, which can't be read: {reason}")
+        check_readable(path, file, self.folder, self.report)
 
     def _audit(self, file: object) -> None:
         if not isinstance(file, str) or not file or "\0" in file:

@@ -4,7 +4,6 @@ adapters, metrics, audit.
 
 from __future__ import annotations
 
-from ipaddress import IPv4Network, IPv6Network
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import Discriminator, Field, Strict, Tag
@@ -12,7 +11,6 @@ from pydantic import Discriminator, Field, Strict, Tag
 from holdfast.config.base import Model
 from holdfast.config.broker import Broker, parse_broker
 from holdfast.config.scalars import (
-    Access,
     Areas,
     BindAddress,
     BrokerUrl,
@@ -35,6 +33,9 @@ from holdfast.config.scalars import (
     TopicFilter,
 )
 from holdfast.config.scanning import MAX_DEVICES, MAX_TAGS, PREFIX
+from holdfast.net.addresses import LOOPBACK
+from holdfast.net.tls import Tls
+from holdfast.types import Access
 
 
 class GatewayTokenConfig(Model):
@@ -86,26 +87,20 @@ class RestConfig(Model):
     """Seconds from the first byte of a request to its last."""
 
 
-class BrokerTlsConfig(Model):
-    """Certificates for TLS with a broker, which without them is judged by the system's own."""
+class ClientTlsConfig(Model):
+    """Certificates for TLS with a broker or with devices; the system's authorities without any."""
 
     ca_file: Annotated[FilePath | None, NotNull()] = None
-    """The authorities that may vouch for the broker, in PEM."""
+    """The certificates that are trusted, in PEM: of authorities, or of devices themselves."""
     cert_file: Annotated[FilePath | None, NotNull()] = None
-    """The certificate that is shown to the broker, in PEM; together with key_file."""
+    """The certificate that is shown to the other side, in PEM; together with key_file."""
     key_file: Annotated[FilePath | None, NotNull()] = None
     """The key of that certificate, in PEM."""
 
-
-class DeviceTlsConfig(Model):
-    """Certificates for TLS with devices, which without them are judged by the system's own."""
-
-    ca_file: Annotated[FilePath | None, NotNull()] = None
-    """The certificates that are trusted, of authorities or of devices themselves, in PEM."""
-    cert_file: Annotated[FilePath | None, NotNull()] = None
-    """The certificate that is shown to devices, in PEM; together with key_file."""
-    key_file: Annotated[FilePath | None, NotNull()] = None
-    """The key of that certificate, in PEM."""
+    @property
+    def files(self) -> Tls:
+        """The files."""
+        return Tls.of(self.ca_file, self.cert_file, self.key_file)
 
 
 class SubscriptionConfig(Model):
@@ -136,7 +131,7 @@ class MqttConfig(Model):
     """The version of MQTT."""
     keep_alive: Annotated[int, Field(ge=1, le=65535)] = 60
     """Seconds without a message after which the connection is tested."""
-    tls: Annotated[BrokerTlsConfig | None, NotNull()] = None
+    tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates; beside mqtts:// only."""
     subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
     """The topics to listen to."""
@@ -186,9 +181,9 @@ class NatsConfig(Model):
     """A file that holds a token, in the place of a user."""
     credentials_file: Annotated[FilePath | None, NotNull()] = None
     """A file with a JWT and the seed of its key, in the place of a user."""
-    tls: Annotated[BrokerTlsConfig | None, NotNull()] = None
+    tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates; beside tls:// only."""
-    device_tls: Annotated[DeviceTlsConfig | None, NotNull()] = None
+    device_tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates for devices that are subscribed to with TLS."""
     prefix: SubjectPrefix = PREFIX
     """The first part of all subjects."""
@@ -209,7 +204,7 @@ class GatewayConfig(Model):
     """Whether it may write to devices."""
     tokens: Tokens[GatewayTokenConfig]
     """Who may use it; `none` lets everyone, from this machine only."""
-    tls: Annotated[DeviceTlsConfig | None, NotNull()] = None
+    tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates for devices that are talked to with TLS."""
     in_flight: Annotated[int, Field(ge=1, le=64)] = 1
     """Requests on their way to one device at once."""
@@ -235,7 +230,7 @@ class MetricsConfig(Model):
 
     bind: BindAddress
     """Where to listen: an IP address and a port."""
-    sources: Sources = (IPv4Network("127.0.0.0/8"), IPv6Network("::1"))
+    sources: Sources = LOOPBACK
     """Networks and addresses of the readers, IPv4 or IPv6."""
 
 

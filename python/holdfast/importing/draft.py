@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from holdfast.config.scalars import AREAS
+from holdfast.types import AREAS
 
 
 @dataclass

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from holdfast.importing.peers import EVERYBODY, Peers, parse_network
 
 if TYPE_CHECKING:
-    from holdfast.config.addresses import Network
     from holdfast.importing.sections import Section
+    from holdfast.net.addresses import Network
 
 ALL = Peers.of(EVERYBODY)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.scalars import FUNCTIONS, WRITES
 from holdfast.config.words import listing, show
+from holdfast.protocol import CODES, FUNCTIONS, WRITING_CODES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -15,18 +15,13 @@ if TYPE_CHECKING:
 SOURCE = frozenset({1, 2, 3, 4, 5, 6, 15, 16})
 """What the source serves; the others it always refused."""
 
-ALL = frozenset(FUNCTIONS)
-READING = ALL - frozenset(WRITES)
-WRITING_ONLY = frozenset({5, 6, 15, 16})
+ALL = frozenset(CODES)
+WRITING = frozenset(WRITING_CODES)
+READING = ALL - WRITING
+WRITING_ONLY = SOURCE & WRITING
 """Functions that write and read nothing: without 23, and without 22, whose result tells bits."""
 
-_OF_AREA = {
-    "coils": {1, 5, 15},
-    "discrete_inputs": {2},
-    "holding_registers": {3, 6, 16, 22, 23},
-    "input_registers": {4},
-}
-OTHERS = ALL - frozenset().union(*_OF_AREA.values())
+OTHERS = frozenset(each.code for each in FUNCTIONS if each.area is None)
 """Functions that read or write no area."""
 
 _CLOSE = {22: {6, 16}, 23: {3, 6, 16}}
@@ -53,7 +48,8 @@ def read_codes(section: Section, key: str) -> list[int] | None:
 
 def touching(areas: Iterable[str]) -> frozenset[int]:
     """The functions that read or write these areas."""
-    return frozenset(code for area in areas for code in _OF_AREA[area])
+    wanted = set(areas)
+    return frozenset(each.code for each in FUNCTIONS if each.area in wanted)
 
 
 def beside(denied: Iterable[int]) -> list[int]:
@@ -64,7 +60,7 @@ def beside(denied: Iterable[int]) -> list[int]:
 
 def rights(allowed: frozenset[int]) -> dict[str, Any]:
     """`access` and, where it takes them, `functions` of a rule that allows exactly these."""
-    access = "read-write" if allowed & frozenset(WRITES) else "read-only"
+    access = "read-write" if allowed & WRITING else "read-only"
     if allowed in (ALL, READING):
         return {"access": access}
     return {"access": access, "functions": sorted(allowed)}

@@ -5,15 +5,14 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.scalars import AREAS
 from holdfast.config.words import listing
+from holdfast.protocol import ADDRESSES
+from holdfast.types import AREAS
 
 if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
     from holdfast.importing.notes import Desk
     from holdfast.importing.sections import Section
-
-ADDRESSES = 65536
 
 
 def read_id(name: str) -> dict[str, int]:

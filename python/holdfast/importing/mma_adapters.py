@@ -11,8 +11,9 @@ from holdfast.config.broker import parse_broker, parse_topic_filter
 from holdfast.config.words import listing, show
 from holdfast.importing.filters import ALL
 from holdfast.importing.names import free_name, unique_names
-from holdfast.importing.peers import LOOPBACK, Peers, written
+from holdfast.importing.peers import Peers, written
 from holdfast.importing.sections import section
+from holdfast.net.addresses import LOOPBACK
 
 if TYPE_CHECKING:
     from holdfast.config.addresses import Bind

@@ -6,13 +6,13 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.scalars import WRITES
 from holdfast.config.words import guess, listing, show
 from holdfast.importing import functions
 from holdfast.importing.filters import ALL, read_filter
 from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
 from holdfast.importing.sections import Section, section
+from holdfast.protocol import LAST_ADDRESS, WRITING_CODES
 
 if TYPE_CHECKING:
     from holdfast.config.addresses import Bind
@@ -106,7 +106,7 @@ class FirstGeneration:
         if gate is None:
             return None
         gate.word("area", ["discrete_inputs"], required=bool(enabled))
-        address = gate.integer("address", 0, 65535, required=bool(enabled))
+        address = gate.integer("address", 0, LAST_ADDRESS, required=bool(enabled))
         gate.close()
         return (gate.at("address"), address) if enabled and address is not None else None
 
@@ -237,7 +237,7 @@ class FirstGeneration:
             message = f"not {functions.spelled(both)}: denied too, and that wins"
             self.desk.note("changed", path, message)
         left = [code for code in allow if code not in deny]
-        writing = [code for code in left if code in WRITES]
+        writing = [code for code in left if code in WRITING_CODES]
         if access == "read-only" and writing:
             message = f"not {functions.spelled(writing)}: writes, and access is read-only"
             self.desk.note("changed", path, message)

@@ -11,14 +11,15 @@ from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
 from holdfast.importing.policies import Merger, Policy, unserved
 from holdfast.importing.sections import Section, section
+from holdfast.protocol import LAST_ADDRESS
 
 if TYPE_CHECKING:
-    from holdfast.config.addresses import Network
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
     from holdfast.importing.draft import Draft
     from holdfast.importing.notes import Desk
     from holdfast.importing.peers import Peers
+    from holdfast.net.addresses import Network
 
 TOP_REASONS = {
     "debug": "what is logged is set by log.level",
@@ -155,7 +156,7 @@ class SecondGeneration:
             return None
         enabled = sealing.flag("enabled") is not False
         sealing.word("area", ["coil"], required=enabled)
-        address = sealing.integer("address", 0, 65535, required=enabled)
+        address = sealing.integer("address", 0, LAST_ADDRESS, required=enabled)
         exception = sealing.integer("exception", 1, 255)
         sealing.close()
         if not enabled:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.config.addresses import SOURCE_FORM, Network
+from holdfast.config.addresses import SOURCE_FORM
 from holdfast.config.words import show
+from holdfast.net.addresses import MAPPED, Network, unmapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -21,9 +22,7 @@ if TYPE_CHECKING:
 Stretch: TypeAlias = tuple[int, int]
 
 _FOUR = 1 << 129
-_MAPPED = IPv6Network("::ffff:0:0/96")
 EVERYBODY = (IPv4Network("0.0.0.0/0"), IPv6Network("::/0"))
-LOOPBACK = (IPv4Network("127.0.0.0/8"), IPv6Network("::1/128"))
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Peers:
         return cls(_joined(_stretch(network) for network in networks))
 
     def __bool__(self) -> bool:
-        low, high = _stretch(_MAPPED)
+        low, high = _stretch(MAPPED)
         return any(first < low or last > high for first, last in self.stretches)
 
     def __or__(self, other: Peers) -> Peers:
@@ -75,7 +74,7 @@ class Peers:
                 four += ipaddress.summarize_address_range(*ends)
             else:
                 found = ipaddress.summarize_address_range(IPv6Address(first), IPv6Address(last))
-                six += (network for network in found if not network.subnet_of(_MAPPED))
+                six += (network for network in found if not network.subnet_of(MAPPED))
         return [*four, *six]
 
     def written(self) -> list[str]:
@@ -103,10 +102,7 @@ def parse_network(text: object) -> Network:
         network = ipaddress.ip_network(text.strip(), strict=False)
     except ValueError:
         raise ValueError(message) from None
-    if isinstance(network, IPv6Network) and network.subnet_of(_MAPPED):
-        low = int(network.network_address) & 0xFFFF_FFFF
-        return IPv4Network((low, network.prefixlen - 96))
-    return network
+    return unmapped(network)
 
 
 def _stretch(network: Network) -> Stretch:

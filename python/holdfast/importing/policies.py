@@ -17,9 +17,9 @@ from holdfast.importing.peers import Peers, written
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.config.addresses import Network
     from holdfast.config.source import KeyPath
     from holdfast.importing.notes import Desk
+    from holdfast.net.addresses import Network
 
 MAX_SHOWN = 4
 
