@@ -447,7 +447,7 @@ def test_a_device_is_told_of_when_it_comes_or_goes_or_refuses_something_new() ->
 
 
 def test_one_scan_without_an_answer_is_forgiven_unless_there_is_no_connection() -> None:
-    gateway = "exception 0B (Gateway Target Device Failed to Respond)"
+    gateway = "exception 0B (Gateway Target Device Failed To Respond)"
     assert [found[1:] for found in judged([0], [0x0B], [0], [0x8003], [0], [0x8002], [0])] == [
         ("online", 0, None),
         ("online", 1, gateway),

@@ -10,6 +10,7 @@ import jsonschema_rs
 import pytest
 
 from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.hosts import Allowed
@@ -289,7 +290,8 @@ def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
 
 
 def test_serial_devices_beside_networks(caller: Caller) -> None:
-    allowed = Allowed(["/dev/ttyUSB0", "10.0.0.0/8"])
+    line_only = [parse_pollable("/dev/ttyUSB0")]
+    allowed = Allowed([*line_only, parse_pollable("10.0.0.0/8")])
     line = SerialTarget("rtu", "/dev/ttyUSB0")
     assert caller.do(allowed.address(line)) == line
     with pytest.raises(Refused):
@@ -299,13 +301,13 @@ def test_serial_devices_beside_networks(caller: Caller) -> None:
     with pytest.raises(
         Refused, match=r"10\.1\.2\.3 is not allowed, allowed are serial devices only"
     ):
-        caller.do(Allowed(["/dev/ttyUSB0"]).address(device))
+        caller.do(Allowed(line_only).address(device))
 
 
 @pytest.mark.parametrize("entry", ["10.0.0.1/8", "plc", "::ffff:10.0.0.1", "COMPANY"])
 def test_what_is_no_device_can_not_be_allowed(entry: str) -> None:
     with pytest.raises(ValueError, match="found"):
-        Allowed([entry])
+        parse_pollable(entry)
 
 
 def test_the_schema_of_the_docs_is_that_of_the_program() -> None:

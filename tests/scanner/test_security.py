@@ -12,6 +12,7 @@ import pytest
 from nats.errors import NoRespondersError
 
 from holdfast import logs
+from holdfast.net.tls import Tls
 from holdfast.scanner import Scanner, Servers, Settings, broker
 from support import wire
 from support.certificates import Certificates
@@ -79,7 +80,7 @@ def test_tls_is_spoken_with_a_server_that_the_authority_vouches_for(
 ) -> None:
     server = serve_nats("--tls", *certified(authority, "nats"))
     url = server.url.replace("nats", scheme)
-    assert run_scanner(servers=Servers((url,), ca_file=authority.ca)).serves
+    assert run_scanner(servers=Servers((url,), tls=Tls.of(authority.ca))).serves
 
 
 def test_a_server_that_the_authority_does_not_vouch_for_is_refused(
@@ -91,7 +92,7 @@ def test_a_server_that_the_authority_does_not_vouch_for_is_refused(
 ) -> None:
     stranger = Certificates(tmp_path, "stranger")
     server = serve_nats("--tls", *certified(stranger, "nats"))
-    scanner = run_scanner(wait=False, servers=Servers((server.url,), ca_file=authority.ca))
+    scanner = run_scanner(wait=False, servers=Servers((server.url,), tls=Tls.of(authority.ca)))
     assert "CERTIFICATE_VERIFY_FAILED" in failure(caplog)
     assert not scanner.serves
 
@@ -102,7 +103,7 @@ def test_a_server_wants_our_certificate(
     certificate, key = authority.issue("scan", "DNS:scan")
     options = ["--tlsverify", "--tlscacert", str(authority.ca), *certified(authority, "nats")]
     server = serve_nats(*options)
-    servers = Servers((server.url,), ca_file=authority.ca, cert_file=certificate, key_file=key)
+    servers = Servers((server.url,), tls=Tls.of(authority.ca, certificate, key))
     assert run_scanner(servers=servers).serves
 
 
@@ -117,7 +118,7 @@ def test_a_server_without_tls_is_refused_where_tls_is_asked_for(
     server = serve_nats()
     url = server.url.replace("nats", scheme)
     ca = authority.ca if scheme == "nats" else None
-    scanner = run_scanner(wait=False, servers=Servers((url,), ca_file=ca))
+    scanner = run_scanner(wait=False, servers=Servers((url,), tls=Tls.of(ca)))
     assert failure(caplog) == "the server does not use TLS"
     assert not scanner.serves
 
@@ -174,7 +175,7 @@ def test_files_are_read_when_it_starts(tmp_path: Path) -> None:
     for servers in (
         Servers(token_file=tmp_path / "missing"),
         Servers(credentials=tmp_path / "missing"),
-        Servers(ca_file=tmp_path / "missing"),
+        Servers(tls=Tls.of(tmp_path / "missing")),
     ):
         assert "No such file" in refusal(servers)
 

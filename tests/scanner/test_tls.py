@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner import DeviceTls
+from holdfast.net.tls import Tls
 from support import wire
 from support.nats_bus import leaving, tag
 from support.secured import VERSIONS, Authority, Relay, context
@@ -76,7 +76,7 @@ def test_a_device_is_scanned_and_written_by_the_name_that_was_asked_for(
 ) -> None:
     """With `localhost` a certificate that has no address."""
     owner = authority.issue("named", f"{'DNS' if host == 'localhost' else 'IP'}:{host}")
-    run_scanner(device_tls=DeviceTls(authority.ca))
+    run_scanner(device_tls=Tls.of(authority.ca))
     with Relay(address, context(owner, version)) as relay:
         where: dict[str, Any] = {"host": host, "port": relay.address[1], "transport": "tls"}
         if by_url:
@@ -105,7 +105,7 @@ def test_another_authority_is_not_trusted(
     plc: Owner,
     stranger: Authority,
 ) -> None:
-    run_scanner(device_tls=DeviceTls(stranger.ca))
+    run_scanner(device_tls=Tls.of(stranger.ca))
     with Relay(address, context(plc)) as relay:
         data, states = subscribed(caller, url=f"tls://127.0.0.1:{relay.address[1]}")
         assert refused(states) == "no connection"
@@ -131,7 +131,7 @@ def test_the_certificate_has_the_name_that_is_said(
     authority: Authority,
     name: str | None,
 ) -> None:
-    run_scanner(device_tls=DeviceTls(authority.ca))
+    run_scanner(device_tls=Tls.of(authority.ca))
     with Relay(address, context(authority.issue("plc7", "DNS:plc7"))) as relay:
         url = f"tls://127.0.0.1:{relay.address[1]}"
         data, states = subscribed(caller, url=url if name is None else f"{url}?name={name}")
@@ -160,7 +160,7 @@ def test_a_certificate_is_shown_to_a_device_that_asks_for_one(
     shows: bool,
 ) -> None:
     own = authority.issue("scanner", "DNS:scanner") if shows else (None, None)
-    run_scanner(device_tls=DeviceTls(authority.ca, *own))
+    run_scanner(device_tls=Tls.of(authority.ca, *own))
     with Relay(address, context(plc, asks=authority.ca)) as relay:
         data, states = subscribed(caller, url=f"tls://127.0.0.1:{relay.address[1]}")
         if shows:
@@ -191,10 +191,10 @@ def test_files_that_can_not_be_used_end_it_before_it_serves(
     empty = tmp_path / "empty"
     empty.touch()
     wrong = [
-        DeviceTls(tmp_path / "missing"),
-        DeviceTls(empty),
-        DeviceTls(authority.ca, plc[0], empty),
-        DeviceTls(authority.ca, plc[0], authority.issue("other", HOST)[1]),
+        Tls.of(tmp_path / "missing"),
+        Tls.of(empty),
+        Tls.of(authority.ca, plc[0], empty),
+        Tls.of(authority.ca, plc[0], authority.issue("other", HOST)[1]),
     ]
     for files in wrong:
         running = run_scanner(wait=False, device_tls=files)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import pytest
 from nats.aio.client import Client
 
+from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import Scanner, Servers, Settings
 from support import wire
 from support.brokers import free_port
@@ -290,6 +291,7 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
 
         def start(server: NatsServer | None = None, *, wait: bool = True, **more: Any) -> Running:
             more.setdefault("servers", Servers(((server or nats).url,)))
+            more["allow"] = tuple(map(parse_pollable, more.get("allow", ())))
             scanner = Running(Settings(**more))
             running.callback(scanner.stop)
             if wait:

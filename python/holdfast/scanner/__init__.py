@@ -11,8 +11,7 @@ and `publishing` make messages of what was read. The last four do no I/O.
 from __future__ import annotations
 
 from holdfast.scanner.broker import Servers
-from holdfast.scanner.device_tls import DeviceTls
 from holdfast.scanner.limits import ScannerLimits
 from holdfast.scanner.service import Scanner, Settings
 
-__all__ = ["DeviceTls", "Scanner", "ScannerLimits", "Servers", "Settings"]
+__all__ = ["Scanner", "ScannerLimits", "Servers", "Settings"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import ssl
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from nats.errors import Error
 
 from holdfast import logs
+from holdfast.net.tls import NO_FILES, Tls, broker_context
 from holdfast.scanner.credentials import Credentials
 from holdfast.scanner.receiving import SafeClient, TlsClient
 
@@ -58,15 +58,13 @@ class Servers:
     token_file: Path | None = None
     credentials: Path | None = None
     """A file with a JWT and a seed, see `Credentials`."""
-    ca_file: Path | None = None
-    cert_file: Path | None = None
-    key_file: Path | None = None
+    tls: Tls = NO_FILES
+    """Whom we trust there, and what we show."""
 
     @property
     def secure(self) -> bool:
         """Whether nothing may be sent without TLS."""
-        files = self.ca_file or self.cert_file
-        return files is not None or any(url.startswith("tls://") for url in self.urls)
+        return self.tls != NO_FILES or any(url.startswith("tls://") for url in self.urls)
 
     def options(self) -> dict[str, Any]:
         """As `Client.connect` has them. Raises `OSError` for a file that can't be used."""
@@ -81,11 +79,7 @@ class Servers:
             options["signature_cb"] = credentials.sign
             options["user_jwt_cb"] = credentials.jwt
         if self.secure:
-            context = ssl.create_default_context(cafile=self.ca_file)
-            context.minimum_version = ssl.TLSVersion.TLSv1_2
-            if self.cert_file is not None:
-                context.load_cert_chain(self.cert_file, self.key_file, password="")
-            options["tls"] = context
+            options["tls"] = broker_context(self.tls)
         return options
 
 

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast.errors import fault_text
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.health import beside, described
+from holdfast.scanner.health import beside
 from holdfast.scanner.messages import (
     BlockReport,
     BrowseAnswer,
@@ -16,7 +17,7 @@ from holdfast.scanner.messages import (
     SubscriberReport,
     TagReport,
 )
-from holdfast.scanner.tags import FUNCTION_CODES, Places
+from holdfast.scanner.tags import CODE_OF_AREA, Places
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence, Set
@@ -173,7 +174,7 @@ class _Report:
                 count=count,
                 tags=len(inside),
                 holes=count - len(wanted),
-                error=described(fault) if fault else None,
+                error=fault_text(fault) if fault else None,
             )
 
     def _reports(self, tags: Sequence[Tag]) -> Iterator[TagReport]:
@@ -181,14 +182,14 @@ class _Report:
         for area, address, count, _, fault, _ in self._device.health.blocks:
             if fault:
                 inside = self._places.inside(area, address, count)
-                errors |= dict.fromkeys((tag.id for tag in inside), described(fault))
+                errors |= dict.fromkeys((tag.id for tag in inside), fault_text(fault))
         subscribers = self._device.subscribers.values()
         for tag in tags:
             said = [each.tags[tag.id] for each in subscribers if tag.id in each.tags]
             yield TagReport(
                 id=tag.id,
                 address=tag.address,
-                function_code=FUNCTION_CODES[tag.area],
+                function_code=CODE_OF_AREA[tag.area],
                 datatype=tag.asked_type,
                 byte_order=tag.order,
                 encoding=tag.encoding,

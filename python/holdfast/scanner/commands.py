@@ -14,9 +14,11 @@ import msgspec
 
 from holdfast import logs
 from holdfast.client.requests import write_typed
+from holdfast.errors import fault_text
+from holdfast.protocol import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.health import described, is_unwritten
-from holdfast.scanner.tags import FLOATS, WRITABLE
+from holdfast.scanner.health import is_unwritten
+from holdfast.scanner.tags import FLOATS
 from holdfast.values import ConversionError, encode
 from holdfast.values.types import parsed
 
@@ -106,7 +108,7 @@ async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) ->
 
     Raises `Refused`.
     """
-    if not device.writable(tag.id) or tag.area not in WRITABLE:
+    if not device.writable(tag.id) or tag.area not in WRITE_LIMITS:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable")
     made = value(text, tag)
     try:
@@ -118,5 +120,5 @@ async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) ->
     fault = await polling.write(device, request)
     if fault:
         said = "not written" if is_unwritten(fault) else "not confirmed"
-        raise Refused(f"{said}: {described(fault)}")
+        raise Refused(f"{said}: {fault_text(fault)}")
     logs.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

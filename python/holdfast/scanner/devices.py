@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast._core import plan_blocks
+from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.tags import AREAS, Tag
+from holdfast.scanner.tags import AREA_OF_CODE, Tag
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -30,8 +31,8 @@ class Plan:
     """The rules that blocks are drawn by."""
 
     max_gap: int = MAX_GAP
-    max_registers: int = 125
-    max_bits: int = 2000
+    max_registers: int = READ_REGISTERS
+    max_bits: int = READ_BITS
     readable: tuple[tuple[Area, int, int], ...] = ()
     """Areas with start and end, the end not included."""
     forbidden: tuple[tuple[Area, int, int], ...] = ()
@@ -43,8 +44,8 @@ class Plan:
             return Plan()
         return Plan(
             MAX_GAP if request.max_gap is None else request.max_gap,
-            request.max_registers or 125,
-            request.max_bits or 2000,
+            request.max_registers or READ_REGISTERS,
+            request.max_bits or READ_BITS,
             tuple(_ranges("plan.readable", request.readable or ())),
             tuple(_ranges("plan.forbidden", request.forbidden or ())),
         )
@@ -78,12 +79,12 @@ def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, in
     for index, given in enumerate(ranges):
         *area, start, end = given
         addresses = isinstance(start, int) and isinstance(end, int) and start <= end
-        if not addresses or any(word not in AREAS for word in area):
+        if not addresses or any(word not in AREA_OF_CODE for word in area):
             allowed = "allowed are first and last address, an area may stand before them"
             raise Refused(f"{where}[{index}] is {given}, {allowed}")
         assert isinstance(start, int)
         assert isinstance(end, int)
-        for code, name in AREAS.items():
+        for code, name in AREA_OF_CODE.items():
             if not area or code in area:
                 yield name, start, end + 1
 

@@ -7,6 +7,16 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from holdfast.errors import NO_CONNECTION, fault_text, is_exception
+from holdfast.protocol import (
+    BUSY,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
+    PATH_UNAVAILABLE,
+    TARGET_SILENT,
+)
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -16,40 +26,21 @@ if TYPE_CHECKING:
 Found = TypeVar("Found", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""
 
-TRANSPORT = 0x8000
-"""From here on faults are none of the device's: the request or its reply got lost."""
-
-UNREACHED = (0x0A, 0x0B)
+UNREACHED = (PATH_UNAVAILABLE, TARGET_SILENT)
 """What a gateway answers that does not reach the device."""
-
-NO_CONNECTION = 0x8002
 
 FORGIVEN = 1
 """Scans in a row that a device may leave unanswered before it is offline."""
 
-FAULTS = {
-    0x01: "exception 01 (Illegal Function)",
-    0x02: "exception 02 (Illegal Data Address)",
-    0x03: "exception 03 (Illegal Data Value)",
-    0x04: "exception 04 (Server Device Failure)",
-    0x05: "exception 05 (Acknowledge)",
-    0x06: "exception 06 (Server Device Busy)",
-    0x08: "exception 08 (Memory Parity Error)",
-    0x0A: "exception 0A (Gateway Path Unavailable)",
-    0x0B: "exception 0B (Gateway Target Device Failed to Respond)",
-    0x8001: "no reply in time",
-    NO_CONNECTION: "no connection",
-    0x8003: "the connection was lost",
-    0x8004: "an invalid reply",
-}
-
-UNWRITTEN = (0x01, 0x02, 0x03, 0x06, 0x0A, NO_CONNECTION)
+UNWRITTEN = (
+    ILLEGAL_FUNCTION,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    BUSY,
+    PATH_UNAVAILABLE,
+    NO_CONNECTION,
+)
 """Faults of a write that never came to be carried out."""
-
-
-def described(fault: int) -> str:
-    """A fault in words."""
-    return FAULTS.get(fault, f"exception {fault:02X}")
 
 
 def is_unwritten(fault: int) -> bool:
@@ -98,8 +89,8 @@ class Health:
         self.error = None
         if faults:
             fault, self.last_error_at = faults[0]
-            self.error = self.last_error = described(fault)
-        cut_short = any(fault >= TRANSPORT for fault, _ in faults)
+            self.error = self.last_error = fault_text(fault)
+        cut_short = not all(is_exception(fault) for fault, _ in faults)
         self.blocks = [*beside(self.blocks, blocks), *blocks] if cut_short else blocks
         return before != (self.state, self.error if self.state == "online" else None)
 
@@ -118,4 +109,4 @@ def beside(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> list[Found
 
 
 def _answered(fault: int) -> bool:
-    return fault < TRANSPORT and fault not in UNREACHED
+    return is_exception(fault) and fault not in UNREACHED

@@ -12,17 +12,18 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import msgspec
 from msgspec import Meta
 
+from holdfast.net.addresses import LAST_PORT
+from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
-from holdfast.types import Area
+from holdfast.types import TRANSPORTS, Area, Transport
 
 FunctionCode = Literal["coil", "discrete", "holding", "input"]
-Transport = Literal["tcp", "tls", "udp", "rtu+tcp"]
 Publish = Literal["scan", "change"]
 State = Literal["connecting", "online", "offline"]
 DataType = Literal["number", "boolean", "string", "array"]
 
 Id = Annotated[str, Meta(min_length=1, max_length=256)]
-Address = Annotated[int, Meta(ge=0, le=65535)]
+Address = Annotated[int, Meta(ge=0, le=LAST_ADDRESS)]
 Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)]
 Ranges = Annotated[list[Range], Meta(max_length=32)]
 Marker = bool | int | float | str
@@ -32,7 +33,7 @@ EXACT = 2.0**53
 
 CHOICES = {
     "functionCode": get_args(FunctionCode),
-    "transport": get_args(Transport),
+    "transport": TRANSPORTS,
     "publish": get_args(Publish),
 }
 
@@ -67,10 +68,10 @@ class TagRequest(_Request):
 class PlanRequest(_Request, rename=None):
     """How the tags of a device are put together into requests."""
 
-    max_gap: Annotated[int, Meta(ge=0, le=65535)] | None = None
+    max_gap: Annotated[int, Meta(ge=0, le=LAST_ADDRESS)] | None = None
     """Holes of up to so many items are read; 10 if left out."""
-    max_registers: Annotated[int, Meta(ge=1, le=125)] | None = None
-    max_bits: Annotated[int, Meta(ge=1, le=2000)] | None = None
+    max_registers: Annotated[int, Meta(ge=1, le=READ_REGISTERS)] | None = None
+    max_bits: Annotated[int, Meta(ge=1, le=READ_BITS)] | None = None
     readable: Ranges | None = None
     """First and last addresses of all areas, or of the one that is named before them: holes are
     read only inside these."""
@@ -85,13 +86,13 @@ class SubscribeRequest(_Request):
     subscriber_id: Id
     tags: list[TagRequest]
     host: Annotated[str, Meta(min_length=1, max_length=253)] | None = None
-    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    port: Annotated[int, Meta(ge=1, le=LAST_PORT)] | None = None
     """502 if left out, 802 with `tls`."""
     transport: Transport | None = None
     """`tcp` if left out."""
     url: Annotated[str, Meta(max_length=512)] | None = None
     """In place of host, port and transport."""
-    unit_id: Annotated[int, Meta(ge=0, le=255)] | None = None
+    unit_id: Annotated[int, Meta(ge=0, le=MAX_UNIT)] | None = None
     """1 if left out."""
     byte_order: str | None = None
     """`ABCD` if left out."""

@@ -13,6 +13,8 @@ from urllib.parse import parse_qsl, urlsplit
 
 from holdfast.client import target as targets
 from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.net.addresses import address_in, unbracketed
+from holdfast.protocol import usual_port
 from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
@@ -116,15 +118,10 @@ def _target(request: SubscribeRequest) -> Target:
     if request.host is None:
         raise Refused("host is missing; a url in its place would do")
     transport = request.transport or "tcp"
-    usual = targets.TLS_PORT if transport == "tls" else targets.PORT
-    port = usual if request.port is None else request.port
-    return NetworkTarget(transport, _unbracketed(request.host), port)
-
-
-def _unbracketed(host: str) -> str:
-    """An IPv6 address without the brackets that it has in URLs; any other host as it is."""
-    inner = host[1:-1]
-    return inner if host == f"[{inner}]" and ":" in inner else host
+    port = usual_port(transport) if request.port is None else request.port
+    is_address = address_in(request.host) is not None
+    host = unbracketed(request.host) if is_address else request.host
+    return NetworkTarget(transport, host, port)
 
 
 def _within(key: str, value: int | None, default: int, least: int, most: int) -> int:

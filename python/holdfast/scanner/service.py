@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import WeakValueDictionary
 
 from holdfast import logs
-from holdfast.scanner import commands, wire
+from holdfast.net.tls import NO_FILES, Tls
+from holdfast.scanner import commands, device_tls, wire
 from holdfast.scanner.broker import Broker, Servers
 from holdfast.scanner.browsing import browsed
-from holdfast.scanner.device_tls import DeviceTls
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint
     from holdfast.client.target import Target
+    from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.polling import PolledBlock
@@ -69,10 +70,10 @@ class Settings:
     servers: Servers = field(default_factory=Servers)
     prefix: str = "modbus"
     """The first part of all subjects, and the id of the module in messages."""
-    allow: tuple[str, ...] = ()
+    allow: tuple[AllowEntry, ...] = ()
     """Networks and serial devices, see `Allowed`."""
     limits: ScannerLimits = field(default_factory=ScannerLimits)
-    device_tls: DeviceTls = field(default_factory=DeviceTls)
+    device_tls: Tls = NO_FILES
     """Whom it trusts among devices, and what it shows them."""
 
 
@@ -97,7 +98,7 @@ class Scanner:
 
     async def run(self) -> None:
         """Serves until `end` is called or asked for. Raises `OSError` for files of the settings."""
-        self._settings.device_tls.check()
+        device_tls.check(self._settings.device_tls)
         self._polling = Polling(self._take)
         running: list[asyncio.Task[object]] = [
             asyncio.create_task(work)
@@ -217,7 +218,7 @@ class Scanner:
         device = self._registry.devices.get(asked.device)
         if device is None:
             address = await self._allowed.address(asked.source.target)
-            return address, self._settings.device_tls.endpoint(address)
+            return address, device_tls.endpoint_of(address, self._settings.device_tls)
         check_address(device, asked)
         return device.address, device.endpoint
 
@@ -319,7 +320,7 @@ class Scanner:
                 return
             try:
                 address = await self._allowed.address(device.source.target, after=device.address)
-                endpoint = self._settings.device_tls.endpoint(address)
+                endpoint = device_tls.endpoint_of(address, self._settings.device_tls)
             except Refused as refused:
                 logs.refused("not_found", kind="name", device=device.id, reason=str(refused))
                 return

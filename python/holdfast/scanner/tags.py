@@ -5,30 +5,25 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
-from holdfast.client.requests import WRITE_LIMITS
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.scanner.errors import Refused
-from holdfast.values import ConversionError, decode, encode
-from holdfast.values.codec import codec_of
+from holdfast.scanner.messages import FunctionCode
+from holdfast.types import AREAS, BIT_AREAS
+from holdfast.values import ConversionError, WrongArea, codec_for, decode, encode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.scanner.messages import DataType, FunctionCode, Marker, TagRequest
+    from holdfast.scanner.messages import DataType, Marker, TagRequest
     from holdfast.types import Area
     from holdfast.values.types import Type
 
-AREAS: dict[FunctionCode, Area] = {
-    "coil": "coils",
-    "discrete": "discrete_inputs",
-    "holding": "holding_registers",
-    "input": "input_registers",
-}
-FUNCTION_CODES: dict[Area, FunctionCode] = {area: code for code, area in AREAS.items()}
-BITS = ("coils", "discrete_inputs")
-WRITABLE = ("coils", "holding_registers")
+AREA_OF_CODE: dict[FunctionCode, Area] = dict(zip(get_args(FunctionCode), AREAS, strict=True))
+CODE_OF_AREA = {area: code for code, area in AREA_OF_CODE.items()}
+"""What messages call the areas."""
 
 FLOATS = ("float16", "float32", "float64")
 KINDS: dict[str, DataType] = {
@@ -78,7 +73,7 @@ class Tag:
     @property
     def of_bits(self) -> bool:
         """Whether it is in an area of bits."""
-        return self.area in BITS
+        return self.area in BIT_AREAS
 
 
 class Places:
@@ -99,7 +94,7 @@ class Places:
 
 def tag(request: TagRequest, order: str, where: str) -> Tag:
     """The tag of a request in which `order` is that of the device. Raises `Refused`."""
-    area = AREAS[request.function_code]
+    area = AREA_OF_CODE[request.function_code]
     asked = name = request.datatype
     if name == "boolean" or name.startswith("boolean["):
         name = "bool" + name.removeprefix("boolean")
@@ -108,19 +103,21 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
         type = parsed(name)
         if type.base == "bool":
             order = "ABCD"
-        codec_of(name, order, request.encoding)
-    except ConversionError as error:
-        raise Refused(f"{where}: {error}") from None
-    if area in BITS and type.base != "bool":
+        codec_for(area, name, order, request.encoding)
+    except WrongArea:
         raise Refused(
             f"{where}: datatype is {name}, functionCode {request.function_code} reads boolean"
-        )
-    if request.writable and area not in WRITABLE:
+        ) from None
+    except ConversionError as error:
+        raise Refused(f"{where}: {error}") from None
+    if request.writable and area not in WRITE_LIMITS:
         raise Refused(f"{where}: what functionCode {request.function_code} reads can't be written")
     if request.writable:
         _check_writable(asked, type, area, where)
-    if request.address + type.registers > 65536:
-        raise Refused(f"{where}: {name} from address {request.address} on, the last is 65535")
+    if request.address + type.registers > ADDRESSES:
+        raise Refused(
+            f"{where}: {name} from address {request.address} on, the last is {LAST_ADDRESS}"
+        )
     null = frozenset(
         _marker(marker, type, request.encoding, where) for marker in request.null or ()
     )
@@ -133,7 +130,7 @@ def _check_writable(name: str, type: Type, area: Area, where: str) -> None:
         raise Refused(f"{where}: {name} can't be written, only one bit can")
     most = WRITE_LIMITS[area]
     if type.registers > most:
-        kind = "coils" if area in BITS else "registers"
+        kind = "coils" if area in BIT_AREAS else "registers"
         raise Refused(
             f"{where}: {name} takes {type.registers} {kind}, one request writes at most {most}"
         )
