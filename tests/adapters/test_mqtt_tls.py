@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.adapters.mqtt import backoff, dialing
+from holdfast.net.tls import NO_FILES, broker_context
 from support import wire
 from support.brokers import Rig, command, settings, text
 from support.certificates import Certificates
@@ -166,7 +167,7 @@ def test_a_file_that_is_missing_is_a_failure_until_it_is_there(
 
 
 def test_nothing_below_tls_1_2_and_nobody_unknown() -> None:
-    context = dialing.tls_context(None)
+    context = broker_context(NO_FILES)
 
     assert context.minimum_version == ssl.TLSVersion.TLSv1_2
     assert context.verify_mode == ssl.CERT_REQUIRED

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
 import math
 import socket
@@ -27,12 +26,13 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from holdfast import logs
+from holdfast.net.addresses import holds, joined, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
-    from ipaddress import IPv4Network, IPv6Network
 
     from holdfast.adapters import Stop
+    from holdfast.net.addresses import Network
 
     Scope: TypeAlias = MutableMapping[str, Any]
     Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -80,7 +80,7 @@ def listen(host: str, port: int) -> socket.socket:
         else:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if family == socket.AF_INET6:
-            any_address = ipaddress.IPv6Address(host).is_unspecified
+            any_address = parse_address(host).is_unspecified
             listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, not any_address)
         listener.bind(address)
         listener.listen(BACKLOG)
@@ -92,13 +92,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 def address_of(host: str, port: int) -> str:
     """`10.0.0.9:51200` or `[fd00::9]:51200`; an IPv4 address in IPv6 is that IPv4 address."""
-    address = _unmapped(host)
-    return f"[{address}]:{port}" if address.version == 6 else f"{address}:{port}"
-
-
-def _unmapped(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    address = ipaddress.ip_address(host)
-    return getattr(address, "ipv4_mapped", None) or address
+    return joined(str(parse_address(host)), port)
 
 
 def rejection(reason: str, detail: str, status: str = "rejected") -> tuple[Headers, bytes]:
@@ -145,7 +139,7 @@ class Host:
         app: App,
         listener: socket.socket,
         *,
-        sources: Iterable[IPv4Network | IPv6Network],
+        sources: Iterable[Network],
         max_connections: int,
         request_timeout: float,
         leaving: bool = False,
@@ -173,8 +167,7 @@ class Host:
 
     def admits(self, host: str) -> bool:
         """Whether a peer with this address may connect."""
-        address = _unmapped(host)
-        return any(address in network for network in self.sources)
+        return holds(self.sources, parse_address(host))
 
     def note(self, event: str, peer: str) -> None:
         """Counts and logs what happened to a connection. Called in the thread of `run`."""

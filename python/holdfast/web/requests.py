@@ -11,10 +11,11 @@ import contextlib
 import functools
 import hashlib
 import hmac
-import ipaddress
 import json
 import re
 from typing import TYPE_CHECKING
+
+from holdfast.net.addresses import address_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -187,10 +188,4 @@ def _too_large(most: int) -> BadRequest:
 @functools.lru_cache(maxsize=64)
 def _is_direct(host: bytes) -> bool:
     name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
-    if name in ("", "localhost"):
-        return True
-    try:
-        ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
-    except ValueError:
-        return False
-    return True
+    return name in ("", "localhost") or address_in(name) is not None

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 from holdfast import logs
 from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.backoff import Backoff
-from holdfast.adapters.mqtt.dialing import dial, tls_context
+from holdfast.adapters.mqtt.dialing import dial
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
 from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
 from holdfast.adapters.mqtt.waiting import Ended, Waiter
+from holdfast.net.addresses import joined
+from holdfast.net.tls import NO_FILES, broker_context
 
 if TYPE_CHECKING:
     import socket
@@ -43,9 +45,8 @@ class Mqtt:
     """Takes messages from a broker, and hands them to the memory access."""
 
     def __init__(self, settings: MqttConfig, memory_access: MemoryAccess) -> None:
-        host = f"[{settings.host}]" if ":" in settings.host else settings.host
         self._settings = settings
-        self._broker = f"{host}:{settings.port}"
+        self._broker = joined(settings.host, settings.port)
         filters = Filters(settings.subscriptions)
         self._inbox = Inbox(memory_access, filters, self._broker)
         self._answers = Answers(filters)
@@ -108,7 +109,8 @@ class Mqtt:
 
     def _link(self, waiter: Waiter) -> BrokerConnection:
         settings = self._settings
-        context = tls_context(settings.tls) if settings.secure else None
+        tls = NO_FILES if settings.tls is None else settings.tls.files
+        context = broker_context(tls) if settings.secure else None
 
         def open_socket() -> socket.socket:
             return dial(settings.host, settings.port, context, waiter)

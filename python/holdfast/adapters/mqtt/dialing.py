@@ -6,33 +6,24 @@ import errno
 import os
 import socket
 import ssl
-import threading
 import time
+from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any
+
+from holdfast.net.resolver import Resolver
 
 if TYPE_CHECKING:
     from holdfast.adapters.mqtt.waiting import Waiter
-    from holdfast.config import BrokerTlsConfig
+    from holdfast.net.resolver import SocketAddress
 
 CONNECT_TIMEOUT = 10.0
 """Seconds that one address of the broker has to accept the connection, and TLS to be agreed on."""
 
+CHECK_INTERVAL = 0.1
+"""Seconds between looks whether it is to stop, while a name is looked up."""
+
+_RESOLVER = Resolver()
 _UNDER_WAY = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
-
-
-def tls_context(files: BrokerTlsConfig | None) -> ssl.SSLContext:
-    """Checks certificate and host name; the files are read now, so a renewed one is taken.
-
-    Raises `OSError` for a file that can't be used.
-    """
-    context = ssl.create_default_context(
-        cafile=None if files is None or files.ca_file is None else str(files.ca_file)
-    )
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    if files is not None and files.cert_file is not None:
-        # A password is given lest OpenSSL ask for one on the terminal.
-        context.load_cert_chain(files.cert_file, files.key_file, password="")
-    return context
 
 
 def dial(host: str, port: int, context: ssl.SSLContext | None, waiter: Waiter) -> socket.socket:
@@ -49,29 +40,14 @@ def dial(host: str, port: int, context: ssl.SSLContext | None, waiter: Waiter) -
     raise failure
 
 
-def _addresses(host: str, port: int, waiter: Waiter) -> list[tuple[int, Any]]:
-    """Asks in a thread of its own, because nothing can interrupt the system's resolver."""
-    found: list[tuple[int, Any]] = []
-    failures: list[OSError] = []
-    done = threading.Event()
-
-    def ask() -> None:
-        try:
-            for family, _, _, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-                found.append((family, address))
-        except OSError as error:
-            failures.append(error)
-        except UnicodeError:
-            failures.append(OSError(f"{host} can't be a host name"))
-        finally:
-            done.set()
-
-    threading.Thread(target=ask, name="holdfast-mqtt-resolver", daemon=True).start()
-    while not done.wait(0.1):
-        waiter.check()
-    if failures:
-        raise failures[0]
-    return found
+def _addresses(host: str, port: int, waiter: Waiter) -> list[SocketAddress]:
+    asked = _RESOLVER.look_up(host, port)
+    try:
+        while not wait((asked,), CHECK_INTERVAL).done:
+            waiter.check()
+    finally:
+        asked.cancel()
+    return asked.result()
 
 
 def _open(

@@ -6,7 +6,6 @@ refused before it came to the memory access.
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qsl
 
@@ -14,16 +13,20 @@ import msgspec
 
 from holdfast import __version__
 from holdfast.adapters.rest import openapi
+from holdfast.adapters.rest.refusals import REFUSALS
+from holdfast.adapters.rest.routes import INGEST, READ, ROUTES
 from holdfast.ingest import Grant, Refused
 from holdfast.types import AREAS
 from holdfast.web import openapi_page as page
 from holdfast.web.host import SAFE, address_of, headers_of, respond
+from holdfast.web.refusals import UNREAD, headers_with
 from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Sequence
 
+    from holdfast.adapters.rest.routes import Parameter
     from holdfast.appliance.diagnostics import Diagnostics
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
@@ -32,19 +35,10 @@ if TYPE_CHECKING:
     Answer: TypeAlias = tuple[bytes, bytes]
     Handler: TypeAlias = Callable[[Request], Answer | Awaitable[Answer]]
 
-STATUSES = {
-    reason: int(status) for status, reasons in openapi.REASONS.items() for reason in reasons
-}
-"""The status of an answer, by the reason of the refusal."""
-
 JSON = b"application/json"
-INGEST = "/api/v1/ingest"
-PARAMETERS = ("memory", "area", "address", "count")
+MAX_PARAMETERS = 8
 ANYONE = "anyone"
 """Who asks, where there are no tokens."""
-
-LINGER_TIMEOUT = 2.0
-"""Seconds that a client has to end a body that is too large, so that it gets the answer."""
 
 
 class Declined(Refused):
@@ -84,16 +78,17 @@ class App:
         document = openapi.document(__version__, self._max_body, secured=self._anyone is None)
         self._document = msgspec.json.encode(document)
         self._page = page.render(document, f"http://{address_of(host, port)}")
-        self.routes: dict[str, tuple[str, Handler]] = {
-            INGEST: ("POST", self._ingest),
-            "/api/v1/memory/read": ("GET", self._read),
-            "/api/v1/health": ("GET", self._health),
-            "/api/v1/diagnostics/memory": ("GET", self._memories),
-            "/api/v1/diagnostics/stats": ("GET", self._stats),
-            "/api/v1/diagnostics/mqtt": ("GET", self._mqtt),
-            "/openapi.json": ("GET", self._openapi),
-            "/docs": ("GET", self._docs),
+        handlers: dict[str, Handler] = {
+            "ingest": self._ingest,
+            "read": self._read,
+            "health": self._health,
+            "memories": self._memories,
+            "stats": self._stats,
+            "mqtt": self._mqtt,
+            "openapi": self._openapi,
+            "docs": self._docs,
         }
+        self.routes = {each.path: (each.method, handlers[each.name]) for each in ROUTES}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answers one request."""
@@ -128,15 +123,14 @@ class App:
     async def _refuse(self, request: Request, refused: Refused, send: Send) -> None:
         """Counts what the door does not know of, and answers."""
         if isinstance(refused, Declined):
-            write = request.scope["path"] == INGEST and request.scope["method"] == "POST"
+            asked = request.scope["path"], request.scope["method"]
+            write = asked == (INGEST.path, INGEST.method)
             note = self._memory_access.refuse if write else self._memory_access.note
             note(refused, request.who, request.peer)
-        status = STATUSES[refused.reason]
+        status = REFUSALS.status(refused.reason)
         body = msgspec.json.encode(refused.answer())
-        headers = headers_of(JSON, body) + request.more_headers
-        if status == 401:
-            headers.append((b"www-authenticate", b"Bearer"))
-        if status in (408, 413) or request.header(b"expect") is not None:
+        headers = headers_of(JSON, body) + request.more_headers + headers_with(status)
+        if status in UNREAD or request.header(b"expect") is not None:
             await respond_to_its_end(request, send, status, headers, body)
         else:
             await respond(send, status, headers, body)
@@ -151,10 +145,8 @@ class App:
 
     def _read(self, request: Request) -> Answer:
         grant = self._authorize(request)
-        memory, area, address, count = _parameters(request.scope["query_string"])
-        start = _number("address", address, 0, 65535)
-        amount = _number("count", count, 1, 65536)
-        values = self._memory_access.read(memory, area, start, amount, grant, request.peer)
+        given = _given(request.scope["query_string"], READ.parameters)
+        values = self._memory_access.read(**given, grant=grant, peer=request.peer)
         return JSON, msgspec.json.encode({"values": values})
 
     def _health(self, _: Request) -> Answer:
@@ -200,31 +192,28 @@ class App:
         return grant
 
 
-def _parameters(query: bytes) -> list[str]:
-    """The four parameters of a read, in their order. Raises `Declined`."""
-    names = ", ".join(PARAMETERS)
+def _given(query: bytes, parameters: Sequence[Parameter]) -> dict[str, Any]:
+    """The parameters of a query by their names, all of them. Raises `BadRequest`."""
+    known = {each.name: each for each in parameters}
+    names = ", ".join(known)
     try:
-        pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True, max_num_fields=8)
+        pairs = parse_qsl(
+            query.decode("latin-1"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS
+        )
     except ValueError:
-        raise _malformed(f"there are more than 8 parameters, allowed are {names}") from None
+        more = f"there are more than {MAX_PARAMETERS} parameters"
+        raise _malformed(f"{more}, allowed are {names}") from None
     given: dict[str, str] = {}
     for name, value in pairs:
-        if name not in PARAMETERS:
+        if name not in known:
             raise _malformed(f"{shown(name)} is not a parameter, allowed are {names}")
         if name in given:
             raise _malformed(f"{name} is given more than once, allowed is once")
         given[name] = value
-    for name in PARAMETERS:
+    for name in known:
         if name not in given:
             raise _malformed(f"{name} is missing, needed are {names}")
-    return [given[name] for name in PARAMETERS]
-
-
-def _number(name: str, text: str, least: int, most: int) -> int:
-    """A parameter as a number. Raises `Declined`."""
-    if re.fullmatch("[0-9]{1,10}", text) and least <= int(text) <= most:
-        return int(text)
-    raise _malformed(f"{name} is {shown(text)}, allowed is a number from {least} to {most}")
+    return {name: each.read(given[name]) for name, each in known.items()}
 
 
 def _malformed(detail: str) -> Declined:

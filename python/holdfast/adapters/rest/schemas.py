@@ -1,0 +1,130 @@
+"""The JSON of REST: what commands and answers are, as schemas with names."""
+
+from __future__ import annotations
+
+from holdfast.adapters.rest.refusals import REFUSALS
+from holdfast.protocol import LAST_ADDRESS, MAX_WORD
+from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS
+from holdfast.web.openapi import Schema, integer, object_of, ref
+
+COUNTER: Schema = {"type": "integer", "minimum": 0}
+AT_LEAST_ONE: Schema = {"type": "integer", "minimum": 1}
+TEXT: Schema = {"type": "string"}
+TEXT_OR_NULL: Schema = {"type": ["string", "null"]}
+REGISTER = integer(0, MAX_WORD)
+ADDRESS = integer(0, LAST_ADDRESS)
+
+
+def _values(items: Schema) -> Schema:
+    return {"type": "array", "minItems": 1, "items": items}
+
+
+def _command(areas: tuple[str, ...], key: str, item: Schema) -> Schema:
+    return object_of(
+        {"memory": TEXT, "area": {"enum": list(areas)}, "address": ADDRESS, key: _values(item)}
+    )
+
+
+COMMANDS: dict[str, Schema] = {
+    "Area": {"type": "string", "enum": list(AREAS)},
+    "Command": {"oneOf": [ref("RegisterCommand"), ref("BitCommand"), ref("BoolsCommand")]},
+    "Batch": _values(ref("Command")),
+    "RegisterCommand": _command(REGISTER_AREAS, "values", REGISTER),
+    "BitCommand": _command(BIT_AREAS, "values", ref("Bit")),
+    "BoolsCommand": _command(BIT_AREAS, "bools", ref("Bit")),
+    "Bit": {"enum": [0, 1, False, True]},
+}
+
+ANSWERS: dict[str, Schema] = {
+    "Accepted": object_of(
+        {"status": {"const": "accepted"}, "memory": TEXT, "written": AT_LEAST_ONE}
+    ),
+    "BatchAccepted": object_of(
+        {"status": {"const": "accepted"}, "commands": AT_LEAST_ONE, "written": AT_LEAST_ONE}
+    ),
+    "Values": object_of({"values": _values(REGISTER)}),
+    "Health": object_of({"status": {"const": "ok"}}),
+    "Refusal": {
+        "type": "object",
+        "required": ["status", "reason", "detail"],
+        "properties": {
+            "status": {"const": "rejected"},
+            "reason": {"enum": list(REFUSALS.reasons)},
+            "command": COUNTER | {"description": "The place of the command in the batch"},
+            "index": COUNTER | {"description": "The place of the value in the command"},
+            "detail": TEXT | {"description": "A sentence for people"},
+        },
+        "additionalProperties": False,
+    },
+}
+
+DIAGNOSTICS: dict[str, Schema] = {
+    "Memories": object_of({"memories": {"type": "object", "additionalProperties": ref("Memory")}}),
+    "Memory": object_of(
+        {
+            "areas": {
+                "type": "object",
+                "propertyNames": ref("Area"),
+                "additionalProperties": object_of({"start": COUNTER, "size": AT_LEAST_ONE}),
+            },
+            "sealed": {
+                "type": "boolean",
+                "description": "Whether Modbus clients are refused for now",
+            },
+            "opened": COUNTER | {"description": "How often the seal opened"},
+            "closed": COUNTER | {"description": "How often it closed again"},
+        }
+    ),
+    "Stats": object_of(
+        {
+            "uptime": {"type": "number", "description": "Seconds"},
+            "listeners": {
+                "type": "object",
+                "description": "By the name of the listener: requests by function code, "
+                "exceptions by code, connections, frames",
+                "additionalProperties": {"type": "object"},
+            },
+            "devices": {
+                "type": "object",
+                "description": "By the name of the device: health, seconds since the last "
+                "valid answer, requests by their outcomes, polls, reads, packets forwarded",
+                "additionalProperties": {
+                    "type": "object",
+                    "required": ["health"],
+                    "properties": {
+                        "health": {"enum": ["unknown", "ok", "error", "stale", "disabled"]},
+                    },
+                },
+            },
+            "adapters": {
+                "type": "object",
+                "description": "By the name of the adapter: messages accepted, values written, "
+                "reads, refusals by reason, and what it says of itself",
+                "additionalProperties": {
+                    "type": "object",
+                    "required": ["state", "restarts", "last_error"],
+                    "properties": {
+                        "state": {"enum": ["running", "failed", "stopped"]},
+                        "restarts": COUNTER,
+                        "last_error": TEXT_OR_NULL,
+                    },
+                },
+            },
+            "events_lost": COUNTER,
+            "audit": {
+                "type": ["object", "null"],
+                "description": "Lines written, and lines that failed",
+            },
+        }
+    ),
+    "Mqtt": {
+        "type": "object",
+        "required": ["connected", "broker", "topics", "last_error"],
+        "properties": {
+            "connected": {"type": "boolean"},
+            "broker": TEXT_OR_NULL,
+            "topics": {"type": "array"},
+            "last_error": TEXT_OR_NULL,
+        },
+    },
+}
