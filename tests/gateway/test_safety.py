@@ -23,7 +23,7 @@ from holdfast.cli import main
 from holdfast.cli.gateway import _greeting
 from holdfast.client.target import NetworkTarget
 from holdfast.config.egress import parse_allowed
-from holdfast.gateway import Settings, egress, tokens
+from holdfast.gateway import Settings, tokens
 from support import cli, gateways, web, wire
 from support.fake_device import FakeDevice, registers
 from support.gateways import PLC, Dialed, Names
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from holdfast.client.target import Transport
+    from holdfast.types import Transport
 
 SECRET = "correct-horse-battery-staple"
 TOKENS = (("edge", hashlib.sha256(SECRET.encode()).digest()),)
@@ -93,49 +93,6 @@ def test_an_entry_is_a_network_and_ports(text: str, means: str) -> None:
 def test_what_is_no_entry_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="found"):
         parse_allowed(text)
-
-
-@pytest.mark.parametrize(
-    ("address", "port", "allowed"),
-    [
-        ("10.1.2.3", 502, True),
-        ("10.1.2.3", 503, False),
-        ("11.0.0.1", 502, False),
-        ("::ffff:10.1.2.3", 502, True),
-        ("::ffff:11.0.0.1", 502, False),
-        ("192.168.1.7", 5029, True),
-        ("192.168.1.7", 5030, False),
-        ("fd12::1", 502, True),
-        ("fe80::1", 502, False),
-        ("::1", 502, False),
-        ("64:ff9b::a01:203", 502, False),
-    ],
-)
-def test_the_list_says_which_addresses(address: str, port: int, allowed: bool) -> None:
-    entries = ["10.0.0.0/8", "192.168.1.0/24:5020-5029", "[fd00::]/8"]
-    assert egress.Egress(map(parse_allowed, entries)).allows(address, port, "tcp") is allowed
-
-
-@pytest.mark.parametrize(
-    ("entry", "port", "transports"),
-    [
-        ("10.0.0.0/8", 502, {"tcp", "udp", "rtu+tcp", "tls"}),
-        ("10.0.0.0/8", 802, {"tls"}),
-        ("10.0.0.0/8:502", 802, set()),
-        ("10.0.0.0/8:802", 802, {"tcp", "udp", "rtu+tcp", "tls"}),
-        ("10.0.0.0/8:802", 502, set()),
-    ],
-)
-def test_without_ports_only_tls_may_go_to_802(entry: str, port: int, transports: set[str]) -> None:
-    listed = egress.Egress([parse_allowed(entry)])
-    every: tuple[Transport, ...] = ("tcp", "udp", "rtu+tcp", "tls")
-    assert {each for each in every if listed.allows("10.1.2.3", port, each)} == transports
-
-
-@pytest.mark.parametrize("address", ["0.0.0.0", "::", "224.0.0.1", "ff02::1", "::ffff:0.0.0.0"])
-def test_no_list_lets_one_to_everybody_or_nobody(address: str) -> None:
-    everything = egress.Egress(map(parse_allowed, ["0.0.0.0/0:*", "[::]/0:*"]))
-    assert not everything.allows(address, 502, "tcp")
 
 
 @pytest.mark.parametrize(

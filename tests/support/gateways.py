@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.adapters import Stop
 from holdfast.config.egress import parse_allowed
-from holdfast.gateway import Gateway, GatewayLimits, Settings, egress
+from holdfast.gateway import Gateway, GatewayLimits, Settings
 from holdfast.gateway.pool import dial
+from holdfast.net.resolver import NoSuchName
 from holdfast.web.host import listen
 from support import web, wire
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from holdfast.client import Client
     from holdfast.client.target import NetworkTarget
-    from holdfast.gateway.egress import Resolve
+    from holdfast.net.resolver import Resolve
 
 API = "/api/modbus"
 PLC = "plc.factory.local"
@@ -51,7 +52,7 @@ class Names:
         self.asked.append(host)
         answers = self._names.get(host)
         if answers is None:
-            raise egress.NoSuchName(f"can't resolve {host}: Name or service not known")
+            raise NoSuchName(host, "Name or service not known")
         return answers.pop(0) if len(answers) > 1 else answers[0]
 
 

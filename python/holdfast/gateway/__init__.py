@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.config.egress import Allowed
 from holdfast.gateway.app import App, rejection
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import GatewayLimits, Settings
+from holdfast.net.allow_list import AllowedNetwork
 from holdfast.web.host import Host, address_of
 
 if TYPE_CHECKING:
     import socket
 
     from holdfast.adapters import Stop
-    from holdfast.gateway.egress import Resolve
     from holdfast.gateway.pool import Dial
+    from holdfast.net.resolver import Resolve
 
-__all__ = ["Allowed", "Gateway", "GatewayLimits", "Settings"]
+__all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 
 
 class Gateway:

@@ -22,17 +22,22 @@ from holdfast.gateway.egress import Egress
 from holdfast.gateway.events import Stream
 from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
+from holdfast.gateway.refusals import FAILURE, REFUSALS
+from holdfast.net.allow_list import AllowList
+from holdfast.net.resolver import Resolver
 from holdfast.web import openapi_page as page
 from holdfast.web.host import SAFE, headers_of, respond
+from holdfast.web.openapi import DOCUMENT, PAGE
+from holdfast.web.refusals import UNREAD, headers_with
 from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterator
 
-    from holdfast.gateway.egress import Resolve
     from holdfast.gateway.endpoint import Operation
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
+    from holdfast.net.resolver import Resolve
     from holdfast.web.host import Headers, Receive, Scope, Send
 
     Handler: TypeAlias = Callable[[Request, Send], Awaitable[None]]
@@ -43,23 +48,6 @@ JSON = b"application/json"
 REASON = b"holdfast-reason"
 FORM = b"application/x-www-form-urlencoded"
 """What curl calls a body when it is not told: taken for JSON, as if it said so."""
-
-STATUSES = {
-    "malformed": 400,
-    "unauthorized": 401,
-    "refused_target": 403,
-    "writes_off": 403,
-    "foreign_page": 403,
-    "not_found": 404,
-    "method_not_allowed": 405,
-    "timeout": 408,
-    "too_large": 413,
-    "not_json": 415,
-    "busy": 503,
-    "stopping": 503,
-}
-"""The status of a refusal by its reason; everything else is 500."""
-
 
 STOPPING = "the gateway stops; a write that was under way may have been carried out"
 WRITES_ON = "--writes, or access: read-write in the configuration, lets this gateway write"
@@ -78,7 +66,8 @@ class App:
     ) -> None:
         self._settings = settings
         limits = self._limits = settings.limits
-        self._egress = Egress(settings.allow, resolve)
+        # A request has no more time than this in any case.
+        self._egress = Egress(AllowList(settings.allow), resolve or Resolver(limits.timeout))
         self._pool = Pool(
             most=limits.devices,
             in_flight=limits.in_flight,
@@ -102,8 +91,8 @@ class App:
             surveying.PATH: ("POST", self._map),
             watching.PATH: ("GET", self._watch),
             openapi.STATUS: ("GET", self._status),
-            "/openapi.json": ("GET", self._openapi),
-            "/docs": ("GET", self._docs),
+            DOCUMENT: ("GET", self._openapi),
+            PAGE: ("GET", self._docs),
             **dict.fromkeys(assets.FILES, ("GET", self._asset)),
         }
 
@@ -139,14 +128,16 @@ class App:
         except Failed as failed:
             self._failed += 1
             body = _error(failed.detail)
-            await self._reply(request, send, body, status=500, reason=failed.reason)
+            status = FAILURE.status
+            await self._reply(request, send, body, status=status, reason=failed.reason)
         except ClientDisconnected:
             pass
         except Exception:
             logs.problem("request_failed", listener="gateway", peer=request.peer)
             with contextlib.suppress(RuntimeError):  # The answer has begun: it ends unfinished.
                 body = _error("internal error, see the log")
-                await self._reply(request, send, body, status=500, reason="internal_error")
+                status = FAILURE.status
+                await self._reply(request, send, body, status=status, reason="internal_error")
 
     async def _answer(self, request: Request, send: Send) -> None:
         hosts = len(request.headers(b"host"))
@@ -169,7 +160,7 @@ class App:
         await respond(send, 204, [*SAFE, *request.more_headers])
 
     async def _refuse(self, request: Request, send: Send, unfit: BadRequest) -> None:
-        status = STATUSES[unfit.reason]
+        status = REFUSALS.status(unfit.reason)
         self._refused[unfit.reason] = self._refused.get(unfit.reason, 0) + 1
         logs.refused(
             "gateway_refused",
@@ -181,12 +172,9 @@ class App:
             # It may repeat values that were to be written.
             detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
-        if status == 401:
-            request.more_headers.append((b"www-authenticate", b"Bearer"))
-        if status == 503:
-            request.more_headers.append((b"retry-after", b"1"))
+        request.more_headers += headers_with(status)
         body = _error(unfit.detail)
-        if status in (408, 413):
+        if status in UNREAD:
             await respond_to_its_end(request, send, status, *rejection(unfit.reason, unfit.detail))
             return
         await self._reply(request, send, body, status=status, reason=unfit.reason)

@@ -7,7 +7,6 @@ import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast import logs
-from holdfast.client.target import PORT, TLS_PORT
 from holdfast.errors import (
     ConnectFailed,
     ConnectionLost,
@@ -17,18 +16,20 @@ from holdfast.errors import (
     TlsFailed,
 )
 from holdfast.gateway.broadcasting import broadcast
-from holdfast.gateway.egress import NoSuchName, Refused
-from holdfast.gateway.fields import malformed
+from holdfast.gateway.egress import Refused
+from holdfast.gateway.fields import listed, malformed
 from holdfast.gateway.pool import Full, Unusable
+from holdfast.net.resolver import NoSuchName
+from holdfast.protocol import BROADCAST_CODES, usual_port
 from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from holdfast.client import Client
-    from holdfast.client.target import Transport
     from holdfast.gateway.egress import Egress
     from holdfast.gateway.pool import Pool
+    from holdfast.types import Transport
 
 Result = TypeVar("Result")
 
@@ -38,7 +39,7 @@ TOO_MANY_BEFORE = (
 )
 NO_BROADCAST = (
     "unitId 0 is the broadcast of a serial line, which nobody answers; with transport rtu+tcp "
-    "allowed are writes by functions 5, 6, 15, 16 and 22"
+    f"allowed are writes by functions {listed(BROADCAST_CODES)}"
 )
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which nobody answers"
 
@@ -60,11 +61,10 @@ class RequestedDevice:
     ) -> None:
         """`broadcast` says whether the request may go to all units of a serial line."""
         self.transport: Transport = given["transport"]
-        secure = self.transport == "tls"
-        if given["serverName"] is not None and not secure:
+        if given["serverName"] is not None and self.transport != "tls":
             raise malformed("serverName goes with transport tls")
         self.host: str = given["host"]
-        self.port: int = given["port"] or (TLS_PORT if secure else PORT)
+        self.port: int = given["port"] or usual_port(self.transport)
         self.unit: int = given["unitId"]
         self.is_broadcast = self.unit == 0 and self.transport == "rtu+tcp"
         if self.is_broadcast and not broadcast:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.gateway.device import exception_text
-from holdfast.gateway.fields import HOST, PORT, SERVER_NAME, TRANSPORT, UNIT, Field, Schema, integer
+from holdfast.gateway.fields import (
+    HOST,
+    PORT,
+    REGISTER,
+    SERVER_NAME,
+    TRANSPORT,
+    UNIT,
+    Field,
+    Schema,
+)
+from holdfast.web.openapi import array_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -32,6 +42,16 @@ def exception_answer(given: Given, device: RequestedDevice, error: ModbusExcepti
     return {"success": False, "error": exception_text(error), **device.told, **about}
 
 
+def always(_: Given) -> bool:
+    """Every request changes something."""
+    return True
+
+
+def never(_: Given) -> bool:
+    """No request changes anything."""
+    return False
+
+
 @dataclass(frozen=True)
 class Operation:
     """One thing that can be asked of a device."""
@@ -48,7 +68,7 @@ class Operation:
     answer: dict[str, Any]
     """The answer to the first example, but for what all answers have."""
     description: str = ""
-    writes: Callable[[Given], bool] = field(default=lambda _: False)
+    writes: Callable[[Given], bool] = never
     """Whether a request changes something on the device."""
     broadcast: bool = False
     """Whether it may go to all units of a serial line; the answer has a `note` then."""
@@ -58,14 +78,4 @@ class Operation:
     on_exception: Callable[[Given, RequestedDevice, ModbusException], Answer] = exception_answer
 
 
-def always(_: Given) -> bool:
-    """Every request changes something."""
-    return True
-
-
-def array_of(items: Schema) -> Schema:
-    """The schema of a list in an answer."""
-    return {"type": "array", "items": items}
-
-
-REGISTERS = array_of(integer(0, 65535))
+REGISTERS = array_of(REGISTER)

@@ -9,21 +9,22 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass, replace
-from ipaddress import ip_address
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 import msgspec
 
-from holdfast.types import AREAS
+from holdfast.net.addresses import LAST_PORT, address_in
+from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
+from holdfast.protocol import PORT as STANDARD_PORT
+from holdfast.types import AREAS, TRANSPORTS
+from holdfast.web.openapi import Schema as Schema
+from holdfast.web.openapi import integer as integer
 from holdfast.web.requests import BadRequest, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-Schema: TypeAlias = dict[str, Any]
-
-LAST = 65535
 REQUIRED: Any = object()
 """In place of a default: there is none."""
 
@@ -75,17 +76,14 @@ class Field:
         return {**self.schema, **optional, "description": self.text}
 
 
-def integer(least: int, most: int) -> Schema:
-    """The schema of an integer."""
-    return {"type": "integer", "minimum": least, "maximum": most}
-
-
 def array(items: Schema, most: int) -> Schema:
     """The schema of a list that is not empty."""
     return {"type": "array", "minItems": 1, "maxItems": most, "items": items}
 
 
-REGISTER = integer(0, LAST)
+REGISTER = integer(0, MAX_WORD)
+ADDRESS_SCHEMA = integer(0, LAST_ADDRESS)
+UNIT_SCHEMA = integer(0, MAX_UNIT)
 BIT: Schema = {"enum": [False, True, 0, 1]}
 TEXT: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
 ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
@@ -93,12 +91,10 @@ ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
 
 def is_host(text: str) -> bool:
     """Whether it is an IP address, or may be a name: what ends in a number is none."""
-    try:
-        ip_address(text.removeprefix("[").removesuffix("]"))
-    except ValueError:
-        last = text.removesuffix(".").rpartition(".")[2]
-        return ":" not in text and re.fullmatch("[0-9]*|0[xX][0-9a-fA-F]*", last) is None
-    return True
+    if address_in(text) is not None:
+        return True
+    last = text.removesuffix(".").rpartition(".")[2]
+    return ":" not in text and re.fullmatch("[0-9]*|0[xX][0-9a-fA-F]*", last) is None
 
 
 NAME_OR_ADDRESS = "a name or an IP address; the port is a field of its own"
@@ -110,11 +106,13 @@ HOST = Field(
     allowed=NAME_OR_ADDRESS,
     fits=is_host,
 )
-PORT = Field("port", integer(1, LAST), "Port; 502 if left out, 802 with `tls`", None)
-UNIT = Field("unitId", integer(0, 255), "Unit id (slave address)", 1)
+PORT = Field(
+    "port", integer(1, LAST_PORT), f"Port; {STANDARD_PORT} if left out, {TLS_PORT} with `tls`", None
+)
+UNIT = Field("unitId", UNIT_SCHEMA, "Unit id (slave address)", 1)
 TRANSPORT = Field(
     "transport",
-    {"type": "string", "enum": ["tcp", "udp", "rtu+tcp", "tls"]},
+    {"type": "string", "enum": list(TRANSPORTS)},
     "How to talk to it; `tls` is Modbus TCP over TLS",
     "tcp",
 )
@@ -126,7 +124,7 @@ SERVER_NAME = Field(
     allowed="a name or an IP address",
     fits=is_host,
 )
-ADDRESS = Field("address", REGISTER, "The first address, from 0")
+ADDRESS = Field("address", ADDRESS_SCHEMA, "The first address, from 0")
 DATATYPE = Field(
     "datatype",
     TEXT,
@@ -147,7 +145,7 @@ AREA_LIST = Field(
     {
         "type": "array",
         "minItems": 1,
-        "maxItems": 4,
+        "maxItems": len(AREAS),
         "uniqueItems": True,
         "items": {"type": "string", "enum": list(AREAS)},
     },
@@ -213,7 +211,7 @@ def _filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]
     missing = [field.name for field in fields if field.required]
     missing = [name for name in missing if name not in given]
     if missing:
-        raise malformed(f"Missing required parameter{'s'[: len(missing) > 1]}: {_and(missing)}")
+        raise malformed(f"Missing required parameter{'s'[: len(missing) > 1]}: {listed(missing)}")
     names = [field.name for field in fields]
     for name in given:
         if name not in names:
@@ -275,5 +273,7 @@ def _words(allowed: Sequence[Any]) -> str:
     return ", ".join(each if isinstance(each, str) else told(each) for each in allowed)
 
 
-def _and(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
+def listed(entries: Iterable[object]) -> str:
+    """`5, 6 and 15`."""
+    *most, last = map(str, entries)
+    return f"{', '.join(most)} and {last}" if most else last

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING
 from holdfast.client.requests import OBJECT_NAMES
 from holdfast.gateway.endpoint import EXAMPLE, MILLISECONDS, REGISTERS, TARGET, Operation
 from holdfast.gateway.fields import REGISTER, Field, array, integer
+from holdfast.protocol import HARMLESS_DIAGNOSTICS, MAX_PDU
 
 if TYPE_CHECKING:
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Answer, Given
 
-HARMLESS = {0, 2, *range(11, 19)}
-"""Sub-functions that change nothing: the echo, the diagnostic register, the counters."""
-
-MAX_WORDS = 125
+MAX_WORDS = (MAX_PDU - 3) // 2
+"""Words that a request has room for behind its function and sub-function."""
 
 _NAMES = {
     name: "".join(word if at == 0 else word.title() for at, word in enumerate(name.split("_")))
@@ -29,7 +28,7 @@ async def _diagnostics(given: Given, device: RequestedDevice) -> Answer:
     number, words = given["subFunction"], given["data"]
     found = await device.ask(
         lambda client: client.diagnostics(number, words, unit=device.unit),
-        repeat=number in HARMLESS,
+        repeat=number in HARMLESS_DIAGNOSTICS,
     )
     return {
         "success": True,
@@ -80,12 +79,12 @@ ENDPOINTS = (
             Field("data", array(REGISTER, MAX_WORDS), "Words that go with it", [0]),
         ),
         _diagnostics,
-        {"subFunction": integer(0, 65535), "data": REGISTERS, "rtt": MILLISECONDS},
+        {"subFunction": REGISTER, "data": REGISTERS, "rtt": MILLISECONDS},
         {"The echo": {**EXAMPLE, "subFunction": 0, "data": [0xA537]}},
         {**EXAMPLE, "subFunction": 0, "data": [0xA537], "rtt": 12},
         "Function 8. Sub-functions other than 0, 2 and 11 to 18 change the device, and are refused "
         "as writes are. 4, Force Listen Only Mode, has no reply.",
-        writes=lambda given: given["subFunction"] not in HARMLESS,
+        writes=lambda given: given["subFunction"] not in HARMLESS_DIAGNOSTICS,
     ),
     Operation(
         "/api/modbus/server-id",

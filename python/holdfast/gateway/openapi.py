@@ -5,49 +5,46 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from holdfast.gateway import surveying, watching
-from holdfast.gateway.endpoint import EXAMPLE, array_of
-from holdfast.gateway.fields import Field, Schema, integer, timeout
-from holdfast.gateway.reading import TYPED
+from holdfast.gateway.endpoint import EXAMPLE, never
+from holdfast.gateway.fields import ADDRESS_SCHEMA, UNIT_SCHEMA, Field, timeout
+from holdfast.gateway.reading import FUNCTION_SCHEMA, TYPED
+from holdfast.gateway.refusals import (
+    ASKING,
+    BODY,
+    DEVICE,
+    EVERYWHERE,
+    FAILURE,
+    QUERY,
+    REFUSALS,
+    WRITE,
+)
+from holdfast.net.addresses import LAST_PORT
+from holdfast.protocol import READ_BITS
 from holdfast.types import AREAS
+from holdfast.web.openapi import (
+    DOCUMENT,
+    PAGE,
+    array_of,
+    html_answer,
+    integer,
+    json_answer,
+    object_of,
+    ref,
+    refusal_components,
+    refused_by,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from holdfast.gateway.endpoint import Operation
     from holdfast.gateway.settings import GatewayLimits, Settings
+    from holdfast.web.openapi import Schema
+    from holdfast.web.refusals import Refusal
 
 STATUS = "/api/gateway"
-
-TEXTS = {
-    "400": ("Not what is asked for", "port is 0, allowed is an integer 1 to 65535"),
-    "401": ("No token, or one that is not known", "the token is not known"),
-    "403": (
-        "The target is not in the egress list, writes are off, or a page of another site asks",
-        "192.168.7.7, port 502, is not in the egress list of this gateway",
-    ),
-    "405": ("Not with this method", "Method not allowed: allowed are POST, OPTIONS"),
-    "408": (
-        "The body did not arrive in time; the connection is closed",
-        "1024 bytes came in time, more were announced",
-    ),
-    "413": (
-        "The body is too large; the connection is closed",
-        "the body has more than 65536 bytes",
-    ),
-    "415": (
-        "Neither `application/json` nor what curl says instead, or compressed",
-        'Content-Type is "text/plain", allowed is application/json',
-    ),
-    "500": ("No connection, TLS not agreed on, or no reply in time", "Connection timeout"),
-    "503": (
-        "Too much at once, or the gateway stops",
-        "128 requests are under way, which is the limit",
-    ),
-}
-"""What a status means, and an example of an error."""
-
-POSTED = ("400", "403", "405", "408", "413", "415", "500", "503")
-STREAMED = ("400", "403", "405", "500", "503")
+FAILED = refused_by([FAILURE])
+_DESCRIBED = (*EVERYWHERE, *ASKING, "unauthorized", *BODY, *DEVICE)
 
 
 def document(version: str, endpoints: Iterable[Operation], settings: Settings) -> dict[str, Any]:
@@ -59,8 +56,7 @@ def document(version: str, endpoints: Iterable[Operation], settings: Settings) -
     for path in paths.values():
         for operation in path.values():
             operation["security"] = [{"token": []}] if secured else []
-            denied = {"401": _ref("Refused401", "responses")} if secured else {}
-            operation["responses"] |= denied
+            operation["responses"] |= _refusals("unauthorized") if secured else {}
     schemes = {"securitySchemes": {"token": {"type": "http", "scheme": "bearer"}}}
     return {
         "openapi": "3.1.0",
@@ -78,7 +74,7 @@ def document(version: str, endpoints: Iterable[Operation], settings: Settings) -
         "paths": paths | _documents(),
         "components": {
             "schemas": _schemas(),
-            "responses": {f"Refused{status}": _refused(status) for status in TEXTS},
+            "responses": refusal_components((*REFUSALS.of(_DESCRIBED), FAILURE), _refused),
             **(schemes if secured else {}),
         },
     }
@@ -90,7 +86,7 @@ def _endpoint(endpoint: Operation, limits: GatewayLimits) -> dict[str, Any]:
     answer = {"success": {"const": True}, **_target(), **endpoint.properties}
     if endpoint.broadcast:
         answer["note"] = {"type": "string", "description": "Of a broadcast: nobody confirms it"}
-    whole = _object(answer, optional=(*endpoint.optional, "note"))
+    whole = object_of(answer, optional=(*endpoint.optional, "note"))
     example = {"success": True, **endpoint.answer}
     return {
         "operationId": endpoint.name,
@@ -98,12 +94,17 @@ def _endpoint(endpoint: Operation, limits: GatewayLimits) -> dict[str, Any]:
         "description": endpoint.description,
         "requestBody": _body(fields, endpoint.examples),
         "responses": {
-            "200": _answer(
-                "What the device answered", {"oneOf": [whole, _ref("ModbusException")]}, example
+            "200": json_answer(
+                "What the device answered", {"oneOf": [whole, ref("ModbusException")]}, example
             ),
-            **_refusals(*POSTED),
+            **_refusals(*BODY, *_of_device(endpoint)),
+            **FAILED,
         },
     }
+
+
+def _of_device(endpoint: Operation) -> tuple[str, ...]:
+    return (*ASKING, *DEVICE, *(() if endpoint.writes is never else WRITE))
 
 
 def _streams(limits: GatewayLimits) -> dict[str, Any]:
@@ -121,7 +122,8 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
                 ),
                 "responses": {
                     "200": _stream(progress="Progress", result="Map"),
-                    **_refusals(*POSTED),
+                    **_refusals(*BODY, *ASKING, *DEVICE),
+                    **FAILED,
                 },
             }
         },
@@ -134,7 +136,8 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
                 "parameters": [_parameter(field) for field in watching.fields(limits)],
                 "responses": {
                     "200": _stream(values="Values", change="Change", problem="Problem"),
-                    **_refusals(*STREAMED),
+                    **_refusals(*QUERY, *ASKING, *DEVICE),
+                    **FAILED,
                 },
             }
         },
@@ -146,9 +149,9 @@ def _status() -> dict[str, Any]:
         "operationId": "status",
         "summary": "What this gateway may do",
         "responses": {
-            "200": _answer(
+            "200": json_answer(
                 "Its version, and its limits",
-                _ref("Status"),
+                ref("Status"),
                 {
                     "version": "0.1.0",
                     "writes": False,
@@ -158,41 +161,36 @@ def _status() -> dict[str, Any]:
                     "connections": 2,
                 },
             ),
-            **_refusals("403", "405"),
+            **_refusals(*ASKING),
         },
     }
 
 
 def _documents() -> dict[str, Any]:
     """The document itself, as JSON and as a page, and the console."""
-    html = {
-        "description": "HTML",
-        "content": {"text/html": {"schema": {"type": "string"}}},
-    }
-    whole = _answer("OpenAPI 3.1", {"type": "object"})
+    whole = json_answer("OpenAPI 3.1", {"type": "object"})
     return {
         path: {
             "get": {
                 "operationId": name,
                 "summary": summary,
                 "security": [],
-                "responses": {"200": answer, **_refusals("405")},
+                "responses": {"200": answer, **_refusals()},
             }
         }
         for path, name, summary, answer in (
-            ("/openapi.json", "openapi", "This document", whole),
-            ("/docs", "docs", "This document as a page", html),
-            ("/", "console", "The console, for a browser", html),
+            (DOCUMENT, "openapi", "This document", whole),
+            (PAGE, "docs", "This document as a page", html_answer()),
+            ("/", "console", "The console, for a browser", html_answer()),
         )
     }
 
 
 COUNT: Schema = {"type": "integer", "minimum": 0}
-ADDRESS = integer(0, 65535)
 VALUE: Schema = {"type": ["integer", "boolean"]}
 AREA: Schema = {"enum": list(AREAS)}
 RANGES: Schema = {
-    **array_of({**array_of(ADDRESS), "minItems": 2, "maxItems": 2}),
+    **array_of({**array_of(ADDRESS_SCHEMA), "minItems": 2, "maxItems": 2}),
     "description": "First and last addresses",
 }
 NOW: dict[str, Schema] = {
@@ -204,10 +202,14 @@ NOW: dict[str, Schema] = {
 def _schemas() -> dict[str, Schema]:
     """Schemas that are named: errors, the status, and the data of events."""
     said: dict[str, Schema] = {"success": {"const": False}, "error": {"type": "string"}}
-    about = {"functionCode": integer(1, 4), "address": ADDRESS, "quantity": integer(1, 2000)}
+    about = {
+        "functionCode": FUNCTION_SCHEMA,
+        "address": ADDRESS_SCHEMA,
+        "quantity": integer(1, READ_BITS),
+    }
     return {
-        "Error": _object(said),
-        "ModbusException": _object(
+        "Error": object_of(said),
+        "ModbusException": object_of(
             {
                 "success": {"const": False},
                 "error": {
@@ -219,13 +221,13 @@ def _schemas() -> dict[str, Schema]:
             },
             optional=(*_target(), *about),
         ),
-        "Status": _object(
+        "Status": object_of(
             {
                 "version": {"type": "string"},
                 "writes": {"type": "boolean"},
                 "tokens": {"type": "boolean"},
                 "allow": array_of({"type": "string"}),
-                "limits": _object({"timeout": COUNT, "interval": COUNT}),
+                "limits": object_of({"timeout": COUNT, "interval": COUNT}),
                 "connections": {**COUNT, "description": "Devices that it has a connection to"},
             }
         ),
@@ -237,26 +239,26 @@ def _schemas() -> dict[str, Schema]:
 def _schemas_of_watches() -> dict[str, Schema]:
     typed: dict[str, Schema] = {"index": COUNT, "value": {}, "text": {"type": "string"}}
     return {
-        "Values": _object(
+        "Values": object_of(
             {
                 **NOW,
-                "address": ADDRESS,
-                "quantity": integer(1, 2000),
+                "address": ADDRESS_SCHEMA,
+                "quantity": integer(1, READ_BITS),
                 "format": {"enum": ["coils", "registers"]},
                 "values": array_of(VALUE),
                 **TYPED,
             },
             optional=tuple(TYPED),
         ),
-        "Change": _object(
+        "Change": object_of(
             {
                 **NOW,
-                "changes": array_of(_object({"address": ADDRESS, "value": VALUE})),
-                "typed": array_of(_object(typed)),
+                "changes": array_of(object_of({"address": ADDRESS_SCHEMA, "value": VALUE})),
+                "typed": array_of(object_of(typed)),
             },
             optional=("typed",),
         ),
-        "Problem": _object({**NOW, "error": {"type": "string"}, "reason": {"type": "string"}}),
+        "Problem": object_of({**NOW, "error": {"type": "string"}, "reason": {"type": "string"}}),
     }
 
 
@@ -269,15 +271,15 @@ def _schemas_of_maps() -> dict[str, Schema]:
         "are neither there nor outside",
     }
     return {
-        "Progress": _object(
+        "Progress": object_of(
             {
                 "at": {**COUNT, "description": "Addresses that were dealt with"},
                 "total": COUNT,
                 "requests": COUNT,
-                "areas": array_of(_object(found, optional=("ranges",))),
+                "areas": array_of(object_of(found, optional=("ranges",))),
             }
         ),
-        "Map": _object(
+        "Map": object_of(
             {
                 "success": {"type": "boolean"},
                 "error": {"type": "string", "description": "Why it ended early"},
@@ -290,10 +292,10 @@ def _schemas_of_maps() -> dict[str, Schema]:
                     "description": "Samples were read at least every so many addresses, and where "
                     "ranges like to begin; `null` if every address was",
                 },
-                "first": ADDRESS,
-                "last": ADDRESS,
+                "first": ADDRESS_SCHEMA,
+                "last": ADDRESS_SCHEMA,
                 "areas": array_of(
-                    _object(
+                    object_of(
                         {
                             **found,
                             "failures": failures,
@@ -310,7 +312,7 @@ def _schemas_of_maps() -> dict[str, Schema]:
 
 
 def _target() -> dict[str, Schema]:
-    return {"host": {"type": "string"}, "port": integer(1, 65535), "unitId": integer(0, 255)}
+    return {"host": {"type": "string"}, "port": integer(1, LAST_PORT), "unitId": UNIT_SCHEMA}
 
 
 def _body(fields: Sequence[Field], examples: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -344,35 +346,16 @@ def _parameter(field: Field) -> dict[str, Any]:
     }
 
 
-def _object(properties: dict[str, Schema], *, optional: Sequence[str] = ()) -> Schema:
-    """An object that has all of these but for the optional ones, and nothing else."""
-    return {
-        "type": "object",
-        "required": [name for name in properties if name not in optional],
-        "properties": properties,
-        "additionalProperties": False,
-    }
-
-
-def _ref(name: str, kind: str = "schemas") -> Schema:
-    return {"$ref": f"#/components/{kind}/{name}"}
-
-
-def _answer(description: str, schema: Schema, example: object = None) -> dict[str, Any]:
-    content = {"schema": schema} | ({} if example is None else {"example": example})
-    return {"description": description, "content": {"application/json": content}}
-
-
 def _stream(**events: str) -> dict[str, Any]:
     """An answer of events; each has JSON of a schema for its data."""
     kinds = [
-        _object(
+        object_of(
             {
                 "event": {"const": name},
                 "data": {
                     "type": "string",
                     "contentMediaType": "application/json",
-                    "contentSchema": _ref(schema),
+                    "contentSchema": ref(schema),
                 },
             }
         )
@@ -382,20 +365,13 @@ def _stream(**events: str) -> dict[str, Any]:
     return {"description": "Server-sent events, each of which is one of these", "content": content}
 
 
-def _refusals(*statuses: str) -> dict[str, Any]:
-    return {status: _ref(f"Refused{status}", "responses") for status in statuses}
+def _refusals(*reasons: str) -> dict[str, Any]:
+    """The answers of an operation that these reasons refuse."""
+    return refused_by(REFUSALS.of((*reasons, *EVERYWHERE)))
 
 
-def _refused(status: str) -> dict[str, Any]:
-    title, error = TEXTS[status]
-    answer = _answer(title, _ref("Error"), {"success": False, "error": error})
-    answer["headers"] = {
-        "Holdfast-Reason": {"schema": {"type": "string"}, "description": "Why, in a word"}
-    }
-    if status == "401":
-        answer["headers"]["WWW-Authenticate"] = {"schema": {"const": "Bearer"}}
-    if status == "405":
-        answer["headers"]["Allow"] = {"schema": {"type": "string"}}
-    if status == "503":
-        answer["headers"]["Retry-After"] = {"schema": {"type": "string"}}
-    return answer
+def _refused(row: Refusal) -> dict[str, Any]:
+    """The answer to what is refused, or has failed."""
+    said = json_answer(row.means, ref("Error"), {"success": False, "error": row.example})
+    reason = {"schema": {"enum": list(row.reasons)}, "description": "Why, in a word"}
+    return {**said, "headers": {"Holdfast-Reason": reason}}

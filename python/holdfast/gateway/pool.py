@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, TypeVar
 
 from holdfast.client import Client
 from holdfast.client.endpoint import check_files
-from holdfast.client.target import IN_FLIGHT, NetworkTarget, Tls
+from holdfast.client.target import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException
+from holdfast.net.tls import NO_FILES
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
     from typing import Protocol
 
     from holdfast.gateway.egress import Route
+    from holdfast.net.tls import Tls
 
     class Dial(Protocol):
         """Makes clients, which connect when they are first used."""
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-NO_TLS = Tls()
 CHECK_INTERVAL = 0.5
 """Seconds between two looks for connections that nobody uses."""
 
@@ -87,7 +88,7 @@ class Pool:
         in_flight: int,
         idle: float,
         longest: float,
-        tls: Tls = NO_TLS,
+        tls: Tls = NO_FILES,
         dial: Dial = dial,
     ) -> None:
         self._most = most
@@ -117,7 +118,7 @@ class Pool:
         Raises `Full`, `Unusable`, `ValueError` for a name that no certificate can have, and what
         the call raises.
         """
-        tls = NO_TLS if route.name is None else replace(self._tls, name=route.name)
+        tls = NO_FILES if route.name is None else replace(self._tls, name=route.name)
         keys = [NetworkTarget(route.transport, each, route.port, tls) for each in route.addresses]
         keys.sort(key=lambda key: key not in self._entries)
         for key in keys[:-1]:

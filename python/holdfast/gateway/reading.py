@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.client.requests import ADDRESSES, READ_LIMITS
 from holdfast.errors import ModbusException
 from holdfast.gateway.device import exception_name, exception_text
-from holdfast.gateway.endpoint import EXAMPLE, TARGET, Operation, array_of
+from holdfast.gateway.endpoint import EXAMPLE, TARGET, Operation
 from holdfast.gateway.fields import (
     ADDRESS,
+    ADDRESS_SCHEMA,
     BYTE_ORDER,
     DATATYPE,
+    REGISTER,
     Field,
     Schema,
     integer,
@@ -19,7 +20,16 @@ from holdfast.gateway.fields import (
     told,
 )
 from holdfast.gateway.typed import quantity_of, typed
-from holdfast.types import AREAS, BIT_AREAS
+from holdfast.protocol import (
+    ADDRESSES,
+    LAST_ADDRESS,
+    READ_BITS,
+    READ_FUNCTIONS,
+    READ_LIMITS,
+    READ_REGISTERS,
+)
+from holdfast.types import BIT_AREAS
+from holdfast.web.openapi import array_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -30,16 +40,10 @@ if TYPE_CHECKING:
     from holdfast.gateway.typed import Typed
     from holdfast.types import Area
 
-FUNCTION_NAMES = (
-    "READ_COILS",
-    "READ_DISCRETE_INPUTS",
-    "READ_HOLDING_REGISTERS",
-    "READ_INPUT_REGISTERS",
-)
-ALLOWED = (
-    "0x01 (Read Coils), 0x02 (Read Discrete Inputs), 0x03 (Read Holding Registers), "
-    "0x04 (Read Input Registers)"
-)
+AREAS_READ = {each.code: area for area, each in READ_FUNCTIONS.items()}
+FUNCTIONS = {each.code: each for each in READ_FUNCTIONS.values()}
+FUNCTION_SCHEMA = integer(min(FUNCTIONS), max(FUNCTIONS))
+ALLOWED = ", ".join(f"0x{code:02x} ({each.name})" for code, each in FUNCTIONS.items())
 
 
 def _no_read_function(value: Any) -> str:
@@ -49,16 +53,17 @@ def _no_read_function(value: Any) -> str:
 
 FUNCTION = Field(
     "functionCode",
-    {"type": "integer", "enum": [1, 2, 3, 4]},
-    "1 coils, 2 discrete inputs, 3 holding registers, 4 input registers",
+    {"type": "integer", "enum": list(FUNCTIONS)},
+    ", ".join(f"{code} {area.replace('_', ' ')}" for area, (code, *_) in READ_FUNCTIONS.items()),
     refusal=_no_read_function,
 )
 QUANTITY = Field(
     "quantity",
-    integer(1, 2000),
-    "How many, up to 2000 bits or 125 registers; 1 if left out, or what the datatype takes",
+    integer(1, READ_BITS),
+    f"How many, up to {READ_BITS} bits or {READ_REGISTERS} registers; 1 if left out, or what the "
+    "datatype takes",
     None,
-    allowed="an integer 1 to 125 for registers, 1 to 2000 for bits",
+    allowed=f"an integer 1 to {READ_REGISTERS} for registers, 1 to {READ_BITS} for bits",
 )
 
 
@@ -67,7 +72,7 @@ class Range:
 
     def __init__(self, given: Given) -> None:
         self.function: int = given["functionCode"]
-        self.area: Area = AREAS[self.function - 1]
+        self.area: Area = AREAS_READ[self.function]
         self.address: int = given["address"]
         self.kind: Typed | None = typed(given["datatype"], given["byteOrder"], self.area)
         self.quantity = quantity_of(given["quantity"], self.kind)
@@ -75,7 +80,9 @@ class Range:
         if not 1 <= self.quantity <= limit:
             raise malformed(f"Quantity must be between 1 and {limit}, found {self.quantity}")
         if self.address + self.quantity > ADDRESSES:
-            raise malformed(f"{self.quantity} from address {self.address}: the last is 65535")
+            raise malformed(
+                f"{self.quantity} from address {self.address}: the last is {LAST_ADDRESS}"
+            )
 
     @property
     def format(self) -> str:
@@ -88,13 +95,13 @@ class Range:
 
     def _call(self, unit: int) -> Callable[[Client], Awaitable[list[Any]]]:
         def call(client: Client) -> Awaitable[list[Any]]:
-            reads = (
-                client.read_coils,
-                client.read_discrete_inputs,
-                client.read_holding_registers,
-                client.read_input_registers,
-            )
-            return reads[self.function - 1](self.address, self.quantity, unit=unit)
+            reads: dict[Area, Callable[..., Awaitable[list[Any]]]] = {
+                "coils": client.read_coils,
+                "discrete_inputs": client.read_discrete_inputs,
+                "holding_registers": client.read_holding_registers,
+                "input_registers": client.read_input_registers,
+            }
+            return reads[self.area](self.address, self.quantity, unit=unit)
 
         return call
 
@@ -118,7 +125,7 @@ async def _read(given: Given, device: RequestedDevice) -> Answer:
         "success": True,
         **device.told,
         "functionCode": asked.function,
-        "functionName": FUNCTION_NAMES[asked.function - 1],
+        "functionName": FUNCTIONS[asked.function].name.upper().replace(" ", "_"),
         "address": asked.address,
         "quantity": asked.quantity,
         "format": asked.format,
@@ -160,7 +167,7 @@ ENDPOINTS = (
         _connect,
         {
             "message": {"type": "string"},
-            "testRegister": integer(0, 65535),
+            "testRegister": REGISTER,
             "exception": {"type": "string"},
         },
         {"A device on port 502": {"host": "plc.factory.local", "unitId": 1}},
@@ -175,12 +182,12 @@ ENDPOINTS = (
         (*TARGET, FUNCTION, ADDRESS, QUANTITY, DATATYPE, BYTE_ORDER),
         _read,
         {
-            "functionCode": integer(1, 4),
+            "functionCode": FUNCTION_SCHEMA,
             "functionName": {"type": "string"},
-            "address": integer(0, 65535),
-            "quantity": integer(1, 2000),
+            "address": ADDRESS_SCHEMA,
+            "quantity": integer(1, READ_BITS),
             "format": {"enum": ["coils", "registers"]},
-            "values": array_of({"type": ["integer", "boolean"], "minimum": 0, "maximum": 65535}),
+            "values": array_of({**REGISTER, "type": ["integer", "boolean"]}),
             **TYPED,
         },
         {

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from ipaddress import ip_network
 from typing import TYPE_CHECKING
 
-from holdfast.client.target import Tls
+from holdfast.net.addresses import LOOPBACK
+from holdfast.net.tls import NO_FILES
 
 if TYPE_CHECKING:
-    from holdfast.config.addresses import Network
-    from holdfast.config.egress import Allowed
     from holdfast.gateway.tokens import Token
-
-LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"))
+    from holdfast.net.addresses import Network
+    from holdfast.net.allow_list import AllowedNetwork
+    from holdfast.net.tls import Tls
 
 
 @dataclass(frozen=True)
@@ -59,11 +58,11 @@ class GatewayLimits:
 class Settings:
     """Whom it may talk to, what it may do, and who may ask."""
 
-    allow: tuple[Allowed, ...]
+    allow: tuple[AllowedNetwork, ...]
     writes: bool = False
     tokens: tuple[Token, ...] = ()
     """Without any, whoever may connect may ask."""
     sources: tuple[Network, ...] = LOOPBACK
     limits: GatewayLimits = field(default_factory=GatewayLimits)
-    tls: Tls = field(default_factory=Tls)
+    tls: Tls = NO_FILES
     """Whom it trusts among devices with TLS, and what it shows them; callers have no say in it."""

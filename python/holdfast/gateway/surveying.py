@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any, cast
 from holdfast.errors import ConnectionLost, ModbusError, ModbusException
 from holdfast.gateway.device import Failed
 from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.fields import AREA_LIST, LAST, Field, integer, malformed, timeout
+from holdfast.gateway.fields import (
+    ADDRESS_SCHEMA,
+    AREA_LIST,
+    Field,
+    integer,
+    malformed,
+    timeout,
+)
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS
 from holdfast.tools import discovery
 from holdfast.tools.discovery import Survey
 from holdfast.types import AREAS, BIT_AREAS
@@ -39,11 +47,11 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     return (
         *TARGET,
         AREA_LIST,
-        Field("first", integer(0, LAST), "The first address to look at", 0),
-        Field("last", integer(0, LAST), "The last address to look at", LAST),
+        Field("first", ADDRESS_SCHEMA, "The first address to look at", 0),
+        Field("last", ADDRESS_SCHEMA, "The last address to look at", LAST_ADDRESS),
         Field("exact", {"type": "boolean"}, "Read every address, not samples", False),
-        Field("step", integer(1, LAST + 1), "Addresses between two samples", discovery.STEP),
-        Field("maxQuantity", integer(1, 2000), "The most that a read asks for", None),
+        Field("step", integer(1, ADDRESSES), "Addresses between two samples", discovery.STEP),
+        Field("maxQuantity", integer(1, READ_BITS), "The most that a read asks for", None),
         timeout(TIMEOUT, round(1000 * limits.timeout), "Milliseconds for each read"),
     )
 

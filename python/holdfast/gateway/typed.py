@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast.gateway.fields import malformed
 from holdfast.tools.inference import shortest
-from holdfast.types import BIT_AREAS
-from holdfast.values import ConversionError
+from holdfast.values import ConversionError, WrongArea
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -89,17 +87,14 @@ def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
         if order != "ABCD":
             raise malformed("byteOrder goes with datatype")
         return None
-    match = re.fullmatch(r"(.+)\[([0-9]{1,6})\]", datatype)
-    element, count = (match[1], int(match[2])) if match else (datatype, None)
     try:
-        width = values.register_count(element)
-        values.register_count(datatype)
-        values.decode(bytes(2 * width), element, order)
+        type = values.codec_for(area, datatype, order).type
+    except WrongArea:
+        of = area.replace("_", " ")
+        raise malformed(f"datatype is {datatype}, of {of} allowed is bool") from None
     except ConversionError as error:
         raise malformed(str(error)) from None
-    if area in BIT_AREAS and element != "bool":
-        raise malformed(f"datatype is {element}, of {area.replace('_', ' ')} allowed is bool")
-    return Typed(element, order, width, count)
+    return Typed(type.element, order, type.width // 2, type.count)
 
 
 def quantity_of(given: int | None, kind: Typed | None) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.client.requests import ADDRESSES, WRITE_LIMITS
 from holdfast.gateway.endpoint import (
     EXAMPLE,
     MILLISECONDS,
@@ -15,6 +14,7 @@ from holdfast.gateway.endpoint import (
 )
 from holdfast.gateway.fields import (
     ADDRESS,
+    ADDRESS_SCHEMA,
     BIT,
     BYTE_ORDER,
     DATATYPE,
@@ -25,6 +25,14 @@ from holdfast.gateway.fields import (
     malformed,
 )
 from holdfast.gateway.typed import typed
+from holdfast.protocol import (
+    ADDRESSES,
+    LAST_ADDRESS,
+    MAX_WORD,
+    READ_WRITE,
+    WRITE_BITS,
+    WRITE_REGISTERS,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,10 +41,6 @@ if TYPE_CHECKING:
     from holdfast.gateway.endpoint import Answer, Given
 
 ON = 0xFF00
-MAX_REGISTERS = WRITE_LIMITS["holding_registers"]
-MAX_COILS = WRITE_LIMITS["coils"]
-MAX_WITH_READ = 121
-MAX_READ = 125
 TIMEOUT = 5_000
 
 PLAIN_OR_TYPED = {"type": ["integer", "number", "string", "boolean"]}
@@ -77,8 +81,8 @@ async def _write_register(given: Given, device: RequestedDevice) -> Answer:
 
 async def _write_registers(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], _registers(given)
-    if len(values) > MAX_REGISTERS:
-        raise malformed(f"{len(values)} registers, allowed are {MAX_REGISTERS} in a request")
+    if len(values) > WRITE_REGISTERS:
+        raise malformed(f"{len(values)} registers, allowed are {WRITE_REGISTERS} in a request")
     _check_end(address, len(values))
     await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
     return _written(device, address, len(values))
@@ -136,7 +140,7 @@ def _registers(given: Given) -> Sequence[int]:
 
 def _check_end(address: int, count: int) -> None:
     if address + count > ADDRESSES:
-        raise malformed(f"{count} from address {address}: the last address is 65535")
+        raise malformed(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
 
 
 def _values(items: dict[str, Any], most: int, text: str) -> Field:
@@ -144,8 +148,8 @@ def _values(items: dict[str, Any], most: int, text: str) -> Field:
 
 
 _WRITTEN = {
-    "startAddress": integer(0, 65535),
-    "quantity": integer(1, MAX_COILS),
+    "startAddress": ADDRESS_SCHEMA,
+    "quantity": integer(1, WRITE_BITS),
     "rtt": MILLISECONDS,
 }
 
@@ -157,7 +161,7 @@ ENDPOINTS = (
         (*TARGET, ADDRESS, Field("value", BIT, "`true` or 1 is on, `false` or 0 is off")),
         _write_coil,
         {
-            "address": integer(0, 65535),
+            "address": ADDRESS_SCHEMA,
             "coilValue": {"enum": [0, ON]},
             "written": {"type": "boolean", "description": "Whether the coil is on now"},
             "rtt": MILLISECONDS,
@@ -178,9 +182,9 @@ ENDPOINTS = (
             ADDRESS,
             _values(
                 PLAIN_OR_TYPED,
-                MAX_REGISTERS,
-                "Registers 0 to 65535, up to 123; with `datatype` values of that type, bytes in "
-                "hex",
+                WRITE_REGISTERS,
+                f"Registers 0 to {MAX_WORD}, up to {WRITE_REGISTERS}; with `datatype` values of "
+                "that type, bytes in hex",
             ),
             DATATYPE,
             BYTE_ORDER,
@@ -207,9 +211,9 @@ ENDPOINTS = (
         "/api/modbus/write/register",
         "writeRegister",
         "Write one holding register",
-        (*TARGET, ADDRESS, Field("value", REGISTER, "0 to 65535")),
+        (*TARGET, ADDRESS, Field("value", REGISTER, f"0 to {MAX_WORD}")),
         _write_register,
-        {"address": integer(0, 65535), "value": integer(0, 65535), "rtt": MILLISECONDS},
+        {"address": ADDRESS_SCHEMA, "value": REGISTER, "rtt": MILLISECONDS},
         {"Register 5": {**EXAMPLE, "address": 5, "value": 1234}},
         {**EXAMPLE, "address": 5, "value": 1234, "rtt": 12},
         "Function 6.",
@@ -221,7 +225,11 @@ ENDPOINTS = (
         "/api/modbus/write/coils",
         "writeCoils",
         "Write coils",
-        (*TARGET, ADDRESS, _values(BIT, MAX_COILS, "Up to 1968 of `true`, `false`, 1, 0")),
+        (
+            *TARGET,
+            ADDRESS,
+            _values(BIT, WRITE_BITS, f"Up to {WRITE_BITS} of `true`, `false`, 1, 0"),
+        ),
         _write_coils,
         _WRITTEN,
         {"Three coils": {**EXAMPLE, "address": 16, "values": [True, False, True]}},
@@ -243,9 +251,9 @@ ENDPOINTS = (
         ),
         _mask,
         {
-            "address": integer(0, 65535),
-            "andMask": integer(0, 65535),
-            "orMask": integer(0, 65535),
+            "address": ADDRESS_SCHEMA,
+            "andMask": REGISTER,
+            "orMask": REGISTER,
             "rtt": MILLISECONDS,
         },
         {"Set bit 3": {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8}},
@@ -261,17 +269,21 @@ ENDPOINTS = (
         "Write holding registers, then read some, as one step",
         (
             *TARGET,
-            Field("readAddress", REGISTER, "The first address to read"),
-            Field("readQuantity", integer(1, MAX_READ), "How many registers to read"),
-            Field("writeAddress", REGISTER, "The first address to write"),
-            _values(REGISTER, MAX_WITH_READ, "Registers to write, up to 121"),
+            Field("readAddress", ADDRESS_SCHEMA, "The first address to read"),
+            Field("readQuantity", integer(1, READ_WRITE.most_read), "How many registers to read"),
+            Field("writeAddress", ADDRESS_SCHEMA, "The first address to write"),
+            _values(
+                REGISTER,
+                READ_WRITE.most_written,
+                f"Registers to write, up to {READ_WRITE.most_written}",
+            ),
         ),
         _read_write,
         {
-            "writeAddress": integer(0, 65535),
-            "written": integer(1, MAX_WITH_READ),
-            "readAddress": integer(0, 65535),
-            "quantity": integer(1, MAX_READ),
+            "writeAddress": ADDRESS_SCHEMA,
+            "written": integer(1, READ_WRITE.most_written),
+            "readAddress": ADDRESS_SCHEMA,
+            "quantity": integer(1, READ_WRITE.most_read),
             "format": {"const": "registers"},
             "values": REGISTERS,
             "rtt": MILLISECONDS,

@@ -2,13 +2,8 @@
 
 import { notice, stream } from "./api.js";
 import { $, colour, h, onTheme, say } from "./dom.js";
+import { AREAS } from "./standard.js";
 
-const AREAS = {
-  coils: ["Coils", 1],
-  discrete_inputs: ["Discrete inputs", 2],
-  holding_registers: ["Holding registers", 3],
-  input_registers: ["Input registers", 4],
-};
 const FAILURES = { timeout: "no answer", connection: "connection lost", invalid: "wrong reply" };
 const CELLS = 1024;
 const NARROW = 640;
@@ -118,7 +113,7 @@ export class Map_ {
 /** One area: every cell is some addresses, the darker the more of them are there. */
 class Picture {
   constructor(area, first, last, open) {
-    [this.title, this.code] = AREAS[area];
+    ({ title: this.title, code: this.code } = AREAS[area]);
     this.first = first;
     this.columns = innerWidth < NARROW ? 32 : 64;
     this.each = Math.max(1, Math.ceil((last - first + 1) / CELLS));

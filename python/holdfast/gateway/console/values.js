@@ -4,11 +4,10 @@ import { notice, post, stream } from "./api.js";
 import { $, h, say, show } from "./dom.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
 import { Plots } from "./plots.js";
+import { areaOf, LAST } from "./standard.js";
 import { Table } from "./table.js";
 import { Writer } from "./writing.js";
 
-const AREAS = { 1: "Coils", 2: "Discrete inputs", 3: "Holding registers", 4: "Input registers" };
-const LAST = 65535;
 const RESUME = 1000;
 const WRITTEN = { written: "Written", refused: "Not written", unknown: "Not known whether it was written" };
 /** Problems that waiting for the gateway does not solve. */
@@ -63,7 +62,7 @@ export class Values {
     show($("size"), !ofBits && ["bit", "string", "bytes"].includes(kind));
     $("size-name").textContent = kind === "bit" ? "Which bit" : "Bytes each";
     [$("size").min, $("size").max] = kind === "bit" ? [0, 15] : [1, 250];
-    $("quantity").max = ofBits ? 2000 : 125;
+    $("quantity").max = areaOf(area).most;
     const address = Number($("address").value);
     $("modicon").textContent = Number.isInteger(address) && address >= 0 ? `= ${modicon(area, address)}` : "";
     const past = address + whole(Number($("quantity").value), this.type().width) > LAST + 1;
@@ -105,7 +104,7 @@ export class Values {
       ofBits: area < 3,
       width: type.width,
       order: this.order(),
-      title: `${AREAS[area]} ${address} to ${address + quantity - 1}`,
+      title: `${areaOf(area).title} ${address} to ${address + quantity - 1}`,
       note: asked === quantity ? null : `Each ${type.name} takes ${type.width} registers: ${quantity} rather than ${asked}.`,
     };
   }

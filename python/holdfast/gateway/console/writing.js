@@ -3,6 +3,7 @@
 import { notice, post, Problem } from "./api.js";
 import { $, h, once } from "./dom.js";
 import { binary, bit, hex, literal, modicon, register } from "./numbers.js";
+import { areaOf } from "./standard.js";
 
 const BITS_HELP = "0, 1, on or off. Several, with commas between them, go to the coils that follow.";
 const HELP = {
@@ -154,7 +155,7 @@ export class Writer {
 
   /** What is there of what a change is about. */
   async read({ range, address }, { count, typed }) {
-    const most = range.ofBits ? 2000 : 125;
+    const { most } = areaOf(range.area);
     if (count > most) throw new Error(`${count} are too many: ${most} at most`);
     const found = await post("/api/modbus/read", { ...range.device, functionCode: range.area, address, quantity: count, ...typed });
     return found.typedText ?? found.values;

@@ -1,0 +1,13 @@
+// What the standard fixes: the areas with their read functions, and what one request reads at most.
+
+export const AREAS = {
+  coils: { title: "Coils", code: 1, most: 2000 },
+  discrete_inputs: { title: "Discrete inputs", code: 2, most: 2000 },
+  holding_registers: { title: "Holding registers", code: 3, most: 125 },
+  input_registers: { title: "Input registers", code: 4, most: 125 },
+};
+
+/** The area that a function reads. */
+export const areaOf = (code) => Object.values(AREAS).find((area) => area.code === code);
+
+export const LAST = 65535;
