@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, assert_never
 
 from holdfast import _core
 from holdfast.client.endpoint import endpoint
-from holdfast.client.target import Tls
 from holdfast.config import (
-    BrokerTlsConfig,
     ModbusAsciiListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
@@ -22,6 +20,8 @@ from holdfast.config import (
     ModbusUdpListener,
     RawIngestListener,
 )
+from holdfast.config.devices import STATUS_BLOCK
+from holdfast.net.tls import NO_FILES
 from holdfast.server import Identity
 from holdfast.tools import planning
 
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         ServerTlsConfig,
     )
     from holdfast.gateway import Settings as GatewaySettings
+    from holdfast.net.tls import Tls
     from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area
 
@@ -54,9 +55,6 @@ DISABLED = 4
 
 STATUS_NAME = 16
 """Bytes of the name in a status block."""
-
-STATUS_BLOCK = 30
-"""Registers of a status block."""
 
 
 def memory(settings: MemoryConfig) -> Memory:
@@ -198,31 +196,24 @@ def gateway(settings: GatewayConfig) -> GatewaySettings:
 
 def gateway_tls(settings: GatewayConfig) -> Tls:
     """Whom the gateway trusts among devices, and what it shows them."""
-    given = settings.tls
-    files = () if given is None else (given.ca_file, given.cert_file, given.key_file)
-    return Tls(*(None if file is None else str(file) for file in files))
+    return NO_FILES if settings.tls is None else settings.tls.files
 
 
 def scanner(settings: NatsConfig) -> ScannerSettings:
     """What the scanner is told."""
-    from holdfast.scanner import DeviceTls, ScannerLimits, Servers, Settings
+    from holdfast.scanner import ScannerLimits, Servers, Settings
 
-    tls = settings.tls or BrokerTlsConfig()
     servers = Servers(
         settings.servers,
         settings.username,
         settings.password_file,
         settings.token_file,
         settings.credentials_file,
-        tls.ca_file,
-        tls.cert_file,
-        tls.key_file,
+        NO_FILES if settings.tls is None else settings.tls.files,
     )
-    devices = tuple(str(entry) for entry in settings.devices)
     limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
-    of = settings.device_tls
-    trust = DeviceTls() if of is None else DeviceTls(of.ca_file, of.cert_file, of.key_file)
-    return Settings(servers, settings.prefix, devices, limits, trust)
+    trust = NO_FILES if settings.device_tls is None else settings.device_tls.files
+    return Settings(servers, settings.prefix, settings.devices, limits, trust)
 
 
 def _place(

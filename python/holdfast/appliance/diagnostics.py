@@ -14,15 +14,6 @@ if TYPE_CHECKING:
     from holdfast.ingest.audit import Audit
 
 
-FAULTS = {0x8001: "timeout", 0x8002: "refused", 0x8003: "reset", 0x8004: "invalid reply"}
-"""Why a device did not answer, by the last error of its status block."""
-
-
-def fault(code: int) -> str:
-    """The last error of a device in words."""
-    return FAULTS.get(code, f"exception {code:02X}") if code else "none"
-
-
 class Diagnostics:
     """Looks at the parts of a running appliance, from any thread, and changes nothing."""
 

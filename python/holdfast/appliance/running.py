@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Self
 from holdfast import _core, logs
 from holdfast.adapters import foreign
 from holdfast.appliance import assembly
-from holdfast.appliance.diagnostics import Diagnostics, fault
+from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
 from holdfast.config import ModbusAsciiListener, ModbusRtuListener
+from holdfast.errors import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.ingest.audit import Audit
+from holdfast.net.addresses import joined
 
 if TYPE_CHECKING:
     import socket
@@ -89,7 +91,8 @@ class Appliance:
             raise RuntimeError("the appliance runs already")
         self._running = _Running(self.config, self.memories)
         for endpoint in self.endpoints():
-            address = endpoint.host if endpoint.port is None else _joined(endpoint)
+            host, port = endpoint.host, endpoint.port
+            address = host if port is None else joined(host, port)
             logs.write(logging.INFO, "listening", listener=endpoint.name, address=address)
         return self
 
@@ -216,7 +219,7 @@ class _Running:
             self._health[name] = health
             fields: dict[str, object] = {"device": name, "health": health}
             if health == "error":
-                fields |= {"error": fault(told["last_error"]), "failures": told["failures"]}
+                fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
             logs.write(
                 logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields
             )
@@ -371,8 +374,3 @@ def _check_files(name: str, tls: Tls) -> None:
         check_files(tls)
     except (OSError, ValueError) as error:
         raise OSError(f"{name}: {error}") from error
-
-
-def _joined(endpoint: ListenAddress) -> str:
-    host = f"[{endpoint.host}]" if ":" in endpoint.host else endpoint.host
-    return f"{host}:{endpoint.port}"

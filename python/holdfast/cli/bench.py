@@ -14,6 +14,7 @@ import click
 from holdfast.cli import device, places, showing
 from holdfast.cli.progress import bar
 from holdfast.errors import ModbusError
+from holdfast.protocol import LAST_ADDRESS, READ_BITS
 from holdfast.tools.load import MAX_CONNECTIONS, Load
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def _area(text: str) -> Area:
 )
 @click.option(
     "--address",
-    type=click.IntRange(0, places.LAST),
+    type=click.IntRange(0, LAST_ADDRESS),
     default=0,
     show_default=True,
     metavar="N",
@@ -73,7 +74,7 @@ def _area(text: str) -> Area:
 )
 @click.option(
     "--count",
-    type=click.IntRange(1, 2000),
+    type=click.IntRange(1, READ_BITS),
     default=10,
     show_default=True,
     metavar="N",

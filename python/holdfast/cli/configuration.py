@@ -41,8 +41,10 @@ def load_whole(path: Path | str) -> Config:
         except (OSError, ValueError) as error:
             problems["devices", name, "url"] = str(error)
     if config.nats is not None and config.nats.device_tls is not None:
+        from holdfast.scanner import device_tls
+
         try:
-            assembly.scanner(config.nats).device_tls.check()
+            device_tls.check(assembly.scanner(config.nats).device_tls)
         except OSError as error:
             problems["nats", "device_tls"] = str(error)
     if config.gateway is not None and config.gateway.tls is not None:

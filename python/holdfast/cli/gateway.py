@@ -15,12 +15,14 @@ import click
 from holdfast import logs
 from holdfast.adapters import Stop
 from holdfast.cli.run import JOIN_TIMEOUT, Signals
+from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.client.endpoint import check_files
-from holdfast.client.target import PORT, Tls
 from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.egress import parse_allowed
 from holdfast.gateway import Gateway, GatewayLimits, Settings, tokens
-from holdfast.gateway.settings import LOOPBACK
+from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
+from holdfast.net.tls import NO_FILES
+from holdfast.protocol import PORT
 from holdfast.web.host import listen
 
 if TYPE_CHECKING:
@@ -28,11 +30,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from concurrent.futures import Future
 
-    from holdfast.config.addresses import Bind, Network
-    from holdfast.config.egress import Allowed
+    from holdfast.config.addresses import Bind
+    from holdfast.net.addresses import Network
+    from holdfast.net.allow_list import AllowedNetwork
+    from holdfast.net.tls import Tls
 
 FAILED = 1
-FILE = click.Path(exists=True, dir_okay=False)
 
 Parsed = TypeVar("Parsed")
 
@@ -83,15 +86,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     metavar="NETWORK",
     help="Who may connect to it; again for more.",
 )
-@click.option(
-    "--tls-ca",
-    type=FILE,
-    metavar="FILE",
-    help="Who is trusted among devices with TLS: authorities, or devices themselves; without it "
-    "the system's authorities.",
-)
-@click.option("--tls-cert", type=FILE, metavar="FILE", help="Our certificate for devices.")
-@click.option("--tls-key", type=FILE, metavar="FILE", help="Its key.")
+@tls_options("tls", DEVICES, " for devices")
 @click.option(
     "--in-flight",
     type=click.IntRange(1, 64),
@@ -103,7 +98,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
 @click.option("--json-log", is_flag=True, help="Log JSON, an object a line.")
 def gateway(
     bind: Bind,
-    allow: tuple[Allowed, ...],
+    allow: tuple[AllowedNetwork, ...],
     writes: bool,
     token_file: Path | None,
     sources: tuple[Network, ...],
@@ -173,13 +168,8 @@ def _tokens(file: Path) -> tuple[tokens.Token, ...]:
 
 def _tls(ca: str | None, cert: str | None, key: str | None) -> Tls:
     """The files, which can be used."""
-    if (cert is None) != (key is None):
-        given, missing = (
-            ("--tls-key", "--tls-cert") if cert is None else ("--tls-cert", "--tls-key")
-        )
-        raise click.UsageError(f"{given} goes with {missing}.")
-    tls = Tls(ca, cert, key)
-    if tls != Tls():
+    tls = tls_of("tls", ca, cert, key)
+    if tls != NO_FILES:
         try:
             check_files(tls)
         except (OSError, ValueError) as error:
@@ -188,11 +178,12 @@ def _tls(ca: str | None, cert: str | None, key: str | None) -> Tls:
 
 
 def _greeting(address: str, settings: Settings) -> str:
-    url = f"http://{_reachable(address)}"
+    at, _, port = address.rpartition(":")
+    url = f"http://{joined(reachable(unbracketed(at)), int(port))}"
     can = "reads and writes" if settings.writes else "reads"
     who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
-    host, port = _example(settings.allow[0])
-    body = f'{{"host":"{host}","port":{port}}}'
+    example, its_port = _example(settings.allow[0])
+    body = f'{{"host":"{example}","port":{its_port}}}'
     header = "-H 'Content-Type: application/json'"
     if settings.tokens:
         header += ' -H "Authorization: Bearer $TOKEN"'
@@ -212,7 +203,7 @@ def _greeting(address: str, settings: Settings) -> str:
     )
 
 
-def _example(entry: Allowed) -> tuple[str, int]:
+def _example(entry: AllowedNetwork) -> tuple[str, int]:
     """A host and a port that an entry of the list allows."""
     network, (first, last) = entry.network, entry.ports or (PORT, PORT)
     if network.prefixlen == 0:
@@ -220,10 +211,3 @@ def _example(entry: Allowed) -> tuple[str, int]:
     else:
         host = str(network[1] if network.num_addresses > 2 else network[0])
     return host, PORT if first <= PORT <= last else first
-
-
-def _reachable(address: str) -> str:
-    """The address that a client on this machine can connect to."""
-    host, _, port = address.rpartition(":")
-    local = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-    return f"{local.get(host, host)}:{port}"

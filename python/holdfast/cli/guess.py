@@ -10,7 +10,8 @@ import click
 
 from holdfast.cli import device, pace, places, showing
 from holdfast.errors import ModbusError, ModbusException
-from holdfast.tools import discovery, inference
+from holdfast.protocol import ILLEGAL_ADDRESS, LAST_ADDRESS, READ_REGISTERS
+from holdfast.tools import inference
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ WIDEST = 12
 )
 @click.option(
     "--count",
-    type=click.IntRange(1, 125),
+    type=click.IntRange(1, READ_REGISTERS),
     metavar="N",
     help=f"Registers to look at.  [default: {REGISTERS}, or as many as there are]",
 )
@@ -121,12 +122,12 @@ def guess(
 
 def _size(client: SyncClient, place: Place) -> int:
     """As many registers as there are, up to what the largest number takes."""
-    size = min(REGISTERS, places.LAST + 1 - place.address)
+    size = min(REGISTERS, LAST_ADDRESS + 1 - place.address)
     while True:
         try:
             device.read_raw(client, place.area, place.address, size)
         except ModbusException as error:
-            if error.code != discovery.OUTSIDE or size == 1:
+            if error.code != ILLEGAL_ADDRESS or size == 1:
                 raise
             size -= 1
         else:

@@ -14,6 +14,7 @@ import click
 from holdfast.cli import device, places, showing
 from holdfast.cli.progress import bar
 from holdfast.errors import ModbusError
+from holdfast.protocol import LAST_ADDRESS
 from holdfast.tools import discovery
 from holdfast.tools.discovery import Survey
 from holdfast.types import AREAS
@@ -39,8 +40,8 @@ def _areas(text: str) -> tuple[Area, ...]:
 def _span(text: str) -> range:
     first, dash, last = text.partition("-")
     numbers = places.number(first), places.number(last if dash else first)
-    if None in numbers or not 0 <= (numbers[0] or 0) <= (numbers[1] or 0) <= places.LAST:
-        raise click.BadParameter(f"{text!r} is not FIRST-LAST, as 0-999, up to {places.LAST}.")
+    if None in numbers or not 0 <= (numbers[0] or 0) <= (numbers[1] or 0) <= LAST_ADDRESS:
+        raise click.BadParameter(f"{text!r} is not FIRST-LAST, as 0-999, up to {LAST_ADDRESS}.")
     return range(numbers[0] or 0, (numbers[1] or 0) + 1)
 
 
@@ -66,7 +67,7 @@ def _span(text: str) -> range:
     "--range",
     "span",
     type=_span,
-    default="0-65535",
+    default=f"0-{LAST_ADDRESS}",
     show_default=True,
     metavar="FIRST-LAST",
     help="Only these addresses.",

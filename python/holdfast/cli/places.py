@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from click.shell_completion import CompletionItem
 
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -16,19 +17,10 @@ if TYPE_CHECKING:
 
     from holdfast.types import Area
 
-LAST = 0xFFFF
-SHORT: dict[str, Area] = {
-    "co": "coils",
-    "di": "discrete_inputs",
-    "hr": "holding_registers",
-    "ir": "input_registers",
-}
-MODICON: dict[str, Area] = {
-    "0": "coils",
-    "1": "discrete_inputs",
-    "3": "input_registers",
-    "4": "holding_registers",
-}
+SHORT: dict[str, Area] = dict(zip(("co", "di", "hr", "ir"), AREAS, strict=True))
+MODICON: dict[str, Area] = dict(zip("0143", AREAS, strict=True))
+"""The first digits of Modicon numbers."""
+
 FORMS = "40001, 400001 or 4x0001, and 0, 1, 3 for coils, discrete inputs, input registers"
 
 _MODICON = re.compile(r"([0134])(?:[xX]([0-9]{1,5})|([0-9]{4,5}))")
@@ -96,8 +88,8 @@ def counted(words: Sequence[str]) -> int:
     if len(words) > 1:
         raise click.UsageError(f"Got unexpected extra argument ({' '.join(words[1:])}).")
     count = number(words[0])
-    if count is None or not 1 <= count <= LAST + 1:
-        raise click.UsageError(f"COUNT is {words[0]!r}, allowed are 1 to {LAST + 1}.")
+    if count is None or not 1 <= count <= ADDRESSES:
+        raise click.UsageError(f"COUNT is {words[0]!r}, allowed are 1 to {ADDRESSES}.")
     return count
 
 
@@ -119,10 +111,10 @@ def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> l
 
 def _address(text: str) -> int:
     address = number(text)
-    if address is None or address > LAST:
+    if address is None or address > LAST_ADDRESS:
         hint = f"; did you mean {text} --modicon?" if _MODICON.fullmatch(text) else "."
         raise click.UsageError(
-            f"address {text!r} is not allowed, allowed are 0 to {LAST}, decimal or 0x{hint}"
+            f"address {text!r} is not allowed, allowed are 0 to {LAST_ADDRESS}, decimal or 0x{hint}"
         )
     return address
 
@@ -130,6 +122,6 @@ def _address(text: str) -> int:
 def _modicon(text: str) -> Place:
     match = _MODICON.fullmatch(text)
     count = int(match[2] or match[3]) if match else 0
-    if match is None or not 1 <= count <= LAST + 1:
+    if match is None or not 1 <= count <= ADDRESSES:
         raise click.UsageError(f"{text!r} is no Modicon number, as in {FORMS}.")
     return Place(MODICON[match[1]], count - 1)

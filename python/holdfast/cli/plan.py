@@ -12,6 +12,7 @@ import click
 
 from holdfast.cli import device, places, showing
 from holdfast.cli.configuration import load_or_exit
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
 from holdfast.tools import planning
 from holdfast.tools.planning import Preset
 
@@ -30,8 +31,10 @@ def _read(text: str) -> Field:
     area, _, rest = text.partition(":")
     address, _, count = rest.partition(":")
     first, size = places.number(address), places.number(count or "1")
-    if first is None or size is None or not 1 <= size <= places.LAST + 1 - first:
-        raise click.BadParameter(f"{text!r} is not AREA:ADDRESS:COUNT, as hr:100:20, up to 65535.")
+    if first is None or size is None or not 1 <= size <= ADDRESSES - first:
+        raise click.BadParameter(
+            f"{text!r} is not AREA:ADDRESS:COUNT, as hr:100:20, up to {LAST_ADDRESS}."
+        )
     return places.area_of(area), first, size
 
 
@@ -39,8 +42,10 @@ def _stretch(text: str) -> tuple[Area, int, int]:
     area, _, span = text.partition(":")
     first, dash, last = span.partition("-")
     start, end = places.number(first), places.number(last if dash else first)
-    if start is None or end is None or not start <= end <= places.LAST:
-        raise click.BadParameter(f"{text!r} is not AREA:FIRST-LAST, as hr:100-119, up to 65535.")
+    if start is None or end is None or not start <= end <= LAST_ADDRESS:
+        raise click.BadParameter(
+            f"{text!r} is not AREA:FIRST-LAST, as hr:100-119, up to {LAST_ADDRESS}."
+        )
     return places.area_of(area), start, end + 1
 
 
@@ -64,7 +69,7 @@ def _cost(text: str) -> tuple[float, float]:
     help="With URL: what is to be read.",
 )
 @click.option(
-    "--max-gap", type=click.IntRange(0, places.LAST), metavar="N", help="Read holes of up to N."
+    "--max-gap", type=click.IntRange(0, LAST_ADDRESS), metavar="N", help="Read holes of up to N."
 )
 @click.option(
     "--cost",
@@ -72,8 +77,10 @@ def _cost(text: str) -> tuple[float, float]:
     metavar="REQUEST:REGISTER",
     help="Read holes where that is cheaper, at these prices in milliseconds.",
 )
-@click.option("--max-registers", type=click.IntRange(1, 125), metavar="N", help="In a request.")
-@click.option("--max-bits", type=click.IntRange(1, 2000), metavar="N", help="In a request.")
+@click.option(
+    "--max-registers", type=click.IntRange(1, READ_REGISTERS), metavar="N", help="In a request."
+)
+@click.option("--max-bits", type=click.IntRange(1, READ_BITS), metavar="N", help="In a request.")
 @click.option(
     "--readable",
     multiple=True,

@@ -12,7 +12,7 @@ import click
 from holdfast.cli import device, pace, places, showing
 from holdfast.cli.typed import typed, typed_options
 from holdfast.errors import ModbusError, ModbusException
-from holdfast.tools import discovery
+from holdfast.protocol import ADDRESSES, ILLEGAL_ADDRESS, LAST_ADDRESS
 from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
 
@@ -40,7 +40,7 @@ WIDEST = 14
     shell_complete=places.complete,
 )
 @typed_options
-@click.option("--count", type=click.IntRange(1, 65536), metavar="N", help="The same as COUNT.")
+@click.option("--count", type=click.IntRange(1, ADDRESSES), metavar="N", help="The same as COUNT.")
 @click.option(
     "--every", type=device.seconds, metavar="SECONDS", help="Read again and again, until Ctrl-C."
 )
@@ -108,9 +108,11 @@ def _count(words: Sequence[str], count: int | None) -> int:
 def _query(place: Place, count: int, kind: str | None, order: str, encoding: str | None) -> _Query:
     asked = typed(kind, order, encoding, place.area, count)
     query = _Query(place, count if asked is None else asked.registers, asked)
-    if place.address + query.size > places.LAST + 1:
+    if place.address + query.size > ADDRESSES:
         items = showing.counted(query.size, query.noun)
-        raise click.UsageError(f"{items} from {place.address} on: the last address is 65535.")
+        raise click.UsageError(
+            f"{items} from {place.address} on: the last address is {LAST_ADDRESS}."
+        )
     return query
 
 
@@ -299,7 +301,7 @@ class _Lines:
 
 
 def _hint(error: ModbusError, query: _Query) -> str | None:
-    if isinstance(error, ModbusException) and error.code == discovery.OUTSIDE:
+    if isinstance(error, ModbusException) and error.code == ILLEGAL_ADDRESS:
         return places.modicon_hint(query.place)
     return None
 

@@ -19,7 +19,12 @@ from holdfast.appliance import Appliance, assembly
 from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
+from holdfast.cli.places import MODICON
 from holdfast.config import GatewayConfig, ModbusTcpListener
+from holdfast.config.scanning import written_pollable
+from holdfast.net.addresses import joined, reachable
+from holdfast.protocol import WRITE_LIMITS
+from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -40,12 +45,12 @@ JOIN_TIMEOUT = 0.2
 # Devices that the greeting names.
 MAX_DEVICES = 10
 
-# The number that mbpoll gives each area.
+# The number that mbpoll gives each area, registers first: they show more.
 MBPOLL_TYPES = {
-    "holding_registers": 4,
-    "input_registers": 3,
-    "coils": 0,
-    "discrete_inputs": 1,
+    area: number
+    for preferred in (REGISTER_AREAS, BIT_AREAS)
+    for number, area in MODICON.items()
+    if area in preferred
 }
 
 
@@ -139,7 +144,7 @@ def _greeting(appliance: Appliance, file: Path) -> str:
 def _address(endpoint: ListenAddress) -> str:
     if endpoint.port is None:
         return f"{endpoint.type}  {endpoint.host}"
-    address = f"{_bracketed(endpoint.host)}:{endpoint.port}"
+    address = joined(endpoint.host, endpoint.port)
     return f"http://{address}" if endpoint.type == "http" else f"{endpoint.type}  {address}"
 
 
@@ -160,7 +165,7 @@ def _reached(gateway: GatewayConfig) -> str:
 
 def _scanned(nats: NatsConfig) -> str:
     """What the scanner does for whom, in a line."""
-    devices = ", ".join(map(str, nats.devices))
+    devices = ", ".join(map(written_pollable, nats.devices))
     return f"polls and writes {devices} for subscribers at {nats.prefix}.subscribe"
 
 
@@ -193,9 +198,9 @@ def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Pat
                 f"mbpoll -m tcp -p {endpoint.port} -a {unit} -0 -t {MBPOLL_TYPES[area]}"
                 f" -r {addresses.start}"
             )
-            host = _reachable(endpoint.host)
+            host = reachable(endpoint.host)
             read = f"{command} -c {min(len(addresses), 5)} -1 {host}"
-            writable = rule.access == "read-write" and area in ("holding_registers", "coils")
+            writable = rule.access == "read-write" and area in WRITE_LIMITS
             return [read, f"{command} {host} 1", check] if writable else [read, check]
     return [check]
 
@@ -206,12 +211,3 @@ def _program() -> str:
     if name == "holdfast" and shutil.which(name) is None:
         return shlex.quote(os.path.relpath(sys.argv[0]))
     return name
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
-
-
-def _reachable(host: str) -> str:
-    """An address that a client on this machine can connect to."""
-    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)

@@ -17,16 +17,27 @@ import click
 
 from holdfast import logs
 from holdfast.cli.open_files import allow_open_files
-from holdfast.config.scanning import PREFIX, SERVER_PORT, parse_prefix, parse_server
-from holdfast.scanner import DeviceTls, Scanner, ScannerLimits, Servers, Settings
+from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
+from holdfast.config.scanning import (
+    PREFIX,
+    SERVER_PORT,
+    parse_pollable,
+    parse_prefix,
+    parse_server,
+    written_pollable,
+)
+from holdfast.net.allow_list import AllowedNetwork
+from holdfast.scanner import Scanner, ScannerLimits, Servers, Settings, device_tls
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
-from holdfast.scanner.hosts import PRIVATE, Allowed
+from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from holdfast.config.remote import Remote
+    from holdfast.net.allow_list import AllowEntry
+    from holdfast.net.tls import Tls
 
 DEFAULT_URL = f"nats://127.0.0.1:{SERVER_PORT}"
 FAILED = 1
@@ -106,18 +117,8 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option("--password-file", type=FILE, metavar="FILE", help="Holds the user's password.")
 @click.option("--token-file", type=FILE, metavar="FILE", help="Holds a token for the NATS server.")
 @click.option("--creds", type=FILE, metavar="FILE", help="Holds a user's JWT and seed.")
-@click.option("--tls-ca", type=FILE, metavar="FILE", help="Authorities that sign the server.")
-@click.option("--tls-cert", type=FILE, metavar="FILE", help="Our certificate.")
-@click.option("--tls-key", type=FILE, metavar="FILE", help="Its key.")
-@click.option(
-    "--device-ca",
-    type=FILE,
-    metavar="FILE",
-    help="Who is trusted among devices with TLS: authorities, or devices themselves; without it "
-    "the system's authorities.",
-)
-@click.option("--device-cert", type=FILE, metavar="FILE", help="Our certificate for devices.")
-@click.option("--device-key", type=FILE, metavar="FILE", help="Its key.")
+@tls_options("tls", "Authorities that sign the server.")
+@tls_options("device", DEVICES, " for devices")
 @click.option(
     "--max-devices",
     type=click.IntRange(1),
@@ -159,7 +160,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     """
     urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
-    device_tls = DeviceTls(options["device_ca"], options["device_cert"], options["device_key"])
+    trust = _tls("device", options)
     allow = _allowed(options["allow"])
     if store is not None and not embedded:
         raise click.UsageError("--store goes with --embedded.")
@@ -169,11 +170,11 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     with ExitStack() as stack:
         check: Callable[[], None] | None = None
         try:
-            device_tls.check()
+            device_tls.check(trust)
             if embedded:
                 server = stack.enter_context(Embedded(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
-            settings = Settings(servers, options["prefix"], allow, limits, device_tls)
+            settings = Settings(servers, options["prefix"], allow, limits, trust)
             click.echo(_greeting(settings))
             asyncio.run(_serve(settings, check))
         except (EmbeddedFailed, OSError) as error:
@@ -181,28 +182,20 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
             sys.exit(FAILED)
 
 
-def _allowed(entries: tuple[str, ...]) -> tuple[str, ...]:
+def _allowed(entries: tuple[str, ...]) -> tuple[AllowEntry, ...]:
     """Whom subscribers may have polled: without a network, private and loopback addresses too."""
     try:
-        listed = Allowed(entries)
+        listed = tuple(map(parse_pollable, entries))
     except ValueError as error:
         raise click.BadParameter(f"{error}.", param_hint="'--allow'") from None
-    return entries if listed.networks else (*entries, *map(str, PRIVATE))
+    only_lines = listed and not any(isinstance(entry, AllowedNetwork) for entry in listed)
+    return (*listed, *PRIVATE) if only_lines else listed
 
 
 def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
     """The servers, and who we are there; a usage error for what does not go together."""
-    together = (
-        ("password_file", "user"),
-        ("tls_cert", "tls_key"),
-        ("tls_key", "tls_cert"),
-        ("device_cert", "device_key"),
-        ("device_key", "device_cert"),
-    )
-    for key, other in together:
-        if options[key] is not None and options[other] is None:
-            given, missing = (f"--{name.replace('_', '-')}" for name in (key, other))
-            raise click.UsageError(f"{given} goes with {missing}.")
+    if options["password_file"] is not None and options["user"] is None:
+        raise click.UsageError("--password-file goes with --user.")
     ways = [key for key in ("user", "token_file", "creds") if options[key] is not None]
     if len(ways) > 1:
         given = " and ".join(f"--{key.replace('_', '-')}" for key in ways)
@@ -213,10 +206,12 @@ def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
         options["password_file"],
         options["token_file"],
         options["creds"],
-        options["tls_ca"],
-        options["tls_cert"],
-        options["tls_key"],
+        _tls("tls", options),
     )
+
+
+def _tls(prefix: str, options: dict[str, Any]) -> Tls:
+    return tls_of(prefix, *(options[f"{prefix}_{key}"] for key in ("ca", "cert", "key")))
 
 
 def _embedded_port(servers: Servers) -> int:
@@ -261,11 +256,15 @@ def _greeting(settings: Settings) -> str:
         f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse",
         f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",
         f"  published  {prefix}.data.DEVICE, {prefix}.status.DEVICE",
-        f"  devices    {', '.join(settings.allow) or 'at private and loopback addresses'}",
+        f"  devices    {_places(settings.allow)}",
         "",
         "Ctrl-C stops it.",
     ]
     return "\n".join(lines)
+
+
+def _places(allow: Iterable[AllowEntry]) -> str:
+    return ", ".join(map(written_pollable, allow)) or "at private and loopback addresses"
 
 
 def _without_secrets(servers: Servers) -> Iterator[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import http.client
-import ipaddress
 import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -12,6 +11,8 @@ from urllib.parse import urlencode
 
 from holdfast.cli.device import read_raw
 from holdfast.config import ModbusTcpListener
+from holdfast.net.addresses import holds, joined, parse_address, reachable
+from holdfast.protocol import READ_FUNCTIONS
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 MAX_ADDRESSES = 8192
 """Addresses that are watched at most: more nobody can look at, and reading them takes long."""
-
-READ_FUNCTIONS: dict[Area, int] = dict(zip(AREAS, (1, 2, 3, 4), strict=True))
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,9 @@ class Rest:
         self.where = f"REST at http://{_shown(bind)}"
         self.blocks = list(blocks)
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._connection = http.client.HTTPConnection(reachable(bind), bind.port, timeout=timeout)
+        self._connection = http.client.HTTPConnection(
+            reachable(bind.host), bind.port, timeout=timeout
+        )
 
     def read(self) -> list[list[int]]:
         """The values of each block."""
@@ -159,8 +160,8 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
         raise Unwatchable("there is neither rest nor a listener of type modbus-tcp")
     name, listener = found[0]
     _check_port(f"listener {name}", listener.bind)
-    host = ipaddress.ip_address(reachable(listener.bind))
-    rules = [rule for rule in listener.rules if any(host in source for source in rule.sources)]
+    host = parse_address(reachable(listener.bind.host))
+    rules = [rule for rule in listener.rules if holds(rule.sources, host)]
     if not rules:
         raise Unwatchable(f"no rule of listener {name} lets {host} in")
     rule = rules[0]
@@ -204,19 +205,13 @@ def cut(
     return kept, total - sum(block.count for block in kept)
 
 
-def reachable(bind: Bind) -> str:
-    """The address that a client on this machine connects to."""
-    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(bind.host, bind.host)
-
-
 def url_of(bind: Bind) -> str:
     """The URL of a listener, for a client on this machine."""
     return f"tcp://{_shown(bind)}"
 
 
 def _shown(bind: Bind) -> str:
-    host = reachable(bind)
-    return f"[{host}]:{bind.port}" if ":" in host else f"{host}:{bind.port}"
+    return joined(reachable(bind.host), bind.port)
 
 
 def _check_port(what: str, bind: Bind) -> None:
@@ -230,5 +225,5 @@ def _areas(config: Config, memory: str, unit: int) -> list[WatchedRange]:
 
 
 def _may_read(area: Area, functions: Sequence[int] | None, deny: Sequence[int] | None) -> bool:
-    function = READ_FUNCTIONS[area]
+    function = READ_FUNCTIONS[area].code
     return (functions is None or function in functions) and function not in (deny or ())

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from holdfast import values
-from holdfast.types import BIT_AREAS
-from holdfast.values import ConversionError
+from holdfast.values import ConversionError, WrongArea
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -48,6 +46,11 @@ class Typed:
     """The registers that a value takes."""
 
     @property
+    def name(self) -> str:
+        """The type of all of them, which is no array if it is one value."""
+        return self.element if self.count == 1 else f"{self.element}[{self.count}]"
+
+    @property
     def registers(self) -> int:
         """The registers that all of them take."""
         return self.width * self.count
@@ -71,14 +74,11 @@ def typed(
         if order != "ABCD" or encoding is not None:
             raise click.UsageError("--order and --encoding go with --type.")
         return None
-    match = re.fullmatch(r"(.+)\[([0-9]{1,6})\]", kind)
-    element, size = (match[1], int(match[2])) if match else (kind, 1)
     try:
-        values.register_count(kind)
-        width = values.register_count(element)
-        values.decode(bytes(2 * width), element, order, encoding=encoding)
+        type = values.codec_for(area, kind, order, encoding).type
+    except WrongArea as error:
+        raise click.UsageError(f"{area} hold bits, whose type is bool.") from error
     except ConversionError as error:
         raise click.UsageError(f"{error}.") from error
-    if area in BIT_AREAS and element != "bool":
-        raise click.UsageError(f"{area} hold bits, whose type is bool.")
-    return Typed(element, size * count, order, encoding, width)
+    size = 1 if type.count is None else type.count
+    return Typed(type.element, size * count, order, encoding, type.width // 2)

@@ -17,6 +17,7 @@ from holdfast.cli.progress import bar
 from holdfast.cli.sources import Unreadable, Unwatchable, WatchedRange
 from holdfast.cli.watching import Tracker
 from holdfast.errors import ModbusError
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.tools import discovery
 from holdfast.types import BIT_AREAS
 
@@ -106,8 +107,10 @@ def _chosen(words: Sequence[str], modicon: bool) -> tuple[Place, int] | None:
         return None
     place, left = places.taken(words, modicon=modicon)
     count = places.counted(left)
-    if place.address + count > places.LAST + 1:
-        raise click.UsageError(f"{count} from {place.address} on: the last address is 65535.")
+    if place.address + count > ADDRESSES:
+        raise click.UsageError(
+            f"{count} from {place.address} on: the last address is {LAST_ADDRESS}."
+        )
     return place, count
 
 

@@ -15,6 +15,7 @@ from holdfast.cli import device, places, showing
 from holdfast.cli.typed import typed, typed_options
 from holdfast.client import requests
 from holdfast.errors import ModbusError, ModbusException
+from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def write(
     for word in left:
         if word.startswith("--") or (word.startswith("-") and not NEGATIVE.match(word)):
             raise click.NoSuchOption(word)
-    if place.area not in requests.WRITE_LIMITS:
+    if place.area not in WRITE_LIMITS:
         raise click.UsageError(f"{place.area} can't be written, only read.")
     if not left:
         raise click.UsageError("Missing argument 'VALUE...'.")
@@ -140,9 +141,8 @@ def _job(
         if asked.element.startswith("bit:") and len(found) > 1:
             raise ValueError(f"{asked.element} takes one value, found {len(found)}")
         value = found[0] if asked.count == 1 else found
-        name = asked.element if asked.count == 1 else f"{asked.element}[{asked.count}]"
         steps = requests.write_typed(
-            place.area, place.address, value, name, order, encoding, split=split
+            place.area, place.address, value, asked.name, order, encoding, split=split
         )
         return _Job(place, asked, value, split, list(steps))
     except ValueError as error:
@@ -179,12 +179,11 @@ class _Job:
     def write(self, client: SyncClient) -> None:
         """Writes it."""
         place, kind = self.place, self.typed
-        name = kind.element if kind.count == 1 else f"{kind.element}[{kind.count}]"
         client.write(
             place.area,
             place.address,
             self.value,
-            name,
+            kind.name,
             kind.order,
             encoding=kind.encoding,
             split=self.split,
@@ -198,8 +197,7 @@ class _Job:
             [mask] = values.encode(self.value, kind.element, kind.order)
             wrote = [now[0] | mask if self.value else now[0] & mask]
         else:
-            name = kind.element if kind.count == 1 else f"{kind.element}[{kind.count}]"
-            wrote = values.encode(self.value, name, kind.order, encoding=kind.encoding)
+            wrote = values.encode(self.value, kind.name, kind.order, encoding=kind.encoding)
         pairs = enumerate(zip(wrote, now, strict=True), place.address)
         return {address: (int(a), int(b)) for address, (a, b) in pairs if a != b}
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast import _core, logs
+from holdfast.protocol import MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -294,7 +295,7 @@ def _explain(command: Mapping[str, object], write: Write, where: dict[str, Any])
     """Raises `Refused` for the first value of a write that can't be, if there is one."""
     _, area, address, values = write
     bits = area in BIT_AREAS
-    most, allowed = (1, "0, 1, false or true") if bits else (65535, "0..65535")
+    most, allowed = (1, "0, 1, false or true") if bits else (MAX_WORD, f"0..{MAX_WORD}")
     for index, value in enumerate(values):
         if bits and type(value) is bool:
             continue
