@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.addresses import parse_source
 from holdfast.config.allowed import allowed
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
+from holdfast.config.scalars import MAX_CONNECTIONS
 from holdfast.config.tls_checks import check_server_tls
 from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.unique import refuse_repeats
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.config.problems import Report
     from holdfast.config.source import KeyPath
 
-_MAX_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default
+_DEFAULT_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default
 _OTHER = {"v1": "crc", "crc": "v1"}
 _NAMING = {"v1": "units", "crc": "memories"}
 """How a raw ingest rule names memories, by the format of the packets."""
@@ -88,8 +89,8 @@ class ListenerChecks:
         ]
 
     def _limits(self, path: KeyPath, listener: dict[Any, Any]) -> None:
-        most = integer(listener.get("max_connections", _MAX_CONNECTIONS), 1, 65535)
-        of_source = integer(listener.get("max_connections_per_source"), 1, 65535)
+        most = integer(listener.get("max_connections", _DEFAULT_CONNECTIONS), 1, MAX_CONNECTIONS)
+        of_source = integer(listener.get("max_connections_per_source"), 1, MAX_CONNECTIONS)
         if most is not None and of_source is not None and of_source > most:
             message = f"{of_source} has no effect: max_connections is {most}"
             self.report.doubt((*path, "max_connections_per_source"), message)

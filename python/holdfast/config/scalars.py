@@ -47,6 +47,7 @@ from holdfast.protocol import CODES, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
 from holdfast.types import Area
 
 MAX_BYTES = 244
+MAX_CONNECTIONS = 65535
 MAX_DEVICE = 4095
 MAX_ROLE = 255
 MAX_TIME = 31_622_400
@@ -331,7 +332,7 @@ QualityOfService = Annotated[Literal[0, 1, 2], BeforeValidator(_integral)]
 StopBits = Annotated[Literal[1, 2], BeforeValidator(_integral)]
 DataBits = Annotated[Literal[7, 8], BeforeValidator(_integral)]
 EightBits = Annotated[Literal[8], BeforeValidator(_integral)]
-Connections = Annotated[int, Field(ge=1, le=65535)]
+Connections = Annotated[int, Field(ge=1, le=MAX_CONNECTIONS)]
 Source = Annotated[
     Network,
     PlainValidator(parse_source),

@@ -23,6 +23,7 @@ from holdfast.gateway.typed import quantity_of, typed
 from holdfast.protocol import (
     ADDRESSES,
     LAST_ADDRESS,
+    MAX_WORD,
     READ_BITS,
     READ_FUNCTIONS,
     READ_LIMITS,
@@ -209,7 +210,7 @@ ENDPOINTS = (
             "format": "registers",
             "values": [1234, 0, 65535, 42, 7],
         },
-        "Functions 1 to 4. `values` are booleans, or registers 0 to 65535.",
+        f"Functions 1 to 4. `values` are booleans, or registers 0 to {MAX_WORD}.",
         optional=tuple(TYPED),
         on_exception=_read_exception,
     ),

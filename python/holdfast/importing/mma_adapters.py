@@ -14,6 +14,7 @@ from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.peers import Peers, written
 from holdfast.importing.sections import section
 from holdfast.net.addresses import LOOPBACK
+from holdfast.protocol import MAX_WORD
 
 if TYPE_CHECKING:
     from holdfast.config.addresses import Bind
@@ -238,7 +239,7 @@ class Adapters:
                 message = f"never reached {name}, whose name is no MemoryID"
                 self.desk.note("check", raw.path, f"{message}; give it an id if it should")
         if not memories:
-            message = "Raw Ingest is left out: no memory is named by a number from 0 to 65535"
+            message = f"Raw Ingest is left out: no memory is named by a number from 0 to {MAX_WORD}"
             self.desk.note("left out", raw.path, message)
             return
         sources = self._sources(raw, "Raw Ingest")

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from holdfast.config.scalars import MAX_CONNECTIONS
 from holdfast.config.words import guess, listing, show
 from holdfast.importing import functions
 from holdfast.importing.filters import ALL, read_filter
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.importing.notes import Desk
     from holdfast.importing.peers import Peers
 
-MAX_CONNECTIONS = 32
+DEFAULT_CONNECTIONS = 32
 
 
 @dataclass
@@ -261,10 +262,11 @@ class FirstGeneration:
     def _max_connections(self, policy: Section) -> int:
         most = policy.integer("max_connections", -(2**31), 2**31 - 1)
         if most is None:
-            return MAX_CONNECTIONS
-        allowed = MAX_CONNECTIONS if most < 1 else min(most, 65535)
+            return DEFAULT_CONNECTIONS
+        allowed = DEFAULT_CONNECTIONS if most < 1 else min(most, MAX_CONNECTIONS)
         if allowed != most:
-            message = f"is {allowed}, found {most}, allowed: an integer from 1 to 65535"
+            integer = f"an integer from 1 to {MAX_CONNECTIONS}"
+            message = f"is {allowed}, found {most}, allowed: {integer}"
             self.desk.note("changed", policy.at("max_connections"), message)
         return allowed
 

@@ -15,6 +15,7 @@ from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
 from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
 from holdfast.adapters.mqtt.waiting import Ended, Waiter
+from holdfast.config.broker import MAX_TEXT
 from holdfast.net.addresses import joined
 from holdfast.net.tls import NO_FILES, broker_context
 
@@ -35,7 +36,7 @@ WELCOME = 10.0
 SILENCE = 600.0
 """Seconds for which a failure to connect is not logged again when its reason is the same."""
 
-MAX_PASSWORD = 65535
+MAX_PASSWORD = MAX_TEXT
 
 _TICK = 1.0
 """Seconds between looks at the keep-alive."""
