@@ -30,8 +30,8 @@ HOST = "IP:127.0.0.1"
 TARGET = {"host": "127.0.0.1", "transport": "tls"}
 READ = {"functionCode": 3, "address": 0, "quantity": 3}
 UNKNOWN = (
-    "the issuer of the certificate is unknown: neither the certificate nor an authority above it is "
-    "trusted"
+    "the issuer of the certificate is unknown: neither the certificate nor an authority above it "
+    "is trusted"
 )
 
 
@@ -170,8 +170,8 @@ def test_a_certificate_is_for_the_name_that_was_asked_for(
         assert running.ask("/read", at(relay, host=host)).json["values"] == [11, 22, 33]
         assert failure(running.ask("/read", at(relay))) == (
             "tls_failed",
-            f"can't connect to 127.0.0.1:{relay.address[1]}: the certificate is not for "
-            "'127.0.0.1'",
+            f"can't connect to 127.0.0.1:{relay.address[1]}: the certificate is for "
+            f"'{PLC}', not for '127.0.0.1'",
         )
     assert [each.host for each in dialed.calls] == ["127.0.0.1"] * 2
 
@@ -188,7 +188,8 @@ def test_a_certificate_for_another_name_is_told(device: Relay, trust: Tls) -> No
     with gateways.running(tls=trust, resolve=names) as running:
         assert failure(running.ask("/read", at(device, host=PLC))) == (
             "tls_failed",
-            f"can't connect to {PLC}:{device.address[1]}: the certificate is for '127.0.0.1', not for '{PLC}'",
+            f"can't connect to {PLC}:{device.address[1]}: the certificate is for '127.0.0.1', "
+            f"not for '{PLC}'",
         )
 
 

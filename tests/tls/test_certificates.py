@@ -80,9 +80,11 @@ def read(face: str, url: str) -> str:
 
 def refusal(url: str) -> str:
     """What is wrong with a device, in words."""
-    with holdfast.SyncClient(url, timeout=wire.DEADLINE) as client:
-        with pytest.raises(holdfast.TlsFailed) as raised:
-            client.read_holding_registers(0, 1)
+    with (
+        holdfast.SyncClient(url, timeout=wire.DEADLINE) as client,
+        pytest.raises(holdfast.TlsFailed) as raised,
+    ):
+        client.read_holding_registers(0, 1)
     return raised.value.detail
 
 

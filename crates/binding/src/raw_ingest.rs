@@ -1,8 +1,11 @@
 //! Raw Ingest packets: values to a payload, a payload to a packet.
 
+use std::num::NonZeroU16;
+
+use holdfast_engine::packet_area::in_packet;
 use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest::{Format, Header};
-use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyBytes, PyInt, PyList};
 
@@ -51,22 +54,13 @@ pub fn encode_raw_ingest<'py>(
     let required = word("crc", crc, &[("required", true), ("none", false)])?;
     let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
     let format = word("format", format, &formats)?;
-    let area = named(area)?;
-    let (code, _) = (1..)
-        .zip(Area::ALL)
-        .find(|(_, each)| *each == area)
-        .ok_or_else(|| PyRuntimeError::new_err("an area that packets can't name"))?;
-    let header = Header { area: code, target, address, count };
-    if count == 0 || payload.len() != header.payload_len() {
-        let (len, expected) = (payload.len(), header.payload_len());
-        let message =
-            format!("the payload has {len} bytes, {count} {} have {expected}", area.name());
-        return Err(PyValueError::new_err(message));
-    }
-    let len = format.packet_len(&header);
-    let mut packet = Vec::with_capacity(len);
-    format.encode(&header, payload, &mut packet);
-    Ok(PyBytes::new(py, &packet))
+    let area = in_packet(named(area)?);
+    let count = NonZeroU16::new(count).ok_or_else(|| PyValueError::new_err("count is 0"))?;
+    let header = Header { area, target, address, count };
+    PyBytes::new_with(py, format.packet_len(&header), |packet| {
+        let encoded = format.encode_to_slice(&header, payload, packet);
+        encoded.map(drop).map_err(|error| PyValueError::new_err(error.to_string()))
+    })
 }
 
 fn item(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {

@@ -16,6 +16,7 @@
 
 pub mod client;
 mod counter;
+pub mod packet_area;
 pub mod poller;
 mod serial_line;
 pub mod server;

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_memory::Area;
-use holdfast_protocol::raw_ingest::{self, DONE, Format, Header};
+use holdfast_protocol::raw_ingest::{DONE, Format, Header};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
@@ -18,6 +18,7 @@ use tokio::time::{sleep, timeout};
 
 use super::backoff;
 use crate::counter::Counter;
+use crate::packet_area::in_packet;
 
 /// The longest pause before a target that is down is tried again.
 const MAX_PAUSE: Duration = Duration::from_secs(10);
@@ -107,12 +108,7 @@ impl Forward {
         count: NonZeroU16,
         bytes: &[u8],
     ) {
-        let area = match area {
-            Area::Coils => raw_ingest::Area::Coils,
-            Area::DiscreteInputs => raw_ingest::Area::DiscreteInputs,
-            Area::HoldingRegisters => raw_ingest::Area::HoldingRegisters,
-            Area::InputRegisters => raw_ingest::Area::InputRegisters,
-        };
+        let area = in_packet(area);
         let header = Header { area, target: self.settings.target, address, count };
         let mut packet = Vec::with_capacity(self.settings.format.packet_len(&header));
         let encoded = self.settings.format.encode(&header, bytes, &mut packet);

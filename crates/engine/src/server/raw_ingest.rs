@@ -11,12 +11,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Write};
-use holdfast_protocol::raw_ingest::{self, DONE, Format, Header, REFUSED, Refusal};
+use holdfast_protocol::raw_ingest::{DONE, Format, Header, REFUSED, Refusal};
 use ipnet::IpNet;
 use socket2::SockRef;
 use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
+
+use crate::packet_area::of_packet;
 
 use super::audit::{Record, Written};
 use super::counters::PacketCounters;
@@ -107,7 +109,7 @@ impl RawIngest {
             Format::Crc { .. } => Refusal::Memory,
         };
         let memory = rights.targets.get(&header.target).ok_or(unmapped)?;
-        let area = area(&header);
+        let area = of_packet(header.area);
         if !rights.areas.contains(&area) {
             return Err(Refusal::NotGranted);
         }
@@ -134,8 +136,12 @@ impl RawIngest {
         (header, memory, payload): (Header, &Memory, &[u8]),
     ) -> Result<(), Refusal> {
         let (address, count) = (header.address, header.count.get());
-        let write =
-            Write { area: area(&header), address, count: usize::from(count), bytes: payload };
+        let write = Write {
+            area: of_packet(header.area),
+            address,
+            count: usize::from(count),
+            bytes: payload,
+        };
         memory.write(Access::Ingest, write).map_err(|_| Refusal::Range)?;
         self.packets.accepted.add();
         self.packets.values.add_many(u64::from(count));
@@ -273,13 +279,4 @@ impl Service for RawIngest {
 /// Whether bytes behind the packet have arrived.
 fn more_is_there(stream: &TcpStream) -> bool {
     matches!((&*SockRef::from(stream)).read(&mut [0]), Ok(len) if len > 0)
-}
-
-fn area(header: &Header) -> Area {
-    match header.area {
-        raw_ingest::Area::Coils => Area::Coils,
-        raw_ingest::Area::DiscreteInputs => Area::DiscreteInputs,
-        raw_ingest::Area::HoldingRegisters => Area::HoldingRegisters,
-        raw_ingest::Area::InputRegisters => Area::InputRegisters,
-    }
 }

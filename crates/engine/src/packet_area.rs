@@ -1,0 +1,22 @@
+//! The area that a Raw Ingest packet names, as memories have it, and back.
+
+use holdfast_memory::Area;
+use holdfast_protocol::raw_ingest;
+
+pub fn of_packet(area: raw_ingest::Area) -> Area {
+    match area {
+        raw_ingest::Area::Coils => Area::Coils,
+        raw_ingest::Area::DiscreteInputs => Area::DiscreteInputs,
+        raw_ingest::Area::HoldingRegisters => Area::HoldingRegisters,
+        raw_ingest::Area::InputRegisters => Area::InputRegisters,
+    }
+}
+
+pub fn in_packet(area: Area) -> raw_ingest::Area {
+    match area {
+        Area::Coils => raw_ingest::Area::Coils,
+        Area::DiscreteInputs => raw_ingest::Area::DiscreteInputs,
+        Area::HoldingRegisters => raw_ingest::Area::HoldingRegisters,
+        Area::InputRegisters => raw_ingest::Area::InputRegisters,
+    }
+}
