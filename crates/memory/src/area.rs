@@ -73,6 +73,16 @@ impl Span {
         self.size
     }
 
+    /// The address behind the last one, up to 65,536.
+    pub const fn end(self) -> u32 {
+        self.start as u32 + self.size
+    }
+
+    /// Whether all of `address .. address + count` is inside.
+    pub fn holds(self, address: u16, count: usize) -> bool {
+        self.offset(address, count).is_some()
+    }
+
     /// The offset of `address` from the start, when all of `address .. address + count` is inside.
     pub(crate) fn offset(self, address: u16, count: usize) -> Option<usize> {
         let offset = usize::from(address.checked_sub(self.start)?);

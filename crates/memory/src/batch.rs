@@ -29,16 +29,17 @@ pub(crate) fn is_large<'w>(writes: impl ExactSizeIterator<Item = &'w Write<'w>>)
         || (writes.len() > 1 && writes.map(|write| write.bytes.len()).sum::<usize>() > SHORT)
 }
 
-/// What writes to one area come to. They have been checked.
-pub(crate) fn flatten(area: Area, writes: &[Write<'_>]) -> Vec<Run> {
-    let starts = writes.iter().map(|write| usize::from(write.address));
-    let ends = writes.iter().map(|write| usize::from(write.address) + write.count);
-    let (Some(start), Some(end)) = (starts.min(), ends.max()) else {
-        return Vec::new();
-    };
+/// The runs that writes to one area leave, by address. The writes have been checked.
+pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -> Vec<Run> {
+    let Some(&Write { area, .. }) = writes.clone().next() else { return Vec::new() };
+    let (start, end) = writes.clone().fold((usize::MAX, 0), |(start, end), write| {
+        let at = usize::from(write.address);
+        (start.min(at), end.max(at + write.count))
+    });
     let mut image = vec![0; area.byte_len(end - start)];
     let mut written = vec![false; end - start];
     for write in writes {
+        debug_assert_eq!(write.area, area);
         let at = usize::from(write.address) - start;
         written[at..at + write.count].fill(true);
         if area.is_bits() {
@@ -47,7 +48,7 @@ pub(crate) fn flatten(area: Area, writes: &[Write<'_>]) -> Vec<Run> {
             image[at * 2..(at + write.count) * 2].copy_from_slice(write.bytes);
         }
     }
-    let mut runs = Vec::new();
+    let mut runs: Vec<Run> = Vec::new();
     let mut at = 0;
     for stretch in written.chunk_by(|a, b| a == b) {
         let count = stretch.len();
@@ -62,5 +63,9 @@ pub(crate) fn flatten(area: Area, writes: &[Write<'_>]) -> Vec<Run> {
         }
         at += count;
     }
+    debug_assert!(
+        runs.is_sorted_by(|a, b| usize::from(a.address) + a.count < usize::from(b.address)),
+        "runs are apart, by address"
+    );
     runs
 }

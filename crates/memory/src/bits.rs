@@ -3,6 +3,8 @@
 /// Copies `count` bits of `area`, from bit `offset`, to the start of `out`. Unused bits of the last
 /// byte of `out` become 0. `out` has `count.div_ceil(8)` bytes; `area` has the whole range.
 pub fn copy_out(area: &[u8], offset: usize, count: usize, out: &mut [u8]) {
+    debug_assert_eq!(out.len(), count.div_ceil(8));
+    debug_assert!(offset + count <= area.len() * 8);
     let first = offset / 8;
     let shift = offset % 8;
     if shift == 0 {
@@ -20,8 +22,13 @@ pub fn copy_out(area: &[u8], offset: usize, count: usize, out: &mut [u8]) {
 }
 
 /// Copies the first `count` bits of `bits` into `area`, from bit `offset`. Bits beyond `count` in
-/// the last byte of `bits` are ignored.
+/// the last byte of `bits` are ignored. `bits` has `count.div_ceil(8)` bytes; `area` has the whole
+/// range.
 pub fn copy_in(area: &mut [u8], offset: usize, count: usize, bits: &[u8]) {
+    debug_assert_eq!(bits.len(), count.div_ceil(8));
+    debug_assert!(offset + count <= area.len() * 8);
+    // A byte more would change bits behind the range.
+    assert!(bits.len() * 8 < count + 8);
     let first = offset / 8;
     let shift = offset % 8;
     for (index, &byte) in bits.iter().enumerate() {

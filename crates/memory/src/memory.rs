@@ -1,6 +1,6 @@
 //! The memory itself: reads and writes under one lock, and the seal.
 
-use std::collections::BTreeMap;
+use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
@@ -243,7 +243,12 @@ impl Memory {
     }
 
     /// Carries out writes that have been checked, then moves the seal.
-    fn apply(&self, access: Access, content: &mut Content, writes: &[Write<'_>]) {
+    fn apply<'w>(
+        &self,
+        access: Access,
+        content: &mut Content,
+        writes: impl IntoIterator<Item = &'w Write<'w>>,
+    ) {
         for write in writes {
             self.copy_in(content, write);
         }
@@ -251,7 +256,9 @@ impl Memory {
     }
 
     fn copy_in(&self, content: &mut Content, write: &Write<'_>) {
-        let offset = usize::from(write.address - self.span(write.area).start());
+        let span = self.span(write.area);
+        debug_assert!(span.holds(write.address, write.count), "{write:?} is outside {span:?}");
+        let offset = usize::from(write.address - span.start());
         let area = &mut content.areas[write.area.index()];
         if write.area.is_bits() {
             bits::copy_in(area, offset, write.count, write.bytes);
@@ -296,6 +303,8 @@ impl Content {
 
     fn copy_out(&self, offset: usize, read: Read<'_>) {
         let area = &self.areas[read.area.index()];
+        debug_assert!(read.area.byte_len(offset + read.count) <= area.len(), "{read:?}");
+        debug_assert_eq!(read.out.len(), read.area.byte_len(read.count));
         if read.area.is_bits() {
             bits::copy_out(area, offset, read.count, read.out);
         } else {
@@ -315,54 +324,77 @@ impl Write<'_> {
 /// write is refused none is carried out. A memory may be named more than once.
 ///
 /// # Errors
-/// As [`Memory::write_many`]; the index is that of the first refused write in `writes`.
+/// `WrongLength`, `OutOfRange` or `GateBit`, with the index of the first write that is refused for
+/// one of them; then [`Refusal::Sealed`] (to a client), with the index of the first write to a
+/// memory that is sealed. Nothing has changed.
 pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     for (index, (memory, write)) in writes.iter().enumerate() {
         memory
             .writable(access, std::slice::from_ref(write))
             .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
     }
-    if access == Access::Ingest && batch::is_large(writes.iter().map(|(_, write)| write)) {
-        let flat = flattened(writes);
-        let runs: Vec<(&Memory, Write<'_>)> = flat
-            .iter()
-            .flat_map(|(memory, area, runs)| runs.iter().map(|run| (*memory, run.writing(*area))))
-            .collect();
-        return apply_across(access, &runs);
+    let mut placed: Vec<Placed> = writes
+        .iter()
+        .enumerate()
+        .map(|(index, &(memory, write))| Placed { index, memory, write })
+        .collect();
+    // The sort is stable: writes to one area of one memory keep their order.
+    placed.sort_by_key(|placed| (placed.memory.rank, placed.write.area));
+    if !batch::is_large(placed.iter().map(|placed| &placed.write)) {
+        return apply_across(access, &placed);
     }
-    apply_across(access, writes)
+    let flat: Vec<(&Placed, Vec<Run>)> = placed
+        .chunk_by(|a, b| ptr::eq(a.memory, b.memory) && a.write.area == b.write.area)
+        .map(|writes| (&writes[0], batch::flatten(writes.iter().map(|placed| &placed.write))))
+        .collect();
+    let runs: Vec<Placed> = flat
+        .iter()
+        .flat_map(|(first, runs)| {
+            runs.iter().map(|run| Placed { write: run.writing(first.write.area), ..**first })
+        })
+        .collect();
+    apply_across(access, &runs)
 }
 
-/// Writes that have been checked, over several memories.
-fn apply_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
-    let mut memories: Vec<&Memory> = writes.iter().map(|(memory, _)| *memory).collect();
-    memories.sort_unstable_by_key(|memory| memory.rank);
-    memories.dedup_by_key(|memory| memory.rank);
-    let mut locked: Vec<_> = memories.iter().map(|memory| memory.exclusive()).collect();
-    let position = |memory: &Memory| {
-        memories.binary_search_by_key(&memory.rank, |other| other.rank).unwrap_or_default()
-    };
-    for (index, (memory, _)) in writes.iter().enumerate() {
-        locked[position(memory)].admit(access).map_err(|refusal| Refused { index, refusal })?;
+/// A write that has been checked, with its memory: it can't reach another one.
+struct Placed<'a> {
+    /// Its index in the batch. A run has the index of the first write in it.
+    index: usize,
+    memory: &'a Memory,
+    write: Write<'a>,
+}
+
+/// A memory that is locked, and the writes to it.
+struct Target<'p, 'a> {
+    memory: &'a Memory,
+    content: RwLockWriteGuard<'a, Content>,
+    writes: &'p [Placed<'a>],
+}
+
+/// Carries out writes over several memories. They are sorted by the ranks of these.
+fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
+    debug_assert!(placed.is_sorted_by_key(|placed| placed.memory.rank), "locks are taken in order");
+    let by_memory = placed.chunk_by(|a, b| ptr::eq(a.memory, b.memory));
+    let mut targets: Vec<Target> = by_memory
+        .map(|writes| {
+            let memory = writes[0].memory;
+            Target { memory, content: memory.exclusive(), writes }
+        })
+        .collect();
+    debug_assert!(
+        targets.is_sorted_by(|a, b| a.memory.rank < b.memory.rank),
+        "each lock is taken once"
+    );
+    let refused = targets.iter().filter_map(|target| {
+        let refusal = target.content.admit(access).err()?;
+        let indexes = target.writes.iter().map(|placed| placed.index);
+        Some(Refused { index: indexes.fold(usize::MAX, usize::min), refusal })
+    });
+    if let Some(first) = refused.min_by_key(|refused| refused.index) {
+        return Err(first);
     }
-    for (memory, write) in writes {
-        memory.copy_in(&mut locked[position(memory)], write);
-    }
-    for (memory, content) in memories.iter().zip(&mut locked) {
-        memory.settle(access, content);
+    for Target { memory, content, writes } in &mut targets {
+        memory.apply(access, content, writes.iter().map(|placed| &placed.write));
     }
     Ok(())
-}
-
-/// What many writes come to, area by area.
-fn flattened<'m>(writes: &[(&'m Memory, Write<'_>)]) -> Vec<(&'m Memory, Area, Vec<Run>)> {
-    let mut groups: BTreeMap<(u64, Area), (&'m Memory, Vec<Write<'_>>)> = BTreeMap::new();
-    for (memory, write) in writes {
-        let key = (memory.rank, write.area);
-        groups.entry(key).or_insert_with(|| (memory, Vec::new())).1.push(*write);
-    }
-    let groups = groups.into_iter();
-    groups
-        .map(|((_, area), (memory, writes))| (memory, area, batch::flatten(area, &writes)))
-        .collect()
 }

@@ -1,10 +1,10 @@
-//! The memory against a model that keeps one value an address: whatever is done to both, both say
-//! the same, refusals included.
+//! The memory against a model that keeps one value per address: every operation on both has the same
+//! result, refusals included.
 
 use std::collections::BTreeMap;
 
 use holdfast_memory::{
-    Access, Area, Gate, GateMode, Layout, Memory, Read, Refusal, Span, Write, write_across,
+    Access, Area, Gate, GateMode, Layout, Memory, Read, Refusal, Refused, Span, Write, write_across,
 };
 use proptest::prelude::*;
 
@@ -45,6 +45,10 @@ impl Values {
             *last |= 0xFF << used;
         }
         bytes
+    }
+
+    fn packed<'a>(&self, bytes: &'a [u8]) -> Write<'a> {
+        Write { area: self.area, address: self.address, count: self.values.len(), bytes }
     }
 }
 
@@ -95,14 +99,25 @@ impl Model {
     fn write(&mut self, access: Access, writes: &[Values]) -> Result<(), Refusal> {
         self.admit(access)?;
         for write in writes {
-            let addresses = self.addresses(write.area, write.address, write.values.len())?;
-            let hits_gate = self
-                .gate
-                .is_some_and(|gate| gate.area == write.area && addresses.contains(&gate.address));
-            if hits_gate && access == Access::Client {
-                return Err(Refusal::GateBit);
-            }
+            self.checked(access, write)?;
         }
+        self.apply(access, writes);
+        Ok(())
+    }
+
+    fn checked(&self, access: Access, write: &Values) -> Result<(), Refusal> {
+        if write.values.is_empty() {
+            return Err(Refusal::WrongLength);
+        }
+        let addresses = self.addresses(write.area, write.address, write.values.len())?;
+        let hits_gate = self
+            .gate
+            .is_some_and(|gate| gate.area == write.area && addresses.contains(&gate.address));
+        if hits_gate && access == Access::Client { Err(Refusal::GateBit) } else { Ok(()) }
+    }
+
+    /// Carries out writes that have been checked, then moves the seal.
+    fn apply<'w>(&mut self, access: Access, writes: impl IntoIterator<Item = &'w Values>) {
         for Values { area, address, values } in writes {
             for (index, value) in values.iter().enumerate() {
                 let value = if area.is_bits() { value & 1 } else { *value };
@@ -113,8 +128,36 @@ impl Model {
             let open = self.areas[gate.area as usize][&gate.address] == 1;
             self.sealed = !open && (gate.mode == GateMode::Level || self.sealed);
         }
-        Ok(())
     }
+
+    fn contents(&self) -> Vec<Vec<u16>> {
+        LAYOUT
+            .iter()
+            .map(|&(area, ..)| self.areas[area as usize].values().copied().collect())
+            .collect()
+    }
+}
+
+/// What `write_across` does: the first write that can't be is refused, then the first to a memory
+/// that is sealed.
+fn model_write_across(
+    models: &mut [Model; 3],
+    access: Access,
+    batch: &[(usize, Values)],
+) -> Result<(), Refused> {
+    for (index, (which, write)) in batch.iter().enumerate() {
+        models[*which].checked(access, write).map_err(|refusal| Refused { index, refusal })?;
+    }
+    for (index, (which, _)) in batch.iter().enumerate() {
+        models[*which].admit(access).map_err(|refusal| Refused { index, refusal })?;
+    }
+    for (which, model) in models.iter_mut().enumerate() {
+        let mut writes = batch.iter().filter(|(to, _)| *to == which).map(|(_, w)| w).peekable();
+        if writes.peek().is_some() {
+            model.apply(access, writes);
+        }
+    }
+    Ok(())
 }
 
 const LAYOUT: [(Area, u16, u32); 3] =
@@ -167,6 +210,21 @@ fn some_values() -> impl Strategy<Value = Values> {
     })
 }
 
+/// A write that no memory takes: its area is missing, its range is outside, or it has no values.
+fn a_bad_write() -> impl Strategy<Value = (usize, Values)> {
+    let place = prop_oneof![
+        Just((Area::InputRegisters, 0, 1)),
+        Just((Area::Coils, 2, 2)),
+        Just((Area::Coils, 42, 2)),
+        Just((Area::DiscreteInputs, 21, 1)),
+        Just((Area::HoldingRegisters, 65_535, 2)),
+        Just((Area::HoldingRegisters, 65_500, 0)),
+    ];
+    (0..3usize, place).prop_map(|(which, (area, address, count))| {
+        (which, Values { area, address, values: vec![1; count] })
+    })
+}
+
 fn a_step() -> impl Strategy<Value = Step> {
     prop_oneof![
         (an_access(), a_range())
@@ -200,16 +258,8 @@ fn take(memory: &Memory, model: &mut Model, step: Step) {
         }
         Step::Write(access, writes) => {
             let packed: Vec<Vec<u8>> = writes.iter().map(Values::pack).collect();
-            let borrowed: Vec<Write> = writes
-                .iter()
-                .zip(&packed)
-                .map(|(write, bytes)| Write {
-                    area: write.area,
-                    address: write.address,
-                    count: write.values.len(),
-                    bytes,
-                })
-                .collect();
+            let borrowed: Vec<Write> =
+                writes.iter().zip(&packed).map(|(write, bytes)| write.packed(bytes)).collect();
             let done = memory.write_many(access, &borrowed).map_err(|refused| refused.refusal);
             assert_eq!(done, model.write(access, &writes));
         }
@@ -231,12 +281,7 @@ fn take(memory: &Memory, model: &mut Model, step: Step) {
             let done = memory
                 .write_then_read(
                     access,
-                    Write {
-                        area: write.area,
-                        address: write.address,
-                        count: write.values.len(),
-                        bytes: &bytes,
-                    },
+                    write.packed(&bytes),
                     Read { area, address, count, out: &mut out },
                 )
                 .map(|()| unpack(area, count, &out));
@@ -265,66 +310,50 @@ proptest! {
             take(&memory, &mut model, step);
             prop_assert_eq!(memory.sealed(), model.sealed);
         }
-        let expected: Vec<Vec<u16>> = LAYOUT
-            .iter()
-            .map(|&(area, ..)| model.areas[area as usize].values().copied().collect())
-            .collect();
-        prop_assert_eq!(contents(&memory), expected);
+        prop_assert_eq!(contents(&memory), model.contents());
     }
 
     #[test]
     fn a_batch_over_several_memories_is_written_whole_or_not_at_all(
-        batch in prop::collection::vec((0..3usize, some_values()), 1..6),
+        gates in prop::array::uniform3(a_gate()),
+        earlier in prop::collection::vec((0..3usize, some_values()), 0..20),
+        access in an_access(),
+        // Short batches are written as they are, long ones are flattened first.
+        batch in prop_oneof![
+            prop::collection::vec((0..3usize, some_values()), 0..8),
+            prop::collection::vec((0..3usize, some_values()), 8..120),
+        ],
+        bad in prop::collection::vec((any::<prop::sample::Index>(), a_bad_write()), 0..3),
     ) {
-        let memories: Vec<Memory> = (0..3).map(|_| Memory::new(layout(), None).unwrap()).collect();
-        let mut models: Vec<Model> = (0..3).map(|_| Model::new(&layout(), None)).collect();
+        let memories = gates.map(|gate| Memory::new(layout(), gate).unwrap());
+        let mut models = gates.map(|gate| Model::new(&layout(), gate));
+        for (which, write) in &earlier {
+            let _ = models[*which].write(Access::Ingest, std::slice::from_ref(write));
+            let _ = memories[*which].write(Access::Ingest, write.packed(&write.pack()));
+        }
+        let mut batch = batch;
+        batch.retain(|(which, write)| models[*which].checked(access, write).is_ok());
+        for (place, write) in bad {
+            batch.insert(place.index(batch.len() + 1), write);
+        }
         let packed: Vec<Vec<u8>> = batch.iter().map(|(_, write)| write.pack()).collect();
-        let writes: Vec<(&Memory, Write)> = batch.iter().zip(&packed).map(|((which, write), bytes)| {
-            let count = write.values.len();
-            (&memories[*which], Write { area: write.area, address: write.address, count, bytes })
-        }).collect();
-        let before = models.clone();
-        let expected = batch.iter().position(|(which, write)| {
-            models[*which].write(Access::Ingest, std::slice::from_ref(write)).is_err()
-        });
-        if expected.is_some() {
-            models = before;
-        }
-        let done = write_across(Access::Ingest, &writes);
-        prop_assert_eq!(done.err().map(|refused| refused.index), expected);
-        for (memory, model) in memories.iter().zip(&models) {
-            let expected: Vec<Vec<u16>> = LAYOUT
-                .iter()
-                .map(|&(area, ..)| model.areas[area as usize].values().copied().collect())
-                .collect();
-            prop_assert_eq!(contents(memory), expected);
-        }
-    }
-
-    #[test]
-    fn a_large_batch_leaves_what_its_writes_leave_one_by_one(
-        batch in prop::collection::vec((0..3usize, some_values()), 17..120),
-    ) {
-        let memories: Vec<Memory> = (0..3).map(|_| Memory::new(layout(), None).unwrap()).collect();
-        let mut models: Vec<Model> = (0..3).map(|_| Model::new(&layout(), None)).collect();
-        let valid: Vec<_> = batch
+        let writes: Vec<(&Memory, Write)> = batch
             .iter()
-            .filter(|(which, write)| {
-                models[*which].write(Access::Ingest, std::slice::from_ref(write)).is_ok()
-            })
-            .map(|(which, write)| (*which, write, write.pack()))
+            .zip(&packed)
+            .map(|((which, write), bytes)| (&memories[*which], write.packed(bytes)))
             .collect();
-        let writes: Vec<(&Memory, Write)> = valid.iter().map(|(which, write, bytes)| {
-            let count = write.values.len();
-            (&memories[*which], Write { area: write.area, address: write.address, count, bytes })
-        }).collect();
-        prop_assert_eq!(write_across(Access::Ingest, &writes), Ok(()));
+        let changes = memories.each_ref().map(Memory::seal_changes);
+
+        let done = write_across(access, &writes);
+
+        let expected = model_write_across(&mut models, access, &batch);
+        prop_assert_eq!(done, expected);
         for (memory, model) in memories.iter().zip(&models) {
-            let expected: Vec<Vec<u16>> = LAYOUT
-                .iter()
-                .map(|&(area, ..)| model.areas[area as usize].values().copied().collect())
-                .collect();
-            prop_assert_eq!(contents(memory), expected);
+            prop_assert_eq!(memory.sealed(), model.sealed);
+            prop_assert_eq!(contents(memory), model.contents());
+        }
+        if done.is_err() {
+            prop_assert_eq!(memories.each_ref().map(Memory::seal_changes), changes);
         }
     }
 }
