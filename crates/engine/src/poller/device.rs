@@ -16,7 +16,7 @@ use std::convert::Infallible;
 use std::future::pending;
 use std::num::NonZeroU16;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicU16, AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
@@ -26,11 +26,12 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::backoff;
+use super::caught::{Panicked, caught};
 use super::cost::Samples;
 use super::forward::{Forward, ForwardSettings};
 use super::learned::{Learned, Unreadable};
 use super::link::{Link, Priority};
-use super::plan::{self, Block, Field, PlanLimits, Strategy};
+use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::results::{BlockResult, Poll, Results};
 use super::search;
 use super::sink::Destination;
@@ -95,6 +96,9 @@ pub struct DeviceState {
     round_trip: AtomicU64,
     requests_per_poll: AtomicU32,
     since: Mutex<Times>,
+    plan_error: Mutex<Option<String>>,
+    /// Whether a task of the device has panicked since it was made or replaced.
+    broken: AtomicBool,
 }
 
 #[derive(Debug, Default)]
@@ -114,9 +118,13 @@ pub struct DeviceCounters {
     pub polls: Counter,
     /// Polls that could not begin in time.
     pub missed: Counter,
-    /// Reads that were written, and values in them.
+    /// Polls that were not carried out, because no plan reads the device.
+    pub unplanned: Counter,
+    /// Reads that came whole and were stored, if they have a destination; and the values in them.
     pub reads: Counter,
     pub values: Counter,
+    /// Reads and status blocks that memory refused.
+    pub unstored: Counter,
 }
 
 impl DeviceState {
@@ -127,6 +135,9 @@ impl DeviceState {
     }
 
     pub fn health(&self) -> Health {
+        if self.broken.load(Ordering::Relaxed) {
+            return Health::Error;
+        }
         match self.health.load(Ordering::Relaxed) {
             1 if self.age().is_some_and(|age| age > self.stale_after()) => Health::Stale,
             1 => Health::Ok,
@@ -135,9 +146,29 @@ impl DeviceState {
         }
     }
 
-    /// As the status block tells it: an exception code, or 0x8000 and a class.
+    /// As in the status block: an exception code, or 0x8000 and a class.
     pub fn last_error(&self) -> u16 {
+        if self.broken.load(Ordering::Relaxed) {
+            return Fault::Internal.code();
+        }
         self.last_error.load(Ordering::Relaxed)
+    }
+
+    /// Why no plan reads the device.
+    pub fn plan_error(&self) -> Option<String> {
+        self.plan_error.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn set_plan_error(&self, error: Option<String>) {
+        *self.plan_error.lock().unwrap_or_else(PoisonError::into_inner) = error;
+    }
+
+    /// A task of the device has panicked: the device is in error until it is replaced.
+    pub(super) fn set_broken(&self, broken: bool) {
+        self.broken.store(broken, Ordering::Relaxed);
+        if broken {
+            self.bad(Fault::Internal);
+        }
     }
 
     pub fn failures(&self) -> u32 {
@@ -191,7 +222,7 @@ impl DeviceState {
         self.most_failures.fetch_max(failures, Ordering::Relaxed);
     }
 
-    fn status(&self) -> Status {
+    pub(super) fn status(&self) -> Status {
         let counters = &self.counters;
         Status {
             health: self.health(),
@@ -225,11 +256,14 @@ pub(super) struct Device {
     report: Option<Arc<Results>>,
     name: Arc<str>,
     learned: RefCell<Learned>,
-    plan: RefCell<Rc<Vec<Block>>>,
+    /// `None` while no plan reads the device; the state has the error.
+    plan: RefCell<Option<Rc<Vec<Block>>>>,
     /// The block that a poll begins with.
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
+    /// Whether memory has refused something since the last poll.
+    unstored: Cell<bool>,
     silent: Cell<u32>,
     /// When the next poll is to begin.
     due: Cell<Instant>,
@@ -282,35 +316,57 @@ impl Inbox {
     }
 }
 
-/// The fields of reads, each no longer than a request.
-pub(super) fn fields(reads: &[ReadSettings], limits: &PlanLimits) -> Vec<(Field, usize, u32)> {
-    let mut fields = Vec::new();
+/// A device with a plan that reads all of it.
+#[derive(Debug)]
+pub(super) struct Planned {
+    pub(super) settings: DeviceSettings,
+    /// The parts of reads that one request can carry.
+    fields: Vec<Field>,
+    /// The read that each field is a part of, and its place in it, in items.
+    parts: Vec<(usize, u32)>,
+    plan: Vec<Block>,
+}
+
+impl Planned {
+    /// # Errors
+    /// [`PlanError`] for a read that no request may carry.
+    pub(super) fn new(settings: DeviceSettings) -> Result<Planned, PlanError> {
+        let (fields, parts) = parted(&settings.reads, &settings.limits);
+        let plan = plan::plan(&fields, &settings.limits, settings.strategy)?;
+        Ok(Planned { settings, fields, parts, plan })
+    }
+}
+
+/// The fields of reads, each no longer than a request; and for each the read that it is a part of,
+/// and its place in it.
+fn parted(reads: &[ReadSettings], limits: &PlanLimits) -> (Vec<Field>, Vec<(usize, u32)>) {
+    let (mut fields, mut parts) = (Vec::new(), Vec::new());
     for (index, read) in reads.iter().enumerate() {
-        let most =
-            u32::from(if read.area.is_bits() { limits.max_bits } else { limits.max_registers });
+        let most = if read.area.is_bits() { limits.max_bits } else { limits.max_registers };
         let mut at = 0;
         while at < read.count {
-            let count = most.max(1).min(read.count - at);
+            // A limit of 0 is an error of the plan.
+            let count = u32::from(most.max(1)).min(read.count - at);
             let address = (u32::from(read.address) + at) as u16;
-            fields.push((Field { area: read.area, address, count: count as u16 }, index, at));
+            fields.push(Field { area: read.area, address, count: count as u16 });
+            parts.push((index, at));
             at += count;
         }
     }
-    fields
+    (fields, parts)
 }
 
 impl Device {
     pub(super) fn new(
-        settings: DeviceSettings,
+        Planned { settings, fields, parts, plan }: Planned,
         state: Arc<DeviceState>,
         (link, turn): (Rc<Link>, Rc<Turn>),
         forwards: Vec<Rc<Forward>>,
         report: Option<Arc<Results>>,
     ) -> Device {
-        let parted = fields(&settings.reads, &settings.limits);
         let device = Device {
-            fields: parted.iter().map(|(field, ..)| *field).collect(),
-            parts: parted.iter().map(|(_, read, at)| (*read, *at)).collect(),
+            fields,
+            parts,
             report,
             name: settings.name.as_str().into(),
             learned: RefCell::default(),
@@ -318,6 +374,7 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
+            unstored: Cell::new(false),
             silent: Cell::new(0),
             due: Cell::new(Instant::now()),
             backing_off: Cell::new(false),
@@ -329,7 +386,7 @@ impl Device {
             turn,
             forwards,
         };
-        device.draw_plan();
+        device.adopt(Ok(plan));
         device
     }
 
@@ -338,12 +395,34 @@ impl Device {
         self.due.set(Instant::now() + phase);
         loop {
             self.tell();
-            let successor = tokio::select! {
-                successor = self.poll_until_replaced(&inbox) => successor,
-                never = self.tell_for_ever() => match never {},
+            let polled = async {
+                tokio::select! {
+                    successor = self.poll_until_replaced(&inbox) => successor,
+                    never = self.tell_for_ever() => match never {},
+                }
             };
-            successor.follow(self);
-            self = *successor;
+            self = match caught(polled).await {
+                Ok(successor) => {
+                    successor.follow(self);
+                    *successor
+                }
+                // What it knows may be half done: the successor begins anew.
+                Err(Panicked) => *self.wait_until_replaced(&inbox).await,
+            };
+        }
+    }
+
+    /// Asks nothing any more, and shows that in the status block.
+    async fn wait_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
+        self.state.set_broken(true);
+        loop {
+            self.tell();
+            tokio::select! {
+                told = inbox.next() => if let Told::Successor(successor) = told {
+                    return successor;
+                },
+                () = sleep(TELLING) => {}
+            }
         }
     }
 
@@ -457,13 +536,28 @@ impl Device {
             (0..self.fields.len()).filter(|at| !learned.is_refused(&self.fields[*at])).collect();
         let fields: Vec<Field> = known.iter().map(|at| self.fields[*at]).collect();
         let limits = learned.limits(&self.settings.limits, &self.fields);
-        // That every field can be read was checked when the poller was made.
-        let mut plan = plan::plan(&fields, &limits, self.strategy.get()).unwrap_or_default();
-        for at in plan.iter_mut().flat_map(|block| &mut block.fields) {
-            *at = known[*at];
+        let mut drawn = plan::plan(&fields, &limits, self.strategy.get());
+        if let Ok(plan) = &mut drawn {
+            for at in plan.iter_mut().flat_map(|block| &mut block.fields) {
+                *at = known[*at];
+            }
         }
-        self.state.requests_per_poll.store(plan.len() as u32, Ordering::Relaxed);
-        *self.plan.borrow_mut() = Rc::new(plan);
+        self.adopt(drawn.map_err(|error| {
+            let (read, _) = self.parts[known[error.field()]];
+            format!("read {read}: {error}")
+        }));
+    }
+
+    /// Polls by a plan from now on, or not at all without one.
+    fn adopt(&self, drawn: Result<Vec<Block>, String>) {
+        let requests = drawn.as_ref().map_or(0, Vec::len);
+        self.state.requests_per_poll.store(requests as u32, Ordering::Relaxed);
+        let (plan, error) = match drawn {
+            Ok(plan) => (Some(Rc::new(plan)), None),
+            Err(error) => (None, Some(error)),
+        };
+        *self.plan.borrow_mut() = plan;
+        self.state.set_plan_error(error);
     }
 
     pub(super) fn learned(&self) -> RefMut<'_, Learned> {
@@ -493,10 +587,12 @@ impl Device {
             self.draw_plan();
         }
         self.learn();
-        self.state.counters.polls.add();
         let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
+        let Some(plan) = self.plan.borrow().clone() else {
+            return self.leave_out(due, gathered);
+        };
+        self.state.counters.polls.add();
         let (mut fault, mut answered) = (None, false);
-        let plan = Rc::clone(&self.plan.borrow());
         let known = self.learned().unreadable().to_vec();
         let first = self.first.take();
         for index in (0..plan.len()).map(|offset| (first + offset) % plan.len()) {
@@ -518,18 +614,35 @@ impl Device {
             fault = fault.or(self.look_at_unreadable(&known, &mut gathered).await);
             answered |= fault.is_some_and(Fault::is_answer);
         }
-        if let Some(results) = &self.report {
-            let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
-            results.push(Poll { device, due: results.counted(due.into_std()), blocks });
-        }
+        self.hand_over(due, gathered);
         if self.settings.release {
             self.link.release();
         }
         let silent = fault.is_some() && !answered;
         self.silent.set(if silent { self.silent.get().saturating_add(1) } else { 0 });
-        match fault {
+        let unstored = self.unstored.take().then_some(Fault::Unstored);
+        match fault.or(unstored) {
             None => self.state.good(),
             Some(fault) => self.state.bad(fault),
+        }
+    }
+
+    /// A poll without a plan: nothing is asked, and every field has the fault.
+    fn leave_out(&self, due: Instant, mut gathered: Gathered) {
+        self.state.counters.unplanned.add();
+        for Field { area, address, count } in self.fields.iter().copied() {
+            let block = Block { area, address, count, fields: Vec::new(), gaps: 0 };
+            gathered.note(&block, Err(Fault::Unplanned));
+        }
+        self.hand_over(due, gathered);
+        self.state.bad(Fault::Unplanned);
+    }
+
+    /// Hands the blocks of a poll to whoever takes results.
+    fn hand_over(&self, due: Instant, gathered: Gathered) {
+        if let Some(results) = &self.report {
+            let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
+            results.push(Poll { device, due: results.counted(due.into_std()), blocks });
         }
     }
 
@@ -540,7 +653,7 @@ impl Device {
         known: &[Unreadable],
         gathered: &mut Gathered,
     ) -> Option<Fault> {
-        let only = self.plan.borrow().is_empty();
+        let only = self.plan.borrow().as_ref().is_none_or(|plan| plan.is_empty());
         let retried = self.learned().retry(Instant::now(), only);
         let mut fault = None;
         for range in known {
@@ -593,7 +706,8 @@ impl Device {
             }
             Area::InputRegisters => Range::new(address, quantity).map(Request::ReadInputRegisters),
         };
-        let request = EncodedRequest::new(&request.or(Err(Fault::Invalid))?);
+        // The limits of a device are those of a request at most, and no block is beyond them.
+        let request = EncodedRequest::new(&request.expect("a block is a valid request"));
         let _turn = self.turn.lock().await;
         let counters = &self.state.counters;
         counters.requests.add();
@@ -602,7 +716,8 @@ impl Device {
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let answer = self.link.call(*unit_id, &request, *timeout, priority).await;
         match &answer {
-            Ok(_) => {
+            Ok(bytes) => {
+                debug_assert_eq!(bytes.len(), block.area.byte_len(block.count.into()));
                 let took = began.elapsed();
                 self.state.answered(took);
                 let mut samples = self.samples.get();
@@ -622,7 +737,7 @@ impl Device {
         for index in &block.fields {
             let field = self.fields[*index];
             let (read, at) = self.parts[*index];
-            let offset = usize::from(field.address - block.address);
+            let offset = block.offset(&field);
             let settings = &self.settings.reads[read];
             let whole = settings.count == u32::from(field.count);
             if whole && !field.area.is_bits() {
@@ -636,25 +751,37 @@ impl Device {
 
     fn hand_on(&self, index: usize, bytes: &[u8]) {
         let read = &self.settings.reads[index];
-        self.state.counters.reads.add();
-        self.state.counters.values.add_many(u64::from(read.count));
-        let (mut area, mut address) = (read.area, read.address);
+        let (mut area, mut address, mut stored) = (read.area, read.address, Ok(()));
         if let Some(into) = &read.into {
             (area, address) = (into.area, into.address);
-            // That it fits was checked when the poller was made.
-            let _ = into.write(read.count, bytes);
+            stored = into.write(read.count, bytes);
         }
-        if let Some(count) = u16::try_from(read.count).ok().and_then(NonZeroU16::new) {
-            for forward in &self.forwards {
-                forward.offer(index, area, address, count, bytes);
+        match stored {
+            Ok(()) => {
+                self.state.counters.reads.add();
+                self.state.counters.values.add_many(u64::from(read.count));
             }
+            Err(_) => self.count_unstored(),
+        }
+        for forward in &self.forwards {
+            let count = u16::try_from(read.count).ok().and_then(NonZeroU16::new);
+            let count = count.expect("a read that is forwarded fits a packet");
+            forward.offer(index, area, address, count, bytes);
         }
     }
 
     fn tell(&self) {
-        if let Some(to) = &self.settings.status {
-            self.state.status().write(&self.settings.name, to);
+        if let Some(to) = &self.settings.status
+            && self.state.status().write(&self.settings.name, to).is_err()
+        {
+            self.count_unstored();
         }
+    }
+
+    /// Memory has refused something: that is counted, and makes the poll one that failed.
+    fn count_unstored(&self) {
+        self.state.counters.unstored.add();
+        self.unstored.set(true);
     }
 }
 
@@ -708,6 +835,7 @@ impl Gathered {
             whole[at * 2..(at + count) * 2]
                 .copy_from_slice(&block[offset * 2..(offset + count) * 2]);
         }
+        assert!(*missing >= u32::from(field.count), "each field of a read comes once a poll");
         *missing -= u32::from(field.count);
         if *missing > 0 {
             return None;
@@ -717,35 +845,4 @@ impl Gathered {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn polls_are_due_at_whole_intervals_whatever_was_missed() {
-        let (due, interval) = (Instant::now(), Duration::from_millis(100));
-        let of = |now: u64| {
-            let (next, missed) = first_from(due + Duration::from_millis(now), due, interval);
-            ((next - due).as_millis(), missed)
-        };
-        assert_eq!(of(0), (0, 0));
-        assert_eq!(of(1), (100, 1));
-        assert_eq!(of(100), (100, 1));
-        assert_eq!(of(101), (200, 2));
-        assert_eq!(of(86_400_000), (86_400_000, 864_000));
-        assert_eq!(first_from(due - interval, due, interval), (due, 0));
-        assert_eq!(first_from(due + interval, due, Duration::ZERO), (due, 0));
-    }
-
-    #[test]
-    fn reads_are_parted_into_what_one_request_can_carry() {
-        let of = |area, count, limits: &PlanLimits| {
-            let read = ReadSettings { area, address: 5, count, into: None };
-            let parts = fields(&[read], limits).into_iter();
-            parts.map(|(field, _, at)| (field.address, field.count, at)).collect::<Vec<_>>()
-        };
-        let limits = PlanLimits { max_bits: 3, max_registers: 100, ..PlanLimits::default() };
-        assert_eq!(of(Area::Coils, 7, &limits), [(5, 3, 0), (8, 3, 3), (11, 1, 6)]);
-        assert_eq!(of(Area::HoldingRegisters, 100, &limits), [(5, 100, 0)]);
-        assert_eq!(of(Area::InputRegisters, 65_531, &PlanLimits::default()).len(), 525);
-    }
-}
+mod tests;

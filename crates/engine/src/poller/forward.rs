@@ -83,8 +83,10 @@ impl Waiting {
     }
 
     fn take(&mut self) -> Option<(usize, Vec<u8>)> {
+        debug_assert_eq!(self.order.len(), self.newest.len());
         let read = self.order.pop_front()?;
-        Some((read, self.newest.remove(&read)?))
+        let packet = self.newest.remove(&read).expect("a read in the order has a packet");
+        Some((read, packet))
     }
 }
 

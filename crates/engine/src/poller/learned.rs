@@ -69,6 +69,7 @@ impl Learned {
 
     /// A device bears fewer items in one request.
     pub(super) fn lower(&mut self, area: Area, most: u16) {
+        debug_assert!(most > 0, "no limit is below one item");
         let known = if area.is_bits() { &mut self.max_bits } else { &mut self.max_registers };
         *known = Some(known.map_or(most, |known| known.min(most)));
         self.remember();
@@ -86,6 +87,7 @@ impl Learned {
     /// A block can't be read at all.
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
         let Block { area, address, count, .. } = *block;
+        debug_assert!(count > 0);
         let retry_at = Instant::now() + RETRY;
         self.unreadable.push(Unreadable { area, address, count, fault, retry_at });
         self.remember();
@@ -125,7 +127,7 @@ impl Learned {
     pub(super) fn limits(&self, of: &PlanLimits, fields: &[Field]) -> PlanLimits {
         let longest = |bits: bool| {
             let alike = fields.iter().filter(|field| field.area.is_bits() == bits);
-            alike.map(|field| field.count).max().unwrap_or(1)
+            alike.map(|field| field.count).fold(1, u16::max)
         };
         let within = |known: Option<u16>, most: u16, bits: bool| {
             known.map_or(most, |known| most.min(known.max(longest(bits))))

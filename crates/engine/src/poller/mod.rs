@@ -8,6 +8,7 @@
 //! All tasks of a poller live on one thread, so that they share without locks.
 
 mod backoff;
+mod caught;
 mod cost;
 mod device;
 mod forward;

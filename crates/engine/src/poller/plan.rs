@@ -80,6 +80,35 @@ pub enum PlanError {
     Forbidden { index: usize },
 }
 
+impl PlanError {
+    /// The index of the field.
+    pub(super) fn field(&self) -> usize {
+        match *self {
+            PlanError::TooLong { index, .. }
+            | PlanError::Empty { index }
+            | PlanError::Beyond { index }
+            | PlanError::Forbidden { index } => index,
+        }
+    }
+}
+
+impl Block {
+    /// The offset of a field of the block from its start, in items.
+    ///
+    /// # Panics
+    /// For a field that is not inside: with its bytes another field would be written.
+    pub(super) fn offset(&self, field: &Field) -> usize {
+        let (start, end) = (u32::from(self.address), self.end());
+        let inside = field.area == self.area && start <= field.address.into() && field.end() <= end;
+        assert!(inside, "{field:?} is not inside {self:?}");
+        usize::from(field.address - self.address)
+    }
+
+    fn end(&self) -> u32 {
+        u32::from(self.address) + u32::from(self.count)
+    }
+}
+
 impl Default for PlanLimits {
     fn default() -> PlanLimits {
         PlanLimits {
@@ -160,7 +189,22 @@ pub fn plan(
             }
         }
     }
+    // A field in two blocks would stand for one that is missing from a read of several.
+    assert!(holds_once(fields, &blocks), "each field is in one block: {blocks:?}");
+    debug_assert!(
+        blocks.iter().all(|block| block.count <= limits.most(block.area) && block.end() <= 65_536),
+        "no block is beyond the limits: {blocks:?}"
+    );
     Ok(blocks)
+}
+
+/// Whether each field is in exactly one block.
+fn holds_once(fields: &[Field], blocks: &[Block]) -> bool {
+    let mut held = vec![0u8; fields.len()];
+    for index in blocks.iter().flat_map(|block| &block.fields) {
+        held[*index] = held[*index].saturating_add(1);
+    }
+    held.iter().all(|times| *times == 1)
 }
 
 /// Greedy from the left: a block ends where the gap is too large, or the block would be.
@@ -246,7 +290,7 @@ fn by_cost(
 
 /// Where the last of some fields ends.
 fn reach(fields: &[Field], order: &[usize]) -> u32 {
-    order.iter().map(|index| fields[*index].end()).max().unwrap_or_default()
+    order.iter().map(|index| fields[*index].end()).fold(0, u32::max)
 }
 
 fn block(fields: &[Field], order: &[usize]) -> Block {
@@ -258,6 +302,7 @@ fn block(fields: &[Field], order: &[usize]) -> Block {
         gaps += u32::from(field.address).saturating_sub(end);
         end = end.max(field.end());
     }
+    debug_assert!(end - start <= u32::from(u16::MAX), "a block has at most 65535 items");
     let count = (end - start) as u16;
     Block { area: first.area, address: first.address, count, fields: order.to_vec(), gaps }
 }

@@ -89,6 +89,7 @@ impl Results {
 
     pub(super) fn push(&self, poll: Poll) {
         self.put(|batch| {
+            debug_assert!(batch.polls.len() <= CAPACITY);
             if batch.polls.len() == CAPACITY {
                 batch.polls.pop_front();
                 self.dropped.fetch_add(1, Ordering::Relaxed);
@@ -107,6 +108,7 @@ impl Results {
 
     fn put(&self, put: impl FnOnce(&mut Batch)) {
         let mut batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        debug_assert!(!batch.ended, "nothing comes after the end");
         let first = batch.is_empty();
         put(&mut batch);
         drop(batch);

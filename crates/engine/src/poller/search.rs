@@ -34,14 +34,22 @@ impl Device {
     ) -> Result<(), Fault> {
         let mut parts = Vec::new();
         self.divide(block, fault, gathered, &mut parts).await?;
+        debug_assert!(
+            parts.is_sorted_by_key(|part| part.block.address)
+                && parts.iter().map(|part| part.block.fields.len()).sum::<usize>()
+                    == block.fields.len(),
+            "the parts of a block have its fields"
+        );
         let refused = parts.iter().find_map(|part| part.refused);
         if refused.is_none() && fault == Fault::Exception(ILLEGAL_VALUE) {
             // All of it can be read, only not at once.
-            let most = parts.iter().map(|part| part.block.count).max().unwrap_or(1);
+            let most = parts.iter().map(|part| part.block.count).fold(1, u16::max);
             self.learned().lower(block.area, most);
         } else {
-            for part in parts.iter().filter(|part| part.refused.is_some()) {
-                self.learned().refused(&part.block, part.refused.unwrap_or(fault));
+            for Part { block, refused } in &parts {
+                if let Some(fault) = refused {
+                    self.learned().refused(block, *fault);
+                }
             }
             for run in parts.split(|part| part.refused.is_some()) {
                 self.join(block, run).await?;

@@ -25,9 +25,6 @@ impl Destination {
 
     /// Whether `count` items fit.
     pub(super) fn holds(&self, count: u32) -> bool {
-        let span = self.memory.span(self.area);
-        let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
-        let address = u32::from(self.address);
-        start <= address && address + count <= end
+        self.memory.span(self.area).holds(self.address, count as usize)
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use holdfast_memory::{Access, Area, Memory, Write};
+use holdfast_memory::{Access, Area, Memory, Refusal, Write};
 
 /// Registers of one block.
 pub const STATUS_BLOCK_LEN: u16 = 30;
@@ -10,8 +10,8 @@ pub const STATUS_BLOCK_LEN: u16 = 30;
 /// Bytes of the name in it.
 const NAME: usize = 16;
 
-/// Transport errors stand beside exception codes from here on.
-const TRANSPORT: u16 = 0x8000;
+/// Errors above this code are not exceptions of the device.
+const NO_EXCEPTION: u16 = 0x8000;
 
 /// Where the block of a device is: at `slot` × 30 of an area of registers.
 #[derive(Debug, Clone)]
@@ -19,6 +19,20 @@ pub struct StatusSettings {
     pub memory: Arc<Memory>,
     pub area: Area,
     pub slot: u16,
+}
+
+impl StatusSettings {
+    /// The first register of the block; `None` beyond address 65535.
+    fn address(&self) -> Option<u16> {
+        self.slot.checked_mul(STATUS_BLOCK_LEN)
+    }
+
+    /// Whether the memory has the registers of the block.
+    pub(super) fn fits(&self) -> bool {
+        let span = self.memory.span(self.area);
+        let inside = |address| span.holds(address, usize::from(STATUS_BLOCK_LEN));
+        !self.area.is_bits() && self.address().is_some_and(inside)
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -52,7 +66,7 @@ impl Health {
     }
 }
 
-/// Why a request failed, as the block tells it.
+/// Why a request or a poll failed, as the block shows it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     Exception(u8),
@@ -60,6 +74,12 @@ pub enum Fault {
     Refused,
     Reset,
     Invalid,
+    /// No plan reads the device: nothing is asked.
+    Unplanned,
+    /// Memory refused what was read, or the status block.
+    Unstored,
+    /// A task of the device has panicked.
+    Internal,
 }
 
 /// Exceptions of a gateway that did not reach the unit.
@@ -74,10 +94,13 @@ impl Fault {
     pub const fn code(self) -> u16 {
         match self {
             Fault::Exception(code) => code as u16,
-            Fault::Timeout => TRANSPORT + 1,
-            Fault::Refused => TRANSPORT + 2,
-            Fault::Reset => TRANSPORT + 3,
-            Fault::Invalid => TRANSPORT + 4,
+            Fault::Timeout => NO_EXCEPTION + 1,
+            Fault::Refused => NO_EXCEPTION + 2,
+            Fault::Reset => NO_EXCEPTION + 3,
+            Fault::Invalid => NO_EXCEPTION + 4,
+            Fault::Unplanned => NO_EXCEPTION + 5,
+            Fault::Unstored => NO_EXCEPTION + 6,
+            Fault::Internal => NO_EXCEPTION + 7,
         }
     }
 }
@@ -119,17 +142,19 @@ impl Status {
     }
 
     /// Writes the block, as one step.
-    pub fn write(&self, name: &str, to: &StatusSettings) {
+    ///
+    /// # Errors
+    /// [`Refusal::OutOfRange`] when the block does not fit; nothing has changed then.
+    pub fn write(&self, name: &str, to: &StatusSettings) -> Result<(), Refusal> {
         let bytes: Vec<u8> =
             self.registers(name).iter().flat_map(|register| register.to_be_bytes()).collect();
         let write = Write {
             area: to.area,
-            address: to.slot.saturating_mul(STATUS_BLOCK_LEN),
+            address: to.address().ok_or(Refusal::OutOfRange)?,
             count: usize::from(STATUS_BLOCK_LEN),
             bytes: &bytes,
         };
-        // That it fits was checked when the poller was made.
-        let _ = to.memory.write(Access::Ingest, write);
+        to.memory.write(Access::Ingest, write)
     }
 }
 

@@ -8,18 +8,19 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_protocol::pdu::{EncodedRequest, limit};
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::device::{Device, DeviceSettings, DeviceState, Inbox, Turn, fields};
+use super::caught::spawn_watched;
+use super::device::{Device, DeviceSettings, DeviceState, Inbox, Planned, Turn};
 use super::forward::{Forward, ForwardCounters};
 use super::link::{Link, Priority};
-use super::plan::{self, PlanError};
+use super::plan::{PlanError, PlanLimits};
 use super::results::{Results, Written};
-use super::status::{Fault, STATUS_BLOCK_LEN};
+use super::status::Fault;
 use crate::client::Endpoint;
 use crate::tls::client::Identity;
 
@@ -31,14 +32,24 @@ pub enum PollerError {
     Destination { device: String, read: usize },
     #[error("device {device}: the status block does not fit into its memory")]
     Status { device: String },
-    #[error("device {device}: read {read} goes beyond address 65535")]
+    #[error("device {device}: read {read} has no items, or goes beyond address 65535")]
     Beyond { device: String, read: usize },
+    #[error(
+        "device {device}: read {read} has 65536 items, a packet that is forwarded at most 65535"
+    )]
+    Forward { device: String, read: usize },
+    #[error("device {device}: max_{items} is {found}, allowed are 1 to {most}")]
+    Limit { device: String, items: &'static str, found: u16, most: u16 },
     #[error("device {device}: there is one of that name")]
     Taken { device: String },
     #[error("device {device}: there is none of that name")]
     Unknown { device: String },
     #[error("device {device}: function {function} does not write")]
     NoWrite { device: String, function: u8 },
+    #[error("device {device}: the request has no function code")]
+    NoFunction { device: String },
+    #[error("the poller has been stopped")]
+    Stopped,
     #[error("can't start the poller's thread: {0}")]
     Thread(io::Error),
 }
@@ -70,11 +81,11 @@ pub struct Poller {
 
 /// What the poller's thread is told; it ends when nobody can tell it anything any more.
 enum Order {
-    Add(Box<DeviceSettings>, Polled),
+    Add(Box<Planned>, Polled),
     /// The device of that name gives way to another one.
     Replace {
         name: String,
-        device: Box<DeviceSettings>,
+        device: Box<Planned>,
         polled: Polled,
         at_once: bool,
     },
@@ -93,9 +104,7 @@ impl Poller {
     /// # Errors
     /// [`PollerError`], with nothing left running.
     pub fn start(devices: Vec<DeviceSettings>) -> Result<Poller, PollerError> {
-        for device in &devices {
-            check(device)?;
-        }
+        let devices = devices.into_iter().map(checked).collect::<Result<Vec<_>, _>>()?;
         let (orders, told) = mpsc::unbounded_channel();
         let results = Arc::new(Results::default());
         let runtime = Builder::new_current_thread()
@@ -122,7 +131,7 @@ impl Poller {
             thread: Mutex::new(Some(thread)),
         };
         for device in devices {
-            poller.add(device)?;
+            poller.begin(device)?;
         }
         Ok(poller)
     }
@@ -132,15 +141,23 @@ impl Poller {
     /// # Errors
     /// [`PollerError`] for one that can't be polled, or whose name is taken.
     pub fn add(&self, device: DeviceSettings) -> Result<(), PollerError> {
-        check(&device)?;
+        self.begin(checked(device)?)
+    }
+
+    fn begin(&self, device: Planned) -> Result<(), PollerError> {
         let mut all = self.polled();
-        if all.iter().any(|other| other.name == device.name) {
-            return Err(PollerError::Taken { device: device.name });
+        let settings = &device.settings;
+        if all.iter().any(|other| other.name == settings.name) {
+            return Err(PollerError::Taken { device: settings.name.clone() });
         }
-        let polled = Polled::new(&device, Arc::default());
-        all.push(polled.clone());
-        let _ = self.orders.send(Order::Add(Box::new(device), polled));
+        let polled = Polled::new(settings, Arc::default());
+        self.order(Order::Add(Box::new(device), polled.clone()))?;
+        all.push(polled);
         Ok(())
+    }
+
+    fn order(&self, order: Order) -> Result<(), PollerError> {
+        self.orders.send(order).map_err(|_| PollerError::Stopped)
     }
 
     /// Polls a device in the place of the one called `name`, whose poll under way is completed. It
@@ -155,18 +172,19 @@ impl Poller {
         device: DeviceSettings,
         at_once: bool,
     ) -> Result<(), PollerError> {
-        check(&device)?;
+        let device = checked(device)?;
+        let settings = &device.settings;
         let mut all = self.polled();
-        if device.name != name && all.iter().any(|other| other.name == device.name) {
-            return Err(PollerError::Taken { device: device.name });
+        if settings.name != name && all.iter().any(|other| other.name == settings.name) {
+            return Err(PollerError::Taken { device: settings.name.clone() });
         }
         let Some(before) = all.iter_mut().find(|other| other.name == name) else {
             return Err(PollerError::Unknown { device: name.to_owned() });
         };
-        *before = Polled::new(&device, Arc::clone(&before.state));
-        let polled = before.clone();
+        let polled = Polled::new(settings, Arc::clone(&before.state));
         let (name, device) = (name.to_owned(), Box::new(device));
-        let _ = self.orders.send(Order::Replace { name, device, polled, at_once });
+        self.order(Order::Replace { name, device, polled: polled.clone(), at_once })?;
+        *before = polled;
         Ok(())
     }
 
@@ -187,7 +205,7 @@ impl Poller {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
-        let _ = self.orders.send(Order::Write { device: name.to_owned(), ticket, request });
+        self.order(Order::Write { device: name.to_owned(), ticket, request })?;
         Ok(ticket)
     }
 
@@ -197,8 +215,12 @@ impl Poller {
         let mut all = self.polled();
         let before = all.len();
         all.retain(|device| device.name != name);
-        let _ = self.orders.send(Order::Remove(name.to_owned()));
-        all.len() < before
+        let known = all.len() < before;
+        if known {
+            // A poller that has been stopped polls nothing.
+            let _ = self.order(Order::Remove(name.to_owned()));
+        }
+        known
     }
 
     /// The devices as they are now.
@@ -217,9 +239,11 @@ impl Poller {
 
     /// Stops polling. What was read has been handed on; a read under way is given up.
     pub fn stop(&self) {
-        let _ = self.orders.send(Order::Stop);
+        // It may have been stopped before.
+        let _ = self.order(Order::Stop);
         if let Some(thread) = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            let _ = thread.join();
+            let ended = thread.join();
+            debug_assert!(ended.is_ok() || thread::panicking(), "the poller's thread panicked");
         }
     }
 }
@@ -249,6 +273,9 @@ impl Drop for Running {
     }
 }
 
+/// Orders are sent under the lock of the list of devices: they come as the list changes.
+const IN_ORDER: &str = "what runs is what the list of devices has";
+
 /// Starts and ends the tasks of devices, until it is told to stop.
 async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
     let mut links: HashMap<Address, Weak<Link>> = HashMap::new();
@@ -258,24 +285,34 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
         match order {
             Order::Stop => return,
             Order::Remove(name) => {
-                running.remove(&name);
+                let removed = running.remove(&name);
+                debug_assert!(removed.is_some(), "{IN_ORDER}");
+                drop(removed);
                 links.retain(|_, link| link.strong_count() > 0);
             }
-            Order::Add(settings, polled) => {
-                let phase = spread(settings.start_within, started);
+            Order::Add(planned, polled) => {
+                let phase = spread(planned.settings.start_within, started);
                 started += 1;
-                let name = settings.name.clone();
-                let link = link_to(&settings.endpoint, &mut links);
-                running.insert(name, Running::start(*settings, polled, link, phase, &results));
+                let name = planned.settings.name.clone();
+                let link = link_to(&planned.settings.endpoint, &mut links);
+                let device = Running::start(*planned, polled, link, phase, &results);
+                let before = running.insert(name, device);
+                debug_assert!(before.is_none(), "{IN_ORDER}");
             }
-            Order::Replace { name, device: settings, polled, at_once } => {
-                let link = link_to(&settings.endpoint, &mut links);
-                // It is there as long as nobody removes it.
-                if let Some(mut device) = running.remove(&name) {
-                    let name = settings.name.clone();
-                    device.replace(*settings, polled, link, at_once, &results);
-                    running.insert(name, device);
-                }
+            Order::Replace { name, device: planned, polled, at_once } => {
+                let link = link_to(&planned.settings.endpoint, &mut links);
+                let before = running.remove(&name);
+                debug_assert!(before.is_some(), "{IN_ORDER}");
+                let name = planned.settings.name.clone();
+                let device = match before {
+                    Some(mut device) if !device.has_ended() => {
+                        device.replace(*planned, polled, link, at_once, &results);
+                        device
+                    }
+                    // A task that has panicked takes no successor.
+                    _ => Running::start(*planned, polled, link, Duration::ZERO, &results),
+                };
+                running.insert(name, device);
                 links.retain(|_, link| link.strong_count() > 0);
             }
             Order::Write { device, ticket, request } => match running.get(&device) {
@@ -289,33 +326,40 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
 impl Running {
     /// Starts the tasks of a device.
     fn start(
-        settings: DeviceSettings,
+        planned: Planned,
         polled: Polled,
         link: Rc<Link>,
         phase: Duration,
         results: &Arc<Results>,
     ) -> Running {
         let inbox = Rc::new(Inbox::default());
-        let DeviceSettings { unit_id, timeout, release, .. } = settings;
+        let DeviceSettings { unit_id, timeout, release, .. } = planned.settings;
         let turn = Rc::new(Turn::default());
         let to = (Rc::clone(&link), Rc::clone(&turn));
-        let (device, forwards) = made(settings, polled, to, results);
-        let device = spawn_local(device.run(phase, Rc::clone(&inbox))).abort_handle();
+        let state = Arc::clone(&polled.state);
+        let (device, forwards) = made(planned, polled, to, results);
+        let device = spawn_watched(device.run(phase, Rc::clone(&inbox)), state);
         Running { link, turn, unit_id, timeout, release, inbox, device, forwards }
+    }
+
+    /// Whether the device's task has panicked; it does not end otherwise.
+    fn has_ended(&self) -> bool {
+        self.device.is_finished()
     }
 
     fn replace(
         &mut self,
-        settings: DeviceSettings,
+        planned: Planned,
         polled: Polled,
         link: Rc<Link>,
         at_once: bool,
         results: &Arc<Results>,
     ) {
         self.stop_forwards();
+        let settings = &planned.settings;
         (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
         (self.release, self.link) = (settings.release, Rc::clone(&link));
-        let (device, forwards) = made(settings, polled, (link, Rc::clone(&self.turn)), results);
+        let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)), results);
         self.forwards = forwards;
         if at_once {
             device.want_soon();
@@ -352,11 +396,14 @@ impl Running {
 
 /// A device, and the tasks that forward what it reads.
 fn made(
-    settings: DeviceSettings,
+    planned: Planned,
     polled: Polled,
     to: (Rc<Link>, Rc<Turn>),
     results: &Arc<Results>,
 ) -> (Device, Vec<AbortHandle>) {
+    polled.state.set_broken(false);
+    let settings = &planned.settings;
+    debug_assert_eq!(settings.forward.len(), polled.forwards.len());
     let forwards: Vec<_> = settings
         .forward
         .iter()
@@ -364,10 +411,12 @@ fn made(
         .zip(polled.forwards)
         .map(|(settings, counters)| Forward::new(settings, counters))
         .collect();
-    let tasks = forwards.iter().map(|forward| spawn_local(Rc::clone(forward).run()).abort_handle());
+    let tasks = forwards
+        .iter()
+        .map(|forward| spawn_watched(Rc::clone(forward).run(), Arc::clone(&polled.state)));
     let tasks = tasks.collect();
     let report = settings.report.then(|| Arc::clone(results));
-    (Device::new(settings, polled.state, to, forwards, report), tasks)
+    (Device::new(planned, polled.state, to, forwards, report), tasks)
 }
 
 /// The link to an endpoint, shared with all other devices there.
@@ -401,10 +450,19 @@ fn address(endpoint: &Endpoint) -> Address {
     }
 }
 
-fn check(device: &DeviceSettings) -> Result<(), PollerError> {
+/// A device with its first plan, if it can be polled.
+fn checked(device: DeviceSettings) -> Result<Planned, PollerError> {
     let name = || device.name.clone();
+    let PlanLimits { max_registers, max_bits, .. } = device.limits;
+    for (items, found, most) in
+        [("registers", max_registers, limit::READ_REGISTERS), ("bits", max_bits, limit::READ_BITS)]
+    {
+        if !(1..=most).contains(&found) {
+            return Err(PollerError::Limit { device: name(), items, found, most });
+        }
+    }
     for (read, settings) in device.reads.iter().enumerate() {
-        if u32::from(settings.address) + settings.count > 65_536 || settings.count == 0 {
+        if settings.count == 0 || settings.count > 65_536 - u32::from(settings.address) {
             return Err(PollerError::Beyond { device: name(), read });
         }
         let alike = |into: &super::Destination| {
@@ -413,18 +471,13 @@ fn check(device: &DeviceSettings) -> Result<(), PollerError> {
         if !settings.into.as_ref().is_none_or(alike) {
             return Err(PollerError::Destination { device: name(), read });
         }
-    }
-    if let Some(status) = &device.status {
-        let span = status.memory.span(status.area);
-        let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
-        let first = u32::from(status.slot) * u32::from(STATUS_BLOCK_LEN);
-        if status.area.is_bits() || first < start || first + u32::from(STATUS_BLOCK_LEN) > end {
-            return Err(PollerError::Status { device: name() });
+        if !device.forward.is_empty() && settings.count > u32::from(u16::MAX) {
+            return Err(PollerError::Forward { device: name(), read });
         }
     }
-    let parted = fields(&device.reads, &device.limits);
-    let fields: Vec<_> = parted.iter().map(|(field, ..)| *field).collect();
-    plan::plan(&fields, &device.limits, device.strategy)
-        .map(drop)
-        .map_err(|error| PollerError::Plan { device: name(), error })
+    if !device.status.as_ref().is_none_or(super::StatusSettings::fits) {
+        return Err(PollerError::Status { device: name() });
+    }
+    let name = name();
+    Planned::new(device).map_err(|error| PollerError::Plan { device: name, error })
 }

@@ -1,0 +1,37 @@
+//! Panics of a device's tasks: they are seen, and the other devices go on.
+
+use std::future::poll_fn;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::pin::pin;
+use std::sync::Arc;
+
+use tokio::task::{AbortHandle, spawn_local};
+
+use super::device::DeviceState;
+
+/// A future has panicked. What it worked on may be half done.
+#[derive(Debug)]
+pub(super) struct Panicked;
+
+/// What a future comes to, unless it panics.
+pub(super) async fn caught<F: Future>(future: F) -> Result<F::Output, Panicked> {
+    let mut future = pin!(future);
+    poll_fn(|context| match catch_unwind(AssertUnwindSafe(|| future.as_mut().poll(context))) {
+        Ok(polled) => polled.map(Ok),
+        Err(_) => Err(Panicked).into(),
+    })
+    .await
+}
+
+/// Starts a task of a device. If it panics, the device is in error until it is replaced.
+pub(super) fn spawn_watched(
+    task: impl Future<Output = ()> + 'static,
+    state: Arc<DeviceState>,
+) -> AbortHandle {
+    let watched = async move {
+        if caught(task).await.is_err() {
+            state.set_broken(true);
+        }
+    };
+    spawn_local(watched).abort_handle()
+}
