@@ -1,0 +1,241 @@
+//! What a device does in states that its checks rule out: nothing wrong reaches memory, and it
+//! shows.
+
+use holdfast_memory::{Access, Layout, Memory, Read, Span};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::Builder;
+use tokio::task::{LocalSet, spawn_local};
+use tokio::time::timeout;
+
+use super::*;
+use crate::poller::caught::spawn_watched;
+
+#[test]
+fn polls_are_due_at_whole_intervals_whatever_was_missed() {
+    let (due, interval) = (Instant::now(), Duration::from_millis(100));
+    let of = |now: u64| {
+        let (next, missed) = first_from(due + Duration::from_millis(now), due, interval);
+        ((next - due).as_millis(), missed)
+    };
+    assert_eq!(of(0), (0, 0));
+    assert_eq!(of(1), (100, 1));
+    assert_eq!(of(100), (100, 1));
+    assert_eq!(of(101), (200, 2));
+    assert_eq!(of(86_400_000), (86_400_000, 864_000));
+    assert_eq!(first_from(due - interval, due, interval), (due, 0));
+    assert_eq!(first_from(due + interval, due, Duration::ZERO), (due, 0));
+}
+
+#[test]
+fn reads_are_parted_into_what_one_request_can_carry() {
+    let of = |area, count, limits: &PlanLimits| {
+        let read = ReadSettings { area, address: 5, count, into: None };
+        let (fields, parts) = parted(&[read], limits);
+        let both = fields.iter().zip(parts);
+        both.map(|(field, (_, at))| (field.address, field.count, at)).collect::<Vec<_>>()
+    };
+    let limits = PlanLimits { max_bits: 3, max_registers: 100, ..PlanLimits::default() };
+    assert_eq!(of(Area::Coils, 7, &limits), [(5, 3, 0), (8, 3, 3), (11, 1, 6)]);
+    assert_eq!(of(Area::HoldingRegisters, 100, &limits), [(5, 100, 0)]);
+    assert_eq!(of(Area::InputRegisters, 65_531, &PlanLimits::default()).len(), 525);
+}
+
+const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Runs a test with a device of its own, whose registers are all 0x0102.
+fn with_device<F: Future<Output = ()>>(test: impl FnOnce(Endpoint) -> F) {
+    let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+    LocalSet::new().block_on(&runtime, async {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let port = listener.local_addr().unwrap().port();
+        spawn_local(async move {
+            while let Ok((stream, _)) = listener.accept().await {
+                spawn_local(answer(stream));
+            }
+        });
+        let host = "127.0.0.1".to_owned();
+        timeout(TIMEOUT, test(Endpoint::Tcp { host, port, tls: None })).await.unwrap();
+    });
+}
+
+async fn answer(mut stream: TcpStream) {
+    let mut request = [0; 12];
+    while stream.read_exact(&mut request).await.is_ok() {
+        let len = request[11] * 2;
+        let mut reply = request[..8].to_vec();
+        (reply[4], reply[5]) = (0, len + 3);
+        reply.push(len);
+        reply.extend([1, 2].repeat(usize::from(request[11])));
+        if stream.write_all(&reply).await.is_err() {
+            return;
+        }
+    }
+}
+
+const AREA: Area = Area::HoldingRegisters;
+
+/// A memory with 40 holding registers.
+fn memory() -> Arc<Memory> {
+    let layout = Layout::default().with(AREA, Span::new(0, 40).unwrap());
+    Arc::new(Memory::new(layout, None).unwrap())
+}
+
+fn registers(memory: &Memory) -> Vec<u8> {
+    let mut out = vec![0; 80];
+    let read = Read { area: AREA, address: 0, count: 40, out: &mut out };
+    memory.read(Access::Ingest, read).unwrap();
+    out
+}
+
+/// Reads registers 10 to 13 of the device, into `address` and those behind it.
+fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSettings {
+    let into = Destination { memory: Arc::clone(memory), area: AREA, address };
+    DeviceSettings {
+        name: "meter".into(),
+        endpoint,
+        unit_id: 1,
+        interval: Duration::from_millis(1),
+        timeout: TIMEOUT,
+        reads: vec![ReadSettings { area: AREA, address: 10, count: 4, into: Some(into) }],
+        limits: PlanLimits::default(),
+        strategy: Strategy::Gap { max_gap: 0 },
+        measured: false,
+        forward: Vec::new(),
+        status: None,
+        start_within: Duration::ZERO,
+        report: true,
+        release: false,
+    }
+}
+
+fn made(settings: DeviceSettings, state: &Arc<DeviceState>, results: &Arc<Results>) -> Device {
+    let link = Link::new(settings.endpoint.clone());
+    let planned = Planned::new(settings).unwrap();
+    let to = (link, Rc::default());
+    Device::new(planned, Arc::clone(state), to, Vec::new(), Some(Arc::clone(results)))
+}
+
+fn device(settings: DeviceSettings) -> (Device, Arc<DeviceState>, Arc<Results>) {
+    let (state, results) = <(Arc<DeviceState>, Arc<Results>)>::default();
+    state.set_stale_after(TIMEOUT, TIMEOUT);
+    (made(settings, &state, &results), state, results)
+}
+
+#[test]
+fn a_read_that_memory_refuses_is_counted_and_is_an_error() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        let (device, state, _) = device(settings(endpoint.clone(), &memory, 37));
+        device.poll(Instant::now()).await;
+        let counters = &state.counters;
+        assert_eq!((counters.polls.get(), counters.valid.get()), (1, 1));
+        assert_eq!((counters.unstored.get(), counters.reads.get()), (1, 0));
+        assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8006));
+        assert_eq!(registers(&memory), [0; 80]);
+
+        let (device, state, _) = self::device(settings(endpoint, &memory, 36));
+        device.poll(Instant::now()).await;
+        assert_eq!((state.counters.unstored.get(), state.counters.reads.get()), (0, 1));
+        assert_eq!(state.health(), Health::Ok);
+        assert_eq!(registers(&memory)[72..], [1, 2].repeat(4));
+    });
+}
+
+#[test]
+fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        for (slot, area) in [(1, AREA), (u16::MAX, AREA), (0, Area::InputRegisters)] {
+            let status = StatusSettings { memory: Arc::clone(&memory), area, slot };
+            let settings =
+                DeviceSettings { status: Some(status), ..settings(endpoint.clone(), &memory, 0) };
+            let (device, state, _) = device(settings);
+            device.tell();
+            assert_eq!(state.counters.unstored.get(), 1);
+            device.poll(Instant::now()).await;
+            assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8006));
+            // The read itself was stored, and a poll after which nothing is refused is good.
+            assert_eq!(state.counters.reads.get(), 1);
+            device.poll(Instant::now()).await;
+            assert_eq!(state.health(), Health::Ok);
+        }
+        assert_eq!(registers(&memory)[8..], [0; 72]);
+    });
+}
+
+#[test]
+fn a_device_without_a_plan_asks_nothing_and_is_in_error() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        let (mut device, state, results) = device(settings(endpoint, &memory, 0));
+        assert_eq!((state.plan_error(), state.requests_per_poll()), (None, 1));
+        let limits = PlanLimits { max_registers: 3, ..PlanLimits::default() };
+        let before = std::mem::replace(&mut device.settings.limits, limits);
+        device.draw_plan();
+        let error = "read 0: field 0: 4 items, one request reads at most 3".to_owned();
+        assert_eq!((state.plan_error(), state.requests_per_poll()), (Some(error), 0));
+
+        device.poll(Instant::now()).await;
+        let counters = &state.counters;
+        assert_eq!((counters.unplanned.get(), counters.polls.get()), (1, 0));
+        assert_eq!(counters.requests.get(), 0);
+        assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8005));
+        let [poll] = <[Poll; 1]>::try_from(Vec::from(results.take(TIMEOUT).polls)).unwrap();
+        let outcomes = poll.blocks.into_iter();
+        let outcomes: Vec<_> =
+            outcomes.map(|block| (block.address, block.count, block.outcome)).collect();
+        assert_eq!(outcomes, [(10, 4, Err(Fault::Unplanned))]);
+
+        device.settings.limits = before;
+        device.draw_plan();
+        device.poll(Instant::now()).await;
+        assert_eq!((counters.unplanned.get(), counters.polls.get()), (1, 1));
+        assert_eq!((state.health(), state.plan_error()), (Health::Ok, None));
+    });
+}
+
+#[test]
+fn a_device_that_panics_writes_nothing_and_is_in_error_until_it_is_replaced() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        let status = StatusSettings { memory: self::memory(), area: AREA, slot: 0 };
+        let blocks = Arc::clone(&status.memory);
+        let settings = DeviceSettings { status: Some(status), ..settings(endpoint, &memory, 0) };
+        let (device, state, results) = device(settings.clone());
+        // The field of this block is not inside it.
+        let block = Block { area: AREA, address: 11, count: 4, fields: vec![0], gaps: 0 };
+        device.adopt(Ok(vec![block]));
+        let inbox = Rc::new(Inbox::default());
+        let successor = made(settings, &state, &results);
+        let running = spawn_local(device.run(Duration::ZERO, Rc::clone(&inbox)));
+        let told = || registers(&blocks)[..4].to_vec();
+        until(|| told() == [0, 2, 0x80, 7]).await;
+        assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8007));
+        assert_eq!((state.counters.reads.get(), registers(&memory)), (0, vec![0; 80]));
+
+        state.set_broken(false);
+        inbox.succeed(successor);
+        until(|| state.counters.polls.get() > 2 && told()[..2] == [0, 1]).await;
+        assert_eq!(registers(&memory)[..8], [1, 2].repeat(4));
+        running.abort();
+    });
+}
+
+#[test]
+fn a_task_that_panics_puts_its_device_in_error() {
+    with_device(async |_| {
+        let state = Arc::<DeviceState>::default();
+        state.good();
+        spawn_watched(async { panic!("a fault in a forward") }, Arc::clone(&state));
+        until(|| state.health() == Health::Error).await;
+        state.good();
+        assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8007));
+    });
+}
+
+async fn until(done: impl Fn() -> bool) {
+    while !done() {
+        sleep(Duration::from_millis(1)).await;
+    }
+}
