@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use tokio::task::{AbortHandle, spawn_local};
 
-use super::device::DeviceState;
+use super::state::DeviceState;
 
 /// A future has panicked. What it worked on may be half done.
 #[derive(Debug)]

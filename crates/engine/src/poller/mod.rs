@@ -19,12 +19,14 @@ pub mod plan;
 mod results;
 mod search;
 mod sink;
+mod state;
 mod status;
 mod thread;
 
-pub use device::{DeviceCounters, DeviceSettings, DeviceState, ReadSettings};
+pub use device::{DeviceSettings, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
+pub use state::{DeviceCounters, DeviceState};
 pub use status::{Fault, Health, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

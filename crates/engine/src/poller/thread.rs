@@ -15,11 +15,12 @@ use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::caught::spawn_watched;
-use super::device::{Device, DeviceSettings, DeviceState, Inbox, Planned, Turn};
+use super::device::{Device, DeviceSettings, Inbox, Planned, Turn};
 use super::forward::{Forward, ForwardCounters};
 use super::link::{Link, Priority};
 use super::plan::{PlanError, PlanLimits};
 use super::results::{Results, Written};
+use super::state::DeviceState;
 use super::status::Fault;
 use crate::client::Endpoint;
 use crate::tls::client::Identity;

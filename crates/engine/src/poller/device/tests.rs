@@ -10,6 +10,7 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::poller::caught::spawn_watched;
+use crate::poller::status::Health;
 
 #[test]
 fn polls_are_due_at_whole_intervals_whatever_was_missed() {

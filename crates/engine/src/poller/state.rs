@@ -1,0 +1,174 @@
+//! What a device counted, and how it does: written by its task, read from any thread.
+
+use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use super::status::{Fault, Health, Status};
+use crate::counter::Counter;
+
+/// Counters and health of a device.
+#[derive(Debug, Default)]
+pub struct DeviceState {
+    pub counters: DeviceCounters,
+    /// Milliseconds: the age at which the last answer is out of date.
+    stale_after: AtomicU64,
+    health: AtomicU16,
+    last_error: AtomicU16,
+    failures: AtomicU32,
+    most_failures: AtomicU32,
+    /// Microseconds of the last answer.
+    round_trip: AtomicU64,
+    requests_per_poll: AtomicU32,
+    since: Mutex<Times>,
+    plan_error: Mutex<Option<String>>,
+    /// Whether a task of the device has panicked since it was made or replaced.
+    broken: AtomicBool,
+}
+
+#[derive(Debug, Default)]
+struct Times {
+    last_good: Option<Instant>,
+    error_since: Option<Instant>,
+}
+
+#[derive(Debug, Default)]
+pub struct DeviceCounters {
+    pub requests: Counter,
+    pub valid: Counter,
+    pub exceptions: Counter,
+    pub timeouts: Counter,
+    pub transport_errors: Counter,
+    /// Polls that were carried out.
+    pub polls: Counter,
+    /// Polls that could not begin in time.
+    pub missed: Counter,
+    /// Polls that were not carried out, because no plan reads the device.
+    pub unplanned: Counter,
+    /// Reads that came whole and were stored, if they have a destination; and the values in them.
+    pub reads: Counter,
+    pub values: Counter,
+    /// Reads and status blocks that memory refused.
+    pub unstored: Counter,
+}
+
+impl DeviceState {
+    /// An answer is out of date after three intervals and the time that a reply may take.
+    pub(super) fn set_stale_after(&self, interval: Duration, timeout: Duration) {
+        let after = interval.saturating_mul(3).saturating_add(timeout).as_millis();
+        self.stale_after.store(u64::try_from(after).unwrap_or(u64::MAX), Ordering::Relaxed);
+    }
+
+    pub fn health(&self) -> Health {
+        if self.broken.load(Ordering::Relaxed) {
+            return Health::Error;
+        }
+        match self.health.load(Ordering::Relaxed) {
+            0 => Health::Unknown,
+            1 if self.age().is_some_and(|age| age > self.stale_after()) => Health::Stale,
+            1 => Health::Ok,
+            code => {
+                debug_assert_eq!(code, Health::Error.code());
+                Health::Error
+            }
+        }
+    }
+
+    /// As in the status block: an exception code, or 0x8000 and a class.
+    pub fn last_error(&self) -> u16 {
+        if self.broken.load(Ordering::Relaxed) {
+            return Fault::Internal.code();
+        }
+        self.last_error.load(Ordering::Relaxed)
+    }
+
+    /// Why no plan reads the device.
+    pub fn plan_error(&self) -> Option<String> {
+        self.plan_error.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// The plan has so many requests, or there is none, for a reason.
+    pub(super) fn planned(&self, requests: Result<usize, String>) {
+        let count = *requests.as_ref().unwrap_or(&0);
+        self.requests_per_poll.store(count as u32, Ordering::Relaxed);
+        *self.plan_error.lock().unwrap_or_else(PoisonError::into_inner) = requests.err();
+    }
+
+    /// A task of the device has panicked: the device is in error until it is replaced.
+    pub(super) fn set_broken(&self, broken: bool) {
+        self.broken.store(broken, Ordering::Relaxed);
+        if broken {
+            self.bad(Fault::Internal);
+        }
+    }
+
+    pub fn failures(&self) -> u32 {
+        self.failures.load(Ordering::Relaxed)
+    }
+
+    pub fn round_trip(&self) -> Duration {
+        Duration::from_micros(self.round_trip.load(Ordering::Relaxed))
+    }
+
+    pub fn requests_per_poll(&self) -> u32 {
+        self.requests_per_poll.load(Ordering::Relaxed)
+    }
+
+    /// How long ago the last valid answer came.
+    pub fn age(&self) -> Option<Duration> {
+        self.times().last_good.map(|time| time.elapsed())
+    }
+
+    pub fn in_error(&self) -> Duration {
+        self.times().error_since.map_or(Duration::ZERO, |time| time.elapsed())
+    }
+
+    fn stale_after(&self) -> Duration {
+        Duration::from_millis(self.stale_after.load(Ordering::Relaxed))
+    }
+
+    fn times(&self) -> std::sync::MutexGuard<'_, Times> {
+        self.since.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A valid answer came.
+    pub(super) fn answered(&self, round_trip: Duration) {
+        self.counters.valid.add();
+        self.round_trip.store(round_trip.as_micros() as u64, Ordering::Relaxed);
+        self.times().last_good = Some(Instant::now());
+    }
+
+    /// A whole poll was answered.
+    pub(super) fn good(&self) {
+        self.times().error_since = None;
+        self.failures.store(0, Ordering::Relaxed);
+        self.health.store(Health::Ok.code(), Ordering::Relaxed);
+    }
+
+    pub(super) fn bad(&self, fault: Fault) {
+        self.times().error_since.get_or_insert_with(Instant::now);
+        self.health.store(Health::Error.code(), Ordering::Relaxed);
+        self.last_error.store(fault.code(), Ordering::Relaxed);
+        let failures = self.failures.fetch_add(1, Ordering::Relaxed) + 1;
+        self.most_failures.fetch_max(failures, Ordering::Relaxed);
+    }
+
+    pub(super) fn status(&self) -> Status {
+        let counters = &self.counters;
+        Status {
+            health: self.health(),
+            last_error: self.last_error(),
+            seconds_in_error: saturated(self.in_error().as_secs()),
+            requests: counters.requests.get() as u32,
+            valid: counters.valid.get() as u32,
+            timeouts: counters.timeouts.get() as u32,
+            transport_errors: counters.transport_errors.get() as u32,
+            failures: saturated(self.failures().into()),
+            most_failures: saturated(self.most_failures.load(Ordering::Relaxed).into()),
+        }
+    }
+}
+
+fn saturated(number: u64) -> u16 {
+    u16::try_from(number).unwrap_or(u16::MAX)
+}
