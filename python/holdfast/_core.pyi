@@ -17,6 +17,7 @@ __all__ = [
     "FUNCTIONS",
     "MAX_PDU",
     "SUB_FUNCTIONS",
+    "BatchRefused",
     "BlockingClient",
     "Connection",
     "Endpoint",
@@ -122,11 +123,35 @@ class Memory:
         A later one wins where two overlap. Raises as `write`; when one is refused, none is done.
         """
 
-def write_across(writes: Sequence[tuple[Memory, Area, int, Iterable[int]]]) -> None:
+class BatchRefused(ValueError):
+    """A write of a batch that is refused; nothing has changed."""
+
+    command: int
+    """The index of the write in the batch."""
+    index: int | None
+    """The index of the value in the write, if the value is refused."""
+    reason: Literal[
+        "invalid_area",
+        "empty",
+        "out_of_range",
+        "invalid_value",
+        "invalid_type",
+        "sealed",
+        "gate_bit",
+        "wrong_length",
+        "not_registers",
+    ]
+    """`invalid_type` is a value of another type, or with `index` `None`, values that are no
+    sequence of integers; `invalid_value` an integer that is too small or too large."""
+
+def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> int:
     """Writes to several memories as one step, each with memory, area, address and values.
 
-    No reader of any of them sees a part. Raises as `Memory.write`; when one is refused, none is
-    done.
+    Returns how many values were written. No reader of any of the memories sees a part.
+
+    Raises `BatchRefused` for the first write whose area, number of values or range is wrong, then
+    for the first wrong value; no write is done then. An exception of `writes` itself comes before
+    one of a later write, and before one of any value.
     """
 
 @final
@@ -498,21 +523,25 @@ class Poller:
 
     def __new__(cls, devices: Sequence[PolledDevice]) -> Poller: ...
     def add(self, device: PolledDevice) -> None:
-        """Polls one more device. Raises `ValueError`, also for a name that is taken."""
+        """Polls one more device.
+
+        Raises `ValueError`, also for a name that is taken, and `RuntimeError` after `stop`.
+        """
 
     def replace(self, name: str, device: PolledDevice, *, at_once: bool = True) -> None:
         """Polls a device in the place of the one called `name`; it may have the same name.
 
         The poll under way is completed; counters, connection and schedule stay. `at_once` the new
         device reads once beside the schedule; not more often than each second, or each interval if
-        that is shorter. Raises `ValueError`; then nothing has changed.
+        that is shorter. Raises `ValueError`, and `RuntimeError` after `stop`; then nothing has
+        changed.
         """
 
     def write(self, name: str, request: Request) -> int:
         """Sends a write to a device over its own connection, between two reads.
 
-        Returns the number under which `results` tells what became of it. Raises `ValueError` for a
-        device that is not there, and a request that is no write.
+        Returns the number under which `results` has its outcome. Raises `ValueError` for an
+        unknown device and a request that does not write, `RuntimeError` after `stop`.
         """
 
     def remove(self, name: str) -> bool:
@@ -544,7 +573,9 @@ class Poller:
     def counters(self) -> dict[str, dict[str, Any]]:
         """How each device does, by name: its health, counters, and those of its forwards.
 
-        `age` is that of the last valid answer, `None` before the first.
+        `age` is that of the last valid answer, `None` before the first. `plan_error` says why no
+        plan reads the device, `None` as long as one does. `unplanned` counts the polls that were
+        left out for that, `unstored` the reads and status blocks that memory refused.
         """
 
     def stop(self) -> None:

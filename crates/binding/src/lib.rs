@@ -5,6 +5,7 @@
 
 mod arguments;
 mod audit;
+mod batch;
 mod client;
 mod connection;
 mod engine;
@@ -21,6 +22,8 @@ mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult, limits};
 
     #[pymodule_export]
+    use super::batch::{BatchRefused, write_across};
+    #[pymodule_export]
     use super::client::{BlockingClient, Endpoint, Request};
     #[pymodule_export]
     use super::connection::Connection;
@@ -29,7 +32,7 @@ mod _core {
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule, ServerTls};
     #[pymodule_export]
-    use super::memory::{Memory, OutOfRange, write_across};
+    use super::memory::{Memory, OutOfRange};
     #[pymodule_export]
     use super::poller::{PolledDevice, Poller, plan_blocks};
     #[pymodule_export]

@@ -28,7 +28,16 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     }
     module.add("EXCEPTIONS", exceptions)?;
     let faults = PyDict::new(py);
-    for fault in [Fault::Timeout, Fault::Refused, Fault::Reset, Fault::Invalid] {
+    let all = [
+        Fault::Timeout,
+        Fault::Refused,
+        Fault::Reset,
+        Fault::Invalid,
+        Fault::Unplanned,
+        Fault::Unstored,
+        Fault::Internal,
+    ];
+    for fault in all {
         if let Some(word) = word(fault) {
             faults.set_item(word, fault.code())?;
         }
@@ -44,6 +53,9 @@ fn word(fault: Fault) -> Option<&'static str> {
         Fault::Refused => Some("refused"),
         Fault::Reset => Some("reset"),
         Fault::Invalid => Some("invalid reply"),
+        Fault::Unplanned => Some("no plan"),
+        Fault::Unstored => Some("not stored"),
+        Fault::Internal => Some("internal error"),
     }
 }
 

@@ -64,8 +64,8 @@ impl Memory {
         for area in Area::ALL {
             let span = self.core.span(area);
             if span.size() > 0 {
-                let end = u32::from(span.start()) + span.size();
-                let range = py.get_type::<pyo3::types::PyRange>().call1((span.start(), end))?;
+                let range =
+                    py.get_type::<pyo3::types::PyRange>().call1((span.start(), span.end()))?;
                 areas.set_item(area.name(), range)?;
             }
         }
@@ -145,29 +145,6 @@ impl Memory {
         let areas = areas.iter().map(|(name, range)| format!("{name}={range}"));
         Ok(format!("<Memory {}>", areas.collect::<Vec<_>>().join(" ")))
     }
-}
-
-/// A memory, an area, an address and values.
-type AcrossWrite<'py> = (PyRef<'py, Memory>, String, Bound<'py, PyAny>, Bound<'py, PyAny>);
-
-/// Writes to several memories as one step.
-#[pyfunction]
-pub fn write_across(py: Python<'_>, writes: Vec<AcrossWrite<'_>>) -> PyResult<()> {
-    let packed = writes.iter().map(|(memory, area, address, values)| {
-        let range = Range::packed(&memory.core, area, integer(address)?, values)?;
-        Ok((Arc::clone(&memory.core), range))
-    });
-    let packed = packed.collect::<PyResult<Vec<(Arc<Core>, Range)>>>()?;
-    drop(writes);
-    py.detach(|| {
-        let writes: Vec<(&Core, Write)> =
-            packed.iter().map(|(memory, range)| (&**memory, range.writing())).collect();
-        holdfast_memory::write_across(Access::Ingest, &writes)
-    })
-    .map_err(|refused| {
-        let (memory, range) = &packed[refused.index];
-        range.refused(memory, refused.refusal)
-    })
 }
 
 /// A range inside an area, and its bytes.
@@ -272,8 +249,8 @@ fn out_of_range(memory: &Core, area: Area, address: i128, count: i128) -> PyErr 
     let found = format!("{count} from address {address}");
     OutOfRange::new_err(match span.size() {
         0 => format!("{name}: {found}, but this memory has no {name}"),
-        size => {
-            let last = u32::from(span.start()) + size - 1;
+        _ => {
+            let last = span.end() - 1;
             format!("{name}: {found}, allowed are addresses {} to {last}", span.start())
         }
     })
@@ -295,10 +272,7 @@ pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
     if let Ok(list) = values.cast_exact::<PyList>() {
         return list.iter().enumerate().map(|(index, value)| number(area, index, &value)).collect();
     }
-    let text = values.is_instance_of::<PyString>()
-        || values.is_instance_of::<PyBytes>()
-        || values.is_instance_of::<PyByteArray>();
-    if text {
+    if is_text(values) {
         let found = values.get_type().name()?;
         return Err(PyTypeError::new_err(format!(
             "values are {found}, not a sequence of integers"
@@ -311,25 +285,43 @@ pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
     Ok(numbers)
 }
 
-fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
-    if !area.is_bits()
-        && let Ok(register) = value.cast_exact::<PyInt>()
-        && let Ok(register) = register.extract::<u16>()
+/// Text and bytes are sequences of integers or of texts, but no values.
+pub fn is_text(values: &Bound<'_, PyAny>) -> bool {
+    values.is_instance_of::<PyString>()
+        || values.is_instance_of::<PyBytes>()
+        || values.is_instance_of::<PyByteArray>()
+}
+
+/// Why something is not a value of an area.
+pub enum Unfit {
+    /// An integer that is too small or too large.
+    Value,
+    Type,
+}
+
+/// One value of an area.
+pub fn item(area: Area, value: &Bound<'_, PyAny>) -> Result<u16, Unfit> {
+    let most = if area.is_bits() { 1 } else { u16::MAX };
+    if let Ok(integer) = value.cast_exact::<PyInt>()
+        && let Ok(number) = integer.extract::<u16>()
+        && number <= most
     {
-        return Ok(register);
+        return Ok(number);
     }
-    let (most, allowed) =
-        if area.is_bits() { (1, "0, 1, False, True") } else { (u16::MAX, "integers 0 to 65535") };
-    let is_bool = value.is_instance_of::<PyBool>();
-    let number = if is_bool && !area.is_bits() { None } else { integer(value).ok() };
-    match number.map(|number| u16::try_from(number).ok().filter(|number| *number <= most)) {
-        Some(Some(number)) => Ok(number),
-        out_of_bounds => {
-            let message = format!("values[{index}] is {}, allowed are {allowed}", value.repr()?);
-            Err(match out_of_bounds {
-                Some(None) => PyValueError::new_err(message),
-                _ => PyTypeError::new_err(message),
-            })
-        }
+    if let Ok(bit) = value.cast::<PyBool>() {
+        return if area.is_bits() { Ok(bit.is_true().into()) } else { Err(Unfit::Type) };
     }
+    let number = integer(value).map_err(|_| Unfit::Type)?;
+    u16::try_from(number).ok().filter(|number| *number <= most).ok_or(Unfit::Value)
+}
+
+fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
+    item(area, value).or_else(|unfit| {
+        let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
+        let message = format!("values[{index}] is {}, allowed are {allowed}", value.repr()?);
+        Err(match unfit {
+            Unfit::Value => PyValueError::new_err(message),
+            Unfit::Type => PyTypeError::new_err(message),
+        })
+    })
 }

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast import _core, logs
-from holdfast.protocol import MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -108,7 +107,6 @@ class MemoryAccess:
     ) -> None:
         self.name = name
         self.memories = memories
-        self._addresses = {memory: entry.areas for memory, entry in memories.items()}
         self._audit = audit
         self._counts = Counts()
         self._lock = threading.Lock()
@@ -136,16 +134,18 @@ class MemoryAccess:
         self, memory: str, area: str, address: int, count: int, grant: Grant, peer: str
     ) -> list[int]:
         """`count` values of one moment. Raises `Refused`."""
-        where = _place(memory, area, address)
         try:
-            target = self._granted(memory, area, grant, where)
-            self._check_range(memory, area, address, count, where)
+            target = self._granted(memory, area, address, grant)
+            try:
+                values = target.read(area, address, count)  # type: ignore[arg-type]
+            except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
+                raise self._out_of_range(memory, area, address, count) from None
         except Refused as refused:
             self.note(refused, grant.name, peer)
             raise
         with self._lock:
             self._counts.reads += 1
-        return target.read(area, address, count)  # type: ignore[arg-type]
+        return values
 
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
         """Counts, logs and audits a write that is refused, also one that never came in here."""
@@ -187,91 +187,108 @@ class MemoryAccess:
         else:
             batch = [document]
         single = batch is not document
-        writes = [
-            self._checked(command, grant, {} if single else {"command": index})
-            for index, command in enumerate(batch)
-        ]
         try:
-            _core.write_across(writes)  # type: ignore[arg-type]
-        except (ValueError, TypeError, _core.OutOfRange):
-            for index, (command, write) in enumerate(zip(batch, writes, strict=True)):
-                _explain(command, write, {} if single else {"command": index})
-            raise
-        values = sum(len(write[3]) for write in writes)
+            # A command that is refused ends the batch before native code has seen the next one.
+            values = _core.write_across(
+                self._checked(command, grant, None if single else index)  # type: ignore[misc]
+                for index, command in enumerate(batch)
+            )
+        except _core.BatchRefused as refused:
+            command = batch[refused.command]
+            raise self._refused(command, refused, None if single else refused.command) from None
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
         if self._audit is not None:
-            for command, (_, area, address, items) in zip(batch, writes, strict=True):
+            for command in batch:
                 self._audit.write(
                     listener=self.name,
                     peer=peer,
                     source=grant.name,
                     function="write",
                     memory=command["memory"],
-                    area=area,
-                    address=address,
-                    values=[int(item) for item in items],
+                    area=command["area"],
+                    address=command["address"],
+                    values=[int(item) for item in _values(command)],
                     outcome="done",
                 )
         return Written(len(batch), values, batch[0]["memory"] if single else None)
 
-    def _checked(self, command: object, grant: Grant, where: dict[str, Any]) -> Write:
-        """All of a command but its values, which the memory checks."""
+    def _checked(self, command: object, grant: Grant, index: int | None) -> Write:
+        """All of a command but its range and its values, which native code checks."""
         if not isinstance(command, dict):
-            raise _malformed(where, f"{_of(where)}is {_shown(command)}, not an object")
+            raise _malformed(index, f"is {_shown(command)}, not an object")
         keys = command.keys()
         if keys != _KEYS and keys != _BOOLS_KEYS:
-            raise _malformed(where, f"{_of(where)}{_keys_wrong(command)}")
+            raise _malformed(index, _keys_wrong(command))
         memory, area, address = command["memory"], command["area"], command["address"]
-        values = command["values"] if "values" in command else command["bools"]
-        for key, kind in (("memory", str), ("area", str), ("address", int)):
-            if type(command[key]) is not kind:
-                words = "text" if kind is str else "an integer"
-                found = f"{key} is {_shown(command[key])}, not {words}"
-                raise _malformed(where, f"{_of(where)}{found}")
-        where |= _place(memory, area, address)
-        target = self._granted(memory, area, grant, where)
+        if type(memory) is not str or type(area) is not str or type(address) is not int:
+            raise _malformed(index, _type_wrong(command))
+        target = self._granted(memory, area, address, grant, index)
         if not grant.writes:
+            where = _where(index, memory, area, address)
             raise Refused("not_granted", f"{grant.name} may not write", **where)
         if "bools" in command and area not in BIT_AREAS:
-            raise _malformed(where, f"{_of(where)}bools are for bits, {area} has registers")
-        if type(values) is not list or not values:
-            found = "empty" if values == [] else f"{_shown(values)}, not an array"
-            raise _malformed(where, f"{_of(where)}values are {found}")
-        self._check_range(memory, area, address, len(values), where)
+            where = _where(index, memory, area, address)
+            raise _malformed(index, f"bools are for bits, {area} has registers", where)
+        values = _values(command)
+        if type(values) is not list:
+            where = _where(index, memory, area, address)
+            raise _malformed(index, f"values are {_shown(values)}, not an array", where)
         return target, area, address, values
 
-    def _granted(self, memory: str, area: str, grant: Grant, where: dict[str, Any]) -> Memory:
+    def _granted(
+        self, memory: str, area: str, address: int, grant: Grant, index: int | None = None
+    ) -> Memory:
         target = self.memories.get(memory)
+        if target is not None and memory in grant.memories and area in grant.areas:
+            return target
         if target is None:
-            raise Refused("unknown_memory", f"{_of(where)}no memory {_shown(memory)}", **where)
-        if memory not in grant.memories:
-            detail = f"{_of(where)}memory {memory} is not granted to {grant.name}"
-            raise Refused("not_granted", detail, **where)
-        if area not in AREAS:
+            reason, detail = "unknown_memory", f"no memory {_shown(memory)}"
+        elif memory not in grant.memories:
+            reason, detail = "not_granted", f"memory {memory} is not granted to {grant.name}"
+        elif area not in AREAS:
             allowed = ", ".join(AREAS)
-            detail = f"{_of(where)}area is {_shown(area)}, allowed are {allowed}"
-            raise Refused("invalid_area", detail, **where)
-        if area not in grant.areas:
-            detail = f"{_of(where)}area {area} is not granted to {grant.name}"
-            raise Refused("not_granted", detail, **where)
-        return target
-
-    def _check_range(
-        self, memory: str, area: str, address: int, count: int, where: dict[str, Any]
-    ) -> None:
-        addresses = self._addresses[memory].get(area)  # type: ignore[call-overload]
-        if addresses is not None and address in addresses:
-            if 1 <= count <= addresses.stop - address:
-                return
-            allowed = f"allowed are 1 to {addresses.stop - address}"
-        elif addresses is not None:
-            allowed = f"allowed are addresses {addresses.start} to {addresses.stop - 1}"
+            reason, detail = "invalid_area", f"area is {_shown(area)}, allowed are {allowed}"
         else:
+            reason, detail = "not_granted", f"area {area} is not granted to {grant.name}"
+        raise Refused(reason, f"{_of(index)}{detail}", **_where(index, memory, area, address))
+
+    def _refused(
+        self, command: Mapping[str, Any], refused: _core.BatchRefused, index: int | None
+    ) -> Refused:
+        """Words for what native code refused; raises a refusal that no command can have."""
+        memory, area, address = command["memory"], command["area"], command["address"]
+        values, where = _values(command), _where(index, memory, area, address)
+        match refused.reason:
+            case "empty":
+                return _malformed(index, "values are empty", where)
+            case "out_of_range":
+                return self._out_of_range(memory, area, address, len(values), index)
+            case "invalid_value" | "invalid_type" if refused.index is not None:
+                shown = _shown(values[refused.index])
+                wrong = "outside" if refused.reason == "invalid_value" else "not"
+                allowed = f"{wrong} 0..65535"
+                if area in BIT_AREAS:
+                    allowed = "not 0, 1, false or true"
+                detail = f"{_of(index)}values[{refused.index}] is {shown}, {allowed}"
+                return Refused("invalid_value", detail, index=refused.index, value=shown, **where)
+            case _:
+                raise refused
+
+    def _out_of_range(
+        self, memory: str, area: str, address: int, count: int, index: int | None = None
+    ) -> Refused:
+        addresses = self.memories[memory].areas.get(area)  # type: ignore[call-overload]
+        if addresses is None:
             allowed = f"but {memory} has no {area}"
-        found = f"{_of(where)}{count} from address {_shown(address)} of {area}"
-        raise Refused("out_of_range", f"{found}, {allowed}", **where)
+        elif address in addresses:
+            allowed = f"allowed are 1 to {addresses.stop - address}"
+        else:
+            allowed = f"allowed are addresses {addresses.start} to {addresses.stop - 1}"
+        found = f"{_of(index)}{count} from address {_shown(address)} of {area}"
+        where = _where(index, memory, area, address)
+        return Refused("out_of_range", f"{found}, {allowed}", **where)
 
 
 def _decoded(body: bytes | bytearray | memoryview) -> object:
@@ -291,37 +308,36 @@ def _keys_wrong(command: Mapping[str, object]) -> str:
     return f"lacks {missing[0]}"
 
 
-def _explain(command: Mapping[str, object], write: Write, where: dict[str, Any]) -> None:
-    """Raises `Refused` for the first value of a write that can't be, if there is one."""
-    _, area, address, values = write
-    bits = area in BIT_AREAS
-    most, allowed = (1, "0, 1, false or true") if bits else (MAX_WORD, f"0..{MAX_WORD}")
-    for index, value in enumerate(values):
-        if bits and type(value) is bool:
-            continue
-        if type(value) is int and 0 <= value <= most:
-            continue
-        outside = f"outside {allowed}" if not bits and type(value) is int else f"not {allowed}"
-        detail = f"{_of(where)}values[{index}] is {_shown(value)}, {outside}"
-        where |= {"memory": command["memory"], "area": area, "address": address}
-        raise Refused("invalid_value", detail, index=index, value=_shown(value), **where)
+def _type_wrong(command: Mapping[str, object]) -> str:
+    """Which of memory, area and address is of the wrong type."""
+    for key in ("memory", "area"):
+        if type(command[key]) is not str:
+            return f"{key} is {_shown(command[key])}, not text"
+    return f"address is {_shown(command['address'])}, not an integer"
 
 
-def _of(where: Mapping[str, Any]) -> str:
-    return f"commands[{where['command']}]: " if "command" in where else ""
+def _values(command: Mapping[str, Any]) -> Any:
+    return command["values"] if "values" in command else command["bools"]
 
 
-def _place(memory: str, area: str, address: int) -> dict[str, Any]:
+def _of(index: int | None) -> str:
+    return "" if index is None else f"commands[{index}]: "
+
+
+def _where(index: int | None, memory: str, area: str, address: int) -> dict[str, Any]:
     """What a command aims at, for logs: no longer than a log can take."""
     return {
+        **({} if index is None else {"command": index}),
         "memory": memory[:MAX_SHOWN],
         "area": area[:MAX_SHOWN],
         "address": address if -(2**63) < address < 2**63 else _shown(address),
     }
 
 
-def _malformed(where: Mapping[str, Any], detail: str) -> Refused:
-    return Refused("malformed", detail, **where)
+def _malformed(index: int | None, detail: str, where: Mapping[str, Any] | None = None) -> Refused:
+    if where is None:
+        where = {} if index is None else {"command": index}
+    return Refused("malformed", f"{_of(index)}{detail}", **where)
 
 
 def _shown(value: object) -> str:

@@ -1,0 +1,136 @@
+//! `write_across`: a batch over several memories, and which of its values it is refused for.
+//!
+//! All writes of a batch are taken first, then all values are checked, then memory is written. So
+//! an iterable that raises has changed nothing, and what it raises goes before a value that is refused.
+
+use holdfast_memory::{Access, Area, Memory as Core, Refusal, Write};
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyList, PyString};
+
+use crate::memory::{Memory, Unfit, integer, is_text, item};
+
+pyo3::create_exception!(
+    holdfast._core,
+    BatchRefused,
+    PyValueError,
+    "A write of a batch that is refused."
+);
+
+/// A write whose range is inside its area; its values are not checked yet.
+struct Pending<'py> {
+    memory: Bound<'py, Memory>,
+    area: Area,
+    address: u16,
+    count: usize,
+    values: Bound<'py, PyList>,
+}
+
+/// Writes to several memories as one step; how many values were written.
+#[pyfunction]
+pub fn write_across(py: Python<'_>, writes: &Bound<'_, PyAny>) -> PyResult<usize> {
+    let (mut pending, mut len) = (Vec::new(), 0);
+    for (command, write) in writes.try_iter()?.enumerate() {
+        let write = Pending::new(command, &write?)?;
+        len += write.area.byte_len(write.count);
+        pending.push(write);
+    }
+    let mut bytes = vec![0; len];
+    let mut rest = &mut bytes[..];
+    let mut packed: Vec<(&Core, Write)> = Vec::with_capacity(pending.len());
+    for (command, write) in pending.iter().enumerate() {
+        let (bytes, behind) = rest.split_at_mut(write.area.byte_len(write.count));
+        rest = behind;
+        packed.push((&write.memory.get().core, write.packed(command, bytes)?));
+    }
+    py.detach(|| holdfast_memory::write_across(Access::Ingest, &packed))
+        .map_err(|refused| refusal(py, refused.index, None, reason(refused.refusal)))?;
+    Ok(pending.iter().map(|write| write.count).sum())
+}
+
+impl<'py> Pending<'py> {
+    fn new(command: usize, write: &Bound<'py, PyAny>) -> PyResult<Pending<'py>> {
+        let (memory, area, address, values): (
+            Bound<'py, Memory>,
+            Bound<'py, PyString>,
+            Bound<'py, PyAny>,
+            Bound<'py, PyAny>,
+        ) = write.extract()?;
+        let refused = |reason| Err(refusal(write.py(), command, None, reason));
+        let Some(area) = Area::from_name(area.to_str()?) else { return refused("invalid_area") };
+        let values = match values.cast_into_exact::<PyList>() {
+            Ok(list) => list,
+            Err(error) => match listed(&error.into_inner())? {
+                Some(list) => list,
+                None => return refused("invalid_type"),
+            },
+        };
+        let count = values.len();
+        if count == 0 {
+            return refused("empty");
+        }
+        let span = memory.get().core.span(area);
+        let address = u16::try_from(integer(&address)?).ok();
+        let Some(address) = address.filter(|address| span.holds(*address, count)) else {
+            return refused("out_of_range");
+        };
+        Ok(Pending { memory, area, address, count, values })
+    }
+
+    /// The write with the bytes that its values stand for.
+    fn packed<'b>(&self, command: usize, bytes: &'b mut [u8]) -> PyResult<Write<'b>> {
+        let Pending { area, address, count, ref values, .. } = *self;
+        if values.len() != count {
+            return Err(PyRuntimeError::new_err("values changed while they were read"));
+        }
+        for index in 0..count {
+            let value = item(area, &values.get_item(index)?).map_err(|unfit| {
+                let reason = match unfit {
+                    Unfit::Value => "invalid_value",
+                    Unfit::Type => "invalid_type",
+                };
+                refusal(values.py(), command, Some(index), reason)
+            })?;
+            if area.is_bits() {
+                bytes[index / 8] |= (value as u8) << (index % 8);
+            } else {
+                bytes[index * 2..index * 2 + 2].copy_from_slice(&value.to_be_bytes());
+            }
+        }
+        Ok(Write { area, address, count, bytes })
+    }
+}
+
+/// The items of an iterable that can be values.
+fn listed<'py>(values: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyList>>> {
+    if is_text(values) {
+        return Ok(None);
+    }
+    let Ok(items) = values.try_iter() else { return Ok(None) };
+    let list = PyList::empty(values.py());
+    for item in items {
+        list.append(item?)?;
+    }
+    Ok(Some(list))
+}
+
+fn refusal(py: Python<'_>, command: usize, index: Option<usize>, reason: &'static str) -> PyErr {
+    let place = index.map_or_else(String::new, |index| format!("values[{index}]: "));
+    let error = BatchRefused::new_err(format!("writes[{command}]: {place}{reason}"));
+    let value = error.value(py);
+    let noted = value
+        .setattr("command", command)
+        .and_then(|()| value.setattr("index", index))
+        .and_then(|()| value.setattr("reason", reason));
+    noted.err().unwrap_or(error)
+}
+
+const fn reason(refusal: Refusal) -> &'static str {
+    match refusal {
+        Refusal::Sealed => "sealed",
+        Refusal::OutOfRange => "out_of_range",
+        Refusal::GateBit => "gate_bit",
+        Refusal::WrongLength => "wrong_length",
+        Refusal::NotRegisters => "not_registers",
+    }
+}
