@@ -113,6 +113,9 @@ _TEXTS = {
     NO_CONNECTION: "no connection",
     FAULTS["reset"]: "the connection was lost",
     FAULTS["invalid reply"]: "an invalid reply",
+    FAULTS["no plan"]: "no plan to read the device",
+    FAULTS["not stored"]: "memory refused the values",
+    FAULTS["internal error"]: "an internal error",
 }
 
 

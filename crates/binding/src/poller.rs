@@ -9,7 +9,7 @@ use holdfast_engine::poller::{
     PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
-use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
@@ -106,28 +106,21 @@ impl Poller {
     fn new(py: Python<'_>, devices: Vec<PyRef<'_, PolledDevice>>) -> PyResult<Poller> {
         let devices: Vec<DeviceSettings> =
             devices.iter().map(|device| device.core.clone()).collect();
-        let core = py.detach(|| Core::start(devices)).map_err(|error| match error {
-            PollerError::Thread(_) => PyOSError::new_err(error.to_string()),
-            _ => PyValueError::new_err(error.to_string()),
-        })?;
+        let core = py.detach(|| Core::start(devices)).map_err(raised)?;
         Ok(Poller { core })
     }
 
     fn add(&self, device: PyRef<'_, PolledDevice>) -> PyResult<()> {
-        self.core.add(device.core.clone()).map_err(|error| PyValueError::new_err(error.to_string()))
+        self.core.add(device.core.clone()).map_err(raised)
     }
 
     #[pyo3(signature = (name, device, *, at_once=true))]
     fn replace(&self, name: &str, device: PyRef<'_, PolledDevice>, at_once: bool) -> PyResult<()> {
-        self.core
-            .replace(name, device.core.clone(), at_once)
-            .map_err(|error| PyValueError::new_err(error.to_string()))
+        self.core.replace(name, device.core.clone(), at_once).map_err(raised)
     }
 
     fn write(&self, name: &str, request: PyRef<'_, Request>) -> PyResult<u64> {
-        self.core
-            .write(name, Box::new(request.encoded.clone()))
-            .map_err(|error| PyValueError::new_err(error.to_string()))
+        self.core.write(name, Box::new(request.encoded.clone())).map_err(raised)
     }
 
     fn remove(&self, name: &str) -> bool {
@@ -172,6 +165,14 @@ impl Poller {
 
     fn stop(&self, py: Python<'_>) {
         py.detach(|| self.core.stop());
+    }
+}
+
+fn raised(error: PollerError) -> PyErr {
+    match error {
+        PollerError::Thread(_) => PyOSError::new_err(error.to_string()),
+        PollerError::Stopped => PyRuntimeError::new_err(error.to_string()),
+        _ => PyValueError::new_err(error.to_string()),
     }
 }
 
@@ -264,8 +265,11 @@ fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
             Ok(bytes) => (Some(PyBytes::new(py, bytes)), 0),
             Err(fault) => (None, fault.code()),
         };
-        let time = block.time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-        (block.area.name(), block.address, block.count, bytes, fault, time.as_secs_f64())
+        let time = match block.time.duration_since(SystemTime::UNIX_EPOCH) {
+            Ok(since) => since.as_secs_f64(),
+            Err(error) => -error.duration().as_secs_f64(),
+        };
+        (block.area.name(), block.address, block.count, bytes, fault, time)
     });
     Ok((poll.device.to_string(), poll.due.as_secs_f64(), blocks.collect()))
 }
@@ -280,9 +284,11 @@ fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDic
     told.set_item("failures", state.failures())?;
     told.set_item("round_trip", state.round_trip().as_secs_f64())?;
     told.set_item("requests_per_poll", state.requests_per_poll())?;
+    told.set_item("plan_error", state.plan_error())?;
     for (key, counter) in [
         ("polls", &counters.polls),
         ("missed", &counters.missed),
+        ("unplanned", &counters.unplanned),
         ("requests", &counters.requests),
         ("valid", &counters.valid),
         ("exceptions", &counters.exceptions),
@@ -290,6 +296,7 @@ fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDic
         ("transport_errors", &counters.transport_errors),
         ("reads", &counters.reads),
         ("values", &counters.values),
+        ("unstored", &counters.unstored),
     ] {
         told.set_item(key, counter.get())?;
     }
