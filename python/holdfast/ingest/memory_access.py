@@ -344,5 +344,5 @@ def _shown(value: object) -> str:
     """A value as JSON, cut short: it comes from outside, and goes into logs."""
     if isinstance(value, dict | list):
         return "an object" if isinstance(value, dict) else "an array"
-    text = msgspec.json.encode(value).decode()
+    text = msgspec.json.encode(value, enc_hook=repr).decode()
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
