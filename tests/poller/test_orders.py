@@ -136,6 +136,33 @@ def test_a_device_takes_the_place_of_another_with_its_connection_and_counters(
         assert not poller.remove("a")
 
 
+def test_a_poller_that_has_been_stopped_refuses_orders(poller: Poller) -> None:
+    fake = Fake(data)
+    poller.add(device(fake))
+    poller.stop()
+    for order in (
+        lambda: poller.add(device(fake, "b")),
+        lambda: poller.replace("a", device(fake, "b")),
+        lambda: poller.write("a", Request.write_register(0, 1)),
+    ):
+        with pytest.raises(RuntimeError, match="the poller has been stopped"):
+            order()
+    assert list(poller.counters()) == ["a"]
+    assert (poller.remove("b"), poller.remove("a"), poller.remove("a")) == (False, True, False)
+    poller.stop()
+
+
+def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: Poller) -> None:
+    fake = Fake(data)
+    receiver = ("127.0.0.1", 9, "v1", "required", 1, 1.0)
+    for count, forward in ((65535, [receiver]), (65536, None)):
+        poller.add(device(fake, str(count), reads=[("coils", 0, count, None)], forward=forward))
+    reads = [("coils", 0, 1, None), ("coils", 0, 65536, None)]
+    with pytest.raises(ValueError, match="device c: read 1 has 65536 items, a packet that is"):
+        poller.add(device(fake, "c", reads=reads, forward=[receiver]))
+    assert sorted(poller.counters()) == ["65535", "65536"]
+
+
 def test_a_poll_under_way_is_completed_before_the_device_is_replaced(poller: Poller) -> None:
     begun, go_on = threading.Event(), threading.Event()
 

@@ -482,3 +482,95 @@ fn checked(device: DeviceSettings) -> Result<Planned, PollerError> {
     let name = name();
     Planned::new(device).map_err(|error| PollerError::Plan { device: name, error })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use holdfast_memory::{Area, Layout, Memory, Span};
+
+    use super::*;
+    use crate::poller::plan::Strategy;
+    use crate::poller::{Destination, ReadSettings, StatusSettings};
+
+    const AREA: Area = Area::HoldingRegisters;
+
+    fn memory() -> Arc<Memory> {
+        let layout = Layout::default().with(AREA, Span::new(10, 70).unwrap());
+        Arc::new(Memory::new(layout, None).unwrap())
+    }
+
+    fn settings() -> DeviceSettings {
+        DeviceSettings {
+            name: "meter".into(),
+            endpoint: Endpoint::Tcp { host: "127.0.0.1".into(), port: 502, tls: None },
+            unit_id: 1,
+            interval: Duration::from_secs(1),
+            timeout: Duration::from_secs(1),
+            reads: vec![ReadSettings { area: AREA, address: 0, count: 4, into: None }],
+            limits: PlanLimits::default(),
+            strategy: Strategy::Gap { max_gap: 0 },
+            measured: false,
+            forward: Vec::new(),
+            status: None,
+            start_within: Duration::ZERO,
+            report: false,
+            release: false,
+        }
+    }
+
+    fn refused(change: impl FnOnce(&mut DeviceSettings)) -> String {
+        let mut changed = settings();
+        change(&mut changed);
+        checked(changed).expect_err("it is refused").to_string()
+    }
+
+    #[test]
+    fn limits_beyond_those_of_a_request_are_refused() {
+        for limit in [0, 126, u16::MAX] {
+            let expected = format!("device meter: max_registers is {limit}, allowed are 1 to 125");
+            assert_eq!(refused(|device| device.limits.max_registers = limit), expected);
+        }
+        for limit in [0, 2001] {
+            let expected = format!("device meter: max_bits is {limit}, allowed are 1 to 2000");
+            assert_eq!(refused(|device| device.limits.max_bits = limit), expected);
+        }
+    }
+
+    #[test]
+    fn reads_beyond_the_last_address_are_refused() {
+        for (address, count) in [(0, 0), (1, 65_536), (65_535, 2), (1, u32::MAX)] {
+            let expected = "device meter: read 0 has no items, or goes beyond address 65535";
+            let beyond = ReadSettings { area: AREA, address, count, into: None };
+            assert_eq!(refused(|device| device.reads = vec![beyond]), expected);
+        }
+    }
+
+    #[test]
+    fn what_memory_has_no_room_for_is_refused() {
+        for (area, address) in
+            [(AREA, 9), (AREA, 77), (Area::InputRegisters, 10), (Area::Coils, 10)]
+        {
+            let into = Some(Destination { memory: memory(), area, address });
+            let expected = "device meter: read 0 does not fit into its destination";
+            assert_eq!(refused(|device| device.reads[0].into = into), expected);
+        }
+        for (area, slot) in [(AREA, 0), (AREA, 2), (AREA, u16::MAX), (Area::Coils, 1)] {
+            let status = Some(StatusSettings { memory: memory(), area, slot });
+            let expected = "device meter: the status block does not fit into its memory";
+            assert_eq!(refused(|device| device.status = status), expected);
+        }
+        let mut fits = settings();
+        fits.reads[0].into = Some(Destination { memory: memory(), area: AREA, address: 76 });
+        fits.status = Some(StatusSettings { memory: memory(), area: AREA, slot: 1 });
+        assert!(checked(fits).is_ok());
+    }
+
+    #[test]
+    fn a_write_without_a_function_code_is_refused() {
+        let poller = Poller::start(Vec::new()).unwrap();
+        let refused = |pdu| poller.write("meter", pdu).expect_err("it is refused").to_string();
+        assert_eq!(refused(vec![]), "device meter: the request has no function code");
+        assert_eq!(refused(vec![3]), "device meter: function 3 does not write");
+    }
+}
