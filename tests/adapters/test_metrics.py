@@ -49,6 +49,8 @@ METER: dict[str, Any] = {
     "requests_per_poll": 2,
     "polls": 30,
     "missed": 1,
+    "unplanned": 6,
+    "plan_error": "read 0: field 0: no items",
     "requests": 60,
     "valid": 50,
     "exceptions": 4,
@@ -56,6 +58,7 @@ METER: dict[str, Any] = {
     "transport_errors": 1,
     "reads": 29,
     "values": 290,
+    "unstored": 7,
     "forward": [{"sent": 20, "refused": 2, "failed": 3, "replaced": 4}],
 }
 
@@ -162,8 +165,10 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_device_requests_total", "meter", "transport_errors"), 1),
         (("holdfast_device_polls_total", "meter"), 30),
         (("holdfast_device_missed_polls_total", "meter"), 1),
+        (("holdfast_device_unplanned_polls_total", "meter"), 6),
         (("holdfast_device_reads_total", "meter"), 29),
         (("holdfast_device_values_total", "meter"), 290),
+        (("holdfast_device_unstored_total", "meter"), 7),
         (("holdfast_device_age_seconds", "meter"), 5.5),
         (("holdfast_device_error_seconds", "meter"), 4.5),
         (("holdfast_device_failures", "meter"), 3),

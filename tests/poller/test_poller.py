@@ -12,6 +12,7 @@ import pytest
 
 import holdfast
 from holdfast import logs
+from holdfast.appliance import running
 from holdfast.types import AREAS
 from support import polled, web, wire
 from support.brokers import free_port
@@ -934,6 +935,58 @@ def test_a_change_of_health_is_logged_once(run: Run, records: web.Records) -> No
     assert levels == ["INFO", "WARNING", "INFO"]
 
 
+class Altered:
+    """The poller of an appliance, with other counters."""
+
+    def __init__(self, poller: Any) -> None:
+        self._poller = poller
+        self.counters_instead: dict[str, Any] = {}
+
+    def counters(self) -> dict[str, dict[str, Any]]:
+        told: dict[str, dict[str, Any]] = self._poller.counters()
+        return {name: {**counted, **self.counters_instead} for name, counted in told.items()}
+
+    def stop(self) -> None:
+        self._poller.stop()
+
+
+def test_a_missing_plan_and_refused_results_are_logged(
+    run: Run, records: web.Records, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0)
+    reads = [read("coils", 0, 8, ("coils", 0))]
+    with Fake(data) as fake:
+        appliance = run(configuration({"meter": device(fake.url, *reads)}))
+        parts: Any = appliance._parts()
+        parts._poller = altered = Altered(parts._poller)
+        until_polled(appliance, "meter", 1)
+        told = counters(appliance, "meter")
+        assert (told["plan_error"], told["unplanned"], told["unstored"]) == (None, 0, 0)
+        appliance.log_events(timeout=0)
+        assert not records.of("device_unplanned") + records.of("device_unstored")
+        no_plan = {"plan_error": "read 0: field 0: no items", "health": "error"}
+        for changed in (
+            {"unstored": 2},
+            {"unstored": 5, "health": "error", "last_error": 0x8006},
+            {"unstored": 5, **no_plan, "last_error": 0x8005},
+            {"unstored": 5, **no_plan, "last_error": 0x8005},
+            {"unstored": 5},
+            {"unstored": 5, **no_plan, "last_error": 0x8007},
+        ):
+            altered.counters_instead = changed
+            appliance.log_events(timeout=0)
+    unstored = records.of("device_unstored")
+    assert [(each["device"], each["count"]) for each in unstored] == [("meter", 2), ("meter", 3)]
+    unplanned = records.of("device_unplanned")
+    assert [(each["device"], each["error"]) for each in unplanned] == [
+        ("meter", "read 0: field 0: no items")
+    ] * 2
+    errors = [each["error"] for each in records.of("device_health") if "error" in each]
+    assert errors == ["not stored", "internal error"]
+    levels = {line.split()[0] for line in records.lines if "device_un" in line}
+    assert levels == {"ERROR"}
+
+
 def test_rest_and_metrics_tell_of_devices(run: Run) -> None:
     reads = [read("holding_registers", 0, 10, ("holding_registers", 0))]
     http = {"bind": "127.0.0.1:0", "sources": ["127.0.0.1"]}
@@ -957,6 +1010,8 @@ def test_rest_and_metrics_tell_of_devices(run: Run) -> None:
         assert 'holdfast_device_health{device="meter",state="ok"} 1.0' in text
         assert 'holdfast_device_health{device="other",state="disabled"} 1.0' in text
         assert 'holdfast_device_age_seconds{device="meter"}' in text
+        assert 'holdfast_device_unplanned_polls_total{device="meter"} 0.0' in text
+        assert 'holdfast_device_unstored_total{device="meter"} 0.0' in text
 
 
 def test_an_appliance_can_be_started_again(run: Run) -> None:

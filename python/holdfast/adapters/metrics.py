@@ -158,8 +158,14 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     counters = {
         "polls": _counter("device_polls", "Polls that were carried out.", "device"),
         "missed": _counter("device_missed_polls", "Polls that could not begin in time.", "device"),
+        "unplanned": _counter(
+            "device_unplanned_polls", "Polls left out because no plan reads the device.", "device"
+        ),
         "reads": _counter("device_reads", "Reads that came whole.", "device"),
         "values": _counter("device_values", "Bits and registers in them.", "device"),
+        "unstored": _counter(
+            "device_unstored", "Reads and status blocks that memory refused.", "device"
+        ),
     }
     gauges = {
         "age": _gauge("device_age_seconds", "Since the last valid answer.", "device"),

@@ -12,7 +12,7 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
@@ -28,7 +28,7 @@ from holdfast.net.addresses import joined
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from holdfast.adapters import Adapter
     from holdfast.client.target import Tls
@@ -138,6 +138,8 @@ class _Running:
         self._lost_events = 0
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         self._health = dict.fromkeys(config.devices, "unknown")
+        self._plan_errors: dict[str, str | None] = {}
+        self._unstored: dict[str, int] = {}
         self._looked = time.monotonic()
         # An adapter that is not installed, and a file that TLS of devices can't use, are told
         # before any socket is opened.
@@ -208,21 +210,26 @@ class _Running:
                 )
         if self._poller is not None and time.monotonic() - self._looked >= HEALTH_CHECK_INTERVAL:
             self._looked = time.monotonic()
-            self._log_health(self._poller)
+            for name, told in self._poller.counters().items():
+                self._log_device(name, told)
 
-    def _log_health(self, poller: _core.Poller) -> None:
-        """Logs which devices do better or worse than when it was looked last."""
-        for name, told in poller.counters().items():
-            health = told["health"]
-            if health == self._health[name]:
-                continue
-            self._health[name] = health
-            fields: dict[str, object] = {"device": name, "health": health}
-            if health == "error":
-                fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
-            logs.write(
-                logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields
-            )
+    def _log_device(self, name: str, told: Mapping[str, Any]) -> None:
+        """Logs what has changed for a device since the last look."""
+        health, plan_error, unstored = told["health"], told["plan_error"], told["unstored"]
+        if plan_error is not None and plan_error != self._plan_errors.get(name):
+            logs.write(logging.ERROR, "device_unplanned", device=name, error=plan_error)
+        self._plan_errors[name] = plan_error
+        refused = unstored - self._unstored.get(name, 0)
+        if refused:
+            logs.write(logging.ERROR, "device_unstored", device=name, count=refused)
+        self._unstored[name] = unstored
+        if health == self._health[name]:
+            return
+        self._health[name] = health
+        fields: dict[str, object] = {"device": name, "health": health}
+        if health == "error":
+            fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
+        logs.write(logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields)
 
     def _log_event(self, listener: str, event: str, peer: str | None, reason: str | None) -> None:
         fields = {"listener": listener, "peer": peer or "-"}
