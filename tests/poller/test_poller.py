@@ -555,7 +555,7 @@ def test_a_late_reply_is_not_taken_for_the_next(run: Run) -> None:
 
     reads = [read("holding_registers", 0, 4, ("holding_registers", 0))]
     with Fake(answer) as fake:
-        appliance = run(configuration({"meter": device(fake.url, *reads, timeout=0.05)}))
+        appliance = run(configuration({"meter": device(fake.url, *reads, timeout=0.2)}))
         mirror = appliance.memories["mirror"]
         seen: set[int] = set()
 
