@@ -47,8 +47,6 @@ pub enum PollerError {
     Unknown { device: String },
     #[error("device {device}: function {function} does not write")]
     NoWrite { device: String, function: u8 },
-    #[error("device {device}: the request has no function code")]
-    NoFunction { device: String },
     #[error("the poller has been stopped")]
     Stopped,
     #[error("can't start the poller's thread: {0}")]
@@ -488,6 +486,7 @@ mod tests {
     use std::sync::Arc;
 
     use holdfast_memory::{Area, Layout, Memory, Span};
+    use holdfast_protocol::pdu::{Range, Request};
 
     use super::*;
     use crate::poller::plan::Strategy;
@@ -567,10 +566,10 @@ mod tests {
     }
 
     #[test]
-    fn a_write_without_a_function_code_is_refused() {
+    fn a_request_that_does_not_write_is_refused() {
         let poller = Poller::start(Vec::new()).unwrap();
-        let refused = |pdu| poller.write("meter", pdu).expect_err("it is refused").to_string();
-        assert_eq!(refused(vec![]), "device meter: the request has no function code");
-        assert_eq!(refused(vec![3]), "device meter: function 3 does not write");
+        let read = Request::ReadHoldingRegisters(Range::new(0, 1).unwrap());
+        let error = poller.write("meter", Box::new(EncodedRequest::new(&read))).unwrap_err();
+        assert_eq!(error.to_string(), "device meter: function 3 does not write");
     }
 }
