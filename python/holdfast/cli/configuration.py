@@ -11,7 +11,7 @@ import click
 from holdfast.appliance import assembly
 from holdfast.client.endpoint import check_files, endpoint
 from holdfast.config import ConfigError, ModbusTlsListener, load, source
-from holdfast.config.problems import Report
+from holdfast.config.report import Report
 
 if TYPE_CHECKING:
     from holdfast.config import Config

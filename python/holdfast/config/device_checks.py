@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from holdfast.client.target import Target
     from holdfast.config.grant_checks import GrantChecks
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 MAX_OF_A_PACKET = MAX_WORD

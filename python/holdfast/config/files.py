@@ -12,7 +12,7 @@ from holdfast.config.words import show
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 

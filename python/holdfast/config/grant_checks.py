@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.memories import Seal
     from holdfast.config.model import Config
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
     from holdfast.types import Area
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.config.grant_checks import GrantChecks
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 _DEFAULT_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default

@@ -16,7 +16,8 @@ from holdfast.config.grant_checks import GrantChecks, doubt_grants
 from holdfast.config.listener_checks import ListenerChecks
 from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
-from holdfast.config.problems import ConfigError, Problem, Report
+from holdfast.config.problems import ConfigError, Problem
+from holdfast.config.report import Report
 from holdfast.config.service_checks import ServiceChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build

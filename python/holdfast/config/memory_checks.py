@@ -18,7 +18,8 @@ from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS, Area
 
 if TYPE_CHECKING:
-    from holdfast.config.problems import Problem, Report
+    from holdfast.config.problems import Problem
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 _EXTENT: TypeAdapter[Span | None] = TypeAdapter(Extent)

@@ -1,17 +1,12 @@
-"""What is wrong with a configuration: one `Problem` a mistake, all of them in one `ConfigError`.
-
-A `Report` collects the problems of one file. Nothing here judges a value.
-"""
+"""What is wrong with a configuration: one `Problem` a mistake, all of them in one `ConfigError`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-    from holdfast.config.source import Document, KeyPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,46 +39,3 @@ class ConfigError(Exception):
 
         self.problems: tuple[Problem, ...] = tuple(sorted(problems, key=order))
         super().__init__("\n".join(str(problem) for problem in self.problems))
-
-
-@dataclass
-class Report:
-    """The problems found so far in one document, each once, and what is right but has no effect."""
-
-    document: Document
-    found: dict[Problem, None] = field(default_factory=dict)
-    doubts: list[Problem] = field(default_factory=list)
-    settled: list[KeyPath] = field(default_factory=list)
-
-    @property
-    def problems(self) -> list[Problem]:
-        """In the order they were found."""
-        return list(self.found)
-
-    def add(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
-        """Adds a problem of the value at `path`, or of the key itself."""
-        self.found[self._at(path, message, of_key)] = None
-
-    def settle(
-        self, path: KeyPath, message: str, part: KeyPath = (), *, of_key: bool = False
-    ) -> None:
-        """Adds the one problem of `path`, at a part of it; what is there is not looked at again."""
-        self.add((*path, *part), message, of_key=of_key)
-        self.settled.append(path)
-
-    def is_settled(self, path: KeyPath) -> bool:
-        """Whether all that is to be said of `path` was said."""
-        return any(path[: len(settled)] == settled for settled in self.settled)
-
-    def doubt(self, path: KeyPath, message: str) -> None:
-        """Adds what is allowed at `path` but can't be what was meant."""
-        self.doubts.append(self._at(path, message, of_key=False))
-
-    def _at(self, path: KeyPath, message: str, of_key: bool) -> Problem:
-        place = self.document.place(path, of_key=of_key)
-        key = self.document.spell(path)
-        return Problem(self.document.file, place.line, place.column, key, message)
-
-    def line(self, path: KeyPath) -> int:
-        """The line of the key at `path`."""
-        return self.document.place(path, of_key=True).line

@@ -18,7 +18,7 @@ from holdfast.config.words import choice, show
 
 if TYPE_CHECKING:
     from holdfast.config.grant_checks import GrantChecks
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 _USERS_OF_MEMORIES = ("listeners", "devices", "rest", "mqtt", "adapters")

@@ -14,7 +14,7 @@ from holdfast.config.words import show
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
     _Server: TypeAlias = tuple[KeyPath, dict[Any, Any]]

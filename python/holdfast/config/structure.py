@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pydantic_core import ErrorDetails
 
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 _KEY = "[key]"

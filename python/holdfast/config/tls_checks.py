@@ -10,7 +10,7 @@ from holdfast.net.tls import alone
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 CLIENT_FILES = ("ca_file", "cert_file", "key_file")

@@ -10,7 +10,7 @@ from holdfast.config.words import show
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.config.problems import Report
+    from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
 

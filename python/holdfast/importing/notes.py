@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from holdfast.config.problems import Report
+from holdfast.config.report import Report
 
 if TYPE_CHECKING:
     from holdfast.config.source import Document, KeyPath
