@@ -1,4 +1,4 @@
-"""What can go wrong between a client and a device: errors of clients, faults of polled devices.
+"""What can go wrong between a client and a device, as errors of clients.
 
     ModbusError
     ├── ModbusException      the device answered with an exception: code, name
@@ -12,8 +12,6 @@ The texts are for people; programs decide by class and attributes.
 """
 
 from __future__ import annotations
-
-from holdfast import _core
 
 
 class ModbusError(Exception):
@@ -98,41 +96,3 @@ class InvalidResponse(ModbusError):
 
     def __str__(self) -> str:
         return self.detail
-
-
-FAULTS = _core.FAULTS
-"""Why a polled device did not answer, in a word, with the codes that the poller has for it. A fault
-of another code is an exception of the device.
-"""
-
-NO_CONNECTION = FAULTS["refused"]
-
-_WORDS = {code: word for word, code in FAULTS.items()}
-_TEXTS = {
-    FAULTS["timeout"]: "no reply in time",
-    NO_CONNECTION: "no connection",
-    FAULTS["reset"]: "the connection was lost",
-    FAULTS["invalid reply"]: "an invalid reply",
-    FAULTS["no plan"]: "no plan to read the device",
-    FAULTS["not stored"]: "memory refused the values",
-    FAULTS["internal error"]: "an internal error",
-}
-
-
-def is_exception(fault: int) -> bool:
-    """Whether a fault is an exception; otherwise the request or its reply got lost."""
-    return fault not in _WORDS
-
-
-def fault_word(fault: int) -> str:
-    """A fault as logs have it: `timeout`, `exception 02`, `none` for 0."""
-    if fault == 0:
-        return "none"
-    return _WORDS.get(fault, f"exception {fault:02X}")
-
-
-def fault_text(fault: int) -> str:
-    """A fault in words for people: `no reply in time`, `exception 02 (Illegal Data Address)`."""
-    if fault in _core.EXCEPTIONS:
-        return str(ModbusException(fault, _core.EXCEPTIONS[fault]))
-    return fault_word(fault) if is_exception(fault) else _TEXTS[fault]

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from holdfast import _core, errors, protocol, types
+from holdfast import _core, faults, protocol, types
 from holdfast.gateway.assets import FOLDER
 from holdfast.scanner.messages import FunctionCode
 from holdfast.scanner.tags import AREA_OF_CODE
@@ -131,12 +131,12 @@ def test_diagnostics_that_change_nothing_are_the_echo_the_register_and_the_count
     ],
 )
 def test_a_fault_has_a_word_and_a_text(fault: int, word: str, text: str) -> None:
-    assert (errors.fault_word(fault), errors.fault_text(fault)) == (word, text)
-    assert errors.is_exception(fault) == (fault < 256)
+    assert (faults.fault_word(fault), faults.fault_text(fault)) == (word, text)
+    assert faults.is_exception(fault) == (fault < 256)
 
 
 def test_no_fault_is_called_none() -> None:
-    assert errors.fault_word(0) == "none"
+    assert faults.fault_word(0) == "none"
 
 
 def test_the_console_has_the_same_areas_and_limits() -> None:

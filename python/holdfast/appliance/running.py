@@ -21,7 +21,7 @@ from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
 from holdfast.config import ModbusAsciiListener, ModbusRtuListener
-from holdfast.errors import fault_word
+from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.ingest.audit import Audit
 from holdfast.net.addresses import joined

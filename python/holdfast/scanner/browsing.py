@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.errors import fault_text
+from holdfast.faults import fault_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import beside
 from holdfast.scanner.messages import (

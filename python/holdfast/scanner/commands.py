@@ -14,7 +14,7 @@ import msgspec
 
 from holdfast import logs
 from holdfast.client.requests import write_typed
-from holdfast.errors import fault_text
+from holdfast.faults import fault_text
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import is_unwritten
