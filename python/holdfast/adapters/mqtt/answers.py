@@ -14,15 +14,14 @@ from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from holdfast.adapters.mqtt.link import MAX_WAITING
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.adapters.mqtt.filters import Filters
     from holdfast.adapters.mqtt.link import BrokerConnection
     from holdfast.adapters.mqtt.packets import Publish
-
-MAX_WAITING = 100
-"""Answers that the broker has not taken yet."""
 
 
 class Answers:

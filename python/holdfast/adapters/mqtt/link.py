@@ -20,21 +20,23 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from holdfast.adapters.mqtt.answers import MAX_WAITING
 from holdfast.adapters.mqtt.inbox import MAX_BYTES
 from holdfast.adapters.mqtt.packets import MAX_PROPERTIES, parse_publish
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
-    from holdfast.adapters.mqtt.answers import Answers
     from holdfast.adapters.mqtt.inbox import Inbox
+    from holdfast.adapters.mqtt.packets import Publish
     from holdfast.config import MqttConfig, SubscriptionConfig
 
 SESSION_EXPIRY = 3600
 """Seconds that the broker keeps subscriptions and undelivered messages while this client is away.
 It can be told so with MQTT 5 only."""
+
+MAX_WAITING = 100
+"""Answers that the broker has not taken yet."""
 
 MAX_UNSENT = 1000
 """Packets waiting to be sent, mostly acknowledgements, above which nothing more is read."""
@@ -58,9 +60,11 @@ class BrokerConnection(Client):
         dial: Callable[[], socket.socket],
         unreleased: set[int],
         inbox: Inbox,
-        answers: Answers,
+        answer: Callable[[BrokerConnection, Publish, Mapping[str, object]], None],
     ) -> None:
-        """`unreleased` are packet identifiers of QoS 2, kept from one connection to the next."""
+        """`unreleased` are packet identifiers of QoS 2, kept from one connection to the next.
+        `answer` is called for each message, after its acknowledgement.
+        """
         self._five = settings.version == "5"
         super().__init__(
             CallbackAPIVersion.VERSION2,
@@ -72,7 +76,7 @@ class BrokerConnection(Client):
         self._dial = dial
         self._unreleased = unreleased
         self._inbox = inbox
-        self._answers = answers
+        self._answer = answer
         self._largest_sent: int | None = None
         self.most_qos = 1
         """The best quality of service that the broker takes, not above 1."""
@@ -156,7 +160,7 @@ class BrokerConnection(Client):
             return MQTTErrorCode.MQTT_ERR_PROTOCOL
         if message.qos == 2 and message.identifier in self._unreleased:
             return self._send_pubrec(message.identifier)
-        answer = self._inbox.take(message)
+        result = self._inbox.take(message)
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
         if message.qos == 1:
             code = self._send_puback(message.identifier)
@@ -166,7 +170,7 @@ class BrokerConnection(Client):
         # After the acknowledgement: a broker that closes the connection for the answer's sake
         # does not deliver the message again then.
         if code == MQTTErrorCode.MQTT_ERR_SUCCESS:
-            self._answers.send(self, message, answer)
+            self._answer(self, message, result)
         return code
 
     def _send_pubcomp(self, mid: int) -> MQTTErrorCode:
