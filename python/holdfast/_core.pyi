@@ -7,7 +7,7 @@ from os import PathLike
 from typing import Any, Final, Literal, final
 
 from holdfast.errors import ModbusError
-from holdfast.types import Access, Area, Extent, ListenerCounters, Seal, WhenFull
+from holdfast.types import Access, Area, Extent, ListenerCounters, PolledBlock, Seal, WhenFull
 
 __all__ = [
     "ADDRESSES",
@@ -551,7 +551,7 @@ class Poller:
         self, timeout: float
     ) -> (
         tuple[
-            list[tuple[str, float, list[tuple[Area, int, int, bytes | None, int, float]]]],
+            list[tuple[str, float, list[PolledBlock]]],
             list[tuple[int, int]],
         ]
         | None

@@ -25,6 +25,10 @@ Extent: TypeAlias = int | tuple[int, int]
 Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
 """The gate bit of a memory: area (of bits), address, and when it opens."""
 
+PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
+"""What a poll found: area, address, count, the bytes if there are any, the fault, and the seconds
+since 1970 when that was known."""
+
 
 class ConnectionCounters(TypedDict):
     """Connections of one listener: how many are `open`, and what became of the others."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner.messages import Publish
-    from holdfast.scanner.polling import PolledBlock
+    from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
 ANSWERED = 1_700_000_000.0

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from holdfast.errors import NO_CONNECTION, fault_text, is_exception
+from holdfast.faults import NO_CONNECTION, fault_text, is_exception
 from holdfast.protocol import (
     BUSY,
     ILLEGAL_ADDRESS,
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from holdfast.scanner.messages import State
-    from holdfast.scanner.polling import PolledBlock
+    from holdfast.types import PolledBlock
 
 Found = TypeVar("Found", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""

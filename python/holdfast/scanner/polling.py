@@ -13,14 +13,10 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import _core
+from holdfast.types import PolledBlock
 
 if TYPE_CHECKING:
     from holdfast.scanner.devices import ScannedDevice
-    from holdfast.types import Area
-
-PolledBlock: TypeAlias = "tuple[Area, int, int, bytes | None, int, float]"
-"""Area, address, count, the bytes if there are any, the fault, and the seconds since 1970 when that
-was known."""
 
 Poll: TypeAlias = tuple[str, float, list[PolledBlock]]
 """What the device is polled as, when the schedule wanted the poll, in seconds, and its blocks."""

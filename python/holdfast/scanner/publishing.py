@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
     from holdfast.scanner.decoding import Decoder
-    from holdfast.scanner.polling import PolledBlock
     from holdfast.scanner.tags import Tag
-    from holdfast.types import Area
+    from holdfast.types import Area, PolledBlock
 
 Place: TypeAlias = "tuple[Area, int, int]"
 """Area, address and count of a block."""

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import BrowseAnswer
-    from holdfast.scanner.polling import PolledBlock
     from holdfast.scanner.registry import Subscription
+    from holdfast.types import PolledBlock
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer]]"
 
