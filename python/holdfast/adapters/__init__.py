@@ -10,52 +10,19 @@ group `holdfast.adapters`, see docs/adapters.md.
 
 from __future__ import annotations
 
-import threading
 import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from holdfast.ingest import Counts, Grant, MemoryAccess, Refused, Written
+from holdfast.stop import Stop
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
 __all__ = ["Adapter", "Context", "Counts", "Grant", "MemoryAccess", "Refused", "Stop", "Written"]
 
 ENTRY_POINTS = "holdfast.adapters"
-
-
-class Stop:
-    """Says that an adapter is to end. From any thread."""
-
-    def __init__(self) -> None:
-        self._event = threading.Event()
-        self._lock = threading.Lock()
-        self._then: list[Callable[[], object]] = []
-
-    def set(self) -> None:
-        """Tells the adapter."""
-        with self._lock:
-            self._event.set()
-            then, self._then = self._then, []
-        for callback in then:
-            callback()
-
-    def is_set(self) -> bool:
-        """Whether the adapter is to end."""
-        return self._event.is_set()
-
-    def wait(self, seconds: float | None = None) -> bool:
-        """Waits until the adapter is to end, at most `seconds`; whether it is."""
-        return self._event.wait(seconds)
-
-    def then(self, callback: Callable[[], object]) -> None:
-        """Calls `callback` when the adapter is to end: at once, when it is already."""
-        with self._lock:
-            if not self._event.is_set():
-                self._then.append(callback)
-                return
-        callback()
 
 
 class Adapter(Protocol):

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     from prometheus_client.metrics_core import Metric
 
-    from holdfast.adapters import Stop
-    from holdfast.appliance.diagnostics import Diagnostics
+    from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
+    from holdfast.stop import Stop
     from holdfast.web.host import Receive, Scope, Send
 
 MAX_CONNECTIONS = 32
@@ -39,7 +39,7 @@ class Metrics:
     """The metrics adapter, on a socket that listens already."""
 
     def __init__(
-        self, settings: MetricsConfig, diagnostics: Diagnostics, listener: socket.socket
+        self, settings: MetricsConfig, diagnostics: DiagnosticsSource, listener: socket.socket
     ) -> None:
         registry = CollectorRegistry()
         registry.register(Figures(diagnostics))
@@ -92,7 +92,7 @@ class Metrics:
 class Figures(Collector):
     """Turns the diagnostics of the moment into metrics."""
 
-    def __init__(self, diagnostics: Diagnostics) -> None:
+    def __init__(self, diagnostics: DiagnosticsSource) -> None:
         self._diagnostics = diagnostics
 
     def describe(self) -> Iterable[Metric]:

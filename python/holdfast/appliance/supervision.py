@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING
 
 from holdfast import logs
-from holdfast.adapters import Stop
+from holdfast.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from holdfast import logs
-from holdfast.adapters import Stop
 from holdfast.cli.run import JOIN_TIMEOUT, Signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.client.endpoint import check_files
@@ -23,6 +22,7 @@ from holdfast.gateway import Gateway, GatewayLimits, Settings, tokens
 from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
 from holdfast.net.tls import NO_FILES
 from holdfast.protocol import PORT
+from holdfast.stop import Stop
 from holdfast.web.host import listen
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from holdfast.web.host import Host, address_of
 if TYPE_CHECKING:
     import socket
 
-    from holdfast.adapters import Stop
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
+    from holdfast.stop import Stop
 
 __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
-    from holdfast.adapters import Stop
     from holdfast.scanner.service import Settings
+    from holdfast.stop import Stop
 
 
 class ScannerAdapter:

@@ -31,8 +31,8 @@ from holdfast.net.addresses import holds, joined, parse_address
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 
-    from holdfast.adapters import Stop
     from holdfast.net.addresses import Network
+    from holdfast.stop import Stop
 
     Scope: TypeAlias = MutableMapping[str, Any]
     Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]

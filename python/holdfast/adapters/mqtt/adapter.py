@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.adapters import MemoryAccess, Stop
     from holdfast.config import MqttConfig, SubscriptionConfig
+    from holdfast.ingest import MemoryAccess
+    from holdfast.stop import Stop
 
 WELCOME = 10.0
 """Seconds that the broker has to answer the introduction."""
@@ -118,7 +119,7 @@ class Mqtt:
 
         password = _password(settings.password_file)
         link = BrokerConnection(
-            settings, password, open_socket, self._unreleased, self._inbox, self._answers
+            settings, password, open_socket, self._unreleased, self._inbox, self._answers.send
         )
         link.on_connect = self._on_connect
         link.on_subscribe = self._on_subscribe

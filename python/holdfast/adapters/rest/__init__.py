@@ -10,10 +10,10 @@ from holdfast.web.host import Host
 if TYPE_CHECKING:
     import socket
 
-    from holdfast.adapters import Stop
-    from holdfast.appliance.diagnostics import Diagnostics
+    from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
+    from holdfast.stop import Stop
 
 __all__ = ["Rest"]
 
@@ -25,7 +25,7 @@ class Rest:
         self,
         settings: RestConfig,
         memory_access: MemoryAccess,
-        diagnostics: Diagnostics,
+        diagnostics: DiagnosticsSource,
         listener: socket.socket,
     ) -> None:
         self._host = Host(

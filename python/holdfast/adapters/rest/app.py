@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Awaitable, Callable, Sequence
 
+    from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.rest.routes import Parameter
-    from holdfast.appliance.diagnostics import Diagnostics
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.web.host import Receive, Scope, Send
@@ -52,7 +52,7 @@ class App:
         self,
         settings: RestConfig,
         memory_access: MemoryAccess,
-        diagnostics: Diagnostics,
+        diagnostics: DiagnosticsSource,
         listener: socket.socket,
     ) -> None:
         self._memory_access = memory_access
