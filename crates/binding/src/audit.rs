@@ -7,12 +7,12 @@ use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::engine::canonical;
+use crate::peer;
 
 pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
     let line = PyDict::new(py);
     line.set_item("listener", &*record.listener)?;
-    line.set_item("peer", record.peer.map(canonical))?;
+    line.set_item("peer", record.peer.map(peer::text))?;
     match &record.write {
         Written::Modbus { unit_id, pdu, refused } => {
             line.set_item("unit", unit_id)?;

@@ -1,7 +1,5 @@
 //! `Engine`: listeners in, addresses, counters, events and writes out.
 
-use std::net::SocketAddr;
-
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::{
     Engine as Core, ListenerCounters, ProtocolCounters, Settings, StartError,
@@ -74,7 +72,7 @@ impl Engine {
         let event = py.detach(|| self.core.next_event(timeout));
         Ok(event.map(|event| {
             let reason = event.role.or_else(|| event.kind.reason().map(Box::from));
-            let (kind, peer) = (event.kind.name(), event.peer.map(canonical));
+            let (kind, peer) = (event.kind.name(), event.peer.map(crate::peer::text));
             (event.listener.to_string(), kind, peer, reason.map(String::from))
         }))
     }
@@ -107,11 +105,6 @@ impl Engine {
 
 /// Listener, kind, peer and reason; the role of a peer that was refused for it is the reason.
 type Event = (String, &'static str, Option<String>, Option<String>);
-
-/// A peer as text, an IPv4 address mapped into IPv6 as that IPv4 address.
-pub fn canonical(peer: SocketAddr) -> String {
-    SocketAddr::new(peer.ip().to_canonical(), peer.port()).to_string()
-}
 
 fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bound<'py, PyDict>> {
     let all = PyDict::new(py);

@@ -12,6 +12,7 @@ mod engine;
 mod limits;
 mod listener;
 mod memory;
+mod peer;
 mod poller;
 mod raw_ingest;
 
