@@ -8,7 +8,31 @@ use std::time::Instant;
 
 use tokio::task::AbortHandle;
 
-use super::listener::{ConnectionLimits, WhenFull};
+/// What becomes of a new connection when there is no room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WhenFull {
+    /// It is closed.
+    Refuse,
+    /// The connection that is idle longest is closed instead.
+    Evict,
+}
+
+/// How many connections there may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConnectionLimits {
+    pub max_connections: usize,
+    pub max_connections_per_source: Option<usize>,
+    pub when_full: WhenFull,
+}
+
+impl ConnectionLimits {
+    /// Of a listener that has no connections.
+    pub(super) const NONE: ConnectionLimits = ConnectionLimits {
+        max_connections: 0,
+        max_connections_per_source: None,
+        when_full: WhenFull::Refuse,
+    };
+}
 
 #[derive(Debug)]
 pub(crate) struct Admission {

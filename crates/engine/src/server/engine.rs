@@ -12,11 +12,12 @@ use thiserror::Error;
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
 
+use super::admission::ConnectionLimits;
 use super::audit::{Record, Records, auditing};
 use super::counters::{ConnectionCounters, Counters, PacketCounters};
 use super::event::{Event, Events, Verbosity, channel as event_channel};
 use super::identity::Identity;
-use super::listener::{ConnectionLimits, ListenerContext, accept, bind_tcp, bind_udp};
+use super::listener::{ListenerContext, accept, bind_tcp, bind_udp};
 use super::raw_ingest::{RawIngest, RawSettings};
 use super::serial::{ModbusSerial, SerialSettings};
 use super::tcp::{ModbusStream, StreamSettings};

@@ -11,7 +11,7 @@ use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
-use super::admission::{Admission, Full, Ticket, attach};
+use super::admission::{Admission, ConnectionLimits, Full, Ticket, attach};
 use super::audit::Auditor;
 use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
@@ -28,32 +28,6 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// How long a refused peer is read, at most, and how many bytes at once.
 const DRAIN: Duration = Duration::from_secs(5);
 const DRAIN_CHUNK: usize = 16 * 1024;
-
-/// What becomes of a new connection when there is no room.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WhenFull {
-    /// It is closed.
-    Refuse,
-    /// The connection that is idle longest is closed instead.
-    Evict,
-}
-
-/// How many connections there may be.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ConnectionLimits {
-    pub max_connections: usize,
-    pub max_connections_per_source: Option<usize>,
-    pub when_full: WhenFull,
-}
-
-impl ConnectionLimits {
-    /// Of a listener that has no connections.
-    const NONE: ConnectionLimits = ConnectionLimits {
-        max_connections: 0,
-        max_connections_per_source: None,
-        when_full: WhenFull::Refuse,
-    };
-}
 
 /// The outer side of a listener: all that does not depend on its protocol.
 #[derive(Debug)]

@@ -18,11 +18,11 @@ mod tls;
 mod udp;
 pub mod unit_server;
 
+pub use admission::{ConnectionLimits, WhenFull};
 pub use engine::{
     Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
     StartError,
 };
-pub use listener::{ConnectionLimits, WhenFull};
 pub use raw_ingest::{RawRule, RawSettings};
 pub use serial::SerialSettings;
 pub use tcp::{StreamFraming, StreamSettings};

@@ -20,10 +20,11 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::packet_area::of_packet;
 
+use super::admission::ConnectionLimits;
 use super::audit::{Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
-use super::listener::{Admitted, ConnectionLimits, ListenerContext, Service, drain};
+use super::listener::{Admitted, ListenerContext, Service, drain};
 use super::policy::Policy;
 
 /// Bytes that are read at once.

@@ -8,11 +8,12 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
+use super::admission::ConnectionLimits;
 use super::admission::Ticket;
 use super::connection::{Connection, Timeouts};
 use super::event::Kind;
 use super::framing::{Framing, Mbap, Rtu};
-use super::listener::{Admitted, ConnectionLimits, ListenerContext, Service, drain, set_options};
+use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::policy::{PeerRights, Policy, Rule};
 use super::stream::Stream;
 use super::tls::ServerTlsStream;
