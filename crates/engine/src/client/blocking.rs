@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 use holdfast_protocol::client::{Closed, Connection, Done, Transport};
 use holdfast_protocol::pdu::{EncodedRequest, Response};
 
-use super::byte_stream::{self, ByteStream, StreamError};
+use super::byte_stream::{ByteStream, StreamError};
+use super::connect::connect;
 use super::turns::Turns;
 use super::{ClientError, Endpoint, Lost};
 
@@ -120,7 +121,7 @@ impl Open {
     fn new(endpoint: &Endpoint, deadline: Instant, timeout: Duration) -> Result<Open, ClientError> {
         let transport = endpoint.transport();
         let to = || endpoint.to_string();
-        let stream = byte_stream::connect(endpoint, deadline).map_err(|error| match error {
+        let stream = connect(endpoint, deadline).map_err(|error| match error {
             StreamError::TimedOut => ClientError::ConnectTimeout { to: to(), after: timeout },
             StreamError::Ended => {
                 ClientError::Connect { to: to(), error: ErrorKind::UnexpectedEof.into() }

@@ -4,8 +4,6 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
 
-use super::Endpoint;
-use super::tls_stream::TlsStream;
 use crate::tls::TlsFailure;
 
 /// The shortest time that a system waits for.
@@ -41,29 +39,6 @@ pub(super) trait ByteStream: Send {
     fn is_quiet(&self) -> bool {
         true
     }
-}
-
-/// Opens a stream to an endpoint.
-pub(super) fn connect(
-    endpoint: &Endpoint,
-    deadline: Instant,
-) -> Result<Box<dyn ByteStream>, StreamError> {
-    Ok(match endpoint {
-        Endpoint::Tcp { host, port, tls: None } | Endpoint::RtuOverTcp { host, port } => {
-            Box::new(TcpByteStream::connect(host, *port, deadline)?)
-        }
-        Endpoint::Tcp { host, port, tls: Some(tls) } => {
-            let stream = TcpByteStream::connect(host, *port, deadline)?;
-            Box::new(TlsStream::agree(stream, tls, deadline)?)
-        }
-        Endpoint::Udp { host, port } => Box::new(first(host, *port, |address| {
-            let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
-            let socket = UdpSocket::bind(any)?;
-            socket.connect(address)?;
-            Ok(socket)
-        })?),
-        Endpoint::Serial { line, .. } => Box::new(line.open_blocking()?),
-    })
 }
 
 impl From<io::Error> for StreamError {
@@ -118,7 +93,7 @@ pub(super) struct TcpByteStream {
 
 impl TcpByteStream {
     /// Connects to the first address of a name that takes the connection before the deadline.
-    fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpByteStream> {
+    pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpByteStream> {
         let socket =
             first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
         socket.set_nodelay(true)?;
@@ -176,6 +151,16 @@ impl ByteStream for TcpByteStream {
     fn is_quiet(&self) -> bool {
         self.peek().is_err_and(|error| error.kind() == ErrorKind::WouldBlock)
     }
+}
+
+/// A socket for datagrams to the first address of a name that the system has a way to.
+pub(super) fn connect_udp(host: &str, port: u16) -> io::Result<UdpSocket> {
+    first(host, port, |address| {
+        let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
+        let socket = UdpSocket::bind(any)?;
+        socket.connect(address)?;
+        Ok(socket)
+    })
 }
 
 impl ByteStream for UdpSocket {

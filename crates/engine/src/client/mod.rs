@@ -5,6 +5,7 @@
 
 mod blocking;
 mod byte_stream;
+mod connect;
 mod endpoint;
 mod tls_stream;
 mod turns;
