@@ -13,15 +13,19 @@ pub mod identification;
 mod range;
 pub mod reply;
 mod request;
+mod request_error;
 mod response;
+mod sub_function;
 
 pub use data::{Bits, Registers, pack_bits, pack_registers};
-pub use diagnostics::{Diagnostics, SubFunction};
+pub use diagnostics::Diagnostics;
 pub use encoded::EncodedRequest;
 pub use function::{ExceptionCode, Function};
 pub use range::{BitRange, Range, RegisterRange};
-pub use request::{Request, RequestError};
+pub use request::Request;
+pub use request_error::RequestError;
 pub use response::{Response, ResponseError};
+pub use sub_function::SubFunction;
 
 /// The longest PDU, in bytes (V1.1b3, 4.1).
 pub const MAX_LEN: usize = 253;

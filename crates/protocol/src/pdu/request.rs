@@ -4,12 +4,10 @@
 //! known (exception 01), then form, quantity and value must be right (exception 03). The types of a
 //! request carry the same checks, so that encoding cannot fail.
 
-use thiserror::Error;
-
 use super::identification::{self, ReadCode};
 use super::{
     BitRange, Bits, Buffer, Diagnostics, ExceptionCode, Function, Range, RegisterRange, Registers,
-    SubFunction, limit,
+    limit,
 };
 
 /// One request. Registers are big-endian bytes, bits packed least significant bit first.
@@ -95,38 +93,6 @@ pub enum Request<'a> {
         /// The object, or the first object of a stream.
         object_id: u8,
     },
-}
-
-/// Why a request cannot be made.
-///
-/// ```
-/// use holdfast_protocol::pdu::BitRange;
-///
-/// let error = BitRange::new(0, 2001).unwrap_err();
-/// assert_eq!(error.to_string(), "quantity is 2001, allowed are 1 to 2000");
-/// ```
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
-#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
-pub enum RequestError {
-    /// The quantity is 0, or beyond the limit of the function.
-    #[error("quantity is {found}, allowed are 1 to {max}")]
-    Quantity {
-        /// The quantity that was given.
-        found: usize,
-        /// The limit of the function.
-        max: u16,
-    },
-    /// The data has another length than its quantity requires.
-    #[error("data has {found} bytes, {expected} are required")]
-    Length {
-        /// The length that was given, in bytes.
-        found: usize,
-        /// The length that is required, in bytes.
-        expected: usize,
-    },
-    /// The sub-function of Diagnostics does not allow this data field.
-    #[error("{} does not allow this data field", .0.name())]
-    Data(SubFunction),
 }
 
 impl<'a> Request<'a> {

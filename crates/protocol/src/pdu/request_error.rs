@@ -1,0 +1,37 @@
+//! Why a request cannot be made: the checks that the types of requests carry.
+
+use thiserror::Error;
+
+use super::SubFunction;
+
+/// Why a request cannot be made.
+///
+/// ```
+/// use holdfast_protocol::pdu::BitRange;
+///
+/// let error = BitRange::new(0, 2001).unwrap_err();
+/// assert_eq!(error.to_string(), "quantity is 2001, allowed are 1 to 2000");
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
+pub enum RequestError {
+    /// The quantity is 0, or beyond the limit of the function.
+    #[error("quantity is {found}, allowed are 1 to {max}")]
+    Quantity {
+        /// The quantity that was given.
+        found: usize,
+        /// The limit of the function.
+        max: u16,
+    },
+    /// The data has another length than its quantity requires.
+    #[error("data has {found} bytes, {expected} are required")]
+    Length {
+        /// The length that was given, in bytes.
+        found: usize,
+        /// The length that is required, in bytes.
+        expected: usize,
+    },
+    /// The sub-function of Diagnostics does not allow this data field.
+    #[error("{} does not allow this data field", .0.name())]
+    Data(SubFunction),
+}
