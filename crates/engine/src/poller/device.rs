@@ -369,7 +369,7 @@ impl Device {
     }
 
     /// Draws the plan from what is known; what can't be read is left out.
-    pub(super) fn draw_plan(&self) {
+    fn draw_plan(&self) {
         let learned = self.learned.borrow();
         let known: Vec<usize> =
             (0..self.fields.len()).filter(|at| !learned.is_refused(&self.fields[*at])).collect();
@@ -397,12 +397,8 @@ impl Device {
         *self.plan.borrow_mut() = plan;
     }
 
-    pub(super) fn learned(&self) -> RefMut<'_, Learned> {
+    fn learned(&self) -> RefMut<'_, Learned> {
         self.learned.borrow_mut()
-    }
-
-    pub(super) fn fields(&self) -> &[Field] {
-        &self.fields
     }
 
     /// Draws the plan anew when enough answers have shown what a request costs.
@@ -519,7 +515,9 @@ impl Device {
                 self.take(block, bytes, gathered);
                 Ok(())
             }
-            Err(fault) if search::is_illegal(fault) => self.search(block, fault, gathered).await,
+            Err(fault) if search::is_illegal(fault) => {
+                search::search(&mut Search { device: self, gathered }, block, fault).await
+            }
             Err(other) => {
                 gathered.note(block, Err(other));
                 Err(other)
@@ -528,12 +526,12 @@ impl Device {
     }
 
     /// Hands on what a block brought.
-    pub(super) fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
+    fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
         self.spread(block, &bytes, gathered);
         gathered.note(block, Ok(bytes));
     }
 
-    pub(super) async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
+    async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
         let (address, quantity) = (block.address, block.count);
         let request = match block.area {
             Area::Coils => Range::new(address, quantity).map(Request::ReadCoils),
@@ -634,14 +632,14 @@ fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) 
 /// What one poll brings together: reads that come in parts, and how many items are missing; and
 /// all blocks, where somebody wants them.
 #[derive(Default)]
-pub(super) struct Gathered {
+struct Gathered {
     parts: HashMap<usize, (Vec<u8>, u32)>,
     blocks: Vec<BlockResult>,
     report: bool,
 }
 
 impl Gathered {
-    pub(super) fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
+    fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
         if self.report {
             let Block { area, address, count, .. } = *block;
             let time = SystemTime::now();
@@ -678,6 +676,38 @@ impl Gathered {
             return None;
         }
         self.parts.remove(&read).map(|(whole, _)| whole)
+    }
+}
+
+/// A device while a block that it refused is searched.
+struct Search<'a> {
+    device: &'a Device,
+    gathered: &'a mut Gathered,
+}
+
+impl search::Searched for Search<'_> {
+    fn fields(&self) -> &[Field] {
+        &self.device.fields
+    }
+
+    fn learned(&self) -> RefMut<'_, Learned> {
+        self.device.learned()
+    }
+
+    fn draw_plan(&self) {
+        self.device.draw_plan();
+    }
+
+    async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
+        self.device.ask(block).await
+    }
+
+    fn take(&mut self, block: &Block, bytes: Vec<u8>) {
+        self.device.take(block, bytes, self.gathered);
+    }
+
+    fn note(&mut self, block: &Block, fault: Fault) {
+        self.gathered.note(block, Err(fault));
     }
 }
 
