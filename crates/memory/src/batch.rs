@@ -3,7 +3,7 @@
 
 use crate::area::Area;
 use crate::bits;
-use crate::memory::Write;
+use crate::operation::Write;
 
 /// Batches of up to this many writes, and of up to this many bytes, are copied as they are.
 const FEW: usize = 16;

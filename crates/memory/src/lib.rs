@@ -22,7 +22,9 @@ mod batch;
 mod bits;
 mod error;
 mod memory;
+mod operation;
 
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
-pub use memory::{Access, Gate, GateMode, Memory, Read, Write, write_across};
+pub use memory::{Access, Gate, GateMode, Memory, write_across};
+pub use operation::{Read, Write};

@@ -8,6 +8,7 @@ use crate::area::{Area, Layout, Span};
 use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
+use crate::operation::{Read, Write};
 
 /// On whose behalf memory is touched.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,24 +36,11 @@ pub struct Gate {
     pub mode: GateMode,
 }
 
-/// A range of at least one item to read, and where to: `out` has exactly `area.byte_len(count)` bytes.
-#[derive(Debug)]
-pub struct Read<'a> {
-    pub area: Area,
-    pub address: u16,
-    pub count: usize,
-    pub out: &'a mut [u8],
-}
-
-/// A range of at least one item to write, and its new content: `bytes` has exactly `area.byte_len(count)` bytes,
-/// registers big-endian, bits packed least significant bit first. Bits beyond `count` in the last
-/// byte are ignored.
-#[derive(Debug, Clone, Copy)]
-pub struct Write<'a> {
-    pub area: Area,
-    pub address: u16,
-    pub count: usize,
-    pub bytes: &'a [u8],
+impl Gate {
+    fn is_in(self, write: &Write<'_>) -> bool {
+        let start = usize::from(write.address);
+        self.area == write.area && (start..start + write.count).contains(&usize::from(self.address))
+    }
 }
 
 /// Four areas of fixed size behind one lock.
@@ -232,7 +220,7 @@ impl Memory {
                 Refusal::WrongLength
             } else if self.span(write.area).offset(write.address, write.count).is_none() {
                 Refusal::OutOfRange
-            } else if access == Access::Client && self.gate.is_some_and(|gate| write.covers(gate)) {
+            } else if access == Access::Client && self.gate.is_some_and(|gate| gate.is_in(write)) {
                 Refusal::GateBit
             } else {
                 continue;
@@ -310,13 +298,6 @@ impl Content {
         } else {
             read.out.copy_from_slice(&area[offset * 2..(offset + read.count) * 2]);
         }
-    }
-}
-
-impl Write<'_> {
-    fn covers(&self, gate: Gate) -> bool {
-        let start = usize::from(self.address);
-        self.area == gate.area && (start..start + self.count).contains(&usize::from(gate.address))
     }
 }
 
