@@ -12,8 +12,6 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from click._termui_impl import ProgressBar
-
     Advance: TypeAlias = Callable[[int], None]
 
 BETWEEN = 0.1
@@ -26,8 +24,8 @@ def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Advance | 
     if not sys.stderr.isatty():
         yield None
         return
-    shown: ProgressBar[int] = click.progressbar(
-        length=length, label=label, file=sys.stderr, item_show_func=lambda _: note()
+    shown = click.progressbar(
+        range(length), label=label, file=sys.stderr, item_show_func=lambda _: note()
     )
     seen = 0.0
     with shown:

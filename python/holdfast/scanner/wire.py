@@ -7,8 +7,8 @@ does in the end is to append the text of the protocol
     PUB subject size␍␊payload␍␊
 
 to what the client sends next, and to wake its flusher. Any number of such texts, one behind the
-other, can be appended in the same way, so a batch costs what one message costs. This is the only
-place that reaches into nats-py. `tests/test_scanner_wire.py` checks it with the real server.
+other, can be appended in the same way, so a batch costs what one message costs. This uses private
+names of nats-py (docs/dependencies.md), which `tests/scanner/test_wire.py` checks with the server.
 
 The texts must be right: nothing here looks at them. They are made by `publishing` from device ids
 that were checked when they were subscribed to.

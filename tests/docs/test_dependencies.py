@@ -1,0 +1,62 @@
+"""The page on dependencies: it has all that the project names, and the lists agree."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from typing import Any
+
+import pytest
+from packaging.requirements import Requirement
+
+from support.paths import DOCS, ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SETS = ("run", "dev")
+
+
+def listed(name: str) -> list[str]:
+    """The requirements of a set, as its file has them."""
+    text = (ROOT / "requirements" / f"{name}.in").read_text()
+    return [line for line in text.splitlines() if re.match("[a-z]", line)]
+
+
+def named(requirement: str) -> str:
+    return re.split("[^A-Za-z0-9._-]", requirement)[0]
+
+
+def crates() -> set[str]:
+    """The crates of others that the workspace depends on."""
+    found: set[str] = set()
+    for path in [ROOT / "benches" / "Cargo.toml", *ROOT.glob("crates/*/Cargo.toml")]:
+        parts: dict[str, Any] = tomllib.loads(path.read_text())
+        for part in [parts, *parts.get("target", {}).values()]:
+            found |= set(part.get("dependencies", ())) | set(part.get("dev-dependencies", ()))
+    return {
+        "rustls-webpki" if name == "webpki" else name for name in found if "holdfast" not in name
+    }
+
+
+def test_the_page_has_every_dependency() -> None:
+    page = (DOCS / "dependencies.md").read_text().partition("\n## aws-lc-rs")[0]
+    rows = {
+        name.strip()
+        for line in page.splitlines()
+        if line.startswith("| ")
+        for name in line.split("|")[1].split(",")
+    }
+    python = {named(each) for each in [*PROJECT["dependencies"], *listed("run"), *listed("dev")]}
+    assert sorted((python | crates()) - rows) == []
+
+
+def test_the_set_to_run_is_that_of_the_project() -> None:
+    assert [each for each in listed("run") if named(each) != "maturin"] == PROJECT["dependencies"]
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_lock_file_has_versions_that_are_allowed(name: str) -> None:
+    lock = (ROOT / "requirements" / f"{name}.lock").read_text()
+    locked = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", lock, re.MULTILINE))
+    for each in map(Requirement, [*listed("run"), *(listed(name))]):
+        found = locked[each.name.lower().replace(".", "-").replace("_", "-")]
+        assert each.specifier.contains(found), f"{each}: {found} is locked"
