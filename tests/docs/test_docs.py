@@ -12,6 +12,8 @@ from holdfast.config import json_schema, load
 from support.paths import ROOT
 
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
+PROTOCOL = ROOT / "crates" / "protocol" / "src"
+TLS = ROOT / "crates" / "engine" / "src" / "tls"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -19,6 +21,51 @@ def test_every_link_to_a_file_leads_to_one(page: Path) -> None:
     targets = re.findall(r"\]\(([^)#:]+)\)", page.read_text())
     lost = [target for target in targets if not (page.parent / target).exists()]
     assert lost == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_to_a_heading_leads_to_one(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#:]*)#([^)]+)\)", page.read_text())
+    lost = [
+        (target, anchor)
+        for target, anchor in links
+        if anchor not in anchors(page.parent / target if target else page)
+    ]
+    assert lost == []
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+def reasons(source: Path) -> set[str]:
+    """What the function `reason` of a Rust file returns."""
+    body = source.read_text().split("fn reason(")[1].split("\n    }\n")[0]
+    return set(re.findall(r'=> "(\w+)"', body))
+
+
+def first_cells(page: str, heading: str) -> set[str]:
+    """The words in the first columns of the tables of a section."""
+    section = (ROOT / "docs" / page).read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    return {word for row in rows for word in re.findall(r"`(\w+)`", row)}
+
+
+def test_the_page_on_clients_has_every_reason_of_an_invalid_response() -> None:
+    found = reasons(PROTOCOL / "client" / "mod.rs")
+    assert len(found) > 5
+    assert sorted((found | {"content"}) - first_cells("client.md", "Errors")) == []
+
+
+def test_the_page_on_tls_has_every_reason_of_a_failure() -> None:
+    found = reasons(TLS / "failure.rs")
+    section = (ROOT / "docs" / "modbus-tls.md").read_text()
+    told = section.split("\n## Which certificates are trusted\n")[1].split("\n## ")[0]
+    assert len(found) > 20
+    assert sorted(reason for reason in found if f"`{reason}`" not in told) == []
 
 
 def test_the_schema_of_the_docs_is_that_of_the_program() -> None:
