@@ -243,16 +243,17 @@ class MemoryAccess:
         target = self.memories.get(memory)
         if target is not None and memory in grant.memories and area in grant.areas:
             return target
+        of, where = _of(index), _where(index, memory, area, address)
         if target is None:
-            reason, detail = "unknown_memory", f"no memory {_shown(memory)}"
-        elif memory not in grant.memories:
-            reason, detail = "not_granted", f"memory {memory} is not granted to {grant.name}"
+            raise Refused("unknown_memory", f"{of}no memory {_shown(memory)}", **where)
+        if memory not in grant.memories:
+            detail = f"memory {memory} is not granted to {grant.name}"
         elif area not in AREAS:
-            allowed = ", ".join(AREAS)
-            reason, detail = "invalid_area", f"area is {_shown(area)}, allowed are {allowed}"
+            detail = f"area is {_shown(area)}, allowed are {', '.join(AREAS)}"
+            raise Refused("invalid_area", f"{of}{detail}", **where)
         else:
-            reason, detail = "not_granted", f"area {area} is not granted to {grant.name}"
-        raise Refused(reason, f"{_of(index)}{detail}", **_where(index, memory, area, address))
+            detail = f"area {area} is not granted to {grant.name}"
+        raise Refused("not_granted", f"{of}{detail}", **where)
 
     def _refused(
         self, command: Mapping[str, Any], refused: _core.BatchRefused, index: int | None
