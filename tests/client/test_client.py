@@ -440,7 +440,7 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("read_write", (0, 126, 0, [1]), {}, ValueError, "count is 126, allowed are 1 to 125"),
     ("read_write", (0, 1, 0, [1] * 122), {}, ValueError, "count is 122, allowed are 1 to 121"),
     ("read_write", (65535, 2, 0, [1]), {}, ValueError, "the last address is 65535"),
-    ("diagnostics", (5,), {}, ValueError, "sub_function 5 is not one of the standard"),
+    ("diagnostics", (5,), {}, ValueError, "sub_function 5 is not in the standard"),
     ("diagnostics", (65536,), {}, ValueError, "sub_function is 65536"),
     ("diagnostics", (0, []), {}, ValueError, "does not allow these arguments"),
     ("diagnostics", (0, [65536]), {}, ValueError, "data holds 65536"),

@@ -1,4 +1,4 @@
-//! Which addresses a memory has: its four areas, and the range of each.
+//! The four areas of a memory, and the range of addresses of each.
 
 use crate::error::LayoutError;
 
@@ -29,12 +29,12 @@ impl Area {
         Area::ALL.into_iter().find(|area| area.name() == name)
     }
 
-    /// Whether an item of this area is one bit (else it is a 16-bit register).
+    /// Whether an item of this area is one bit; otherwise it is a 16-bit register.
     pub const fn is_bits(self) -> bool {
         matches!(self, Area::Coils | Area::DiscreteInputs)
     }
 
-    /// How many bytes `count` items take: bits are packed eight to a byte.
+    /// The number of bytes of `count` items. Bits are packed eight to a byte.
     pub const fn byte_len(self, count: usize) -> usize {
         if self.is_bits() { count.div_ceil(8) } else { count * 2 }
     }
@@ -44,8 +44,8 @@ impl Area {
     }
 }
 
-/// The addresses of one area: `start`, `start + 1`, … `start + size - 1`. An area of size 0 does
-/// not exist: every access to it is out of range.
+/// The addresses of one area: `start` to `start + size - 1`. With size 0 the area does not exist:
+/// every access to it is out of range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Span {
     start: u16,
@@ -53,11 +53,11 @@ pub struct Span {
 }
 
 impl Span {
-    /// The number of addresses that a 16-bit address can tell apart.
+    /// The number of 16-bit addresses.
     pub const MAX_SIZE: u32 = 65_536;
 
     /// # Errors
-    /// [`LayoutError`] when `start + size` is beyond 65,536.
+    /// [`LayoutError::TooLarge`] when `start + size` is greater than 65,536.
     pub fn new(start: u16, size: u32) -> Result<Span, LayoutError> {
         match u32::from(start).checked_add(size) {
             Some(end) if end <= Span::MAX_SIZE => Ok(Span { start, size }),
@@ -73,17 +73,18 @@ impl Span {
         self.size
     }
 
-    /// The address behind the last one, up to 65,536.
+    /// The address after the last one, at most 65,536.
     pub const fn end(self) -> u32 {
         self.start as u32 + self.size
     }
 
-    /// Whether all of `address .. address + count` is inside.
+    /// Whether all of `address .. address + count` is inside the span.
     pub fn holds(self, address: u16, count: usize) -> bool {
         self.offset(address, count).is_some()
     }
 
-    /// The offset of `address` from the start, when all of `address .. address + count` is inside.
+    /// The offset of `address` from the start; `None` unless all of `address .. address + count` is
+    /// inside the span.
     pub(crate) fn offset(self, address: u16, count: usize) -> Option<usize> {
         let offset = usize::from(address.checked_sub(self.start)?);
         let end = offset.checked_add(count)?;
@@ -98,7 +99,7 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// This layout, with `span` as the addresses of `area`.
+    /// Returns this layout with the span of `area` replaced.
     #[must_use]
     pub fn with(mut self, area: Area, span: Span) -> Layout {
         self.spans[area.index()] = span;

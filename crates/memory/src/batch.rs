@@ -1,15 +1,15 @@
-//! Large batches, flattened before any lock is taken: what is copied under the lock is then no more
-//! than memory holds, in as few pieces as there can be.
+//! Flattens large batches before any lock is taken. The copy under the lock is then never larger
+//! than the memory, and has as few pieces as possible.
 
 use crate::area::Area;
 use crate::bits;
 use crate::operation::Write;
 
-/// Batches of up to this many writes, and of up to this many bytes, are copied as they are.
+/// Batches within both limits, in writes and in bytes, are copied without flattening.
 const FEW: usize = 16;
 const SHORT: usize = 16 * 1024;
 
-/// Neighbours of one area, each as the last write left it.
+/// Adjacent items of one area, each with the value of the last write to it.
 #[derive(Debug)]
 pub(crate) struct Run {
     address: u16,
@@ -23,13 +23,13 @@ impl Run {
     }
 }
 
-/// Whether flattening writes pays for itself.
+/// Whether flattening these writes saves more time than it costs.
 pub(crate) fn is_large<'w>(writes: impl ExactSizeIterator<Item = &'w Write<'w>>) -> bool {
     writes.len() > FEW
         || (writes.len() > 1 && writes.map(|write| write.bytes.len()).sum::<usize>() > SHORT)
 }
 
-/// The runs that writes to one area leave, by address. The writes have been checked.
+/// Merges writes to one area into runs, sorted by address. The writes must have been checked.
 pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -> Vec<Run> {
     let Some(&Write { area, .. }) = writes.clone().next() else { return Vec::new() };
     let (start, end) = writes.clone().fold((usize::MAX, 0), |(start, end), write| {
@@ -65,7 +65,7 @@ pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -
     }
     debug_assert!(
         runs.is_sorted_by(|a, b| usize::from(a.address) + a.count < usize::from(b.address)),
-        "runs are apart, by address"
+        "runs are sorted by address and do not touch"
     );
     runs
 }

@@ -1,4 +1,4 @@
-//! Ranges of bits packed least significant bit first: copied out of, and into, an area.
+//! Copies ranges of packed bits (least significant bit first) out of an area and into it.
 
 /// Copies `count` bits of `area`, from bit `offset`, to the start of `out`. Unused bits of the last
 /// byte of `out` become 0. `out` has `count.div_ceil(8)` bytes; `area` has the whole range.
@@ -27,7 +27,7 @@ pub fn copy_out(area: &[u8], offset: usize, count: usize, out: &mut [u8]) {
 pub fn copy_in(area: &mut [u8], offset: usize, count: usize, bits: &[u8]) {
     debug_assert_eq!(bits.len(), count.div_ceil(8));
     debug_assert!(offset + count <= area.len() * 8);
-    // A byte more would change bits behind the range.
+    // One more byte would change bits after the range.
     assert!(bits.len() * 8 < count + 8);
     let first = offset / 8;
     let shift = offset % 8;

@@ -1,8 +1,8 @@
-//! Why an operation was refused. A refusal means that nothing has changed.
+//! Errors of memories. A refused operation changes nothing.
 
 use thiserror::Error;
 
-/// A span or gate that no memory can have.
+/// Why a span or a gate is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum LayoutError {
     #[error("start {start} and size {size} reach beyond address 65535")]
@@ -22,17 +22,17 @@ pub enum Refusal {
     OutOfRange,
     #[error("the gate bit can't be written by a client")]
     GateBit,
-    #[error("there are no items, or the number of bytes does not fit them")]
+    #[error("the range has no items, or the number of bytes does not match it")]
     WrongLength,
     #[error("only registers can be masked")]
     NotRegisters,
 }
 
-/// A refusal of one of several operations: none of them has been carried out.
+/// One operation of a batch was refused, so none of the batch was carried out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("operation {index}: {refusal}")]
 pub struct Refused {
-    /// Which operation, counted from 0.
+    /// The index of the refused operation, from 0.
     pub index: usize,
     pub refusal: Refusal,
 }

@@ -1,4 +1,4 @@
-//! The memory itself: reads and writes under one lock, and the seal.
+//! The memory: reads and writes under one lock, and the seal.
 
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,19 +10,19 @@ use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
 use crate::operation::{Read, Write};
 
-/// On whose behalf memory is touched.
+/// Who accesses the memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// A reader or writer bound by the seal, who never changes the gate bit.
+    /// A reader or writer that a sealed memory refuses. It can never write the gate bit.
     Client,
-    /// A source of data: passes the seal, and may open it.
+    /// A source of data. It ignores the seal and can open it.
     Ingest,
 }
 
-/// When a seal opens.
+/// When the gate bit opens the seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GateMode {
-    /// The first ingest that leaves the gate bit at 1 opens the memory for good.
+    /// The first ingest that leaves the gate bit at 1 opens the memory permanently.
     Once,
     /// The memory is sealed whenever the gate bit is 0.
     Level,
@@ -46,8 +46,8 @@ impl Gate {
 /// Four areas of fixed size behind one lock.
 #[derive(Debug)]
 pub struct Memory {
-    /// The order in which locks of several memories are taken, so that two writers never wait for
-    /// each other.
+    /// Locks of several memories are taken in the order of their ranks, so that two writers cannot
+    /// deadlock.
     rank: u64,
     layout: Layout,
     gate: Option<Gate>,
@@ -58,14 +58,14 @@ pub struct Memory {
 struct Content {
     areas: [Box<[u8]>; 4],
     sealed: bool,
-    /// How often the seal opened, and how often it closed again.
+    /// How many times the seal opened, and how many times it closed again.
     seal_changes: (u64, u64),
 }
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
 
 impl Memory {
-    /// All items 0; sealed when there is a gate.
+    /// Creates a memory with all items 0. It is sealed if it has a gate.
     ///
     /// # Errors
     /// [`LayoutError`] when the gate is not a bit of this memory.
@@ -101,7 +101,7 @@ impl Memory {
         self.shared().sealed
     }
 
-    /// How often the seal opened, and how often it closed again.
+    /// How many times the seal opened, and how many times it closed again.
     pub fn seal_changes(&self) -> (u64, u64) {
         self.shared().seal_changes
     }
@@ -109,7 +109,7 @@ impl Memory {
     /// Reads one range.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (to a client), then `WrongLength`, `OutOfRange`; `out` is then as it was.
+    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`. Then `out` is unchanged.
     pub fn read(&self, access: Access, read: Read<'_>) -> Result<(), Refusal> {
         let offset = self.readable(&read);
         let content = self.shared();
@@ -118,7 +118,7 @@ impl Memory {
         Ok(())
     }
 
-    /// Reads several ranges of one moment: no write falls between them.
+    /// Reads several ranges atomically: no write happens between them.
     ///
     /// # Errors
     /// As [`Memory::read`], with the index of the first range that was refused.
@@ -136,15 +136,16 @@ impl Memory {
         Ok(())
     }
 
-    /// Writes one range as one step.
+    /// Writes one range atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (to a client), then `WrongLength`, `OutOfRange`, `GateBit`; nothing has changed.
+    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `GateBit`. Nothing has
+    /// changed then.
     pub fn write(&self, access: Access, write: Write<'_>) -> Result<(), Refusal> {
         self.write_many(access, &[write]).map_err(|refused| refused.refusal)
     }
 
-    /// Writes several ranges, of any areas, as one step; a later one wins where two overlap.
+    /// Writes several ranges, of any areas, atomically. Where two overlap, the later one wins.
     ///
     /// # Errors
     /// As [`Memory::write`], with the index of the first write that was refused.
@@ -157,10 +158,10 @@ impl Memory {
         Ok(())
     }
 
-    /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, as one step.
+    /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (to a client), then `NotRegisters`, `OutOfRange`.
+    /// [`Refusal::Sealed`] (for a client), then `NotRegisters`, `OutOfRange`.
     pub fn mask_write(
         &self,
         access: Access,
@@ -182,10 +183,10 @@ impl Memory {
         Ok(())
     }
 
-    /// Writes one range, then reads one, as one step.
+    /// Writes one range, then reads one, atomically.
     ///
     /// # Errors
-    /// As [`Memory::write`], then as [`Memory::read`]: when either is refused, nothing has changed.
+    /// As [`Memory::write`], then as [`Memory::read`]. When either is refused, nothing has changed.
     pub fn write_then_read(
         &self,
         access: Access,
@@ -204,7 +205,7 @@ impl Memory {
         Ok(())
     }
 
-    /// Checks a read. What needs no lock is judged before the lock is taken.
+    /// Checks a read, without the lock.
     fn readable(&self, read: &Read<'_>) -> Result<usize, Refusal> {
         if read.count == 0 || read.out.len() != read.area.byte_len(read.count) {
             return Err(Refusal::WrongLength);
@@ -212,7 +213,7 @@ impl Memory {
         self.span(read.area).offset(read.address, read.count).ok_or(Refusal::OutOfRange)
     }
 
-    /// Checks writes. What needs no lock is judged before the lock is taken.
+    /// Checks writes, without the lock.
     fn writable(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
         for (index, write) in writes.iter().enumerate() {
             let fits = write.count > 0 && write.bytes.len() == write.area.byte_len(write.count);
@@ -230,7 +231,7 @@ impl Memory {
         Ok(())
     }
 
-    /// Carries out writes that have been checked, then moves the seal.
+    /// Carries out writes that have been checked, then updates the seal.
     fn apply<'w>(
         &self,
         access: Access,
@@ -255,7 +256,7 @@ impl Memory {
         }
     }
 
-    /// Judges the gate bit as the whole of an ingest left it.
+    /// Updates the seal from the gate bit. Called once, after all writes of an ingest.
     fn settle(&self, access: Access, content: &mut Content) {
         if let (Access::Ingest, Some(gate)) = (access, self.gate) {
             let offset = usize::from(gate.address - self.span(gate.area).start());
@@ -273,8 +274,8 @@ impl Memory {
         }
     }
 
-    // Nothing that runs under the lock can panic half-way through a write: ranges and lengths are
-    // checked before. So a poisoned lock still guards whole content.
+    // Code under the lock cannot panic in the middle of a write, because ranges and lengths are
+    // checked before. So the content behind a poisoned lock is consistent.
     fn shared(&self) -> RwLockReadGuard<'_, Content> {
         self.content.read().unwrap_or_else(PoisonError::into_inner)
     }
@@ -301,13 +302,13 @@ impl Content {
     }
 }
 
-/// Writes to several memories as one step: no reader of any of them sees a part, and when one
-/// write is refused none is carried out. A memory may be named more than once.
+/// Writes to several memories atomically: no reader sees some of the writes without the others, and
+/// when one write is refused, none is carried out. Several writes can name the same memory.
 ///
 /// # Errors
-/// `WrongLength`, `OutOfRange` or `GateBit`, with the index of the first write that is refused for
-/// one of them; then [`Refusal::Sealed`] (to a client), with the index of the first write to a
-/// memory that is sealed. Nothing has changed.
+/// `WrongLength`, `OutOfRange` or `GateBit`, with the index of the first write that fails one of
+/// these checks. Then [`Refusal::Sealed`] (for a client), with the index of the first write to a
+/// sealed memory. Nothing has changed then.
 pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     for (index, (memory, write)) in writes.iter().enumerate() {
         memory
@@ -337,24 +338,27 @@ pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(
     apply_across(access, &runs)
 }
 
-/// A write that has been checked, with its memory: it can't reach another one.
+/// A write that has been checked, with the memory it was checked for.
 struct Placed<'a> {
-    /// Its index in the batch. A run has the index of the first write in it.
+    /// The index in the batch. A run has the index of its first write.
     index: usize,
     memory: &'a Memory,
     write: Write<'a>,
 }
 
-/// A memory that is locked, and the writes to it.
+/// A locked memory and the writes to it.
 struct Target<'p, 'a> {
     memory: &'a Memory,
     content: RwLockWriteGuard<'a, Content>,
     writes: &'p [Placed<'a>],
 }
 
-/// Carries out writes over several memories. They are sorted by the ranks of these.
+/// Carries out writes to several memories. The writes are sorted by the rank of their memory.
 fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
-    debug_assert!(placed.is_sorted_by_key(|placed| placed.memory.rank), "locks are taken in order");
+    debug_assert!(
+        placed.is_sorted_by_key(|placed| placed.memory.rank),
+        "locks are taken in rank order"
+    );
     let by_memory = placed.chunk_by(|a, b| ptr::eq(a.memory, b.memory));
     let mut targets: Vec<Target> = by_memory
         .map(|writes| {

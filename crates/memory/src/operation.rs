@@ -1,8 +1,9 @@
-//! One read or write: a range, and its bytes.
+//! Read and write operations: a range and its bytes.
 
 use crate::area::Area;
 
-/// A range of at least one item to read, and where to: `out` has exactly `area.byte_len(count)` bytes.
+/// A range to read, of at least one item, and the buffer that receives it: `out` has exactly
+/// `area.byte_len(count)` bytes.
 #[derive(Debug)]
 pub struct Read<'a> {
     pub area: Area,
@@ -11,9 +12,9 @@ pub struct Read<'a> {
     pub out: &'a mut [u8],
 }
 
-/// A range of at least one item to write, and its new content: `bytes` has exactly `area.byte_len(count)` bytes,
-/// registers big-endian, bits packed least significant bit first. Bits beyond `count` in the last
-/// byte are ignored.
+/// A range to write, of at least one item, and its new content: `bytes` has exactly
+/// `area.byte_len(count)` bytes, registers big-endian, bits packed least significant bit first.
+/// Bits after the first `count` are ignored.
 #[derive(Debug, Clone, Copy)]
 pub struct Write<'a> {
     pub area: Area,

@@ -1,5 +1,5 @@
-//! The memory against a model that keeps one value per address: every operation on both has the same
-//! result, refusals included.
+//! Compares the memory with a model that keeps one value per address: every operation has the same
+//! result on both, refusals included.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use holdfast_memory::{
 };
 use proptest::prelude::*;
 
-/// One value an address; an address that is missing is outside the area.
+/// One value per address. A missing address is outside the area.
 #[derive(Debug, Clone, PartialEq, Default)]
 struct Model {
     areas: [BTreeMap<u16, u16>; 4],
@@ -116,7 +116,7 @@ impl Model {
         if hits_gate && access == Access::Client { Err(Refusal::GateBit) } else { Ok(()) }
     }
 
-    /// Carries out writes that have been checked, then moves the seal.
+    /// Carries out writes that have been checked, then updates the seal.
     fn apply<'w>(&mut self, access: Access, writes: impl IntoIterator<Item = &'w Values>) {
         for Values { area, address, values } in writes {
             for (index, value) in values.iter().enumerate() {
@@ -138,8 +138,8 @@ impl Model {
     }
 }
 
-/// What `write_across` does: the first write that can't be is refused, then the first to a memory
-/// that is sealed.
+/// The model of `write_across`: refuses the first invalid write, then the first write to a sealed
+/// memory.
 fn model_write_across(
     models: &mut [Model; 3],
     access: Access,
@@ -210,7 +210,7 @@ fn some_values() -> impl Strategy<Value = Values> {
     })
 }
 
-/// A write that no memory takes: its area is missing, its range is outside, or it has no values.
+/// A write that every memory refuses: no such area, out of range, or no values.
 fn a_bad_write() -> impl Strategy<Value = (usize, Values)> {
     let place = prop_oneof![
         Just((Area::InputRegisters, 0, 1)),
@@ -287,7 +287,7 @@ fn take(memory: &Memory, model: &mut Model, step: Step) {
                 .map(|()| unpack(area, count, &out));
             let mut after = model.clone();
             let expected = after.write(access, std::slice::from_ref(&write)).and_then(|()| {
-                // What opens or closes the seal in this step does not bind its own read.
+                // The write of this step may close the seal. Its own read still succeeds.
                 after.read(Access::Ingest, area, address, count)
             });
             if expected.is_ok() {
@@ -314,11 +314,11 @@ proptest! {
     }
 
     #[test]
-    fn a_batch_over_several_memories_is_written_whole_or_not_at_all(
+    fn a_batch_over_several_memories_is_written_completely_or_not_at_all(
         gates in prop::array::uniform3(a_gate()),
         earlier in prop::collection::vec((0..3usize, some_values()), 0..20),
         access in an_access(),
-        // Short batches are written as they are, long ones are flattened first.
+        // Covers short batches, which are written directly, and long ones, which are flattened.
         batch in prop_oneof![
             prop::collection::vec((0..3usize, some_values()), 0..8),
             prop::collection::vec((0..3usize, some_values()), 8..120),

@@ -1,4 +1,4 @@
-//! Many threads at once: no reader ever sees part of a write.
+//! Concurrent access: no reader ever sees part of a write.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -15,7 +15,7 @@ fn memory() -> Memory {
     Memory::new(layout, None).unwrap()
 }
 
-/// One writer's mark: in every register and, as all ones or all zeros, in every bit.
+/// The content of one write: `round` in every register, its parity in every bit.
 fn mark(round: usize) -> (Vec<u8>, Vec<u8>) {
     let word = (round as u16).to_be_bytes();
     let bits = if round.is_multiple_of(2) { 0x00 } else { 0xFF };
@@ -31,7 +31,7 @@ fn writes<'a>(registers: &'a [u8], bits: &'a [u8]) -> [Write<'a>; 4] {
     })
 }
 
-/// The value that all of a range holds; `None` where it is mixed.
+/// The value of all items of a range; `None` when the values differ.
 fn uniform(area: Area, bytes: &[u8]) -> Option<u16> {
     if area.is_bits() {
         let (last, whole) = bytes.split_last()?;
@@ -99,7 +99,7 @@ fn no_reader_sees_part_of_a_write_over_four_areas() {
 }
 
 #[test]
-fn mask_writes_of_many_threads_lose_nothing() {
+fn concurrent_mask_writes_lose_no_bit() {
     let memory = memory();
     thread::scope(|scope| {
         for bit in 0..16u16 {
@@ -122,7 +122,7 @@ fn mask_writes_of_many_threads_lose_nothing() {
 }
 
 #[test]
-fn writers_over_the_same_memories_in_any_order_never_wait_for_each_other_for_ever() {
+fn writers_to_the_same_memories_in_any_order_never_deadlock() {
     let memories = [memory(), memory()];
     thread::scope(|scope| {
         for order in [[0, 1], [1, 0]] {
@@ -142,7 +142,7 @@ fn writers_over_the_same_memories_in_any_order_never_wait_for_each_other_for_eve
 }
 
 #[test]
-fn what_one_write_then_read_returns_is_what_it_wrote() {
+fn a_write_then_read_returns_what_it_wrote() {
     let memory = memory();
     thread::scope(|scope| {
         for thread in 0..4u16 {
