@@ -315,7 +315,7 @@ def test_files_are_judged_when_the_client_is_made(
 
 
 def test_cert_and_key_go_together() -> None:
-    with pytest.raises(ValueError, match="cert and key go together"):
+    with pytest.raises(ValueError, match="cert and key: give both, or neither"):
         _core.Endpoint.tls("plc", 802, cert="plc.pem")
 
 

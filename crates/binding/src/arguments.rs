@@ -1,4 +1,4 @@
-//! Arguments from Python, checked: each error names what was found and what is allowed.
+//! Checks arguments from Python. Each error says what was found and what is allowed.
 
 use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
@@ -8,7 +8,7 @@ use ipnet::IpNet;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
-/// An integer of a range that a `usize` holds.
+/// Checks that an integer is in a range.
 pub fn within(what: &str, found: i128, allowed: RangeInclusive<usize>) -> PyResult<usize> {
     usize::try_from(found).ok().filter(|number| allowed.contains(number)).ok_or_else(|| {
         let (least, most) = (allowed.start(), allowed.end());
@@ -24,7 +24,7 @@ pub fn unknown(what: &str, found: &str, allowed: &str) -> PyErr {
     PyValueError::new_err(format!("{what} is {found:?}, allowed are {allowed}"))
 }
 
-/// A network, or one address.
+/// Parses a network or a single address.
 pub fn network(text: &str) -> PyResult<IpNet> {
     let network = text.parse::<IpNet>().ok();
     network.or_else(|| text.parse::<IpAddr>().ok().map(IpNet::from)).ok_or_else(|| {
@@ -44,7 +44,7 @@ pub fn address(text: &str) -> PyResult<SocketAddr> {
     text.parse().map_err(|_| unknown("bind", text, form))
 }
 
-/// One of some words.
+/// Looks up a word in a list of allowed words and their values.
 pub fn word<T: Copy>(what: &str, found: &str, allowed: &[(&str, T)]) -> PyResult<T> {
     let named = allowed.iter().find(|(name, _)| *name == found);
     named.map(|(_, value)| *value).ok_or_else(|| {

@@ -1,4 +1,4 @@
-//! Writes as Python's audit log has them: a dictionary each.
+//! Converts writes into the dictionaries of the audit log.
 
 use holdfast_engine::server::audit::{Record, Written};
 use holdfast_memory::Area;
@@ -31,7 +31,7 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
     Ok(line)
 }
 
-/// What a Modbus request was to write, as far as it was understood.
+/// Adds area, address and values of a Modbus request. A request that does not parse adds nothing.
 fn request(line: &Bound<'_, PyDict>, pdu: &[u8]) -> PyResult<()> {
     let (area, address, values) = match Request::parse(pdu) {
         Ok(Request::WriteSingleCoil { address, value }) => {
@@ -89,7 +89,7 @@ fn registers(packed: &[u8]) -> Vec<u16> {
     packed.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect()
 }
 
-/// The exception as a word: `illegal_data_address`.
+/// The name of an exception in snake case, such as `illegal_data_address`.
 fn exception(code: ExceptionCode) -> String {
     code.name().to_lowercase().replace(' ', "_")
 }

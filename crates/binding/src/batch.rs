@@ -1,7 +1,7 @@
-//! `write_across`: a batch over several memories, and which of its values it is refused for.
+//! `write_across`: writes a batch to several memories, or reports the value that was refused.
 //!
-//! All writes of a batch are taken first, then all values are checked, then memory is written. So
-//! an iterable that raises has changed nothing, and what it raises goes before a value that is refused.
+//! It first consumes all iterables, then checks all values, then writes. So an iterable that raises
+//! has changed nothing, and its exception takes precedence over a refused value.
 
 use holdfast_memory::{Access, Area, Memory as Core, Refusal, Write};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
@@ -14,10 +14,10 @@ pyo3::create_exception!(
     holdfast._core,
     BatchRefused,
     PyValueError,
-    "A write of a batch that is refused."
+    "A write of a batch was refused."
 );
 
-/// A write whose range is inside its area; its values are not checked yet.
+/// A write with a valid range. Its values are not checked yet.
 struct Pending<'py> {
     memory: Bound<'py, Memory>,
     area: Area,
@@ -26,7 +26,7 @@ struct Pending<'py> {
     values: Bound<'py, PyList>,
 }
 
-/// Writes to several memories as one step; how many values were written.
+/// Writes to several memories atomically. Returns the number of values written.
 #[pyfunction]
 pub fn write_across(py: Python<'_>, writes: &Bound<'_, PyAny>) -> PyResult<usize> {
     let (mut pending, mut len) = (Vec::new(), 0);
@@ -77,7 +77,7 @@ impl<'py> Pending<'py> {
         Ok(Pending { memory, area, address, count, values })
     }
 
-    /// The write with the bytes that its values stand for.
+    /// Checks the values and packs them into `bytes`.
     fn packed<'b>(&self, command: usize, bytes: &'b mut [u8]) -> PyResult<Write<'b>> {
         let Pending { area, address, count, ref values, .. } = *self;
         if values.len() != count {
@@ -101,7 +101,7 @@ impl<'py> Pending<'py> {
     }
 }
 
-/// The items of an iterable that can be values.
+/// Lists the items of an iterable. `None` if it is not iterable, or is text or bytes.
 fn listed<'py>(values: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyList>>> {
     if is_text(values) {
         return Ok(None);

@@ -1,4 +1,4 @@
-//! `Request`, `Endpoint` and `BlockingClient`: requests in, values or exceptions out.
+//! `Request`, `Endpoint` and `BlockingClient`: requests, and their results or exceptions.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ pyo3::import_exception!(holdfast.errors, RequestTimeout);
 pyo3::import_exception!(holdfast.errors, InvalidResponse);
 pyo3::import_exception!(holdfast.errors, TlsFailed);
 
-/// Addresses of an area.
+/// The number of addresses of an area.
 const ADDRESSES: i128 = 65_536;
 
 #[pyclass(frozen, module = "holdfast")]
@@ -141,7 +141,7 @@ impl Request {
     ) -> PyResult<Request> {
         let code = register("sub_function", sub_function)?;
         let sub_function = SubFunction::from_code(code).ok_or_else(|| {
-            PyValueError::new_err(format!("sub_function {code} is not one of the standard"))
+            PyValueError::new_err(format!("sub_function {code} is not in the standard"))
         })?;
         let asked = Diagnostics::new(sub_function, data).map_err(|_| {
             let function = Function::Diagnostics.name();
@@ -177,7 +177,7 @@ impl Request {
     }
 }
 
-/// What a client, or the poller, talks to.
+/// The device address that a client or the poller connects to.
 #[pyclass(frozen, module = "holdfast")]
 pub struct Endpoint {
     pub core: CoreEndpoint,
@@ -213,7 +213,7 @@ impl Endpoint {
         let own = match (cert.as_deref(), key.as_deref()) {
             (Some(cert), Some(key)) => Some((cert, key)),
             (None, None) => None,
-            _ => return Err(PyValueError::new_err("cert and key go together")),
+            _ => return Err(PyValueError::new_err("cert and key: give both, or neither")),
         };
         let name = name.unwrap_or(&host);
         let tls = ClientTls::new(ClientSettings { ca: ca.as_deref(), own, name });
@@ -250,7 +250,7 @@ impl BlockingClient {
         BlockingClient { core: Core::new(endpoint.core.clone()) }
     }
 
-    /// The result of a request, as Python has it.
+    /// Sends a request and returns its result as a Python object.
     fn call<'py>(
         &self,
         py: Python<'py>,
@@ -274,7 +274,7 @@ impl BlockingClient {
     }
 }
 
-/// A file that can't be read is an `OSError` of the kind that Python raises itself.
+/// Maps a file that cannot be read to the `OSError` subclass that Python itself would raise.
 fn unusable(error: TlsError) -> PyErr {
     match error {
         TlsError::File(FileError::Unreadable { file, error }) => match error.raw_os_error() {
@@ -285,13 +285,13 @@ fn unusable(error: TlsError) -> PyErr {
     }
 }
 
-/// What the system calls an error, without its number, which Python adds.
+/// The system's text of an error, without its number, which Python adds.
 fn told(error: &std::io::Error) -> String {
     let text = error.to_string();
     text.split(" (os error").next().unwrap_or(&text).to_owned()
 }
 
-/// A serial line as arguments describe it.
+/// Checks the arguments of a serial line.
 pub fn line(
     device: String,
     mode: &str,
@@ -315,9 +315,9 @@ pub fn line(
     })
 }
 
-/// A response without the buffer that it borrows from.
+/// A response that owns its data.
 pub(crate) enum Reply {
-    /// Packed bits, and how many.
+    /// Packed bits, and their number.
     Bits(Vec<u8>, usize),
     Registers(Vec<u8>),
     Written,
@@ -363,7 +363,7 @@ impl Reply {
     }
 }
 
-/// The Python exception that an error is.
+/// Maps an error to its Python exception.
 pub(crate) fn raised(error: ClientError) -> PyErr {
     let text = error.to_string();
     match error {
@@ -402,7 +402,7 @@ fn register(what: &str, number: i128) -> PyResult<u16> {
     Ok(within(what, number, 0..=65_535)? as u16)
 }
 
-/// The value of one bit or register.
+/// Extracts and checks the value of one bit or register.
 fn single(area: holdfast_memory::Area, value: &Bound<'_, PyAny>) -> PyResult<u16> {
     let values = PyList::new(value.py(), [value])?;
     Ok(numbers(area, values.as_any())?[0])

@@ -1,4 +1,5 @@
-//! `Connection`: a TCP connection of a client, with TLS or not, for whoever owns the socket.
+//! `Connection`: the client side of a TCP connection, with or without TLS. The caller owns the
+//! socket.
 
 use std::io;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -33,19 +34,19 @@ struct Tls {
     channel: Channel,
     plain: Vec<u8>,
     out: Vec<u8>,
-    /// Whether the handshake has ended well.
+    /// Whether the handshake has succeeded.
     agreed: bool,
-    /// Whether anything came after the handshake.
+    /// Whether data has been received after the handshake.
     heard: bool,
 }
 
 enum Ending {
-    /// And whether a request may have been carried out.
+    /// The flag says whether the peer may have carried out a request.
     Tls(TlsFailure, bool),
     Io(String),
 }
 
-/// Tickets, each with a result or an exception.
+/// Tickets of completed requests, each with a result or an exception.
 type Completed<'py> = Vec<(u64, Bound<'py, PyAny>)>;
 
 #[pymethods]
@@ -53,7 +54,7 @@ impl Connection {
     #[new]
     fn new(endpoint: PyRef<'_, Endpoint>) -> PyResult<Connection> {
         let CoreEndpoint::Tcp { tls, .. } = &endpoint.core else {
-            return Err(PyValueError::new_err("endpoint is not one of TCP or TLS"));
+            return Err(PyValueError::new_err("endpoint is not TCP or TLS"));
         };
         let to = endpoint.core.to_string();
         let tls = match tls {
@@ -66,7 +67,7 @@ impl Connection {
         Ok(Connection { state: Mutex::new(State { core, tls, ending: None }), to })
     }
 
-    /// Whether requests can be sent: TLS, if there is any, is agreed on.
+    /// Whether requests can be sent: the connection is open, and any TLS handshake is complete.
     #[getter]
     fn is_ready(&self) -> bool {
         let state = self.state();
@@ -74,7 +75,7 @@ impl Connection {
         agreed && state.core.closed().is_none()
     }
 
-    /// Queues a request; its ticket.
+    /// Queues a request and returns its ticket.
     fn send(
         &self,
         request: PyRef<'_, Request>,
@@ -90,7 +91,7 @@ impl Connection {
         }
     }
 
-    /// The bytes to send now.
+    /// Takes the bytes to send now.
     fn outgoing<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         let State { core, tls, .. } = &mut *self.state();
         let plain = core.outgoing();
@@ -108,7 +109,7 @@ impl Connection {
         bytes
     }
 
-    /// Takes received bytes; the requests that they complete.
+    /// Processes received bytes and returns the requests that they complete.
     fn receive<'py>(&self, py: Python<'py>, data: &[u8], now: f64) -> PyResult<Completed<'py>> {
         let now = clock(now)?;
         let State { core, tls, ending } = &mut *self.state();
@@ -133,7 +134,7 @@ impl Connection {
         completed.all
     }
 
-    /// Ends the requests whose time is over.
+    /// Ends the requests whose timeout has expired.
     fn advance<'py>(&self, py: Python<'py>, now: f64) -> PyResult<Completed<'py>> {
         let State { core, ending, .. } = &mut *self.state();
         let mut completed = Completions::new(py);
@@ -141,18 +142,18 @@ impl Connection {
         completed.all
     }
 
-    /// When `advance` is to be called.
+    /// When to call `advance`.
     #[getter]
     fn deadline(&self) -> Option<f64> {
         self.state().core.deadline().map(|deadline| deadline.as_secs_f64())
     }
 
-    /// Drops a request: its reply, should it come, is counted.
+    /// Drops a request. A late reply to it is counted.
     fn cancel(&self, ticket: u64) {
         self.state().core.cancel(Ticket(ticket));
     }
 
-    /// Ends the connection, and with it all requests. Bytes may be left to send.
+    /// Ends the connection and all its requests. `outgoing` may still have bytes to send.
     fn close<'py>(&self, py: Python<'py>) -> PyResult<Completed<'py>> {
         let State { core, tls, ending } = &mut *self.state();
         let mut completed = Completions::new(py);
@@ -163,7 +164,7 @@ impl Connection {
         completed.all
     }
 
-    /// The network has ended the connection; `error` is why, unless that was its regular end.
+    /// Reports that the connection is lost. `error` is `None` when the peer closed it normally.
     #[pyo3(signature = (error=None))]
     fn lost<'py>(&self, py: Python<'py>, error: Option<String>) -> PyResult<Completed<'py>> {
         let State { core, tls, ending } = &mut *self.state();
@@ -183,7 +184,7 @@ impl Connection {
         completed.all
     }
 
-    /// Why it has ended, as an exception; `None` while it has not.
+    /// Why the connection has ended, as an exception; `None` while it is open.
     #[getter]
     fn closed<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyAny>> {
         let state = self.state();
@@ -191,7 +192,7 @@ impl Connection {
         Some(exception(py, self.error(&state.ending, failure, Duration::ZERO)))
     }
 
-    /// Replies that came after their requests had been given up.
+    /// The number of replies that came after their request had ended.
     #[getter]
     fn late(&self) -> u64 {
         self.state().core.late()
@@ -218,7 +219,7 @@ impl Connection {
 }
 
 impl Tls {
-    /// TLS that has something to send: its greeting.
+    /// Starts TLS. The `ClientHello` is in `out`.
     fn new(tls: &ClientTls) -> Result<Tls, TlsFailure> {
         let mut channel = tls.channel().map_err(|error| TlsFailure::from(&error))?;
         let mut out = Vec::new();
@@ -227,7 +228,7 @@ impl Tls {
     }
 }
 
-/// Requests that got their results.
+/// Collects completed requests, or the first error.
 struct Completions<'py> {
     py: Python<'py>,
     all: PyResult<Completed<'py>>,
@@ -255,7 +256,7 @@ fn exception(py: Python<'_>, error: ClientError) -> Bound<'_, PyAny> {
     raised(error).into_value(py).into_bound(py).into_any()
 }
 
-/// The time of an event loop.
+/// Converts the time of an event loop.
 fn clock(now: f64) -> PyResult<Duration> {
     Duration::try_from_secs_f64(now).map_err(|error| PyValueError::new_err(error.to_string()))
 }

@@ -1,4 +1,4 @@
-//! `Engine`: listeners in, addresses, counters, events and writes out.
+//! `Engine`: runs listeners; reports addresses, counters, events and writes.
 
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::{
@@ -103,7 +103,8 @@ impl Engine {
     }
 }
 
-/// Listener, kind, peer and reason; the role of a peer that was refused for it is the reason.
+/// Listener, kind, peer and reason. For a peer that was refused for its role, the reason is the
+/// role.
 type Event = (String, &'static str, Option<String>, Option<String>);
 
 fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bound<'py, PyDict>> {
@@ -164,7 +165,7 @@ fn by_code<'py>(
     Ok(all)
 }
 
-/// An `OSError` with the system's number where a socket failed, so that Python picks its subclass.
+/// Maps a failed socket to an `OSError` with its `errno`, so that Python selects the subclass.
 fn start_error(error: StartError) -> PyErr {
     match &error {
         StartError::Bind { error: cause, .. }

@@ -1,7 +1,7 @@
-//! `holdfast._core`: the native parts as Python sees them.
+//! `holdfast._core`: the Python interface of the native crates.
 //!
-//! This crate converts and forwards, and holds no logic. The interpreter is released around
-//! everything that can wait.
+//! This crate converts and forwards. It contains no logic. It releases the interpreter around every
+//! call that can block.
 
 mod arguments;
 mod audit;

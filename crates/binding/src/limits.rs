@@ -1,5 +1,5 @@
-//! What the standard fixes, as constants of the module: areas, functions and their limits, names of
-//! exceptions, faults of devices. Python has no second list of any of them.
+//! Constants of the module: areas, functions and their limits, names of exceptions, device faults.
+//! Python takes them from here and keeps no list of its own.
 
 use holdfast_engine::poller::Fault;
 use holdfast_memory::{Area, Span};
@@ -45,7 +45,7 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("FAULTS", faults)
 }
 
-/// Why a device did not answer, in a word; an exception has its own name.
+/// The name of a fault; `None` for an exception, which has a name in `EXCEPTIONS`.
 fn word(fault: Fault) -> Option<&'static str> {
     match fault {
         Fault::Exception(_) => None,
@@ -59,7 +59,7 @@ fn word(fault: Fault) -> Option<&'static str> {
     }
 }
 
-/// The area that a function reads or writes, if any, and how many of its items at most.
+/// The area that a function reads or writes, if any, and the most items per request.
 struct Use {
     area: Option<Area>,
     most_read: u16,

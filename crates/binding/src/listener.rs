@@ -1,4 +1,4 @@
-//! `Rule`, `RawRule`, `ServerTls` and `Listener`: what listeners are to be.
+//! `Rule`, `RawRule`, `ServerTls` and `Listener`: settings of listeners.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -50,7 +50,9 @@ impl Rule {
             (Some(codes), None) => Functions::Only(codes),
             (None, Some(codes)) => Functions::Except(codes),
             (Some(_), Some(_)) => {
-                return Err(PyValueError::new_err("functions and deny exclude each other"));
+                return Err(PyValueError::new_err(
+                    "functions and deny: give one of them, or neither",
+                ));
             }
         };
         let units = targets(units)?;
@@ -199,7 +201,7 @@ fn networks(sources: &[String]) -> PyResult<Vec<IpNet>> {
     sources.iter().map(|text| network(text)).collect()
 }
 
-/// Ids and the memories behind them.
+/// Converts a mapping from ids to memories.
 fn targets(mapping: &Bound<'_, PyMapping>) -> PyResult<Vec<(i128, Arc<CoreMemory>)>> {
     let mut targets = Vec::new();
     for item in mapping.items()?.iter() {
@@ -228,7 +230,7 @@ fn limits(
 fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {
     let time = seconds(what, time)?;
     if time.is_zero() {
-        return Err(PyValueError::new_err(format!("{what} is 0, more is allowed")));
+        return Err(PyValueError::new_err(format!("{what} is 0, it must be more than 0")));
     }
     Ok(time)
 }

@@ -1,4 +1,4 @@
-//! `Memory`: Python values in, bytes in memory, and back.
+//! `Memory`: converts between Python values and bytes in memory.
 
 use std::sync::Arc;
 
@@ -147,7 +147,7 @@ impl Memory {
     }
 }
 
-/// A range inside an area, and its bytes.
+/// A range of an area, and its bytes.
 struct Range {
     area: Area,
     address: u16,
@@ -156,7 +156,7 @@ struct Range {
 }
 
 impl Range {
-    /// A range whose bytes are yet to be read.
+    /// A range to read. Its bytes are 0 until then.
     fn new(memory: &Core, area: &str, address: i128, count: i128) -> PyResult<Range> {
         let area = named(area)?;
         if count < 1 {
@@ -169,7 +169,7 @@ impl Range {
         Ok(Range { area, address, count, bytes: vec![0; area.byte_len(count)] })
     }
 
-    /// A range with the bytes that `values` stand for.
+    /// A range to write, with `values` packed into bytes.
     fn packed(
         memory: &Core,
         area: &str,
@@ -256,8 +256,8 @@ fn out_of_range(memory: &Core, area: Area, address: i128, count: i128) -> PyErr 
     })
 }
 
-/// A Python integer; one that 128 bits do not hold becomes the nearest that they do, which no
-/// address, count or value is either.
+/// A Python integer. An integer beyond 128 bits is clamped: the result is still out of range for
+/// every address, count and value.
 pub fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
     match value.extract::<i128>() {
         Err(error) if error.is_instance_of::<PyOverflowError>(value.py()) => {
@@ -267,7 +267,7 @@ pub fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
     }
 }
 
-/// The integers of a Python sequence, each one checked.
+/// Extracts and checks the integers of a Python iterable.
 pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
     if let Ok(list) = values.cast_exact::<PyList>() {
         return list.iter().enumerate().map(|(index, value)| number(area, index, &value)).collect();
@@ -285,21 +285,22 @@ pub fn numbers(area: Area, values: &Bound<'_, PyAny>) -> PyResult<Vec<u16>> {
     Ok(numbers)
 }
 
-/// Text and bytes are sequences of integers or of texts, but no values.
+/// Whether this is text or bytes. Both are iterable, but are not accepted as values.
 pub fn is_text(values: &Bound<'_, PyAny>) -> bool {
     values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>()
 }
 
-/// Why something is not a value of an area.
+/// Why an object is not a value of an area.
 pub enum Unfit {
-    /// An integer that is too small or too large.
+    /// The integer is too small or too large.
     Value,
+    /// The object is not an integer, or is a boolean for a register.
     Type,
 }
 
-/// One value of an area.
+/// Extracts and checks one value of an area.
 pub fn item(area: Area, value: &Bound<'_, PyAny>) -> Result<u16, Unfit> {
     let most = if area.is_bits() { 1 } else { u16::MAX };
     if let Ok(integer) = value.cast_exact::<PyInt>()

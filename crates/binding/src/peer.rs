@@ -1,8 +1,8 @@
-//! Peers as Python's logs have them.
+//! Formats peers for the logs of Python.
 
 use std::net::SocketAddr;
 
-/// A peer as text, an IPv4 address mapped into IPv6 as that IPv4 address.
+/// Formats the address of a peer. An IPv4-mapped IPv6 address is shown as IPv4.
 pub fn text(peer: SocketAddr) -> String {
     SocketAddr::new(peer.ip().to_canonical(), peer.port()).to_string()
 }

@@ -1,4 +1,4 @@
-//! `Device` and `Poller`, and plans: what is to be polled, counters out.
+//! `PolledDevice` and `Poller`: polling, its results and counters; `plan_blocks`: plans.
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -17,19 +17,19 @@ use crate::arguments::{byte, seconds, within, word};
 use crate::client::{Endpoint, Request};
 use crate::memory::{Memory, named};
 
-/// An area, its first address, and the one behind its last.
+/// An area, the first address, and the address after the last.
 type Range = (String, u32, u32);
 
 /// A memory, an area and an address.
 type Place<'py> = (PyRef<'py, Memory>, String, u16);
 
-/// An area, an address, a count, and where the bytes go.
+/// An area, an address, a count, and the destination of the bytes.
 type Read<'py> = (String, i128, i128, Option<Place<'py>>);
 
 /// Host, port, format, crc, unit or memory id, timeout.
 type Forward = (String, u16, String, String, u16, f64);
 
-/// Area, address, count, indexes of fields, items that no field wants.
+/// Area, address, count, indexes of fields, number of items that no field covers.
 type PlannedBlock = (&'static str, u16, u16, Vec<usize>, u32);
 
 #[pyclass(frozen, module = "holdfast")]
@@ -176,7 +176,7 @@ fn raised(error: PollerError) -> PyErr {
     }
 }
 
-/// The requests that read all fields.
+/// Plans the requests that read all fields.
 #[pyfunction]
 #[pyo3(signature = (fields, *, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None))]
 pub fn plan_blocks(
@@ -222,7 +222,7 @@ fn strategy(max_gap: Option<i128>, cost: Option<(f64, f64)>) -> PyResult<Strateg
         (_, Some((request, item))) if request >= 0.0 && item >= 0.0 => {
             Ok(Strategy::Cost { request, item })
         }
-        (_, Some(_)) => Err(PyValueError::new_err("cost is below 0, allowed is 0 and more")),
+        (_, Some(_)) => Err(PyValueError::new_err("cost is below 0, it must be 0 or more")),
         (gap, None) => {
             let max_gap = within("max_gap", gap.unwrap_or_default(), 0..=65_535)? as u16;
             Ok(Strategy::Gap { max_gap })
@@ -251,11 +251,11 @@ fn limits(
     })
 }
 
-/// Polls, and writes as ticket and fault.
+/// Poll results, and writes as ticket and fault.
 type Taken<'py> = (Vec<PollResult<'py>>, Vec<(u64, u16)>);
 
-/// PolledDevice, seconds of the schedule, and blocks: area, address, count, bytes or fault, and seconds
-/// since 1970.
+/// Device name, scheduled time in seconds, and blocks: area, address, count, bytes or fault, and
+/// seconds since 1970.
 type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);
 type ReportedBlock<'py> = (&'static str, u16, u16, Option<Bound<'py, PyBytes>>, u16, f64);
 

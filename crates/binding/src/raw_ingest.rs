@@ -1,4 +1,4 @@
-//! Raw Ingest packets: values to a payload, a payload to a packet.
+//! Encodes Raw Ingest packets: values into a payload, a payload into a packet.
 
 use std::num::NonZeroU16;
 
@@ -12,8 +12,8 @@ use pyo3::types::{PyBool, PyBytes, PyInt, PyList};
 use crate::arguments::word;
 use crate::memory::{integer, named};
 
-/// The payload that bits or registers make. Nothing is converted: a value is an integer, and a
-/// truth only of bits.
+/// Packs bits or registers into a payload. Values must be integers; booleans are allowed for bits
+/// only.
 #[pyfunction]
 pub fn pack_raw_ingest<'py>(
     py: Python<'py>,
@@ -37,7 +37,7 @@ pub fn pack_raw_ingest<'py>(
     Ok(PyBytes::new(py, &payload))
 }
 
-/// One packet. `target` is a unit id (v1) or a memory id (crc).
+/// Encodes one packet. `target` is a unit id (v1) or a memory id (crc).
 #[pyfunction]
 #[pyo3(signature = (payload, *, area, address, count, target, format, crc))]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
