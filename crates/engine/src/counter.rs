@@ -1,8 +1,8 @@
-//! A number that only grows.
+//! A counter that only increases.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A number that only grows.
+/// A counter that only increases.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 

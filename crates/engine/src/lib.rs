@@ -1,16 +1,17 @@
-//! The data plane: Modbus and Raw Ingest listeners over memories, on threads of its own.
+//! The data plane: Modbus and Raw Ingest listeners, clients and the poller, on their own threads.
 //!
 //! The rules this crate keeps:
 //!
-//! * A connection's rights are settled once, when it is accepted: its source address picks one rule
-//!   ([`server::policy`]), and the rule is two tables. A request costs two look-ups.
-//! * All that arrived together is answered together, in order, with one write (`server::connection`). The
-//!   way from request to reply ([`server::unit_server`]) allocates nothing.
-//! * One peer can't hold up another: every buffer has a bound, every wait has a deadline, and no
-//!   code on a worker thread waits for anything but its sockets.
-//! * It says what happened in counters and events, and never waits for whoever reads them.
+//! * The rights of a connection are fixed when it is accepted: its source address selects one rule
+//!   ([`server::policy`]), compiled to two tables. A request costs two look-ups.
+//! * Requests that arrive together are answered together, in order, with one write
+//!   (`server::connection`). The path from request to reply ([`server::unit_server`]) does not
+//!   allocate.
+//! * One peer cannot delay another: every buffer has a limit, every wait has a deadline, and code
+//!   on a worker thread waits for nothing but its sockets.
+//! * Counters and events report what happens. Reporting never blocks.
 //!
-//! It knows no Python, no JSON, and no type wider than a bit or a register.
+//! It does not know Python, JSON, or any type wider than a bit or a register.
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! The area that a Raw Ingest packet names, as memories have it, and back.
+//! Converts between the areas of Raw Ingest packets and those of memories.
 
 use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest;

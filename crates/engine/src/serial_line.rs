@@ -1,11 +1,11 @@
-//! A serial device and how it is set: what a client opens and what a listener opens.
+//! Settings of a serial line, for clients and listeners.
 
 use std::io;
 use std::time::Duration;
 
 use serial2_tokio::{CharSize, FlowControl, Parity, SerialPort, Settings, StopBits};
 
-/// Above 19,200 baud the silence between RTU frames does not get shorter (2.5.1.1).
+/// Above 19,200 baud, the silence between RTU frames is constant (Serial Line V1.02, 2.5.1.1).
 const FAST: (u32, Duration) = (19_200, Duration::from_micros(1_750));
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,14 +17,14 @@ pub enum LineParity {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LineMode {
-    /// A silence ends a frame; `None` for that of the standard.
+    /// A silence ends a frame. `None` uses the silence of the standard.
     Rtu {
         silence: Option<Duration>,
     },
     Ascii,
 }
 
-/// A serial device and how it is set.
+/// Settings of a serial line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SerialLine {
     pub device: String,
@@ -36,7 +36,7 @@ pub struct SerialLine {
 }
 
 impl SerialLine {
-    /// Opens the device, in the context of a runtime.
+    /// Opens the device. Must be called in the context of a runtime.
     pub(crate) fn open(&self) -> io::Result<SerialPort> {
         SerialPort::open(&self.device, |settings: Settings| self.set(settings))
     }
@@ -63,13 +63,13 @@ impl SerialLine {
         Ok(settings)
     }
 
-    /// A pseudo terminal carries bytes: Linux refuses to give its characters another form.
+    /// Linux refuses to set character size and parity of a pseudo terminal.
     fn is_pseudo_terminal(&self) -> bool {
         let device = std::fs::canonicalize(&self.device);
         device.is_ok_and(|device| device.starts_with("/dev/pts"))
     }
 
-    /// The silence that ends an RTU frame: 3.5 characters.
+    /// The silence that ends an RTU frame: 3.5 characters by default.
     pub(crate) fn silence(&self) -> Duration {
         let (fast, shortest) = FAST;
         match self.mode {

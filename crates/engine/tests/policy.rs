@@ -1,4 +1,4 @@
-//! Which rule a peer gets, and what it grants.
+//! Tests which rule applies to a peer, and what it allows.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ fn peer(text: &str) -> IpAddr {
 }
 
 #[test]
-fn the_first_rule_that_names_a_peer_holds() {
+fn the_first_rule_that_names_a_peer_applies() {
     let policy = Policy::of(&[
         rule(&["10.0.0.0/24", "fd00::/64"], 1, AccessMode::ReadWrite, Functions::All),
         rule(&["10.0.0.0/8"], 2, AccessMode::ReadOnly, Functions::All),
@@ -37,7 +37,7 @@ fn the_first_rule_that_names_a_peer_holds() {
 }
 
 #[test]
-fn the_first_rule_that_names_peer_and_role_holds() {
+fn the_first_rule_that_names_peer_and_role_applies() {
     let of_roles = |roles: &[&str], rule: Rule| Rule {
         roles: Some(roles.iter().map(|role| (*role).to_owned()).collect()),
         ..rule
@@ -66,7 +66,7 @@ fn the_first_rule_that_names_peer_and_role_holds() {
 }
 
 #[test]
-fn a_mapped_address_is_the_ipv4_address_it_maps() {
+fn an_ipv4_mapped_address_is_treated_as_ipv4() {
     let rules = vec![rule(&["10.0.0.0/24"], 1, AccessMode::ReadOnly, Functions::All)];
     assert!(Policy::of(&rules).rights(peer("::ffff:10.0.0.7")).is_some());
     let rules = vec![rule(&["::/0"], 1, AccessMode::ReadOnly, Functions::All)];
@@ -74,7 +74,7 @@ fn a_mapped_address_is_the_ipv4_address_it_maps() {
 }
 
 #[test]
-fn functions_are_those_known_allowed_and_fit_for_the_rights() {
+fn a_function_must_be_known_listed_and_within_the_access_mode() {
     let allowed = |rights, functions| -> Vec<u8> {
         let policy = Policy::of(&[rule(&["::/0"], 1, rights, functions)]);
         let rights = policy.rights(peer("::1")).unwrap();

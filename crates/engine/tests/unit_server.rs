@@ -1,4 +1,4 @@
-//! Broadcasts and listen only mode, and what is counted of them.
+//! Tests broadcasts and listen only mode, and their counters.
 
 use std::sync::Arc;
 
@@ -53,7 +53,7 @@ fn broadcast(unit_server: &UnitServer, rights: &PeerRights, request: &[u8]) -> V
 }
 
 #[test]
-fn a_broadcast_is_one_message_however_many_memories_take_it() {
+fn a_broadcast_to_several_memories_counts_as_one_message() {
     let (one, other, unit_server) = (memory(1), memory(1), unit_server());
     let rights = rights(&[(7, &one), (8, &other), (9, &one)], AccessMode::ReadWrite);
     assert_eq!(broadcast(&unit_server, &rights, WRITE), [WRITE, WRITE]);
@@ -67,7 +67,7 @@ fn a_broadcast_is_one_message_however_many_memories_take_it() {
 }
 
 #[test]
-fn a_broadcast_that_one_memory_refuses_is_one_exception_and_no_event() {
+fn a_broadcast_that_some_memories_refuse_counts_one_exception_and_no_event() {
     let (one, other, small) = (memory(9), memory(1), memory(2));
     let unit_server = unit_server();
     let rights = rights(&[(7, &one), (8, &other), (9, &small)], AccessMode::ReadWrite);
@@ -78,7 +78,7 @@ fn a_broadcast_that_one_memory_refuses_is_one_exception_and_no_event() {
 }
 
 #[test]
-fn a_broadcast_passes_over_units_in_listen_only_mode() {
+fn a_broadcast_skips_units_in_listen_only_mode() {
     let (one, other, unit_server) = (memory(1), memory(1), unit_server());
     let rights = rights(&[(7, &one), (8, &other), (9, &other)], AccessMode::ReadWrite);
     for unit_id in [7, 8] {
@@ -91,7 +91,7 @@ fn a_broadcast_passes_over_units_in_listen_only_mode() {
 }
 
 #[test]
-fn a_unit_in_listen_only_mode_does_not_even_answer_what_it_denies() {
+fn a_unit_in_listen_only_mode_does_not_answer_denied_requests() {
     let (memory, unit_server) = (memory(1), unit_server());
     let all = rights(&[(7, &memory)], AccessMode::ReadWrite);
     let read_only = rights(&[(7, &memory)], AccessMode::ReadOnly);
@@ -109,7 +109,7 @@ fn a_unit_in_listen_only_mode_does_not_even_answer_what_it_denies() {
 }
 
 #[test]
-fn damaged_frames_are_errors_and_no_messages() {
+fn damaged_frames_count_as_errors_not_as_messages() {
     let unit_server = unit_server();
     unit_server.counters.frames.damaged.add_many(3);
     unit_server.counters.frames.other_unit.add_many(2);

@@ -1,7 +1,7 @@
-//! A client whose calls wait: it drives a [`Connection`] in the calling thread.
+//! A blocking client: it drives a [`Connection`] in the calling thread.
 //!
-//! The connection is made when it is needed, and kept. No call is repeated: one that fails after its
-//! request may have been sent fails for its caller.
+//! The connection is opened on first use and kept open. Calls are never repeated: if a call fails
+//! after its request may have been sent, the caller gets the error.
 
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -16,13 +16,13 @@ use super::connect::connect;
 use super::turns::Turns;
 use super::{ClientError, Endpoint, Lost};
 
-/// Bytes taken from a socket at once; no datagram of Modbus has more.
+/// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK: usize = 512;
 
-/// After this time without use a TCP connection is looked at before it is trusted.
+/// A TCP connection that was unused for this time is checked before it is used again.
 const IDLE: Duration = Duration::from_millis(50);
 
-/// A client of one endpoint. Any number of threads may call it: their calls take turns.
+/// A client of one endpoint. Any number of threads can call it; their calls take turns.
 pub struct BlockingClient {
     endpoint: Endpoint,
     turns: Turns,
@@ -30,12 +30,12 @@ pub struct BlockingClient {
     late: AtomicU64,
 }
 
-/// A connection that is open.
+/// An open connection.
 struct Open {
     stream: Box<dyn ByteStream>,
     connection: Connection,
     transport: Transport,
-    /// The zero of the connection's clock.
+    /// The zero of the clock of the connection.
     epoch: Instant,
     used: Instant,
 }
@@ -50,12 +50,12 @@ impl BlockingClient {
         }
     }
 
-    /// Sends a request when the caller's turn has come, which `timeout` does not cover, and hands
-    /// its response to `take`. On a serial line unit id 0 is a broadcast: nobody replies, and a
-    /// write is held to be done when it was sent.
+    /// Sends a request when it is the caller's turn, and passes its response to `take`. `timeout`
+    /// does not include the wait for the turn. On a serial line, unit id 0 is a broadcast: no unit
+    /// replies, and a write counts as done when it is sent.
     ///
     /// # Errors
-    /// [`ClientError`]
+    /// [`ClientError`]: the request failed, or there is no connection.
     pub fn call<T>(
         &self,
         unit_id: u8,
@@ -105,13 +105,13 @@ impl BlockingClient {
         })
     }
 
-    /// Ends the connection when the calls before this one have ended; the next makes a new one.
+    /// Closes the connection after the calls before this one. The next call opens a new one.
     pub fn close(&self) {
         let _turn = self.turns.take();
         *self.open.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 
-    /// Replies that came after their requests had been given up.
+    /// The number of replies that came after their request had ended.
     pub fn late(&self) -> u64 {
         self.late.load(Ordering::Relaxed)
     }
@@ -133,8 +133,8 @@ impl Open {
         Ok(Open { stream, connection, transport, epoch: now, used: now })
     }
 
-    /// Whether another request can be sent on it: the peer has not ended it while nobody used it,
-    /// and has not sent what nobody asked for.
+    /// Whether the connection can carry another request: the peer has not closed it, and has not
+    /// sent bytes without a request.
     fn is_usable(&mut self) -> bool {
         match self.transport {
             Transport::Tcp => self.used.elapsed() <= IDLE || !self.stream.has_ended(),
@@ -143,7 +143,7 @@ impl Open {
         }
     }
 
-    /// Carries a request out; why I/O failed, if it has.
+    /// Carries out a request. Returns the I/O error, if there was one.
     fn call(
         &mut self,
         unit_id: u8,
@@ -167,7 +167,7 @@ impl Open {
     ) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK];
         if matches!(self.transport, Transport::SerialRtu(_) | Transport::SerialAscii(_)) {
-            // A line that never falls silent is left to the timeout.
+            // On a line that is never silent, the request times out.
             while Instant::now() < deadline
                 && let Some(len) = self.stream.receive_now(&mut chunk)?
             {
@@ -185,7 +185,7 @@ impl Open {
             let outgoing = self.connection.outgoing();
             if !outgoing.is_empty() {
                 match self.stream.send(outgoing, deadline) {
-                    // A part of it may have been sent.
+                    // Part of the request may have been sent.
                     Err(StreamError::TimedOut) => {
                         self.connection.advance(deadline - self.epoch, &mut *sink);
                         self.connection.close(Closed::TimedOut, sink);

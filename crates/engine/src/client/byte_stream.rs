@@ -1,4 +1,4 @@
-//! What bytes travel on, with deadlines: a TCP connection, datagrams, a serial port.
+//! Byte streams with deadlines: a TCP connection, datagrams, a serial port.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs, UdpSocket};
@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 
 use crate::tls::TlsFailure;
 
-/// The shortest time that a system waits for.
+/// The shortest timeout that all systems accept.
 const MIN_TIMEOUT: Duration = Duration::from_micros(1);
 
-/// Why nothing was received, or sent.
+/// Why bytes were not received, or not sent.
 #[derive(Debug)]
 pub(super) enum StreamError {
-    /// The deadline came first.
+    /// The deadline passed.
     TimedOut,
     /// The peer has ended the stream.
     Ended,
@@ -21,28 +21,28 @@ pub(super) enum StreamError {
 }
 
 pub(super) trait ByteStream: Send {
-    /// Reads what is there, at least one byte; of datagrams, one.
+    /// Reads what is available, at least one byte. Of datagrams, reads one.
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError>;
 
-    /// Reads what is there already.
+    /// Reads what is already available, without waiting.
     fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError>;
 
-    /// Sends all of it; of datagrams, one.
+    /// Sends all bytes. Over UDP, they are one datagram.
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError>;
 
-    /// Whether the peer has ended it; what else it sent is kept.
+    /// Whether the peer has closed the stream. Bytes that it sent before are kept.
     fn has_ended(&mut self) -> bool {
         false
     }
 
-    /// Whether the peer is there, and has sent nothing.
+    /// Whether the stream is open and no bytes wait in it.
     fn is_quiet(&self) -> bool {
         true
     }
 }
 
 impl From<io::Error> for StreamError {
-    /// The same of an end, and of a time that ran out, on every system.
+    /// Systems report an end or a timeout differently: this maps them to the same variants.
     fn from(error: io::Error) -> StreamError {
         match error.kind() {
             ErrorKind::TimedOut | ErrorKind::WouldBlock => StreamError::TimedOut,
@@ -52,19 +52,19 @@ impl From<io::Error> for StreamError {
     }
 }
 
-/// What is left until a deadline, for a system that knows no time of 0.
+/// The time until a deadline, at least [`MIN_TIMEOUT`]: systems do not accept a timeout of 0.
 fn left(deadline: Instant) -> io::Result<Duration> {
     let left = deadline.saturating_duration_since(Instant::now());
     if left.is_zero() { Err(ErrorKind::TimedOut.into()) } else { Ok(left.max(MIN_TIMEOUT)) }
 }
 
-/// The same in whole milliseconds, the last one begun.
+/// The same in whole milliseconds, rounded up.
 fn millis(deadline: Instant) -> io::Result<Duration> {
     let micros = left(deadline)?.as_micros();
     Ok(Duration::from_millis(u64::try_from(micros.div_ceil(1000)).unwrap_or(u64::MAX)))
 }
 
-/// Reads until nothing interrupts it.
+/// Repeats an interrupted read.
 fn read(mut once: impl FnMut() -> io::Result<usize>) -> Result<usize, StreamError> {
     loop {
         return match once() {
@@ -75,7 +75,7 @@ fn read(mut once: impl FnMut() -> io::Result<usize>) -> Result<usize, StreamErro
     }
 }
 
-/// Nothing there is no error where nobody waits.
+/// No available bytes are not an error when the caller does not wait.
 fn at_once(received: Result<usize, StreamError>) -> Result<Option<usize>, StreamError> {
     match received {
         Err(StreamError::TimedOut) => Ok(None),
@@ -83,8 +83,8 @@ fn at_once(received: Result<usize, StreamError>) -> Result<Option<usize>, Stream
     }
 }
 
-/// A TCP connection. It tells the system how long to wait only when that has changed, in whole
-/// milliseconds: most requests have as much time as the one before.
+/// A TCP connection. Timeouts are set in whole milliseconds, and only when they change: most
+/// requests have the same timeout as the one before.
 pub(super) struct TcpByteStream {
     socket: TcpStream,
     read_timeout: Duration,
@@ -92,7 +92,7 @@ pub(super) struct TcpByteStream {
 }
 
 impl TcpByteStream {
-    /// Connects to the first address of a name that takes the connection before the deadline.
+    /// Connects to the first address of a name that accepts before the deadline.
     pub(super) fn connect(host: &str, port: u16, deadline: Instant) -> io::Result<TcpByteStream> {
         let socket =
             first(host, port, |address| TcpStream::connect_timeout(&address, left(deadline)?))?;
@@ -100,7 +100,7 @@ impl TcpByteStream {
         Ok(TcpByteStream { socket, read_timeout: Duration::ZERO, write_timeout: Duration::ZERO })
     }
 
-    /// Does something with the socket that is not to wait.
+    /// Runs an operation on the socket without blocking.
     pub(super) fn at_once<T>(
         &self,
         work: impl FnOnce(&TcpStream) -> io::Result<T>,
@@ -153,7 +153,7 @@ impl ByteStream for TcpByteStream {
     }
 }
 
-/// A socket for datagrams to the first address of a name that the system has a way to.
+/// Creates a UDP socket for the first reachable address of a name.
 pub(super) fn connect_udp(host: &str, port: u16) -> io::Result<UdpSocket> {
     first(host, port, |address| {
         let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
@@ -190,7 +190,7 @@ impl ByteStream for UdpSocket {
 impl ByteStream for serial2::SerialPort {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
         read(|| {
-            // A port leaves away what is no whole millisecond.
+            // A port rounds down to whole milliseconds.
             self.set_read_timeout(millis(deadline)?)?;
             Read::read(self, buffer)
         })
@@ -207,7 +207,7 @@ impl ByteStream for serial2::SerialPort {
     }
 }
 
-/// The first address of a name that `open` succeeds with.
+/// Tries the addresses of a name in order, until `open` succeeds.
 fn first<T>(host: &str, port: u16, open: impl Fn(SocketAddr) -> io::Result<T>) -> io::Result<T> {
     let mut failure = io::Error::new(ErrorKind::NotFound, "the name has no address");
     for address in (host, port).to_socket_addrs()? {

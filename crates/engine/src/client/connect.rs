@@ -1,4 +1,4 @@
-//! From an endpoint to what bytes travel on.
+//! Connects to endpoints.
 
 use std::time::Instant;
 

@@ -1,4 +1,4 @@
-//! What a client talks to.
+//! The device address that a client connects to.
 
 use std::fmt;
 use std::sync::Arc;
@@ -8,7 +8,7 @@ use holdfast_protocol::client::{Line, Transport};
 use crate::serial_line::{LineMode, SerialLine};
 use crate::tls::client::ClientTls;
 
-/// A device, or a gateway, and how it is reached.
+/// A device or a gateway, and how to connect to it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Endpoint {
     Tcp {
@@ -24,7 +24,7 @@ pub enum Endpoint {
         host: String,
         port: u16,
     },
-    /// With `echo` the adapter hands back what is sent; one that does is also noticed by itself.
+    /// With `echo`, the adapter echoes sent bytes. An echo is also detected without this setting.
     Serial {
         line: SerialLine,
         echo: bool,
@@ -32,7 +32,7 @@ pub enum Endpoint {
 }
 
 impl Endpoint {
-    /// How requests travel to it.
+    /// The transport of this endpoint.
     pub fn transport(&self) -> Transport {
         match self {
             Endpoint::Tcp { .. } => Transport::Tcp,
@@ -49,7 +49,7 @@ impl Endpoint {
     }
 }
 
-/// The URL, without its options.
+/// The URL without its options.
 impl fmt::Display for Endpoint {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (scheme, host, port) = match self {

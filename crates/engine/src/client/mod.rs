@@ -1,7 +1,7 @@
-//! Clients: requests out, responses in, over every transport.
+//! Clients: send requests and receive responses, over every transport.
 //!
-//! What happens on a connection is decided by [`holdfast_protocol::client::Connection`], which does no
-//! I/O. [`blocking`] drives it in the calling thread; asyncio and the poller drive it too.
+//! [`holdfast_protocol::client::Connection`] decides what happens on a connection, and does no I/O.
+//! [`blocking`] drives it in the calling thread; asyncio and the poller drive it too.
 
 mod blocking;
 mod byte_stream;
@@ -22,16 +22,16 @@ use thiserror::Error;
 
 use crate::tls::TlsFailure;
 
-/// Why a call has no result.
+/// Why a call failed.
 #[derive(Debug, Error)]
 pub enum ClientError {
-    /// The device answered with an exception; the code as it came.
+    /// The device answered with an exception. The code is not converted.
     #[error("exception {0:#04x}")]
     Exception(u8),
-    /// There was no valid reply in time.
+    /// No valid reply arrived within the timeout.
     #[error("no reply within {} s", .0.as_secs_f64())]
     Timeout(Duration),
-    /// There was no connection in time. Nothing was sent.
+    /// The connection was not made within the timeout. Nothing was sent.
     #[error("no connection to {to} within {} s", .after.as_secs_f64())]
     ConnectTimeout { to: String, after: Duration },
     /// The connection could not be made. Nothing was sent.
@@ -43,7 +43,7 @@ pub enum ClientError {
     /// The connection ended before the reply.
     #[error("connection lost: {0}")]
     Lost(Lost),
-    /// What came can't be the reply.
+    /// The received bytes are not the reply.
     #[error("invalid response: {0}")]
     Invalid(InvalidResponse),
 }
@@ -58,19 +58,19 @@ pub enum Lost {
 }
 
 impl ClientError {
-    /// What a failure of the connection means to a caller that waited for `timeout`.
+    /// Converts a failure of a connection. `timeout` is the timeout of the request.
     pub fn new(failure: Failure, timeout: Duration) -> ClientError {
         match failure {
             Failure::Exception(code) => ClientError::Exception(code),
             Failure::Timeout => ClientError::Timeout(timeout),
             Failure::Invalid(invalid) => ClientError::Invalid(invalid),
             Failure::Closed(why) => ClientError::Lost(Lost::Closed(why)),
-            _ => unreachable!("a failure that is not known here: {failure}"),
+            _ => unreachable!("unknown failure: {failure}"),
         }
     }
 }
 
-/// The standard's name of an exception code.
+/// The name of an exception code in the standard.
 pub fn exception_name(code: u8) -> Option<&'static str> {
     ExceptionCode::from_code(code).map(ExceptionCode::name)
 }

@@ -7,27 +7,27 @@ use super::byte_stream::{ByteStream, StreamError, TcpByteStream};
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const CHUNK: usize = 4096;
 
-/// How often a socket is read in one look.
+/// The most reads of one check for available bytes.
 const READS: usize = 4;
 
 pub(super) struct TlsStream {
     stream: TcpByteStream,
     channel: Channel,
-    /// What came and nobody has taken yet.
+    /// Received data that the caller has not read yet.
     plain: Vec<u8>,
-    /// What is to be sent.
+    /// Bytes to send.
     out: Vec<u8>,
-    /// Whether anything came after the handshake.
+    /// Whether data has been received after the handshake.
     heard: bool,
-    /// Why nothing more can come.
+    /// The error after which nothing more can be received.
     broken: Option<TlsFailure>,
 }
 
 impl TlsStream {
-    /// Agrees with the peer on TLS before the deadline.
+    /// Performs the handshake, before the deadline.
     pub(super) fn agree(
         stream: TcpByteStream,
         tls: &ClientTls,
@@ -52,7 +52,7 @@ impl TlsStream {
         self.broken.clone().map_or(Ok(()), |failure| Err(StreamError::Tls(failure)))
     }
 
-    /// Takes what is there without waiting for it; whether that was the end of the connection.
+    /// Reads what is available, without waiting. Returns `true` if the connection has ended.
     fn look(&mut self) -> bool {
         let mut chunk = [0; CHUNK];
         for _ in 0..READS {
@@ -65,12 +65,12 @@ impl TlsStream {
         false
     }
 
-    /// Takes what comes before the deadline.
+    /// Reads what arrives before the deadline.
     fn take(&mut self, deadline: Instant) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK];
         let len = self.stream.receive(&mut chunk, deadline)?;
         self.feed(&chunk[..len]);
-        // What breaks the connection is told whether the peer hears of it or not.
+        // A TLS failure takes precedence over a failure to send its alert.
         self.flush(deadline)
             .or_else(|error| if self.broken.is_some() { Ok(()) } else { Err(error) })
     }
@@ -91,7 +91,7 @@ impl TlsStream {
         sent
     }
 
-    /// What the end of the connection means: a peer may refuse a certificate without a word.
+    /// Interprets the end of the connection: a peer may refuse a certificate without an alert.
     fn unheard(&self, error: StreamError) -> StreamError {
         match error {
             StreamError::Io(error)
@@ -108,7 +108,7 @@ impl TlsStream {
     }
 }
 
-/// A connection that ends during the handshake.
+/// Interprets a connection that ends during the handshake.
 fn ended(error: StreamError) -> StreamError {
     match error {
         StreamError::Ended => StreamError::Tls(TlsFailure::ClosedDuringHandshake),
@@ -149,7 +149,7 @@ impl ByteStream for TlsStream {
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError> {
         self.channel.send(bytes, &mut self.out);
         self.flush(deadline).map_err(|error| {
-            // A peer that has ended the connection may have said why.
+            // A peer that has closed the connection may have sent an alert.
             self.look();
             self.broken.clone().map_or(self.unheard(error), StreamError::Tls)
         })

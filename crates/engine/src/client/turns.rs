@@ -1,7 +1,7 @@
-//! Turns: a lock whose callers come in one at a time, in the order in which they asked.
+//! A fair lock: callers enter one at a time, in the order in which they asked.
 //!
-//! A mutex alone lets the one that has just left in again, while the others are still waking up: a
-//! thread that calls without a pause would keep all others out.
+//! A mutex alone is not fair: a thread that calls without a pause would lock it again before the
+//! waiting threads wake up.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -14,14 +14,14 @@ pub(super) struct Turns {
 
 #[derive(Default)]
 struct Tickets {
-    /// The number of the next who asks.
+    /// The number of the next caller.
     next: u64,
-    /// The number of who is in, or of the next who may.
+    /// The number of the caller inside, or of the next one to enter.
     current: u64,
     waiting: VecDeque<Thread>,
 }
 
-/// The turn of one caller; it ends when this is dropped.
+/// The turn of one caller. It ends when it is dropped.
 pub(super) struct Turn<'t>(&'t Turns);
 
 impl Turns {
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn callers_come_in_one_at_a_time_and_in_their_order() {
+    fn callers_enter_one_at_a_time_in_order() {
         let turns = Turns::default();
         let served = AtomicU64::new(0);
         thread::scope(|threads| {

@@ -1,4 +1,4 @@
-//! Which connections a listener holds, and whether there is room for one more.
+//! The open connections of a listener, and their limits.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
@@ -8,16 +8,16 @@ use std::time::Instant;
 
 use tokio::task::AbortHandle;
 
-/// What becomes of a new connection when there is no room.
+/// What happens to a new connection when a limit is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WhenFull {
-    /// It is closed.
+    /// The new connection is closed.
     Refuse,
-    /// The connection that is idle longest is closed instead.
+    /// The connection that has been idle longest is closed.
     Evict,
 }
 
-/// How many connections there may be.
+/// The limits on open connections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ConnectionLimits {
     pub max_connections: usize,
@@ -26,7 +26,7 @@ pub struct ConnectionLimits {
 }
 
 impl ConnectionLimits {
-    /// Of a listener that has no connections.
+    /// For a listener without connections.
     pub(super) const NONE: ConnectionLimits = ConnectionLimits {
         max_connections: 0,
         max_connections_per_source: None,
@@ -54,15 +54,15 @@ struct Table {
 struct Held {
     peer: SocketAddr,
     last_request: Arc<AtomicU64>,
-    /// Known once the task of the connection runs.
+    /// Set once the task of the connection runs.
     task: Option<AbortHandle>,
 }
 
-/// No room, and nobody to close instead.
+/// The limit is reached, and no connection can be evicted.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Full;
 
-/// The place of one connection; it is free again when this is dropped.
+/// The place of one connection. Dropping it frees the place.
 #[derive(Debug)]
 pub(crate) struct Ticket {
     id: u64,
@@ -82,7 +82,7 @@ impl Admission {
         }
     }
 
-    /// A place for a connection from `peer`, and the peer that was closed for it.
+    /// Admits a connection from `peer`. Also returns the peer that was evicted for it.
     pub(crate) fn admit(
         self: &Arc<Self>,
         peer: SocketAddr,
@@ -106,7 +106,7 @@ impl Admission {
         Ok((Ticket { id, last_request, admission: Arc::clone(self) }, evicted))
     }
 
-    /// Closes the connection that is idle longest, of one source or of all.
+    /// Closes the connection that has been idle longest, of one source or of all.
     fn evict(&self, table: &mut Table, source: Option<IpAddr>) -> Result<SocketAddr, Full> {
         if self.when_full == WhenFull::Refuse {
             return Err(Full);
@@ -157,7 +157,7 @@ impl Ticket {
         self.id
     }
 
-    /// Notes that the connection had a request just now.
+    /// Records the time of a request.
     #[inline]
     pub(crate) fn touch(&self, now: Instant) {
         let since = now.saturating_duration_since(self.admission.epoch);
@@ -165,7 +165,7 @@ impl Ticket {
     }
 }
 
-/// Says which task serves the connection, so that it can be closed from outside.
+/// Sets the task of a connection, so that it can be evicted.
 pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
     if let Some(held) = admission.table().held.get_mut(&id) {
         held.task = Some(task);
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_free_again_when_its_ticket_is_dropped() {
+    fn dropping_a_ticket_frees_its_place() {
         let admission = admission(1, None, WhenFull::Refuse);
         let (ticket, _) = admission.admit(peer(1, 1)).unwrap();
         assert_eq!(admission.admit(peer(1, 2)).unwrap_err(), Full);
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn the_connection_that_is_idle_longest_is_evicted() {
+    fn the_connection_that_has_been_idle_longest_is_evicted() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let admission = admission(3, None, WhenFull::Evict);
         let tickets = [1, 2, 3].map(|port| {
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_at_its_limit_evicts_only_its_own() {
+    fn a_source_at_its_limit_evicts_only_its_own_connections() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let admission = admission(9, Some(1), WhenFull::Evict);
         let _held = [(1, 1), (2, 2)].map(|(last, port)| {

@@ -1,4 +1,5 @@
-//! Writes, for an audit log: sent without waiting, dropped and counted when nobody takes them.
+//! Writes, for an audit log. Sending never blocks: when the queue is full, records are dropped and
+//! counted.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -9,13 +10,13 @@ use std::time::Duration;
 use holdfast_protocol::pdu::{ExceptionCode, Function};
 use holdfast_protocol::raw_ingest;
 
-/// Bytes that may wait to be taken.
+/// The most bytes in the queue.
 const CAPACITY: usize = 32 << 20;
 
-/// What a record takes beside its bytes.
+/// Bytes of a record without its data.
 const OVERHEAD: usize = 128;
 
-/// A write, done or refused.
+/// A write that was carried out or refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Record {
     pub listener: Arc<str>,
@@ -26,9 +27,9 @@ pub struct Record {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Written {
-    /// A request, as it came.
+    /// A request, unchanged.
     Modbus { unit_id: u8, pdu: Vec<u8>, refused: Option<ExceptionCode> },
-    /// A packet: its header, where it has one, and the payload of one that was written.
+    /// A packet: its header, if it has a valid one, and the payload if it was written.
     Packet {
         format: raw_ingest::Format,
         header: Option<raw_ingest::Header>,
@@ -65,7 +66,7 @@ pub(crate) fn auditing() -> (Auditor, Records) {
 }
 
 impl Auditor {
-    /// Notes a Modbus request if it is one that writes. `reply` is its reply, empty when none is due.
+    /// Records a Modbus request if it writes. `reply` is its reply; empty when there is none.
     pub(crate) fn note(
         &self,
         listener: &Arc<str>,
@@ -108,7 +109,7 @@ impl Record {
 }
 
 impl Records {
-    /// Up to `most` records: waits up to `timeout` for the first, and for no other.
+    /// Takes up to `most` records. Waits up to `timeout` for the first, and not for the others.
     pub(crate) fn take(&self, timeout: Duration, most: usize) -> Vec<Record> {
         let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
         let first = receiver.recv_timeout(timeout).ok();
@@ -119,7 +120,7 @@ impl Records {
         records
     }
 
-    /// How many records found no place.
+    /// The number of dropped records.
     pub(crate) fn lost(&self) -> u64 {
         self.shared.lost.load(Ordering::Relaxed)
     }

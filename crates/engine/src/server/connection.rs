@@ -1,9 +1,10 @@
-//! One Modbus connection over a stream: bytes in, all complete requests answered in order, bytes out.
+//! A Modbus connection over a stream: receives bytes, answers all complete requests in order, sends
+//! bytes.
 //!
-//! A worker thread has one pair of buffers for all of its connections ([`Scratch`]): between a read
-//! and the write that answers it nothing is awaited. What is left over is kept by the connection
-//! itself, and is small: the beginning of a request, or replies that a slow peer does not take.
-//! While replies wait, no more requests are read.
+//! All connections of a worker thread share one pair of buffers ([`Scratch`]): nothing is awaited
+//! between a read and the write that answers it. A connection keeps only what is left over: the
+//! beginning of a request, or replies that a slow peer has not read. While replies wait, no more
+//! requests are read.
 
 use std::cell::RefCell;
 use std::future::poll_fn;
@@ -29,13 +30,13 @@ use super::policy::PeerRights;
 use super::stream::{self, Stream};
 use super::unit_server::UnitServer;
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const INPUT: usize = 4096;
 
 /// The longest frame of any framing.
 const MAX_REQUEST_LEN: usize = mbap::MAX_LEN;
 
-/// Room for the replies to all the requests that one input can hold.
+/// Room for the replies to all requests of one read.
 const OUTPUT: usize = output::<Mbap>(output::<Rtu>(0));
 
 const fn output<F: Framing>(least: usize) -> usize {
@@ -44,13 +45,13 @@ const fn output<F: Framing>(least: usize) -> usize {
     if len > least { len } else { least }
 }
 
-/// How often a connection is read before the others, and the sockets of all, have their turn.
+/// The most reads of a connection before other tasks run.
 const TURNS: u32 = 4;
 
-/// How often the rest of the input is read before a connection ends.
+/// The most reads of the remaining input before a connection ends.
 const LAST_READS: usize = 64;
 
-/// What "no deadline" means to a timer.
+/// The deadline of a timer without a deadline.
 const FAR: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 struct Scratch {
@@ -67,9 +68,10 @@ thread_local! {
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timeouts {
-    /// Without a request; `None` keeps the connection.
+    /// The longest time without a request. `None`: no limit.
     pub(crate) idle: Option<Duration>,
-    /// From the first byte of a request to its last, and for a peer to take its replies.
+    /// The longest time from the first byte of a request to its last, and for a peer to read its
+    /// replies.
     pub(crate) request: Duration,
 }
 
@@ -78,35 +80,35 @@ pub(crate) struct Connection<F, S> {
     answering: Answering<F>,
     timeouts: Timeouts,
     ticket: Ticket,
-    /// What the peer is to get and did not take yet.
+    /// Bytes queued for the peer.
     unsent: Vec<u8>,
     last_request: Instant,
-    /// When the request that is not complete yet began.
+    /// When the incomplete request began.
     begun: Option<Instant>,
-    /// Reads without a pause.
+    /// Reads since the last pause.
     turns: u32,
 }
 
-/// What the answers of a connection depend on.
+/// The state that replies depend on.
 struct Answering<F> {
     context: Arc<ListenerContext>,
     peer: SocketAddr,
     unit_server: Arc<UnitServer>,
     rights: Arc<PeerRights>,
-    /// The beginning of a request.
+    /// The beginning of an incomplete request.
     partial: [u8; MAX_REQUEST_LEN],
     partial_len: usize,
     framing: PhantomData<F>,
 }
 
-/// What became of some input.
+/// The result of answering some input.
 struct Answered {
     /// Bytes of output.
     len: usize,
     requests: usize,
-    /// Bytes of whole frames.
+    /// Bytes of complete frames.
     consumed: usize,
-    /// A frame could not be trusted: nothing behind it was looked at.
+    /// A frame was broken. Bytes after it were ignored.
     broken: bool,
 }
 
@@ -133,13 +135,13 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Serves until the connection ends. What ended it is counted before the peer can see it.
+    /// Serves until the connection ends. The end is counted before the peer can see it.
     pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
         let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer);
         match self.serve(stop).await {
             Some(end) => {
                 context.ended(end, peer);
-                // Behind replies that were cut off, nothing can be said.
+                // After replies that were cut off, a closing message would be misread.
                 if self.unsent.is_empty() {
                     self.stream.end(&mut self.unsent);
                     let _ = stream::write(self.stream.socket(), &mut self.unsent);
@@ -152,9 +154,9 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Serves until the connection ends; `None` when all are to stop.
+    /// Serves until the connection ends. Returns `None` when the engine stops.
     async fn serve(&mut self, mut stop: watch::Receiver<bool>) -> Option<Kind> {
-        // A peer that never pauses never lets the wait for a stop have its turn.
+        // With a peer that never pauses, the branch for `stop` would never run.
         let flooded = stop.clone();
         let mut stopping = pin!(stop.wait_for(|stop| *stop));
         let mut alarm = pin!(sleep_until(self.last_request + FAR));
@@ -182,7 +184,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Reads once, answers all that is complete, and writes once.
+    /// Reads once, answers all complete requests, and writes once.
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let kept = self.answering.restore(input);
@@ -202,7 +204,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         })
     }
 
-    /// Keeps the times that the deadlines hang on.
+    /// Updates the times that the deadlines depend on.
     fn note(&mut self, answered: &Answered) {
         let now = Instant::now();
         if answered.requests > 0 {
@@ -216,12 +218,12 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Waits for the peer to take the replies it is owed.
+    /// Waits for the peer to read its replies.
     async fn send_unsent(&mut self) -> Result<(), Kind> {
         if !self.unsent.is_empty() {
             let patience = self.timeouts.request;
             stream::send_all(self.stream.socket(), &self.unsent, patience).await?;
-            // A slow peer's buffer is given back: most connections never need one.
+            // Frees the buffer of a slow peer: most connections never need one.
             self.unsent = Vec::new();
         }
         Ok(())
@@ -235,8 +237,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Sets the alarm to an earlier time. A later one waits until it rings: requests come much more
-    /// often than alarms.
+    /// Moves the alarm to an earlier time. A later deadline is set when the alarm fires: requests
+    /// are much more frequent than alarms.
     fn set(&self, alarm: Pin<&mut Sleep>) {
         let (deadline, _) = self.deadline();
         if deadline < alarm.deadline() || alarm.is_elapsed() {
@@ -249,9 +251,9 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         if Instant::now() < deadline { Ok(()) } else { Err(kind) }
     }
 
-    /// Answers what the system has received already, then ends.
+    /// Answers what the system has already received, then ends.
     fn finish(mut self) {
-        // A peer whose buffers are full, or who is gone, loses what it does not take.
+        // A peer that does not read loses these replies.
         if self.answering.drain(&mut self.stream, &mut self.unsent).is_ok() {
             self.stream.end(&mut self.unsent);
             let _ = stream::write(self.stream.socket(), &mut self.unsent);
@@ -278,13 +280,13 @@ impl<F: Framing> Answering<F> {
         }
     }
 
-    /// Puts the beginning of a request in context of what will be read; its length.
+    /// Copies the beginning of a request to the start of `input`. Returns its length.
     fn restore(&self, input: &mut [u8]) -> usize {
         input[..self.partial_len].copy_from_slice(&self.partial[..self.partial_len]);
         self.partial_len
     }
 
-    /// Answers the complete requests of `input` and keeps the incomplete one behind them.
+    /// Answers the complete requests of `input`, and keeps the incomplete one after them.
     fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
         let mut answered = Answered { len: 0, requests: 0, consumed: 0, broken: false };
         let mut rest = input;
@@ -319,7 +321,7 @@ impl<F: Framing> Answering<F> {
         answered
     }
 
-    /// Writes one framed reply at the start of `output`; its length, 0 when none is due.
+    /// Writes one framed reply at the start of `output`. Returns its length, 0 when there is none.
     #[inline]
     fn reply(&self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
         let room = output.get_mut(F::HEADER_LEN..);
@@ -334,7 +336,7 @@ impl<F: Framing> Answering<F> {
         len.map_or(0, |len| F::complete(output, tag, unit_id, len))
     }
 
-    /// Sends `unsent`, then reads, answers and sends until nothing more is there, without waiting.
+    /// Sends `unsent`, then reads, answers and sends until no input is left, without waiting.
     fn drain(&mut self, stream: &mut impl Stream, unsent: &mut Vec<u8>) -> io::Result<()> {
         stream::write(stream.socket(), unsent)?;
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
@@ -414,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn the_way_from_request_to_reply_allocates_nothing() {
+    fn answering_requests_allocates_nothing() {
         let (mut answering, input, mut output) = (answering(), requests(), vec![0; OUTPUT]);
         answering.answer(&input, &mut output);
         let mut requests = 0;
@@ -426,7 +428,7 @@ mod tests {
     }
 
     #[test]
-    fn requests_cut_anywhere_get_the_replies_they_get_whole() {
+    fn requests_split_anywhere_get_the_same_replies() {
         let input = requests();
         let mut whole = vec![0; OUTPUT];
         let len = answering().answer(&input, &mut whole).len;
@@ -454,7 +456,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_front_of_a_broken_frame_is_answered_and_nothing_behind_it() {
+    fn requests_before_a_broken_frame_are_answered_and_none_after_it() {
         let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
         let answered = answering().answer(&input, &mut vec![0; OUTPUT]);
         assert_eq!((answered.requests, answered.broken), (1, true));

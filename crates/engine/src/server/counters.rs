@@ -1,4 +1,4 @@
-//! What a listener counts. Counting never waits, and reading never stops the counting.
+//! The counters of a listener. Neither counting nor reading blocks.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -7,37 +7,37 @@ use holdfast_protocol::raw_ingest::Refusal;
 
 use crate::counter::Counter;
 
-/// The counters of one listener, since it was started.
+/// The counters of one listener since its start.
 #[derive(Debug)]
 pub struct Counters {
     requests: [Counter; 256],
     exceptions: [Counter; 16],
-    /// Requests carried out, those for the event counter itself not among them (V1.1b3, 6.9).
+    /// Requests carried out, except Get Comm Event Counter (V1.1b3, 6.9).
     pub events: Counter,
-    /// Requests without a reply: to a unit that is in listen only mode, and broadcasts.
+    /// Requests without a reply: broadcasts, and requests to a unit in listen only mode.
     pub unanswered: Counter,
     pub frames: FrameCounters,
     cleared: Mutex<Bus>,
 }
 
-/// Frames that are no requests.
+/// Frames that are not requests.
 #[derive(Debug, Default)]
 pub struct FrameCounters {
-    /// With a protocol id other than 0: discarded.
+    /// Wrong protocol id: discarded.
     pub foreign: Counter,
-    /// With a length that no frame has: a connection is closed, a datagram discarded.
+    /// Invalid length: the connection is closed, or the datagram is discarded.
     pub broken: Counter,
-    /// With a wrong CRC or LRC, cut short, or with characters that belong in no frame: discarded.
+    /// Wrong CRC or LRC, incomplete, or invalid characters: discarded.
     pub damaged: Counter,
-    /// On a serial line, for a unit that is not served here: passed over.
+    /// On a serial line, for a unit that is not served here: ignored.
     pub other_unit: Counter,
 }
 
-/// What became of the packets of a Raw Ingest listener.
+/// Packets of a Raw Ingest listener.
 #[derive(Debug, Default)]
 pub struct PacketCounters {
     pub accepted: Counter,
-    /// Bits and registers that were written.
+    /// Bits and registers written.
     pub values: Counter,
     refused: [Counter; 13],
 }
@@ -47,24 +47,24 @@ impl PacketCounters {
         self.refused[usize::from(refusal.code())].add();
     }
 
-    /// Refused packets by reason, reasons that never came up left out.
+    /// Refused packets by reason. Reasons without a refusal are left out.
     pub fn refused(&self) -> impl Iterator<Item = (Refusal, u64)> {
         let reasons = nonzero(&self.refused);
         reasons.filter_map(|(code, count)| Some((Refusal::from_code(code)?, count)))
     }
 }
 
-/// What became of connections, and of datagrams from peers that no rule names.
+/// Connections, and datagrams from peers that no rule names.
 #[derive(Debug, Default)]
 pub struct ConnectionCounters {
     pub accepted: Counter,
     /// No rule names the peer.
     pub refused_source: Counter,
-    /// No rule names the role that the peer's certificate has.
+    /// No rule names the role in the certificate of the peer.
     pub refused_role: Counter,
     /// `max_connections` or `max_connections_per_source` was reached.
     pub refused_full: Counter,
-    /// TLS failed, most often in its handshake.
+    /// TLS failed, usually in the handshake.
     pub tls_failed: Counter,
     /// Closed in favour of a new connection.
     pub evicted: Counter,
@@ -72,13 +72,13 @@ pub struct ConnectionCounters {
     pub idle: Counter,
     /// Closed because a request did not arrive within `request_timeout`.
     pub request_timeout: Counter,
-    /// Closed because the peer did not take its replies within `request_timeout`.
+    /// Closed because the peer did not read its replies within `request_timeout`.
     pub slow_reader: Counter,
     /// The system could not accept a connection.
     pub accept_errors: Counter,
 }
 
-/// The counters of Diagnostics (V1.1b3, 6.8.1), since they were cleared.
+/// The counters of Diagnostics (V1.1b3, 6.8.1) since they were last cleared.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Bus {
     pub messages: u64,
@@ -113,12 +113,12 @@ impl Counters {
         self.exceptions[usize::from(code.code()) & 0x0F].add();
     }
 
-    /// Requests by function code, codes never asked for left out.
+    /// Requests by function code. Codes without a request are left out.
     pub fn requests(&self) -> impl Iterator<Item = (u8, u64)> {
         nonzero(&self.requests)
     }
 
-    /// Exceptions by code, codes never sent left out.
+    /// Exceptions by code. Codes that were not sent are left out.
     pub fn exceptions(&self) -> impl Iterator<Item = (u8, u64)> {
         nonzero(&self.exceptions)
     }
@@ -140,8 +140,8 @@ impl Counters {
         }
     }
 
-    /// Starts the counters of Diagnostics again at 0; all others go on. `owed` is what the request
-    /// that asks for it will still be counted as.
+    /// Resets the counters of Diagnostics to 0. All other counters continue. `owed` is how the
+    /// current request will be counted after this.
     pub fn clear_bus(&self, owed: Bus) {
         let mut now = self.total();
         now.events += owed.events;
@@ -154,7 +154,7 @@ impl Counters {
         let frames = &self.frames;
         let errors = frames.foreign.get() + frames.broken.get() + frames.damaged.get();
         Bus {
-            // Without damaged ones (Serial Line V1.02, annex A).
+            // Damaged frames are not messages (Serial Line V1.02, annex A).
             messages: requests + frames.other_unit.get(),
             communication_errors: errors,
             exceptions: self.exceptions.iter().map(Counter::get).sum(),

@@ -1,4 +1,4 @@
-//! Listeners on worker threads: started all or none, stopped clean.
+//! Runs listeners on worker threads. Either all listeners start or none.
 
 use std::io;
 use std::net::SocketAddr;
@@ -24,21 +24,21 @@ use super::tcp::{ModbusStream, StreamSettings};
 use super::udp::{ModbusUdp, UdpSettings};
 use super::unit_server::UnitServer;
 
-/// How long connections have to end when the engine stops.
+/// The time that connections have to end when the engine stops.
 const GRACE: Duration = Duration::from_millis(500);
 
-/// What an engine serves.
+/// Settings of an engine.
 #[derive(Debug, Clone)]
 pub struct Settings {
     pub listeners: Vec<ListenerSettings>,
     /// Identification objects by id (function 43/14); 0x00 to 0x02 are mandatory.
     pub identity: Vec<(u8, Vec<u8>)>,
-    /// Names of single units.
+    /// Names of single units, by unit id.
     pub unit_names: Vec<(u8, Vec<u8>)>,
-    /// Threads that serve connections, at least 1.
+    /// The number of threads that serve connections, at least 1.
     pub workers: usize,
     pub events: Verbosity,
-    /// Whether writes are kept for an audit log.
+    /// Whether writes are recorded for an audit log.
     pub audit: bool,
 }
 
@@ -68,7 +68,7 @@ pub enum StartError {
     Worker(io::Error),
 }
 
-/// Listeners that serve, until it is stopped or dropped.
+/// Running listeners, until the engine is stopped or dropped.
 pub struct Engine {
     listeners: Vec<Listener>,
     stop: Arc<watch::Sender<bool>>,
@@ -77,7 +77,7 @@ pub struct Engine {
     records: Option<Records>,
 }
 
-/// A listener that serves.
+/// A running listener.
 struct Listener {
     context: Arc<ListenerContext>,
     /// `None` on a serial line.
@@ -90,7 +90,7 @@ enum Served {
     Packets(Arc<RawIngest>),
 }
 
-/// What a listener has counted.
+/// The counters of a listener.
 pub struct ListenerCounters<'e> {
     pub name: &'e str,
     pub connections: &'e ConnectionCounters,
@@ -103,14 +103,14 @@ pub enum ProtocolCounters<'e> {
     Packets(&'e PacketCounters),
 }
 
-/// A listener's task, to be started when all are bound.
+/// The task of a listener. All tasks are started after all listeners are bound.
 type Task = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 impl Engine {
-    /// Binds every listener, then starts to serve. When one can't be bound, none is served.
+    /// Binds every listener, then starts to serve. If one cannot be bound, none is served.
     ///
     /// # Errors
-    /// [`StartError`], with nothing left running.
+    /// [`StartError`]. Nothing is left running then.
     pub fn start(settings: Settings) -> Result<Engine, StartError> {
         let (reporter, events) = event_channel(settings.events);
         let (auditor, records) = settings.audit.then(auditing).unzip();
@@ -202,7 +202,7 @@ impl Engine {
         Ok(engine)
     }
 
-    /// Runs one worker: until the engine stops, and then until every connection has ended.
+    /// Runs one worker until the engine stops and its connections have ended.
     fn work(
         &self,
         index: usize,
@@ -214,7 +214,7 @@ impl Engine {
             runtime.block_on(async move {
                 let _ = stopping.wait_for(|stop| *stop).await;
                 drop(stopping);
-                // Every connection and listener holds a receiver.
+                // Each connection and listener holds a receiver.
                 let _ = tokio::time::timeout(GRACE, stop.closed()).await;
             });
         };
@@ -224,12 +224,12 @@ impl Engine {
         Ok(())
     }
 
-    /// Where each listener listens, in the order of the settings; `None` for serial lines.
+    /// The address of each listener, in the order of the settings; `None` for serial lines.
     pub fn addresses(&self) -> Vec<Option<SocketAddr>> {
         self.listeners.iter().map(|listener| listener.address).collect()
     }
 
-    /// What each listener has counted, in the order of the settings.
+    /// The counters of each listener, in the order of the settings.
     pub fn counters(&self) -> impl Iterator<Item = ListenerCounters<'_>> {
         self.listeners.iter().map(|Listener { context, served, .. }| ListenerCounters {
             name: &context.name,
@@ -242,28 +242,28 @@ impl Engine {
         })
     }
 
-    /// Up to `most` writes for the audit log: waits up to `timeout` for the first.
+    /// Takes up to `most` writes for the audit log. Waits up to `timeout` for the first.
     pub fn next_writes(&self, timeout: Duration, most: usize) -> Vec<Record> {
         self.records.as_ref().map_or_else(Vec::new, |records| records.take(timeout, most))
     }
 
-    /// Writes that the audit log missed because nobody took them.
+    /// The number of writes that were dropped because the audit queue was full.
     pub fn lost_writes(&self) -> u64 {
         self.records.as_ref().map_or(0, Records::lost)
     }
 
-    /// The next event, if one comes within `timeout`.
+    /// The next event, if one arrives within `timeout`.
     pub fn next_event(&self, timeout: Duration) -> Option<Event> {
         self.events.next(timeout)
     }
 
-    /// Events that were lost because nobody took them.
+    /// The number of events that were dropped because the queue was full.
     pub fn lost_events(&self) -> u64 {
         self.events.lost()
     }
 
-    /// Stops listening, answers what has been received, and ends every connection. Returns when all
-    /// is done, within a second; a second call waits for the first.
+    /// Stops listening, answers what has been received, and closes every connection. Returns within
+    /// a second. A second call waits for the first.
     pub fn stop(&self) {
         let _ = self.stop.send(true);
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
@@ -273,7 +273,7 @@ impl Engine {
     }
 }
 
-/// A socket, and the address that it got.
+/// Binds a socket and returns its address.
 fn bound<S: BoundSocket>(
     listener: &str,
     address: SocketAddr,

@@ -1,5 +1,5 @@
-//! What happened to connections, for a log: sent without waiting, dropped and counted when nobody
-//! takes them.
+//! Events of connections, for a log. Sending never blocks: when the queue is full, events are
+//! dropped and counted.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,44 +9,44 @@ use std::time::Duration;
 
 use holdfast_protocol::raw_ingest::Refusal;
 
-/// Events that wait to be taken.
+/// The most events in the queue.
 const CAPACITY: usize = 1024;
 
-/// Characters of a role that an event tells.
+/// The most characters of a role in an event.
 const MAX_ROLE_LEN: usize = 64;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Opened,
-    /// The peer ended the connection, or it broke.
+    /// The peer closed the connection, or the connection broke.
     Closed,
     /// Closed after `idle_timeout`.
     Idle,
     /// A request did not arrive within `request_timeout`.
     RequestTimeout,
-    /// The peer did not take its replies.
+    /// The peer did not read its replies.
     SlowReader,
-    /// A length that no frame has.
+    /// A frame had an invalid length.
     BrokenFrame,
     /// Closed in favour of a new connection.
     Evicted,
     RefusedSource,
-    /// No rule names the role of the peer, which the event tells.
+    /// No rule names the role of the peer. The event has the role.
     RefusedRole,
     RefusedFull,
-    /// TLS failed, most often in its handshake; why, in a word.
+    /// TLS failed, usually in the handshake. The reason is a word for programs.
     TlsFailed(&'static str),
     AcceptError,
     /// A Raw Ingest packet was not written.
     PacketRefused(Refusal),
-    /// A serial device was lost; it is opened again.
+    /// A serial device was lost. The listener tries to open it again.
     LineLost,
-    /// A serial device is there again.
+    /// A lost serial device was opened again.
     LineBack,
 }
 
 impl Kind {
-    /// Whether this is the ordinary course of a connection.
+    /// Whether this event belongs to the normal life of a connection.
     const fn is_ordinary(self) -> bool {
         matches!(self, Kind::Opened | Kind::Closed | Kind::Idle)
     }
@@ -71,7 +71,7 @@ impl Kind {
         }
     }
 
-    /// Why, where the name does not say it.
+    /// The reason, if the name does not include it.
     pub const fn reason(self) -> Option<&'static str> {
         match self {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
@@ -81,13 +81,13 @@ impl Kind {
     }
 }
 
-/// Something that happened on a listener.
+/// An event of a listener.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Event {
     pub listener: Arc<str>,
     pub kind: Kind,
     pub peer: Option<SocketAddr>,
-    /// Of a peer that was refused for it; its first 64 characters.
+    /// The role of a peer that was refused for it, cut to 64 characters.
     pub role: Option<Box<str>>,
 }
 
@@ -95,9 +95,9 @@ pub struct Event {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verbosity {
     Nothing,
-    /// Refusals and faults.
+    /// Only refusals and faults.
     Refusals,
-    /// Every connection too.
+    /// Also the events of every connection.
     All,
 }
 
@@ -148,12 +148,12 @@ impl Reporter {
 }
 
 impl Events {
-    /// The next event; `None` when there is none for `timeout`, or no more will come.
+    /// The next event; `None` when none arrives within `timeout`, or no more will come.
     pub(crate) fn next(&self, timeout: Duration) -> Option<Event> {
         self.receiver.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout).ok()
     }
 
-    /// How many events found no place.
+    /// The number of dropped events.
     pub(crate) fn lost(&self) -> u64 {
         self.lost.load(Ordering::Relaxed)
     }

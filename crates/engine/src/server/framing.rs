@@ -1,32 +1,32 @@
-//! How a stream of bytes carries requests and replies: Modbus TCP, or RTU over TCP.
+//! The framings of a stream: Modbus TCP, or RTU over TCP.
 
 use holdfast_protocol::frame::{mbap, rtu};
 use holdfast_protocol::pdu;
 
-/// What stands at the start of received bytes.
+/// What is at the start of received bytes.
 pub(crate) enum Next<'a> {
     Incomplete,
-    /// `tag` goes back with the reply.
+    /// `tag` is returned with the reply.
     Request {
         tag: u16,
         unit_id: u8,
         pdu: &'a [u8],
         len: usize,
     },
-    /// No Modbus frame: to be discarded.
+    /// A frame of another protocol: discard it.
     Foreign {
         len: usize,
     },
-    /// A frame with a wrong check sum: to be discarded.
+    /// A frame with a wrong checksum: discard it.
     Damaged {
         len: usize,
     },
-    /// The stream can't be trusted any more.
+    /// The start of the next frame is unknown: close the connection.
     Broken,
 }
 
 pub(crate) trait Framing: Send + Sync + 'static {
-    /// Bytes of a frame before the PDU, and behind it.
+    /// Bytes of a frame before and after the PDU.
     const HEADER_LEN: usize;
     const TRAILER_LEN: usize;
     /// The shortest request.
@@ -36,7 +36,7 @@ pub(crate) trait Framing: Send + Sync + 'static {
 
     fn next(bytes: &[u8]) -> Next<'_>;
 
-    /// Completes a frame whose PDU of `pdu_len` bytes is in place; its length.
+    /// Completes a frame with a PDU of `pdu_len` bytes in place. Returns the length of the frame.
     fn complete(frame: &mut [u8], tag: u16, unit_id: u8, pdu_len: usize) -> usize;
 }
 
@@ -68,7 +68,7 @@ impl Framing for Mbap {
     }
 }
 
-/// RTU frames one behind the other.
+/// RTU frames in a stream.
 pub(crate) struct Rtu;
 
 impl Framing for Rtu {

@@ -1,11 +1,11 @@
-//! What a listener's units say of themselves: functions 17 and 43/14.
+//! The identification of the units of a listener: functions 17 and 43/14.
 
 use std::collections::HashMap;
 
 use holdfast_protocol::pdu::identification::{ObjectError, Objects};
 use holdfast_protocol::pdu::reply::MAX_SERVER_ID_LEN;
 
-/// The object that a unit's own name takes the place of.
+/// The object that the name of a unit replaces.
 const USER_APPLICATION_NAME: u8 = 0x06;
 
 /// Server id and run indicator take one byte each.
@@ -27,10 +27,10 @@ pub struct Card {
 }
 
 impl Identity {
-    /// `objects` are the identification objects by id, `unit_names` names of single units.
+    /// `objects` are the identification objects by id, `unit_names` the names of single units.
     ///
     /// # Errors
-    /// [`ObjectError`] for objects that can't be served.
+    /// [`ObjectError`] for objects that cannot be served.
     pub fn new(
         objects: &[(u8, Vec<u8>)],
         unit_names: &[(u8, Vec<u8>)],

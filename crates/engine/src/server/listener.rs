@@ -1,4 +1,5 @@
-//! What every listener has: a name, a socket, connections that are admitted, counted and reported.
+//! What all listeners share: a name, a socket, and the admission, counting and reporting of
+//! connections.
 
 use std::io;
 use std::net::{IpAddr, Shutdown, SocketAddr};
@@ -16,20 +17,21 @@ use super::audit::Auditor;
 use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
 
-/// Connections that the system holds until they are accepted.
+/// The most connections that wait in the system to be accepted.
 const BACKLOG: i32 = 1024;
 
-/// When a silent peer is asked whether it is still there, how often, and how long apart.
+/// TCP keepalive: the idle time before the first probe, the number of probes, the interval between
+/// them.
 const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Duration::from_secs(15));
 
-/// A pause after the system could not accept, most often for want of file descriptors.
+/// The pause after a failed accept, usually for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// How long a refused peer is read, at most, and how many bytes at once.
+/// The longest time that a refused peer is read, and the bytes per read.
 const DRAIN: Duration = Duration::from_secs(5);
 const DRAIN_CHUNK: usize = 16 * 1024;
 
-/// The outer side of a listener: all that does not depend on its protocol.
+/// The part of a listener that does not depend on its protocol.
 #[derive(Debug)]
 pub(crate) struct ListenerContext {
     pub(crate) name: Arc<str>,
@@ -88,23 +90,23 @@ impl ListenerContext {
     }
 }
 
-/// A connection that was admitted.
+/// An admitted connection.
 pub(crate) struct Admitted<G> {
     pub(crate) stream: TcpStream,
     pub(crate) peer: SocketAddr,
     pub(crate) rights: Arc<G>,
-    /// Bytes that have been read already.
+    /// Bytes that have already been read.
     pub(crate) received: Vec<u8>,
     pub(crate) ticket: Ticket,
 }
 
-/// What a listener does with its connections.
+/// The protocol of a listener.
 pub(crate) trait Service: Send + Sync + Sized + 'static {
     type PeerRights: Send + Sync + 'static;
 
     fn rights(&self, peer: IpAddr) -> Option<&Arc<Self::PeerRights>>;
 
-    /// Serves a connection to its end if that can be done without waiting; else gives it back.
+    /// Serves the connection immediately if that is possible without waiting. Otherwise returns it.
     fn serve_at_once(
         &self,
         _front: &ListenerContext,
@@ -122,7 +124,7 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
     ) -> impl Future<Output = ()> + Send;
 }
 
-/// Accepts until `stop`, and gives the connections to the workers in turn.
+/// Accepts connections until `stop`, and distributes them to the workers in turn.
 pub(crate) async fn accept<S: Service>(
     context: Arc<ListenerContext>,
     service: Arc<S>,
@@ -151,7 +153,7 @@ pub(crate) async fn accept<S: Service>(
     }
 }
 
-/// Settles what a new connection may do, and starts to serve it.
+/// Checks the rights and limits of a new connection, and starts to serve it.
 fn admit<S: Service>(
     context: &Arc<ListenerContext>,
     service: &Arc<S>,
@@ -191,7 +193,7 @@ fn admit<S: Service>(
         let Ok(stream) = stream.into_std() else { return };
         let worker = &workers[id as usize % workers.len()];
         worker.spawn(async move {
-            // The socket belongs to the worker that serves it: it is registered there.
+            // The socket must be registered with the worker that serves it.
             let Ok(stream) = TcpStream::from_std(stream) else { return };
             let connection = Admitted { stream, peer, rights, received, ticket };
             service.serve(context, connection, stop).await;
@@ -200,10 +202,10 @@ fn admit<S: Service>(
     attach(&admission, id, task.abort_handle());
 }
 
-/// A socket that listens, not yet known to any runtime.
+/// Binds a listening socket that is not registered with a runtime.
 pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
-    // Elsewhere the option lets two programs take the same port.
+    // On other systems, the option lets two programs bind the same port.
     #[cfg(unix)]
     socket.set_reuse_address(true)?;
     bind(&socket, address)?;
@@ -211,7 +213,7 @@ pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener>
     Ok(socket.into())
 }
 
-/// A socket that receives datagrams, not yet known to any runtime.
+/// Binds a datagram socket that is not registered with a runtime.
 pub(crate) fn bind_udp(address: SocketAddr) -> io::Result<std::net::UdpSocket> {
     let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
     bind(&socket, address)?;
@@ -226,8 +228,8 @@ fn bind(socket: &Socket, address: SocketAddr) -> io::Result<()> {
     socket.set_nonblocking(true)
 }
 
-/// Replies leave at once, and a peer that is gone is noticed. Where the system refuses an option,
-/// the connection works without it.
+/// Disables delays of replies, and enables keepalive to detect lost peers. The options are not
+/// essential: errors are ignored.
 pub(crate) fn set_options(stream: &TcpStream) {
     let (time, retries, interval) = KEEPALIVE;
     let keepalive = TcpKeepalive::new().with_time(time).with_interval(interval);
@@ -239,8 +241,8 @@ pub(crate) fn set_options(stream: &TcpStream) {
     let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
 }
 
-/// Ends the sending side, and reads until the peer has ended its own: a socket that is closed with
-/// unread bytes resets the connection, and the peer may lose what it was told.
+/// Shuts down the sending side, then reads until the peer closes. Closing a socket with unread
+/// bytes resets the connection, and the peer may lose the last reply.
 pub(crate) async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
     if SockRef::from(stream).shutdown(Shutdown::Write).is_err() {
         return;
@@ -263,7 +265,7 @@ pub(crate) async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
     }
 }
 
-/// Errors of `accept` that say something of one peer, not of the listener.
+/// Whether an error of `accept` concerns one peer, not the listener.
 fn is_of_one_peer(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionAborted, ConnectionReset, Interrupted, WouldBlock};
     matches!(error.kind(), ConnectionAborted | ConnectionReset | Interrupted | WouldBlock)

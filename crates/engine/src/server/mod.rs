@@ -1,4 +1,4 @@
-//! Listeners: Modbus and Raw Ingest over memories, one file a transport.
+//! Listeners: Modbus and Raw Ingest over memories, one file per transport.
 
 mod admission;
 pub mod audit;

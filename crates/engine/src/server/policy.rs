@@ -1,4 +1,4 @@
-//! Who may do what: rules, compiled into tables.
+//! Access rules, compiled into tables.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use holdfast_memory::Memory;
 use holdfast_protocol::pdu::Function;
 use ipnet::IpNet;
 
-/// What a rule lets its peers do with the memories it names.
+/// What a rule allows its peers to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AccessMode {
     ReadOnly,
@@ -22,19 +22,19 @@ pub enum Functions {
     Except(Vec<u8>),
 }
 
-/// What peers from some networks are granted.
+/// The rights of peers from some networks.
 #[derive(Debug, Clone)]
 pub struct Rule {
     pub sources: Vec<IpNet>,
-    /// The roles that certificates of these peers may name, empty text the null role; `None` for any
-    /// role. Only TLS has roles.
+    /// The roles that a rule applies to; empty text is the null role, `None` is any role. Only TLS
+    /// has roles.
     pub roles: Option<Vec<String>>,
     pub units: Vec<(u8, Arc<Memory>)>,
     pub access: AccessMode,
     pub functions: Functions,
 }
 
-/// The rules of a listener: the first that holds a peer settles what it may do.
+/// The rules of a listener. The first rule that matches a peer applies.
 #[derive(Debug)]
 pub struct Policy<G> {
     rules: Vec<Entry<G>>,
@@ -48,7 +48,7 @@ struct Entry<G> {
 }
 
 impl<G> Policy<G> {
-    /// Rules as the sources that each holds, and what it grants them.
+    /// Creates a policy from the sources and rights of each rule.
     pub fn new(rules: impl IntoIterator<Item = (Vec<IpNet>, G)>) -> Policy<G> {
         let rules = rules.into_iter().map(|(sources, rights)| {
             let rights = Arc::new(rights);
@@ -57,13 +57,13 @@ impl<G> Policy<G> {
         Policy { rules: rules.collect() }
     }
 
-    /// What a peer is granted, whatever its role; `None` for one that no rule names. An IPv4 address
-    /// mapped into IPv6 is that IPv4 address.
+    /// The rights of a peer, whatever its role; `None` when no rule matches. An IPv4-mapped IPv6
+    /// address is treated as IPv4.
     pub fn rights(&self, peer: IpAddr) -> Option<&Arc<G>> {
         self.find(peer, |_| true)
     }
 
-    /// What a peer of that role is granted.
+    /// The rights of a peer with that role; `None` when no rule matches.
     pub fn grant_of_role(&self, peer: IpAddr, role: &str) -> Option<&Arc<G>> {
         self.find(peer, |roles| roles.iter().any(|allowed| allowed == role))
     }
@@ -90,7 +90,7 @@ impl Policy<PeerRights> {
     }
 }
 
-/// One rule as tables.
+/// One rule, compiled to tables.
 #[derive(Debug)]
 pub struct PeerRights {
     units: [Option<Arc<Memory>>; 256],
@@ -119,13 +119,13 @@ impl PeerRights {
         PeerRights { units, functions, access: rule.access }
     }
 
-    /// The memory behind a unit id.
+    /// The memory of a unit id.
     #[inline]
     pub fn memory(&self, unit_id: u8) -> Option<&Memory> {
         self.units[usize::from(unit_id)].as_deref()
     }
 
-    /// Unit ids that map every memory behind those that are `wanted`, each memory once.
+    /// One unit id per memory, chosen among the `wanted` unit ids.
     pub fn one_unit_of_each_memory(&self, wanted: impl Fn(u8) -> bool) -> Vec<u8> {
         let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
         for (unit_id, memory) in (0..=u8::MAX).zip(&self.units) {

@@ -1,8 +1,8 @@
-//! A Raw Ingest listener: one connection is one packet, one write, one byte of reply.
+//! A Raw Ingest listener: each connection carries one packet, one write, and one byte of reply.
 //!
-//! What is wrong with a packet is known from its header, before its payload is read, or from its
-//! whole; memory is touched only then. A refused peer is read until it is done: a socket that is
-//! closed with unread bytes resets the connection, and the reply could be lost.
+//! The header is checked before the payload is read, and the whole packet before memory is written.
+//! After a refusal, the listener reads until the peer closes: closing a socket with unread bytes
+//! resets the connection, and the reply could be lost.
 
 use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write as _};
@@ -27,14 +27,14 @@ use super::event::Kind;
 use super::listener::{Admitted, ListenerContext, Service, drain};
 use super::policy::Policy;
 
-/// Bytes that are read at once.
+/// Bytes per read of a new connection.
 const CHUNK: usize = 16 * 1024;
 
-/// What peers from some networks may write.
+/// What peers from some networks can write.
 #[derive(Debug, Clone)]
 pub struct RawRule {
     pub sources: Vec<IpNet>,
-    /// The memory behind each unit id (v1) or memory id (crc).
+    /// The memory of each unit id (v1) or memory id (crc).
     pub targets: Vec<(u16, Arc<Memory>)>,
     pub areas: Vec<Area>,
 }
@@ -42,12 +42,12 @@ pub struct RawRule {
 /// A listener for Raw Ingest packets.
 #[derive(Debug, Clone)]
 pub struct RawSettings {
-    /// Port 0 lets the system pick one. `[::]` takes IPv4 connections too.
+    /// With port 0, the system picks a port. `[::]` also accepts IPv4 connections.
     pub bind: SocketAddr,
     pub format: Format,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
-    /// From the start of a connection to the last byte of its packet.
+    /// The longest time from the start of a connection to the last byte of its packet.
     pub request_timeout: Duration,
 }
 
@@ -65,9 +65,9 @@ pub(crate) struct RawIngest {
     request_timeout: Duration,
 }
 
-/// A packet as far as it has come.
+/// The state of a packet that is being received.
 enum Packet<'p> {
-    /// This many bytes are missing, at least.
+    /// At least this many bytes are missing.
     Incomplete {
         missing: usize,
     },
@@ -99,7 +99,7 @@ impl RawIngest {
         }
     }
 
-    /// Judges what has come so far.
+    /// Checks the bytes received so far.
     fn judge<'p>(&self, rights: &'p RawGrant, bytes: &'p [u8]) -> Result<Packet<'p>, Refusal> {
         let Some(header) = self.format.header(bytes)? else {
             let missing = self.format.header_len().saturating_sub(bytes.len()).max(1);
@@ -129,7 +129,7 @@ impl RawIngest {
         }
     }
 
-    /// Writes a whole packet, as one step.
+    /// Writes a complete packet, atomically.
     fn write(
         &self,
         context: &ListenerContext,
@@ -150,7 +150,7 @@ impl RawIngest {
         Ok(())
     }
 
-    /// Receives a packet; an error is a refusal, or the reason why nobody waits for a reply.
+    /// Receives a packet. The inner error is a refusal; the outer one says why no reply is due.
     async fn receive(
         &self,
         stream: &TcpStream,
@@ -178,7 +178,7 @@ impl RawIngest {
                 Ok(Err(_)) => return Err(Gone::Closed),
                 Ok(Ok(())) => {}
             }
-            // One byte more than the packet has, so that bytes behind it come with it.
+            // One byte more than the packet has, to detect extra bytes.
             packet.reserve(missing + 1);
             match stream.try_read_buf(packet) {
                 Ok(0) if packet.is_empty() => return Err(Gone::Closed),
@@ -220,7 +220,7 @@ impl Service for RawIngest {
         self.policy.rights(peer)
     }
 
-    /// Most packets are there when their connection is accepted, and need no task.
+    /// Most packets have arrived when their connection is accepted, and do not require a task.
     fn serve_at_once(
         &self,
         context: &ListenerContext,
@@ -277,7 +277,7 @@ impl Service for RawIngest {
     }
 }
 
-/// Whether bytes behind the packet have arrived.
+/// Whether bytes after the packet have arrived.
 fn more_is_there(stream: &TcpStream) -> bool {
     matches!((&*SockRef::from(stream)).read(&mut [0]), Ok(len) if len > 0)
 }

@@ -1,8 +1,8 @@
 //! Modbus on a serial line: one device, RTU or ASCII frames, one request at a time.
 //!
-//! Only frames for a unit that is served here are answered; all others, and damaged ones, are passed
-//! over in silence. Unit id 0 is the broadcast: every memory takes the write, nobody replies.
-//! A device that is lost is opened again until it is back.
+//! The listener answers only frames for units that it serves, and ignores all others and damaged
+//! ones. Unit id 0 is the broadcast: every memory carries out the write, no unit replies. A lost
+//! device is opened again when it returns.
 
 use std::io;
 use std::sync::Arc;
@@ -21,23 +21,23 @@ use super::policy::{PeerRights, Rule};
 use super::unit_server::UnitServer;
 use crate::serial_line::{LineMode, SerialLine};
 
-/// The unit id that addresses all (Modbus over Serial SerialLine V1.02, 2.2).
+/// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
 const BROADCAST: u8 = 0;
 
 /// The longest pause between two characters of an ASCII frame (2.5.2.1).
 const CHARACTER_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// How often a lost device is tried.
+/// The interval between attempts to open a lost device.
 const REOPEN: Duration = Duration::from_secs(1);
 
-/// How long the line may take for a reply before it is held to be stuck.
+/// A line that does not send a reply within this time counts as lost.
 const STUCK: Duration = Duration::from_secs(10);
 
 /// A listener on a serial line.
 #[derive(Debug, Clone)]
 pub struct SerialSettings {
     pub line: SerialLine,
-    /// A line has no sources: those of the rule are not looked at.
+    /// The sources of the rule are ignored: a serial line has none.
     pub rule: Rule,
 }
 
@@ -87,13 +87,14 @@ impl ModbusSerial {
     /// Serves RTU frames until the device is lost.
     async fn serve_rtu(&self, context: &ListenerContext, port: &SerialPort) -> io::Error {
         let silence = self.line.silence();
-        // One byte more than the longest frame: a longer one shows.
+        // One byte more than the longest frame, so that a longer one is detected.
         let mut frame = [0; rtu::MAX_LEN + 1];
         let mut len = 0;
         let mut quiet = std::pin::pin!(sleep_until(Instant::now()));
         loop {
             let at = len.min(frame.len() - 1);
-            // Characters that are there already end no silence, however late they are looked at.
+            // Characters that are already available do not count as silence, even if they are read
+            // late.
             let read = tokio::select! {
                 biased;
                 read = port.read(&mut frame[at..]) => read,
@@ -169,7 +170,7 @@ impl ModbusSerial {
                     }
                     frame.clear();
                 } else if frame.is_empty() {
-                    // Between frames: nothing that is for anybody.
+                    // Characters between frames are ignored.
                     continue;
                 } else if frame.len() == ascii::MAX_LEN {
                     damaged.add();
@@ -212,7 +213,7 @@ impl ModbusSerial {
         }
     }
 
-    /// The length of the reply, if one is due.
+    /// Returns the length of the reply, if there is one.
     fn answer(
         &self,
         context: &ListenerContext,
@@ -236,7 +237,7 @@ impl ModbusSerial {
         len
     }
 
-    /// A write for all: every memory takes it, nobody replies.
+    /// Carries out a broadcast: every memory carries out the write, no unit replies.
     fn broadcast(&self, context: &ListenerContext, request: &[u8]) {
         let function = request.first().copied().and_then(Function::from_code);
         let wanted = function
@@ -253,7 +254,7 @@ impl ModbusSerial {
     }
 }
 
-/// Sends a reply; a line that does not take it is held to be lost.
+/// Sends a reply. An error means that the line is lost.
 async fn send(port: &SerialPort, reply: &[u8]) -> io::Result<()> {
     timeout(STUCK, port.write_all(reply))
         .await

@@ -1,4 +1,4 @@
-//! What a connection reads requests from and sends replies to: a socket, or TLS between it and one.
+//! The stream of a connection: a socket, or TLS over a socket.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::pin::Pin;
@@ -12,10 +12,11 @@ use tokio::time::timeout;
 
 use super::event::Kind;
 
-/// `unsent` is what the system did not take yet: what is to be sent is appended to it, never sent
-/// before it.
+/// `unsent` holds bytes that the system has not accepted yet. Further bytes are appended to it, so
+/// that they keep their order.
 pub(crate) trait Stream: Send {
-    /// Reads once. The length of what came for Modbus, which can be 0; an error is the end.
+    /// Reads once. Returns the length of received Modbus data, which can be 0. An error ends the
+    /// connection.
     fn poll_read(
         &mut self,
         context: &mut Context<'_>,
@@ -23,16 +24,16 @@ pub(crate) trait Stream: Send {
         unsent: &mut Vec<u8>,
     ) -> Poll<Result<usize, Kind>>;
 
-    /// Reads once what the system has received already; `None` when there is no more.
+    /// Reads once what the system has already received; `None` when there is no more.
     fn read_now(&mut self, input: &mut [u8], unsent: &mut Vec<u8>) -> Option<usize>;
 
-    /// Sends as much as the system takes at once.
+    /// Sends as much as the system accepts without blocking.
     fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind>;
 
-    /// Whether the peer has begun something whose rest is needed to make sense of it.
+    /// Whether the peer has sent part of a TLS record.
     fn is_amid_record(&self) -> bool;
 
-    /// Appends what tells the peer of the end.
+    /// Appends the message that announces the end, if the stream has one.
     fn end(&mut self, unsent: &mut Vec<u8>);
 
     fn socket(&self) -> &TcpStream;
@@ -75,8 +76,8 @@ impl Stream for TcpStream {
     }
 }
 
-/// Sends behind `unsent`, at once where it is empty, as much as the system takes; the rest is
-/// appended to it.
+/// Sends what the system accepts without blocking, and appends the rest to `unsent`. If `unsent` is
+/// not empty, all of `output` is appended.
 #[inline]
 pub(crate) fn send(socket: &TcpStream, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind> {
     let sent = if unsent.is_empty() { socket.try_write(output) } else { Ok(0) };
@@ -88,7 +89,7 @@ pub(crate) fn send(socket: &TcpStream, output: &[u8], unsent: &mut Vec<u8>) -> R
     Ok(())
 }
 
-/// Waits for the peer to take all of `output`, for `patience` without any progress.
+/// Sends all of `output`. Fails when nothing can be sent for the duration of `patience`.
 pub(crate) async fn send_all(
     socket: &TcpStream,
     output: &[u8],
@@ -110,12 +111,12 @@ pub(crate) async fn send_all(
     Ok(())
 }
 
-/// Reads what the system has received, whatever the runtime knows of it.
+/// Reads directly from the system, even if the runtime does not report the socket as readable.
 pub(crate) fn read(socket: &TcpStream, input: &mut [u8]) -> Option<usize> {
     (&*SockRef::from(socket)).read(input).ok().filter(|len| *len > 0)
 }
 
-/// Sends all of `unsent`, or fails: nothing is waited for.
+/// Sends all of `unsent` without waiting, or fails.
 pub(crate) fn write(socket: &TcpStream, unsent: &mut Vec<u8>) -> io::Result<()> {
     let written = (&*SockRef::from(socket)).write_all(unsent);
     unsent.clear();

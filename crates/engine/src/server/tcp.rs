@@ -1,5 +1,4 @@
-//! Modbus over TCP connections: what a listener for Modbus TCP, with or without TLS, or RTU over TCP,
-//! serves.
+//! Listeners for Modbus TCP, with or without TLS, and RTU over TCP.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -21,27 +20,27 @@ use super::unit_server::UnitServer;
 use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 
-/// How a TCP stream carries Modbus.
+/// The framing of Modbus on a TCP stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StreamFraming {
     /// Modbus TCP: an MBAP header before each PDU.
     Mbap,
-    /// RTU over TCP: frames of a serial line, one behind the other.
+    /// RTU over TCP: RTU frames, one after another.
     Rtu,
 }
 
 /// A listener for Modbus over TCP connections.
 #[derive(Debug, Clone)]
 pub struct StreamSettings {
-    /// Port 0 lets the system pick one. `[::]` takes IPv4 connections too.
+    /// With port 0, the system picks a port. `[::]` also accepts IPv4 connections.
     pub bind: SocketAddr,
     pub framing: StreamFraming,
     pub rules: Vec<Rule>,
     pub limits: ConnectionLimits,
-    /// How long a connection may be without a request; `None` keeps it.
+    /// Closes a connection after this time without a request. `None`: never.
     pub idle_timeout: Option<Duration>,
-    /// From the first byte of a request to its last, and for a peer to take its replies.
-    /// With TLS also for its handshake.
+    /// The longest time from the first byte of a request to its last, and for a peer to read its
+    /// replies. With TLS also for the handshake.
     pub request_timeout: Duration,
     /// `None` is plain TCP.
     pub tls: Option<Arc<ServerTls>>,
@@ -77,12 +76,13 @@ impl ModbusStream {
                 let Admitted { stream, peer, rights, ticket, .. } = admitted;
                 self.modbus::<F, _>(context, (stream, peer), rights, ticket, stop).await;
             }
-            // Apart, so that a plain connection takes no room for it.
+            // In a box of its own, so that plain connections do not reserve memory for it.
             Some(tls) => Box::pin(self.secure::<F>(tls, context, admitted, stop)).await,
         }
     }
 
-    /// Settles by the peer's certificate what it may do, and serves it.
+    /// Performs the handshake, selects the rights by the role in the certificate, and serves the
+    /// connection.
     async fn secure<F: Framing>(
         &self,
         tls: &ServerTls,

@@ -1,8 +1,8 @@
-//! TLS between a connection and its socket: records in, plain text out, and back.
+//! TLS over the socket of a connection: converts between records and plain text.
 //!
-//! What a peer can make this hold is bounded: one record that is not complete, the plain text of one
-//! that is (16 KB), and what answers them. Handshake messages are at most 64 KB long. Renegotiation
-//! is refused, and a flood of alerts or new keys ends the connection.
+//! The memory that a peer can occupy is limited: one incomplete record, the plain text of one
+//! complete record (16 KB), and the replies to it. Handshake messages are at most 64 KB long.
+//! Renegotiation is refused, and a flood of alerts or key updates ends the connection.
 
 use std::cell::RefCell;
 use std::future::poll_fn;
@@ -18,13 +18,13 @@ use super::stream::{self, Stream};
 use crate::tls::server::{self, ServerTls};
 use crate::tls::{Channel, TlsFailure};
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const INPUT: usize = 4096;
 
-/// Bytes before each record.
+/// The header of a record, in bytes.
 const HEADER_LEN: usize = 5;
 
-/// Buffers of a worker thread, for all of its connections.
+/// Buffers of a worker thread, shared by all of its connections.
 struct Scratch {
     input: Box<[u8]>,
     plain: Vec<u8>,
@@ -43,10 +43,10 @@ pub(crate) struct ServerTlsStream {
     socket: TcpStream,
     channel: Channel,
     records: Records,
-    /// Plain text that had no room in the input of the connection, and how much of it was read.
+    /// Plain text that did not fit into the input of the connection, and how much of it was read.
     plain: Vec<u8>,
     taken: usize,
-    /// Why nothing more is read.
+    /// Why the stream has ended.
     ended: Option<Kind>,
 }
 
@@ -57,10 +57,10 @@ impl ServerTlsStream {
         Ok(ServerTlsStream { socket, channel, records, plain: Vec::new(), taken: 0, ended: None })
     }
 
-    /// Gets to know the peer.
+    /// Performs the handshake.
     ///
     /// # Errors
-    /// It is not trusted, or went away; it was told.
+    /// The peer is not trusted, or closed the connection. An alert has been sent.
     pub(crate) async fn handshake(&mut self, patience: Duration) -> Result<(), Kind> {
         let mut unsent = Vec::new();
         while self.channel.is_handshaking() || !unsent.is_empty() {
@@ -73,12 +73,12 @@ impl ServerTlsStream {
         Ok(())
     }
 
-    /// The role that the peer's certificate names; empty for the null role.
+    /// The role in the certificate of the peer; empty for the null role.
     pub(crate) fn role(&self) -> Result<String, Kind> {
         server::role(&self.channel).map_err(|error| failed(&error))
     }
 
-    /// Tells the peer of the end, without waiting.
+    /// Announces the end to the peer, without waiting.
     pub(crate) fn say_end(&mut self) {
         let mut unsent = Vec::new();
         self.end(&mut unsent);
@@ -89,7 +89,7 @@ impl ServerTlsStream {
         self.socket
     }
 
-    /// Takes what came from the peer; the length of the plain text that it made.
+    /// Processes received bytes. Returns the length of the plain text written to `input`.
     fn receive(
         &mut self,
         bytes: &[u8],
@@ -114,7 +114,8 @@ impl ServerTlsStream {
         Ok(len)
     }
 
-    /// Takes plain text that waits, or says that there will be none.
+    /// Takes waiting plain text, or returns the reason why there is no more; `None` when bytes must
+    /// be read.
     fn take(&mut self, input: &mut [u8]) -> Option<Result<usize, Kind>> {
         let waiting = &self.plain[self.taken..];
         if waiting.is_empty() {
@@ -191,12 +192,12 @@ fn failed(error: &rustls::Error) -> Kind {
     Kind::TlsFailed(TlsFailure::from(error).event_reason())
 }
 
-/// Where records begin and end.
+/// Finds the boundaries of records.
 #[derive(Debug, Default)]
 struct Records {
     header: [u8; HEADER_LEN],
     header_len: usize,
-    /// Bytes of the record that are to come.
+    /// Bytes of the record that are still missing.
     missing: usize,
 }
 
@@ -233,7 +234,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn records_are_told_apart_however_they_are_cut() {
+    fn record_boundaries_are_found_for_every_split() {
         let stream = [&[23, 3, 3, 0, 2, 8, 9][..], &[21, 3, 3, 0, 0], &[23, 3, 3, 1, 4]].concat();
         let stream = [&stream[..], &[0; 260]].concat();
         let ends = [0, 7, 12, stream.len()];

@@ -1,4 +1,5 @@
-//! Modbus over UDP: one request a datagram, one reply, from the address that was asked.
+//! Modbus over UDP: one request per datagram. The reply comes from the address that received the
+//! request.
 
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::SocketAddr;
@@ -17,16 +18,16 @@ use super::listener::ListenerContext;
 use super::policy::{PeerRights, Policy, Rule};
 use super::unit_server::UnitServer;
 
-/// Bytes taken from a socket at once: the system may hand over several datagrams of one peer.
+/// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
 const INPUT: usize = 64 * 1024;
 
-/// How often the rest of the input is taken before all stops.
+/// The most reads of the remaining input when the listener stops.
 const LAST_READS: usize = 1024;
 
 /// A listener for Modbus datagrams.
 #[derive(Debug, Clone)]
 pub struct UdpSettings {
-    /// Port 0 lets the system pick one. `[::]` takes IPv4 datagrams too.
+    /// With port 0, the system picks a port. `[::]` also accepts IPv4 datagrams.
     pub bind: SocketAddr,
     pub rules: Vec<Rule>,
 }
@@ -41,7 +42,7 @@ impl ModbusUdp {
         ModbusUdp { unit_server, policy: Policy::of(&settings.rules) }
     }
 
-    /// Answers datagrams until `stop`, then those that the system has received already.
+    /// Answers datagrams until `stop`, then those that the system has already received.
     pub(crate) async fn serve(
         self,
         context: Arc<ListenerContext>,
@@ -58,7 +59,7 @@ impl ModbusUdp {
                 _ = stop.wait_for(|stop| *stop) => break,
                 ready = socket.socket.readable() => ready,
             };
-            // An error tells of an earlier reply that could not be delivered.
+            // An error reports that an earlier reply was not delivered.
             let received = ready.and_then(|()| {
                 socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
             });
@@ -75,7 +76,7 @@ impl ModbusUdp {
         }
     }
 
-    /// Answers all datagrams that came at once, which have one length but for the last.
+    /// Answers all datagrams of one read. All have the same length, except the last.
     fn take(&self, context: &ListenerContext, socket: &Datagrams, meta: &RecvMeta, input: &[u8]) {
         let mut output = [0; mbap::MAX_LEN];
         let mut rest = &input[..meta.len];
@@ -92,7 +93,7 @@ impl ModbusUdp {
         }
     }
 
-    /// The length of the reply, 0 when none is due.
+    /// Returns the length of the reply, 0 when there is none.
     fn answer(
         &self,
         context: &ListenerContext,
@@ -130,7 +131,7 @@ impl ModbusUdp {
     }
 }
 
-/// A socket that tells which of its addresses was asked.
+/// A socket that reports the local address of each datagram.
 struct Datagrams {
     socket: UdpSocket,
     state: UdpSocketState,
@@ -143,7 +144,7 @@ impl Datagrams {
         Ok(meta[0])
     }
 
-    /// A reply that the system has no room for is lost, as any datagram can be.
+    /// A reply that the system does not accept is lost, as any datagram can be.
     fn send(&self, reply: &[u8], to: &RecvMeta) {
         let transmit = Transmit {
             destination: to.addr,
@@ -152,9 +153,10 @@ impl Datagrams {
             segment_size: None,
             src_ip: to.dst_ip,
         };
-        // The system is asked, whatever the runtime knows of the socket: it may know nothing yet.
+        // Sends directly by the system: the runtime may not know yet that the socket is writable.
         if self.state.try_send((&self.socket).into(), &transmit).is_err() {
-            // What was asked need not be an address of this machine: a broadcast is none.
+            // The request may have been sent to a broadcast address, which cannot be the source of
+            // a reply.
             let _ = SockRef::from(&self.socket).send_to(reply, &to.addr.into());
         }
     }

@@ -1,9 +1,10 @@
-//! From a request PDU to its reply: what the units of one listener do, whatever the transport.
+//! Turns a request PDU into its reply: the behaviour of all units of a listener, on every
+//! transport.
 //!
-//! The order of checks: the function is known and allowed (exception 01), the unit is mapped (0B),
-//! form, quantity and value are right (03), the memory is open (06), the range is inside its area
-//! (02). A denied function is answered before the unit is looked up, so that a stranger can't learn
-//! which units there are. A unit in listen only mode answers nothing at all.
+//! The checks run in this order: the function is known and allowed (exception 01), the unit is
+//! mapped (0B), form, quantity and value are right (03), the memory is not sealed (06), the range
+//! is inside its area (02). A denied function is refused before the unit is looked up, so that a
+//! peer without rights cannot discover units. A unit in listen only mode never answers.
 
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
@@ -34,12 +35,13 @@ impl UnitServer {
         UnitServer { counters: Counters::default(), identity, silent, ascii_delimiter }
     }
 
-    /// The character that ends an ASCII frame, behind a carriage return.
+    /// The character that follows the carriage return at the end of an ASCII frame.
     pub fn ascii_delimiter(&self) -> u8 {
         self.ascii_delimiter.load(Ordering::Relaxed)
     }
 
-    /// Carries out a request and writes the reply; its length, or `None` when no reply is due.
+    /// Carries out a request and writes the reply. Returns its length, or `None` when there is no
+    /// reply.
     #[inline]
     pub fn answer(
         &self,
@@ -68,8 +70,9 @@ impl UnitServer {
         }
     }
 
-    /// Carries out a write that is addressed to all (Serial Line V1.02, 2.1): one message without a
-    /// reply, however many memories take it. `note` gets what each would have answered.
+    /// Carries out a broadcast write (Serial Line V1.02, 2.1). It counts as one message without a
+    /// reply, even if several memories carry it out. `note` receives the reply that each would have
+    /// sent.
     pub fn broadcast(&self, rights: &PeerRights, request: &[u8], mut note: impl FnMut(&[u8])) {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
@@ -184,7 +187,7 @@ impl UnitServer {
             Request::ReportServerId => {
                 let text = &self.identity.card(unit_id).text;
                 let len = reply::server_id(&[unit_id], true, text, reply);
-                Ok(len.expect("an identity has no text that is too long"))
+                Ok(len.expect("the text of an identity fits into a reply"))
             }
             Request::ReadDeviceIdentification { code, object_id } => {
                 self.identity.card(unit_id).objects.reply(code, object_id, reply)
@@ -193,7 +196,8 @@ impl UnitServer {
         .map(Some)
     }
 
-    /// A unit in listen only mode does one thing: it ends that mode, without a reply.
+    /// In listen only mode, a unit carries out only the request that ends the mode, without a
+    /// reply.
     fn listen(&self, unit_id: u8, request: &Result<Request<'_>, ExceptionCode>) {
         if let Ok(Request::Diagnostics(asked)) = request
             && asked.sub_function() == SubFunction::RestartCommunications
@@ -203,7 +207,7 @@ impl UnitServer {
         }
     }
 
-    /// Function 8. The counters are the listener's, their low 16 bits are sent.
+    /// Function 8. The counters are those of the listener; their low 16 bits are sent.
     fn diagnose(&self, unit_id: u8, asked: Diagnostics<'_>, reply: &mut Buffer) -> Option<usize> {
         let bus = self.counters.bus();
         let count = match asked.sub_function() {
@@ -221,7 +225,7 @@ impl UnitServer {
                 self.silent[usize::from(unit_id)].store(true, Ordering::Relaxed);
                 return None;
             }
-            // Nothing here overruns or refuses with a negative acknowledge.
+            // This server has no overruns and sends no negative acknowledge.
             SubFunction::ClearOverrunCounter => return Some(reply::diagnostics_echo(asked, reply)),
             SubFunction::ReturnServerNakCount
             | SubFunction::ReturnBusCharacterOverrunCount
@@ -237,8 +241,8 @@ impl UnitServer {
     }
 }
 
-/// Whether a sub-function is unknown, or one that a read-only peer may not use: judged, like the
-/// function, before anything else of the request.
+/// Whether a sub-function is unknown, or not allowed for a read-only peer. Like the function, it is
+/// checked before anything else.
 fn denied(rights: &PeerRights, pdu: &[u8], request: &Result<Request<'_>, ExceptionCode>) -> bool {
     if *request == Err(ExceptionCode::IllegalFunction) {
         return true;
