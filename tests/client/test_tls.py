@@ -48,7 +48,7 @@ TIMEOUT, REFUSED, RESET = 0x8001, 0x8002, 0x8003
 UNKNOWN = "the issuer of the certificate is unknown"
 LOST = "before any reply; it may have refused the certificate"
 """What is told when a reset has overtaken the alert."""
-NO_TLS = "the peer ended the connection instead of agreeing on TLS"
+NO_TLS = "the peer closed the connection during the TLS handshake"
 OTHER_TLS = "no TLS version or cipher suite in common; supported: TLS 1.2 and 1.3"
 
 
@@ -261,11 +261,11 @@ def test_a_device_that_asks_for_a_certificate(
         url = relay.url(ca=authority.ca, cert=certificate, key=key)
         assert reader.read(url) == [11, 22, 33]
 
-        reader.fails(relay.url(ca=authority.ca), f"the peer .*asks? for a certificate|{LOST}", code)
+        reader.fails(relay.url(ca=authority.ca), f"the peer .*requires? a certificate|{LOST}", code)
 
         certificate, key = stranger.issue("panel", "DNS:panel")
         url = relay.url(ca=authority.ca, cert=certificate, key=key)
-        words = f"the peer refused the certificate: it does not know its issuer|{LOST}"
+        words = f"the peer refused the certificate: unknown issuer|{LOST}"
         reader.fails(url, words, code)
 
 
@@ -309,9 +309,9 @@ def test_files_are_judged_when_the_client_is_made(
     for traditional in (True, False):
         locked = authority.locked(key, traditional=traditional)
         assert told(cert=cert, key=locked) == (
-            f"{locked}: the key is encrypted, allowed: one without a passphrase"
+            f"{locked}: the key is encrypted; use a key without a passphrase"
         )
-    assert told(name="a b").startswith('found "a b" as the name of a certificate, allowed: ')
+    assert told(name="a b").startswith('found "a b" as the name in a certificate, allowed: ')
 
 
 def test_cert_and_key_go_together() -> None:

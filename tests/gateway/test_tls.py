@@ -269,7 +269,7 @@ def test_a_device_without_tls_is_told(behind: tuple[str, int], trust: Tls) -> No
         host, port = relay.address
     assert reason == "tls_failed"
     assert said == (
-        f"can't connect to {host}:{port}: the peer ended the connection instead of agreeing on TLS"
+        f"can't connect to {host}:{port}: the peer closed the connection during the TLS handshake"
     )
 
 

@@ -719,7 +719,7 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         (
             {"key_file": locked.key},
             locked.key,
-            "the key is encrypted, allowed: one without a passphrase",
+            "the key is encrypted; use a key without a passphrase",
         ),
         (
             {"cert_file": odd.certificate, "key_file": odd.key},
@@ -731,13 +731,12 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         (
             {"ca_file": party.engineer.certificate},
             party.engineer.certificate,
-            "certificate 1: found neither of both, allowed: authorities (CA:TRUE) and "
-            "self-signed certificates",
+            "certificate 1: neither an authority (CA:TRUE) nor self-signed",
         ),
         (
             {"crl_file": ca},
             ca,
-            "found no list of revoked certificates, allowed: X509 CRL in PEM",
+            "found no revocation list, allowed: X509 CRL in PEM",
         ),
     ]
     file = tmp_path / "plant.yaml"
@@ -757,12 +756,12 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         text=True,
     )
     assert outcome.returncode == 2
-    assert "found no list of revoked certificates" in outcome.stderr
+    assert "found no revocation list" in outcome.stderr
 
 
 def test_lists_without_an_authority_are_told(party: Party, tmp_path: Path) -> None:
     lonely = self_signed(tmp_path, "lonely")
     files = party.files(ca_file=lonely.certificate, crl_file=party.authority.revoke())
     (tmp_path / "plant.yaml").write_text(configuration(files, ANYONE))
-    with pytest.raises(ConfigError, match="found beside a ca_file without authorities"):
+    with pytest.raises(ConfigError, match="crl_file requires an authority"):
         load_whole(tmp_path / "plant.yaml")

@@ -1,5 +1,4 @@
-//! What is read of an X.509 certificate: the answers on which trust and roles depend, each given in
-//! one place.
+//! Reads the properties of an X.509 certificate that trust and roles depend on.
 
 use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::{CertificateError, DistinguishedName, ExtendedKeyPurpose};
@@ -32,11 +31,11 @@ const CURVES: [ObjectIdentifier; 3] = [
     ObjectIdentifier::new_unwrap("1.3.132.0.35"),
 ];
 
-/// Bits of an RSA key.
+/// The allowed sizes of an RSA key, in bits.
 const MIN_RSA_BITS: usize = 2048;
 const MAX_RSA_BITS: usize = 8192;
 
-/// What a peer is, which its certificate has to allow.
+/// The side that a peer is on. Its certificate must allow it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Purpose {
     Server,
@@ -44,9 +43,10 @@ pub(super) enum Purpose {
 }
 
 impl Purpose {
-    /// Whether the purposes that a certificate names include this one. Without any it is for all.
+    /// Whether the purposes in a certificate include this one. A certificate without purposes is
+    /// for all.
     ///
-    /// RFC 5280 leaves it to applications whether `anyExtendedKeyUsage` suffices: here it does.
+    /// RFC 5280 lets applications decide whether `anyExtendedKeyUsage` suffices. Here it does.
     pub(super) fn is_among<'n>(self, named: impl IntoIterator<Item = KeyPurposeId<'n>>) -> bool {
         let oid = match self {
             Purpose::Server => SERVER_AUTH,
@@ -58,7 +58,7 @@ impl Purpose {
             || named.any(|named| suffices.iter().any(|oid| named == purpose_id(oid)))
     }
 
-    /// That a certificate does not allow it.
+    /// The error for a certificate that does not allow it.
     pub(super) fn missing(self) -> CertificateError {
         let required = match self {
             Purpose::Server => ExtendedKeyPurpose::ServerAuth,
@@ -72,7 +72,7 @@ fn purpose_id(oid: &ObjectIdentifier) -> KeyPurposeId<'_> {
     KeyPurposeId::new(oid.as_bytes())
 }
 
-/// Takes serial numbers of any length: nothing depends on them, and some devices make long ones.
+/// Accepts serial numbers of any length: nothing depends on them, and some devices use long ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 struct AnySerial;
 
@@ -82,24 +82,25 @@ impl Profile for AnySerial {
     }
 }
 
-/// A certificate that was read.
+/// A parsed certificate.
 #[derive(Debug)]
 pub(super) struct Parsed(CertificateInner<AnySerial>);
 
 impl Parsed {
     /// # Errors
-    /// It is no X.509 certificate.
+    /// [`CertificateError::BadEncoding`] when it is not an X.509 certificate.
     pub(super) fn new(certificate: &CertificateDer<'_>) -> Result<Parsed, CertificateError> {
         let parsed =
             CertificateInner::from_der(certificate).map_err(|_| CertificateError::BadEncoding)?;
         Ok(Parsed(parsed))
     }
 
-    /// The role of its owner; empty, the null role, when it names none.
+    /// The role in the certificate; empty, the null role, when there is none.
     ///
     /// # Errors
-    /// It names a role twice, or one that is no UTF8String, or calls the extension critical: whoever
-    /// does not know a critical one must refuse, and those who verify know no roles.
+    /// The role occurs twice, is not a UTF8String, or its extension is critical. Software that does
+    /// not know a critical extension must refuse the certificate, and the verifier does not know
+    /// roles.
     pub(super) fn role(&self) -> Result<String, CertificateError> {
         let extensions = self.0.tbs_certificate().extensions().map_or(&[][..], Vec::as_slice);
         let mut named = extensions.iter().filter(|extension| extension.extn_id == ROLE);
@@ -114,20 +115,19 @@ impl Parsed {
         role.map(|role| role.to_string()).map_err(|_| CertificateError::BadEncoding)
     }
 
-    /// Whether it vouches for others: it says `CA:TRUE`, and a `keyUsage`, if there is one, has
-    /// `keyCertSign`.
+    /// Whether it is an authority: it has `CA:TRUE`, and its `keyUsage`, if any, has `keyCertSign`.
     pub(super) fn is_authority(&self) -> bool {
         let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
         self.has_ca_flag()
             && usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.key_cert_sign()))
     }
 
-    /// Whether it says `CA:TRUE`, be it an authority or not.
+    /// Whether it has `CA:TRUE`, even if it is not an authority.
     pub(super) fn has_ca_flag(&self) -> bool {
         self.constraints().is_some_and(|constraints| constraints.ca)
     }
 
-    /// How many authorities may stand between it and an end entity.
+    /// The `pathLenConstraint`: the most authorities between it and an end entity.
     pub(super) fn max_intermediates(&self) -> Option<u8> {
         self.constraints()?.path_len_constraint
     }
@@ -137,13 +137,13 @@ impl Parsed {
         found.ok().flatten().map(|(_, constraints)| constraints)
     }
 
-    /// Whether it names itself as who signed it.
+    /// Whether its issuer is its own subject.
     pub(super) fn is_self_signed(&self) -> bool {
         self.0.tbs_certificate().issuer() == self.0.tbs_certificate().subject()
     }
 
     /// # Errors
-    /// `now` is not within its dates.
+    /// `now` is outside its dates.
     pub(super) fn is_valid_at(&self, now: UnixTime) -> Result<(), CertificateError> {
         let validity = self.0.tbs_certificate().validity();
         let not_before = UnixTime::since_unix_epoch(validity.not_before.to_unix_duration());
@@ -158,7 +158,7 @@ impl Parsed {
     }
 
     /// # Errors
-    /// Its `extendedKeyUsage` is for others.
+    /// Its `extendedKeyUsage` lacks the purpose.
     pub(super) fn is_for(&self, purpose: Purpose) -> Result<(), CertificateError> {
         let named = self.0.tbs_certificate().get_extension::<ExtendedKeyUsage>();
         match named.map_err(|_| CertificateError::BadEncoding)? {
@@ -171,7 +171,7 @@ impl Parsed {
     }
 
     /// # Errors
-    /// [`TlsFailure::UnsupportedCertificate`] for a key that no signature is verified with.
+    /// [`TlsFailure::UnsupportedCertificate`] for an unsupported key.
     pub(super) fn has_supported_key(&self) -> Result<(), TlsFailure> {
         let unsupported = |found: String| {
             let flaw = format!("found {found}, allowed: {KEYS}");
@@ -207,7 +207,7 @@ impl Parsed {
         unsupported(format!("a key of the kind {}", algorithm.oid))
     }
 
-    /// Of a certificate with an RSA-PSS key: what identifies its algorithm, without its header.
+    /// The content of the algorithm identifier of an RSA-PSS key; `None` for another kind of key.
     pub(super) fn pss_algorithm(&self) -> Option<Vec<u8>> {
         let is_pss = self.key().algorithm.oid == rsa_pss::ID_RSASSA_PSS;
         self.key_algorithm().filter(|_| is_pss)
@@ -222,13 +222,13 @@ impl Parsed {
         AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
     }
 
-    /// The name of its owner, as clients are told which certificates are wanted.
+    /// The subject, for the list of accepted issuers that a server sends to clients.
     pub(super) fn subject(&self) -> Option<DistinguishedName> {
         self.0.tbs_certificate().subject().to_der().ok().map(DistinguishedName::from)
     }
 }
 
-/// Bits of the modulus of an RSA key in PKCS#1.
+/// The size of the modulus of an RSA key in PKCS#1, in bits.
 fn rsa_bits(key: &[u8]) -> Option<usize> {
     let whole = AnyRef::from_der(key).ok()?;
     let modulus: UintRef<'_> = SliceReader::new(whole.value()).ok()?.decode().ok()?;
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn anything_else_is_no_role() {
+    fn any_other_content_is_not_a_role() {
         let malformed: [&[u8]; 10] = [
             b"",
             b"abc",
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn an_authority_is_one_that_says_so_and_may_sign() {
+    fn an_authority_has_the_ca_flag_and_may_sign() {
         let ca = IsCa::Ca(Constraints::Unconstrained);
         assert!(!parsed(|_| {}).is_authority());
         assert!(!parsed(|params| params.is_ca = IsCa::ExplicitNoCa).is_authority());
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_are_no_certificate_are_told() {
+    fn bytes_that_are_not_a_certificate_are_an_error() {
         let good = parsed(|_| {}).0.to_der().unwrap();
         for len in 0..good.len() {
             assert!(Parsed::new(&CertificateDer::from(&good[..len])).is_err(), "{len} bytes");

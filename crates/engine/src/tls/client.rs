@@ -1,8 +1,8 @@
-//! The client's side: whom it trusts, and what it shows of itself.
+//! The client side: the servers that it trusts, and its own certificate.
 //!
-//! Each connection checks the certificate of the peer anew; nothing is resumed. Whether a certificate
-//! is valid now is asked when it is used, never when its file is read: the clock of a machine that
-//! has just been switched on may be wrong.
+//! The certificate of the peer is checked for every connection; sessions are never resumed. Dates
+//! are checked when a certificate is used, not when its file is read: the clock of a machine may be
+//! wrong just after power-on.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -23,19 +23,19 @@ use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
 use super::trust::{Listed, Trust};
 use super::{Channel, TlsFailure};
 
-/// What a client's TLS is made from.
+/// The TLS settings of a client.
 #[derive(Debug, Clone, Copy)]
 pub struct ClientSettings<'s> {
-    /// The certificates that are trusted: of authorities, or of the device itself. The system's
-    /// authorities when it is left out.
+    /// Trusted certificates: of authorities, or of the device itself. Default: the authorities of
+    /// the system.
     pub ca: Option<&'s Path>,
-    /// The certificate that is shown to the peer, with those between it and the root; and its key.
+    /// The certificate of the client, with its intermediates; and its key.
     pub own: Option<(&'s Path, &'s Path)>,
-    /// The name or address that the certificate of the peer has.
+    /// The name or address that the certificate of the peer must have.
     pub name: &'s str,
 }
 
-/// Settings that can't be used.
+/// Unusable settings.
 #[derive(Debug, ThisError)]
 pub enum TlsError {
     #[error(transparent)]
@@ -44,14 +44,15 @@ pub enum TlsError {
     Other(String),
 }
 
-/// TLS to one peer. Two are equal when they trust, show and ask for the same.
+/// TLS to one peer. Two values are equal when they trust and present the same certificates, and
+/// expect the same name.
 #[derive(Debug)]
 pub struct ClientTls {
     config: Arc<ClientConfig>,
     identity: Arc<Identity>,
 }
 
-/// What makes the TLS of a client what it is.
+/// What two values are compared by.
 #[derive(Debug, PartialEq, Eq, Hash)]
 pub struct Identity {
     trusted: Arc<[Listed]>,
@@ -63,10 +64,10 @@ impl ClientTls {
     /// Reads the files.
     ///
     /// # Errors
-    /// [`TlsError`] for files and names that can't be used.
+    /// [`TlsError`] for unusable files or names.
     pub fn new(settings: ClientSettings<'_>) -> Result<ClientTls, TlsError> {
         let name = ServerName::try_from(settings.name.to_owned()).map_err(|_| {
-            let found = format!("found {:?} as the name of a certificate", settings.name);
+            let found = format!("found {:?} as the name in a certificate", settings.name);
             TlsError::Other(format!("{found}, allowed: a host name or an IP address"))
         })?;
         let trusted = match settings.ca {
@@ -90,7 +91,7 @@ impl ClientTls {
         Ok(ClientTls { config: Arc::new(config), identity })
     }
 
-    /// The TLS of a new connection.
+    /// Creates the channel of a new connection.
     ///
     /// # Errors
     /// The system has no random numbers.
@@ -112,8 +113,8 @@ impl PartialEq for ClientTls {
 
 impl Eq for ClientTls {}
 
-/// The certificates that the system trusts, the same for all while the variables that name them
-/// stay the same.
+/// The authorities of the system. They are read once, and again when one of the environment
+/// variables that name them changes.
 fn of_system() -> Result<Arc<[Listed]>, TlsError> {
     type Variables = [Option<OsString>; 2];
     static FOUND: Mutex<Option<(Variables, Arc<[Listed]>)>> = Mutex::new(None);
@@ -127,17 +128,17 @@ fn of_system() -> Result<Arc<[Listed]>, TlsError> {
     let found = rustls_native_certs::load_native_certs();
     if found.certs.is_empty() {
         let why = found.errors.first().map(|error| format!(": {error}")).unwrap_or_default();
-        let text = format!("the system has no authorities{why}; ca has to say who is trusted");
+        let text = format!("the system has no trusted authorities{why}; set ca");
         return Err(TlsError::Other(text));
     }
-    // What can't be read is nobody's here.
+    // An authority that cannot be parsed cannot verify anything here.
     let listed: Arc<[Listed]> =
         found.certs.into_iter().filter_map(|each| Listed::new(each).ok()).collect();
     *known = Some((variables, Arc::clone(&listed)));
     Ok(listed)
 }
 
-/// Judges the certificates of servers.
+/// Verifies the certificates of servers.
 #[derive(Debug)]
 struct Servers(Trust);
 
@@ -228,7 +229,7 @@ mod tests {
         }
     }
 
-    /// A file that goes when it is dropped.
+    /// A temporary file, removed on drop.
     struct File(PathBuf);
 
     impl File {
@@ -280,7 +281,7 @@ mod tests {
         Channel::new(ServerConnection::new(Arc::new(config)).unwrap())
     }
 
-    /// What each side has got of the other, or why the client or the server gave up.
+    /// What the client received, or why the client or the server gave up.
     fn talk(client: &ClientTls, server: &mut Channel, piece: usize) -> Result<Vec<u8>, String> {
         let mut client = client.channel().unwrap();
         let (mut to_server, mut to_client) = (Vec::new(), Vec::new());
@@ -327,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sent_arrives_in_whatever_pieces() {
+    fn data_arrives_in_pieces_of_any_size() {
         let authority = Owner::new("authority", CA, None);
         let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
         for version in VERSIONS {
@@ -340,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn the_issuer_and_the_name_decide() {
+    fn issuer_and_name_are_checked() {
         let authority = Owner::new("authority", CA, None);
         let stranger = Owner::new("stranger", CA, None);
         let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
@@ -365,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_expired_is_not_trusted() {
+    fn an_expired_certificate_is_not_trusted() {
         let expired = |params: &mut CertificateParams| {
             params.not_before = date_time_ymd(2020, 1, 1);
             params.not_after = date_time_ymd(2021, 1, 1);
@@ -382,7 +383,7 @@ mod tests {
         });
         let told_early = told(&authority.pem(), "plc", &early);
         assert!(
-            told_early.starts_with("the certificate is not valid yet: its dates begin in "),
+            told_early.starts_with("the certificate is not valid yet: its validity begins in "),
             "{told_early}"
         );
 
@@ -393,7 +394,7 @@ mod tests {
         let plc = Owner::new("plc", IsCa::NoCa, Some(&former));
         let why = told(&former.pem(), "plc", &plc);
         assert!(why.starts_with("an authority above the certificate expired "), "{why}");
-        // One that has expired harms no other.
+        // An expired authority does not affect the others.
         let third = Owner::new("plc", IsCa::NoCa, Some(&authority));
         assert_eq!(told(&(former.pem() + &authority.pem()), "plc", &third), "pong");
     }
@@ -423,7 +424,7 @@ mod tests {
     }
 
     #[test]
-    fn the_key_of_a_device_vouches_for_no_other() {
+    fn the_key_of_a_device_cannot_issue_certificates() {
         for is_ca in [IsCa::NoCa, IsCa::ExplicitNoCa] {
             let device = Owner::new("plc1", is_ca, None);
             let forged = Owner::new("plc2", IsCa::NoCa, Some(&device));
@@ -433,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_asks_for_a_certificate() {
+    fn a_peer_that_requires_a_certificate_gets_it_or_refuses() {
         let authority = Owner::new("authority", CA, None);
         let stranger = Owner::new("stranger", CA, None);
         let plc = Owner::new("plc", IsCa::NoCa, Some(&authority));
@@ -445,16 +446,16 @@ mod tests {
                 talk(&client, &mut server(&plc, version, Some(&authority)), usize::MAX)
             };
             assert_eq!(told(Some(&panel)).unwrap(), b"pong");
-            assert_eq!(told(None).unwrap_err(), "the peer asks for a certificate");
+            assert_eq!(told(None).unwrap_err(), "the peer requires a certificate");
             assert_eq!(
                 told(Some(&foreign)).unwrap_err(),
-                "the peer refused the certificate: it does not know its issuer"
+                "the peer refused the certificate: unknown issuer"
             );
         }
     }
 
     #[test]
-    fn what_is_no_tls_is_told() {
+    fn a_peer_without_tls_is_reported() {
         let authority = Owner::new("authority", CA, None);
         let tls = client(&authority.pem(), None, "plc");
         for bytes in [&b"HTTP/1.1 400 Bad Request\r\n\r\n"[..], b"\0\0\0\0\0\x03\x01\x83\x01"] {
@@ -466,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_can_not_be_used_say_why() {
+    fn unusable_files_are_reported() {
         let [plc, other] = ["plc", "other"].map(|name| Owner::new(name, IsCa::NoCa, None));
         let (certificate, key) = (plc.pem(), plc.key.serialize_pem());
         let told = |certificate: &str, key: &[u8]| {
@@ -496,7 +497,7 @@ mod tests {
         assert_eq!(told(&certificate, b""), "KEY: found no key, allowed: a key in PEM");
         assert_eq!(
             told(&certificate, b"-----BEGIN ENCRYPTED PRIVATE KEY-----\n"),
-            "KEY: the key is encrypted, allowed: one without a passphrase"
+            "KEY: the key is encrypted; use a key without a passphrase"
         );
         assert!(told(&certificate[..100], key.as_bytes()).starts_with("CERT: "));
         assert_eq!(
@@ -516,12 +517,12 @@ mod tests {
         let settings = ClientSettings { ca: Some(&ca.0), own: None, name: "a b" };
         assert_eq!(
             ClientTls::new(settings).unwrap_err().to_string(),
-            "found \"a b\" as the name of a certificate, allowed: a host name or an IP address"
+            "found \"a b\" as the name in a certificate, allowed: a host name or an IP address"
         );
     }
 
     #[test]
-    fn equal_is_what_trusts_shows_and_asks_for_the_same() {
+    fn values_with_the_same_certificates_and_name_are_equal() {
         let [one, two] = ["one", "two"].map(|name| Owner::new(name, IsCa::NoCa, None));
         let made = || client(&one.pem(), Some(&two), "plc");
         assert_eq!(made(), made());

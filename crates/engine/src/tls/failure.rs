@@ -1,5 +1,5 @@
-//! Why TLS failed: a variant a cause, for servers and clients alike. [`TlsFailure::reason`] is for
-//! programs and [`Display`](std::fmt::Display) for people; neither depends on the other.
+//! Why TLS failed: one variant per cause, for servers and clients alike. [`TlsFailure::reason`] is
+//! for programs and [`Display`](std::fmt::Display) for people; neither depends on the other.
 
 use std::time::Duration;
 
@@ -9,14 +9,14 @@ use rustls::{
 };
 use thiserror::Error as ThisError;
 
-/// Names of a certificate that are listed.
+/// The most names of a certificate in a message.
 const MAX_NAMES: usize = 4;
 
 const DAY: u64 = 24 * 60 * 60;
 
-/// Why there is no connection, or not any more.
+/// Why TLS failed, during the handshake or later.
 ///
-/// What comes from a certificate is escaped in the texts: it can't harm a terminal or a log.
+/// Texts from a certificate are escaped in messages, so that they cannot harm a terminal or a log.
 ///
 /// ```
 /// use holdfast_engine::tls::TlsFailure;
@@ -26,13 +26,13 @@ const DAY: u64 = 24 * 60 * 60;
 /// assert_eq!(failure.reason(), "peer_refused_certificate");
 /// assert_eq!(
 ///     failure.to_string(),
-///     "the peer refused the certificate: it does not know its issuer"
+///     "the peer refused the certificate: unknown issuer"
 /// );
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq, ThisError)]
 #[non_exhaustive]
 pub enum TlsFailure {
-    /// Neither is it trusted itself, nor is an authority above it.
+    /// Neither the certificate nor an authority above it is trusted.
     #[error(
         "the issuer of the certificate is unknown: neither the certificate nor an authority above \
          it is trusted"
@@ -40,17 +40,17 @@ pub enum TlsFailure {
     UnknownIssuer,
     #[error("the certificate expired {} ago", span(*.ago))]
     Expired { ago: Duration },
-    #[error("the certificate is not valid yet: its dates begin in {}", span(*.begins_in))]
+    #[error("the certificate is not valid yet: its validity begins in {}", span(*.begins_in))]
     NotYetValid { begins_in: Duration },
-    /// An authority above the certificate, trusted or sent by the peer, is out of date.
+    /// An authority above the certificate, trusted or sent by the peer, has expired.
     #[error("an authority above the certificate expired {} ago", span(*.ago))]
     IssuerExpired { ago: Duration },
     #[error(
-        "an authority above the certificate is not valid yet: its dates begin in {}",
+        "an authority above the certificate is not valid yet: its validity begins in {}",
         span(*.begins_in)
     )]
     IssuerNotYetValid { begins_in: Duration },
-    /// The names are as the certificate has them.
+    /// The names are not escaped.
     #[error("{}", wrong_name(.expected, .presented))]
     WrongName { expected: String, presented: Vec<String> },
     /// `required` is `serverAuth` or `clientAuth`.
@@ -58,67 +58,68 @@ pub enum TlsFailure {
     WrongPurpose { required: &'static str },
     #[error("the certificate, or an authority above it, is revoked")]
     Revoked,
-    #[error("no valid revocation list of an authority above the certificate")]
+    #[error("an authority above the certificate has no valid revocation list")]
     UnknownRevocation,
-    /// Of a certificate, or of the handshake: then the peer does not hold the certificate's key.
-    #[error("a signature of the certificate, or of the handshake with it, is wrong")]
+    /// The signature of a certificate is invalid; or that of the handshake, when the peer does not
+    /// hold the key of its certificate.
+    #[error("the signature of the certificate, or of the handshake, is invalid")]
     BadSignature,
     /// It is not an X.509 certificate, or its role is malformed.
     #[error("the certificate can't be read")]
     BadCertificate,
     #[error("the certificate has a critical extension that is not supported")]
     UnsupportedExtension,
-    /// It is readable, but its version, key or signature is not supported.
+    /// Its version, key or signature is not supported.
     #[error("the certificate is not supported: {flaw}")]
     UnsupportedCertificate { flaw: String },
-    /// A certificate with `CA:TRUE` that is not trusted itself.
+    /// The certificate has `CA:TRUE` and is not listed itself.
     #[error(
         "the peer presented a CA certificate (CA:TRUE); list that exact certificate in `ca`, or \
          issue one with CA:FALSE"
     )]
     CaAsEndEntity,
-    /// A certificate above the peer's own may not sign others.
-    #[error("a certificate above the peer's own is not one of an authority (CA:TRUE, keyCertSign)")]
+    /// A certificate above that of the peer cannot sign others.
+    #[error("a certificate above that of the peer is not an authority (CA:TRUE, keyCertSign)")]
     IssuerNotAuthority,
-    /// `pathLenConstraint` or `nameConstraints` of an authority.
-    #[error("an authority above the certificate may not issue it: {constraint}")]
+    /// The certificate violates a constraint of an authority, such as `pathLenConstraint`.
+    #[error("the certificate violates a constraint of an authority above it: {constraint}")]
     ConstraintViolated { constraint: &'static str },
     #[error("the certificate is not accepted: {flaw}")]
     UntrustedCertificate { flaw: String },
     #[error("the peer presented no certificate")]
     NoCertificate,
-    #[error("the peer asks for a certificate")]
+    #[error("the peer requires a certificate")]
     PeerRequiresCertificate,
     #[error("the peer refused the certificate: {}", refusal(*.alert))]
     PeerRefusedCertificate { alert: AlertDescription },
     /// The alert has several causes.
     #[error(
-        "the peer refused the handshake: it may ask for a certificate, or have no cipher suite in \
+        "the peer refused the handshake: it may require a certificate, or have no cipher suite in \
          common"
     )]
     PeerRefusedHandshake,
     #[error("the peer ended TLS with alert {alert:?}")]
     PeerEnded { alert: AlertDescription },
-    /// With `by_peer` the peer reported it by an alert.
+    /// With `by_peer`, the peer reported it by an alert.
     #[error("no TLS version or cipher suite in common; supported: TLS 1.2 and 1.3")]
     NoCommonVersionOrCipher { by_peer: bool },
     #[error("the peer does not speak TLS")]
     NotTls,
     #[error("a malformed TLS message: {flaw}")]
     MalformedMessage { flaw: String },
-    #[error("the peer ended the connection instead of agreeing on TLS")]
+    #[error("the peer closed the connection during the TLS handshake")]
     ClosedDuringHandshake,
-    /// A peer that refuses a certificate may reset the connection: the alert that says so is lost.
-    #[error("the peer ended the connection before any reply; it may have refused the certificate")]
+    /// When a peer refuses a certificate and resets the connection, its alert is lost.
+    #[error("the peer closed the connection before any reply; it may have refused the certificate")]
     ClosedBeforeReply,
-    #[error("a TLS record was changed on its way")]
+    #[error("a TLS record was modified in transit")]
     BadRecord,
     #[error("{text}")]
     Other { text: String },
 }
 
 impl TlsFailure {
-    /// The cause in a word, which stays the same when texts change.
+    /// The cause as a word for programs. It does not change when messages change.
     pub const fn reason(&self) -> &'static str {
         match self {
             TlsFailure::UnknownIssuer => "unknown_issuer",
@@ -153,8 +154,8 @@ impl TlsFailure {
         }
     }
 
-    /// The `reason` of a listener's event `tls_failed`. Its words are older than those of
-    /// [`TlsFailure::reason`], and fewer.
+    /// The `reason` of the event `tls_failed` of a listener. It is older than
+    /// [`TlsFailure::reason`] and has fewer words.
     pub const fn event_reason(&self) -> &'static str {
         match self {
             TlsFailure::UnknownIssuer => "unknown_authority",
@@ -190,8 +191,8 @@ impl TlsFailure {
 }
 
 impl TlsFailure {
-    /// Whether the peer has not agreed on TLS, even if this side has: then it has carried out
-    /// nothing that was sent.
+    /// Whether the peer has not accepted the handshake, even if this side has. Then it has not
+    /// carried out any request.
     pub const fn refuses_connection(&self) -> bool {
         matches!(
             self,
@@ -292,14 +293,14 @@ fn of_alert(alert: AlertDescription) -> TlsFailure {
     }
 }
 
-/// What an alert says of the certificate that the peer refused.
+/// Why the peer refused the certificate, according to its alert.
 fn refusal(alert: AlertDescription) -> &'static str {
     match alert {
-        AlertDescription::UnknownCA => "it does not know its issuer",
+        AlertDescription::UnknownCA => "unknown issuer",
         AlertDescription::CertificateExpired => "expired",
         AlertDescription::CertificateRevoked => "revoked",
         AlertDescription::AccessDenied => "access denied",
-        AlertDescription::UnsupportedCertificate => "of a kind that it does not take",
+        AlertDescription::UnsupportedCertificate => "unsupported",
         _ => "bad",
     }
 }
@@ -317,7 +318,7 @@ fn wrong_name(expected: &str, presented: &[String]) -> String {
     format!("the certificate is for {}, not for '{expected}'", listed.join(", "))
 }
 
-/// A name as webpki has it, without its kind.
+/// Removes the kind of name that webpki adds.
 fn bare(name: &str) -> &str {
     let text = name.strip_prefix("DnsName(\"").and_then(|rest| rest.strip_suffix("\")"));
     let text =
@@ -325,7 +326,7 @@ fn bare(name: &str) -> &str {
     text.unwrap_or(name)
 }
 
-/// Text without control characters.
+/// Escapes control characters.
 fn plain(text: &str) -> String {
     text.escape_debug().to_string()
 }
@@ -357,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_listed_without_what_could_harm_a_terminal() {
+    fn names_are_listed_with_control_characters_escaped() {
         let told = |presented: &[&str]| of_names(presented).to_string();
         assert_eq!(
             told(&["DnsName(\"plc7\")", "IpAddress(10.0.0.7)"]),
@@ -378,20 +379,20 @@ mod tests {
     }
 
     #[test]
-    fn text_of_a_peer_can_not_harm_a_terminal() {
+    fn text_from_a_peer_cannot_harm_a_terminal() {
         let harmful = Error::General("\x1b[2J\r\n".into());
         assert_eq!(TlsFailure::from(harmful).to_string(), "unexpected error: \\u{1b}[2J\\r\\n");
     }
 
     #[test]
-    fn what_was_judged_here_is_told_as_it_was() {
+    fn a_failure_carried_through_rustls_is_unchanged() {
         let failure = TlsFailure::CaAsEndEntity;
         let carried = CertificateError::Other(OtherError(Arc::new(failure.clone())));
         assert_eq!(TlsFailure::from(Error::from(carried)), failure);
     }
 
     #[test]
-    fn every_cause_has_a_word_of_its_own() {
+    fn every_cause_has_its_own_reason_and_text() {
         let (ago, begins_in) = (Duration::from_secs(59), Duration::from_secs(3 * DAY));
         let (flaw, alert) = (String::from("flaw"), AlertDescription::UnknownCA);
         let causes = [
@@ -428,11 +429,11 @@ mod tests {
         let texts: HashSet<String> = causes.iter().map(TlsFailure::to_string).collect();
         assert_eq!((words.len(), texts.len()), (causes.len(), causes.len()));
         assert!(texts.contains("the certificate expired 59 s ago"));
-        assert!(texts.contains("the certificate is not valid yet: its dates begin in 3 days"));
+        assert!(texts.contains("the certificate is not valid yet: its validity begins in 3 days"));
     }
 
     #[test]
-    fn an_alert_is_told_apart_from_what_was_found_here() {
+    fn an_alert_of_the_peer_differs_from_a_failure_found_here() {
         let told = |error: Error| {
             let failure = TlsFailure::from(error);
             (failure.reason(), failure.event_reason())

@@ -1,4 +1,4 @@
-//! Certificates and keys, out of PEM files.
+//! Reads certificates and keys from PEM files.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -9,18 +9,18 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::server::ParsedCertificate;
 use thiserror::Error;
 
-/// The most bytes of a file.
+/// The size limit of a file, in bytes.
 const MAX_FILE_LEN: u64 = 4 << 20;
 
-/// The first byte of anything in DER.
+/// The first byte of a certificate or key in DER.
 const SEQUENCE: u8 = 0x30;
 
-/// A file that can't be used.
+/// An unusable file.
 #[derive(Debug, Error)]
 pub enum FileError {
     #[error("{file}: {error}")]
     Unreadable { file: String, error: io::Error },
-    /// What is wrong with what is in it.
+    /// The content is invalid.
     #[error("{file}: {flaw}")]
     Content { file: String, flaw: String },
 }
@@ -31,7 +31,7 @@ impl FileError {
     }
 }
 
-/// All certificates of a file, in its order; at least one.
+/// Reads all certificates of a file, in order; at least one.
 ///
 /// # Errors
 /// [`FileError`]
@@ -52,14 +52,14 @@ pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, 
     Ok(found)
 }
 
-/// The first key of a file: PKCS#8, PKCS#1 or SEC1.
+/// Reads the first key of a file: PKCS#8, PKCS#1 or SEC1.
 ///
 /// # Errors
 /// [`FileError`]
 pub(super) fn key(file: &Path) -> Result<PrivateKeyDer<'static>, FileError> {
     let text = read(file)?;
     if text.windows(9).any(|word| word == b"ENCRYPTED") {
-        let flaw = "the key is encrypted, allowed: one without a passphrase";
+        let flaw = "the key is encrypted; use a key without a passphrase";
         return Err(FileError::content(file, flaw));
     }
     match PrivateKeyDer::pem_slice_iter(&text).next() {

@@ -1,6 +1,7 @@
-//! TLS between a socket and a protocol, as Modbus/TCP Security has it.
+//! TLS between a socket and a protocol, as Modbus/TCP Security requires.
 //!
-//! A [`Channel`] does no I/O: whoever has the socket gives it what came, and sends what it says.
+//! A [`Channel`] does no I/O: the owner of the socket passes it received bytes, and sends the bytes
+//! that it returns.
 
 mod certificate;
 pub mod client;
@@ -20,10 +21,10 @@ use rustls::{Connection, Error};
 pub use failure::TlsFailure;
 pub use files::FileError;
 
-/// Bytes of plain text taken out at once.
+/// Bytes of plain text per read.
 const CHUNK: usize = 4096;
 
-/// One connection's TLS.
+/// The TLS state of one connection.
 pub struct Channel(Connection);
 
 impl Channel {
@@ -33,11 +34,11 @@ impl Channel {
         Channel(connection)
     }
 
-    /// Takes bytes that came from the peer, which may end anywhere. What they carry is appended to
-    /// `plain`, and what the peer is to get because of them to `out`, an alert for a failure included.
+    /// Processes received bytes, which may end anywhere. Appends the plain text to `plain`, and
+    /// bytes to send, alerts included, to `out`.
     ///
     /// # Errors
-    /// The connection is to be closed, when `out` was sent.
+    /// TLS failed: send `out`, then close the connection.
     pub fn receive(
         &mut self,
         mut bytes: &[u8],
@@ -46,7 +47,7 @@ impl Channel {
     ) -> Result<(), Error> {
         let mut done = Ok(());
         while done.is_ok() && !bytes.is_empty() {
-            // It takes nothing only while plain text waits, which it never does here.
+            // `read_tls` reads nothing only while plain text waits. Here none ever waits.
             let Ok(1..) = self.0.read_tls(&mut bytes) else { break };
             done = self.0.process_new_packets().map(drop);
             self.take(plain);
@@ -55,15 +56,15 @@ impl Channel {
         done
     }
 
-    /// Appends to `out` what the peer is to get for some plain text to arrive there. Before the
-    /// handshake is over, the text waits for its end.
+    /// Encrypts `plain` and appends the records to `out`. During the handshake, plain text is
+    /// queued until the end of the handshake.
     pub fn send(&mut self, plain: &[u8], out: &mut Vec<u8>) {
-        // It has no limit, so that it takes everything.
+        // The writer has no limit, so it accepts everything.
         let _ = self.0.writer().write_all(plain);
         self.flush(out);
     }
 
-    /// Appends to `out` what tells the peer of the end.
+    /// Appends the closing alert to `out`.
     pub fn end(&mut self, out: &mut Vec<u8>) {
         self.0.send_close_notify();
         self.flush(out);
@@ -73,9 +74,9 @@ impl Channel {
         self.0.is_handshaking()
     }
 
-    /// Whether the peer has said that nothing more will come.
+    /// Whether the peer has announced the end.
     pub fn has_ended(&mut self) -> bool {
-        // No plain text waits here, so that only an end has a length.
+        // No plain text waits here, so a read of length 0 is the end.
         matches!(self.0.reader().read(&mut [0]), Ok(0))
     }
 
@@ -88,7 +89,7 @@ impl Channel {
 
     fn flush(&mut self, out: &mut Vec<u8>) {
         while self.0.wants_write() {
-            // A vector takes everything.
+            // Writing to a vector cannot fail.
             let _ = self.0.write_tls(out);
         }
     }

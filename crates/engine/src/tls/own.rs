@@ -1,4 +1,4 @@
-//! The certificate that this side shows, and its key.
+//! The certificate of this side, and its key.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,10 +12,10 @@ use super::files::{FileError, certificates, key};
 use super::provider::{KEYS, provider};
 use super::rsa_pss::PssKey;
 
-/// Reads a certificate, with those between it and the root, and its key.
+/// Reads a certificate, with its intermediates, and its key.
 ///
 /// # Errors
-/// [`FileError`] for a file that can't be used, or a key that is not the certificate's.
+/// [`FileError`] for an unusable file, or a key that does not belong to the certificate.
 pub(super) fn own(cert_file: &Path, key_file: &Path) -> Result<Arc<CertifiedKey>, FileError> {
     let (chain, key) = (certificates(cert_file)?, key(key_file)?);
     let wrong = |flaw: String| FileError::content(key_file, flaw);
@@ -34,12 +34,12 @@ pub(super) fn own(cert_file: &Path, key_file: &Path) -> Result<Arc<CertifiedKey>
     }
 }
 
-/// `None` for a key of a kind that is not supported.
+/// `None` for an unsupported kind of key.
 fn signing_key(
     key: PrivateKeyDer<'static>,
     of: &CertificateDer<'_>,
 ) -> Option<Arc<dyn SigningKey>> {
-    // What an RSA key may sign is up to the certificate.
+    // The certificate says whether an RSA key is for RSASSA-PSS alone.
     match Parsed::new(of).ok()?.pss_algorithm() {
         Some(algorithm) => Some(Arc::new(PssKey::new(&key, &algorithm)?)),
         None => provider().key_provider.load_private_key(key).ok(),

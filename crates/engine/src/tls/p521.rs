@@ -1,5 +1,5 @@
-//! Key exchange on P-521, which rustls leaves out. With TLS 1.2 a device that has a key on a curve
-//! shows its certificate only to clients that name the curve.
+//! Key exchange on P-521, which rustls lacks. With TLS 1.2, a device with a key on P-521 presents
+//! its certificate only to clients that offer this curve.
 
 use aws_lc_rs::agreement::{
     ECDH_P521, EphemeralPrivateKey, PublicKey, UnparsedPublicKey, agree_ephemeral,
@@ -8,7 +8,7 @@ use aws_lc_rs::rand::SystemRandom;
 use rustls::crypto::{ActiveKeyExchange, GetRandomFailed, SharedSecret, SupportedKxGroup};
 use rustls::{Error, NamedGroup, PeerMisbehaved};
 
-/// The first byte of a point that is not compressed, the only form that TLS allows.
+/// The first byte of an uncompressed point, the only form that TLS allows.
 const UNCOMPRESSED: u8 = 4;
 
 #[derive(Debug)]
@@ -27,7 +27,7 @@ impl SupportedKxGroup for P521 {
     }
 }
 
-/// A key exchange that has begun.
+/// A key exchange in progress.
 struct Exchange {
     private: EphemeralPrivateKey,
     public: PublicKey,
@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn both_sides_find_the_same_secret() {
+    fn both_sides_compute_the_same_secret() {
         let [one, two] = [(); 2].map(|()| P521.start().unwrap());
         let publics = [&one, &two].map(|side| side.pub_key().to_vec());
         let [of_one, of_two] = publics.clone();
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_share_that_is_no_uncompressed_point_of_the_curve_is_refused() {
+    fn a_share_that_is_not_an_uncompressed_point_of_the_curve_is_refused() {
         let good = P521.start().unwrap().pub_key().to_vec();
         let mut off = good.clone();
         off[132] ^= 1;

@@ -1,5 +1,5 @@
-//! The algorithms of TLS, the same for servers and clients: what may sign a certificate or a
-//! handshake, and how keys are agreed on.
+//! The algorithms of TLS, the same for servers and clients: signatures of certificates and
+//! handshakes, and key exchange.
 
 use std::sync::{Arc, LazyLock};
 
@@ -15,10 +15,11 @@ use webpki::aws_lc_rs as algorithm;
 use super::p521::P521;
 use super::rsa_pss;
 
-/// Keys that certificates may have.
+/// The supported keys of certificates.
 pub(super) const KEYS: &str = "RSA or RSA-PSS of 2048 to 8192 bits, P-256, P-384, P-521, Ed25519";
 
-/// With TLS 1.2 a scheme names the hash alone, with TLS 1.3 the curve too: the first of each row.
+/// With TLS 1.2, a scheme names only the hash. With TLS 1.3, it also names the curve: the first
+/// entry of each row.
 pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorithms {
     all: &[
         algorithm::ECDSA_P256_SHA256,
@@ -88,11 +89,11 @@ pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorit
     ],
 };
 
-/// What TLS is done with.
+/// The cryptography of all TLS connections.
 pub(super) fn provider() -> Arc<CryptoProvider> {
     static PROVIDER: LazyLock<Arc<CryptoProvider>> = LazyLock::new(|| {
         Arc::new(CryptoProvider {
-            // Post-quantum groups would make a ClientHello longer than some devices take.
+            // Post-quantum groups would make a ClientHello longer than some devices accept.
             kx_groups: vec![kx_group::X25519, kx_group::SECP256R1, kx_group::SECP384R1, &P521],
             signature_verification_algorithms: ALGORITHMS,
             ..aws_lc_rs::default_provider()
@@ -101,7 +102,7 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
     Arc::clone(&PROVIDER)
 }
 
-/// Whether the peer holds the key of its certificate, as TLS 1.2 proves it.
+/// Verifies the handshake signature of TLS 1.2: the peer holds the key of its certificate.
 pub(super) fn verify_tls12(
     message: &[u8],
     certificate: &CertificateDer<'_>,
@@ -110,7 +111,7 @@ pub(super) fn verify_tls12(
     verify_tls12_signature(message, certificate, signed, &ALGORITHMS)
 }
 
-/// Whether the peer holds the key of its certificate, as TLS 1.3 proves it.
+/// Verifies the handshake signature of TLS 1.3: the peer holds the key of its certificate.
 pub(super) fn verify_tls13(
     message: &[u8],
     certificate: &CertificateDer<'_>,
@@ -119,7 +120,7 @@ pub(super) fn verify_tls13(
     let Some(candidates) = rsa_pss::of_scheme(signed.scheme) else {
         return verify_tls13_signature(message, certificate, signed, &ALGORITHMS);
     };
-    // One scheme stands for keys whose parameters are written differently.
+    // Keys of one scheme may encode their parameters in different ways.
     let unreadable = |_| Error::from(CertificateError::BadEncoding);
     let certificate = webpki::EndEntityCert::try_from(certificate).map_err(unreadable)?;
     let holds = |each| certificate.verify_signature(each, message, signed.signature()).is_ok();

@@ -1,8 +1,8 @@
-//! Keys for RSASSA-PSS alone (id-RSASSA-PSS, RFC 4055). rustls knows PSS signatures of ordinary RSA
-//! keys only.
+//! Keys for RSASSA-PSS alone (id-RSASSA-PSS, RFC 4055). rustls supports PSS signatures only with
+//! ordinary RSA keys.
 //!
-//! Such a key may name the hash that it is for. RFC 8446 requires the same hash in the mask, and a
-//! salt as long as the hash. The keys need TLS 1.3: in TLS 1.2 rustls drops their schemes.
+//! Such a key may name its hash. RFC 8446 requires the same hash in the mask, and a salt as long as
+//! the hash. The keys require TLS 1.3: rustls drops their schemes in TLS 1.2.
 
 use std::fmt;
 use std::sync::Arc;
@@ -27,7 +27,7 @@ pub(super) const SCHEME_SHA256: SignatureScheme = SignatureScheme::Unknown(0x080
 pub(super) const SCHEME_SHA384: SignatureScheme = SignatureScheme::Unknown(0x080a);
 pub(super) const SCHEME_SHA512: SignatureScheme = SignatureScheme::Unknown(0x080b);
 
-/// Verify signatures with SHA-256, of keys that are written in different ways.
+/// Verifiers of signatures with SHA-256, one for each encoding of the key parameters.
 pub(super) const SHA256: [&dyn SignatureVerificationAlgorithm; 3] = {
     const VERIFY: &RsaParameters = &signature::RSA_PSS_2048_8192_SHA256;
     const SIGNATURE: AlgorithmIdentifier = alg_id::RSA_PSS_SHA256;
@@ -58,16 +58,16 @@ pub(super) const SHA512: [&dyn SignatureVerificationAlgorithm; 3] = {
     ]
 };
 
-/// A key without parameters: for any hash.
+/// A key without parameters: any hash.
 const ANY_HASH: AlgorithmIdentifier =
     AlgorithmIdentifier::from_slice(b"\x06\x09\x2a\x86\x48\x86\xf7\x0d\x01\x01\x0a");
 
-/// Keys that name a hash, and leave the least length of a salt at its default, 20.
+/// Keys that name a hash, with the default minimum salt length, 20.
 const ANY_SALT_SHA256: AlgorithmIdentifier = AlgorithmIdentifier::from_slice(&any_salt(1));
 const ANY_SALT_SHA384: AlgorithmIdentifier = AlgorithmIdentifier::from_slice(&any_salt(2));
 const ANY_SALT_SHA512: AlgorithmIdentifier = AlgorithmIdentifier::from_slice(&any_salt(3));
 
-/// `hash` is the last number in the identifier of a hash, which occurs twice.
+/// `hash` is the last number of the object identifier of a hash, which occurs twice.
 const fn any_salt(hash: u8) -> [u8; 60] {
     let mut der = *b"\
         \x06\x09\x2a\x86\x48\x86\xf7\x0d\x01\x01\x0a\x30\x2f\
@@ -79,7 +79,7 @@ const fn any_salt(hash: u8) -> [u8; 60] {
     der
 }
 
-/// What verifies signatures of a scheme, unless it is one of other keys.
+/// The verifiers of a scheme, if it is an RSASSA-PSS scheme.
 pub(super) fn of_scheme(
     scheme: SignatureScheme,
 ) -> Option<&'static [&'static dyn SignatureVerificationAlgorithm]> {
@@ -91,12 +91,12 @@ pub(super) fn of_scheme(
     }
 }
 
-/// Whether a key of this kind is supported: without parameters, or with those of RFC 8446.
+/// Whether the parameters of a key are supported: none, or those of RFC 8446.
 pub(super) fn is_supported(key: &[u8]) -> bool {
     schemes_of(key).is_some()
 }
 
-/// The schemes that a key with this algorithm identifier signs with, and that identifier.
+/// The algorithm identifier of a key, and the schemes that it signs with.
 fn schemes_of(key: &[u8]) -> Option<(AlgorithmIdentifier, &'static [SignatureScheme])> {
     const KEYS: [(AlgorithmIdentifier, &[SignatureScheme]); 7] = [
         (ANY_HASH, &[SCHEME_SHA512, SCHEME_SHA384, SCHEME_SHA256]),
@@ -110,7 +110,7 @@ fn schemes_of(key: &[u8]) -> Option<(AlgorithmIdentifier, &'static [SignatureSch
     KEYS.into_iter().find(|(known, _)| known.as_ref() == key)
 }
 
-/// One way to verify: the algorithm of the key, that of the signature, and what does it.
+/// A verifier: the algorithms of key and signature, and the implementation.
 struct Verify {
     key: AlgorithmIdentifier,
     signature: AlgorithmIdentifier,
@@ -143,7 +143,7 @@ impl fmt::Debug for Verify {
     }
 }
 
-/// A key of our own.
+/// The key of this side.
 pub(super) struct PssKey {
     pair: Arc<RsaKeyPair>,
     algorithm: AlgorithmIdentifier,
@@ -151,7 +151,7 @@ pub(super) struct PssKey {
 }
 
 impl PssKey {
-    /// The key of a certificate whose own says `algorithm`; `None` when it is another kind of key.
+    /// The key of a certificate with this algorithm identifier; `None` for another kind of key.
     pub(super) fn new(key: &PrivateKeyDer<'_>, algorithm: &[u8]) -> Option<PssKey> {
         let (algorithm, schemes) = schemes_of(algorithm)?;
         let pair = match key {
@@ -163,7 +163,7 @@ impl PssKey {
     }
 }
 
-/// The PKCS#1 key in one of PKCS#8.
+/// The PKCS#1 key inside a PKCS#8 key.
 fn inner(pkcs8: &[u8]) -> Option<&[u8]> {
     let whole = AnyRef::from_der(pkcs8).ok()?;
     let mut reader = SliceReader::new(whole.value()).ok()?;
@@ -189,7 +189,7 @@ impl SigningKey for PssKey {
     }
 
     fn algorithm(&self) -> SignatureAlgorithm {
-        // None that a cipher suite of TLS 1.2 has.
+        // An algorithm that no TLS 1.2 cipher suite has.
         SignatureAlgorithm::Unknown(9)
     }
 }

@@ -1,7 +1,7 @@
-//! The server's side: who it is, which clients it trusts, and what role each of them has.
+//! The server side: its certificate, the clients that it trusts, and their roles.
 //!
-//! Mutual authentication is not optional, as MB-TCP-Security has it. Sessions are never resumed: the
-//! certificate of a client, and its dates, are judged at every connection.
+//! Mutual authentication is mandatory, as MB-TCP-Security requires. Sessions are never resumed: the
+//! certificate of a client and its dates are checked for every connection.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -26,28 +26,27 @@ use super::own::own;
 use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
 use super::trust::{Listed, Trust};
 
-/// The files of a server, in PEM.
+/// The PEM files of a server.
 #[derive(Debug, Clone)]
 pub struct ServerFiles {
-    /// The certificate that clients are shown, and those between it and its authority.
+    /// The certificate of the server, with its intermediates.
     pub cert_file: PathBuf,
-    /// The key of that certificate, without a passphrase.
+    /// The key of the certificate, without a passphrase.
     pub key_file: PathBuf,
-    /// The authorities that vouch for clients, and clients' self-signed certificates.
+    /// Authorities of clients, and self-signed certificates of clients.
     pub ca_file: PathBuf,
-    /// Certificates that the authorities have revoked. Where it is given, there is a list of each
-    /// authority above a client.
+    /// Revocation lists. If given, every authority above a client requires a list.
     pub crl_file: Option<PathBuf>,
 }
 
-/// What a server needs to speak TLS with its clients.
+/// The TLS configuration of a server.
 pub struct ServerTls(Arc<ServerConfig>);
 
 impl ServerTls {
     /// Reads the files.
     ///
     /// # Errors
-    /// [`FileError`] for one that can't be used.
+    /// [`FileError`] for an unusable file.
     pub fn load(files: &ServerFiles) -> Result<ServerTls, FileError> {
         let own = own(&files.cert_file, &files.key_file)?;
         let clients = Arc::new(Clients::load(files)?);
@@ -62,7 +61,7 @@ impl ServerTls {
         Ok(ServerTls(Arc::new(config)))
     }
 
-    /// The channel of a connection that was accepted.
+    /// Creates the channel of an accepted connection.
     pub(crate) fn channel(&self) -> Result<Channel, Error> {
         Ok(Channel::new(ServerConnection::new(Arc::clone(&self.0))?))
     }
@@ -74,14 +73,14 @@ impl fmt::Debug for ServerTls {
     }
 }
 
-/// The role of the peer, which has shown its certificate; empty for the null role.
+/// The role in the certificate of the peer, after the handshake; empty for the null role.
 pub(crate) fn role(channel: &Channel) -> Result<String, Error> {
     let certificate = channel.0.peer_certificates().and_then(<[_]>::first);
     let certificate = certificate.ok_or(Error::NoCertificatesPresented)?;
     Ok(Parsed::new(certificate)?.role()?)
 }
 
-/// Judges the certificates of clients.
+/// Verifies the certificates of clients.
 #[derive(Debug)]
 struct Clients {
     trust: Trust,
@@ -94,7 +93,7 @@ impl Clients {
         let subjects = listed.iter().filter_map(Listed::subject).collect();
         let revoked = match &files.crl_file {
             Some(file) if !listed.iter().any(Listed::is_authority) => {
-                let flaw = "found beside a ca_file without authorities, allowed: beside some";
+                let flaw = "crl_file requires an authority (CA:TRUE) in ca_file";
                 return Err(FileError::content(file, flaw));
             }
             Some(file) => revocations(file)?,
@@ -104,31 +103,33 @@ impl Clients {
     }
 }
 
-/// Authorities and self-signed certificates: any other is in the file by mistake.
+/// Reads authorities and self-signed certificates. Any other certificate is a mistake.
 fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
     let listed = Listed::of_file(file)?;
     let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.is_self_signed();
     if let Some(index) = listed.iter().position(is_mistake) {
-        let allowed = "allowed: authorities (CA:TRUE) and self-signed certificates";
-        let flaw = format!("certificate {}: found neither of both, {allowed}", index + 1);
+        let flaw =
+            format!("certificate {}: neither an authority (CA:TRUE) nor self-signed", index + 1);
         return Err(FileError::content(file, flaw));
     }
     Ok(listed)
 }
 
-/// All lists of revoked certificates of a file, at least one.
+/// Reads all revocation lists of a file, at least one.
 fn revocations(file: &Path) -> Result<Vec<CertRevocationList<'static>>, FileError> {
     let text = std::fs::read(file)
         .map_err(|error| FileError::Unreadable { file: file.display().to_string(), error })?;
     let found: Result<Vec<_>, _> = CertificateRevocationListDer::pem_slice_iter(&text).collect();
     let found = found.map_err(|error| FileError::content(file, error.to_string()))?;
     if found.is_empty() {
-        let flaw = "found no list of revoked certificates, allowed: X509 CRL in PEM";
+        let flaw = "found no revocation list, allowed: X509 CRL in PEM";
         return Err(FileError::content(file, flaw));
     }
     let read = found.iter().map(|list| OwnedCertRevocationList::from_der(list).map(Into::into));
     let read: Result<Vec<_>, _> = read.collect();
-    read.map_err(|error| FileError::content(file, format!("a list can't be read: {error}")))
+    read.map_err(|error| {
+        FileError::content(file, format!("a revocation list can't be read: {error}"))
+    })
 }
 
 impl ClientCertVerifier for Clients {

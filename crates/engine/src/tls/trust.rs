@@ -1,13 +1,12 @@
-//! The one judgement of certificates, for servers and clients alike.
+//! Verifies certificates, for servers and clients alike.
 //!
-//! * A certificate that is listed is trusted as itself, whatever its `CA` flag and its `keyUsage`.
-//! * A listed authority ([`Parsed::is_authority`]) vouches for others, while it is within its dates.
-//! * Whoever presents a certificate with `CA:TRUE` is trusted only if it is listed.
-//! * Dates and purpose of the presented certificate count in every case.
+//! * A listed certificate is trusted, regardless of its `CA` flag and `keyUsage`.
+//! * A listed authority ([`Parsed::is_authority`]) can issue certificates within its own dates.
+//! * A presented certificate with `CA:TRUE` is trusted only if it is listed itself.
+//! * Dates and purpose of the presented certificate are always checked.
 //!
-//! Signatures, and the constraints along a path, are the business of webpki. Whether a certificate is
-//! valid now is asked when it is used, never when its file is read: the clock of a machine that has
-//! just been switched on may be wrong.
+//! webpki checks signatures, and the constraints along a path. Dates are checked when a certificate
+//! is used, not when its file is read: the clock of a machine may be wrong just after power-on.
 
 use std::hash::{Hash, Hasher};
 use std::path;
@@ -28,18 +27,18 @@ use super::failure::{TlsFailure, between};
 use super::files::{FileError, certificates};
 use super::provider::ALGORITHMS;
 
-/// A certificate that is listed as trusted.
+/// A trusted certificate.
 #[derive(Debug)]
 pub(super) struct Listed {
     certificate: CertificateDer<'static>,
     parsed: Parsed,
-    /// Of an authority: its name and key.
+    /// The name and key of an authority.
     anchor: Option<TrustAnchor<'static>>,
 }
 
 impl Listed {
     /// # Errors
-    /// It can't be read.
+    /// The certificate cannot be parsed.
     pub(super) fn new(certificate: CertificateDer<'static>) -> Result<Listed, CertificateError> {
         let parsed = Parsed::new(&certificate)?;
         let anchor = match parsed.is_authority() {
@@ -52,7 +51,7 @@ impl Listed {
         Ok(Listed { certificate, parsed, anchor })
     }
 
-    /// All certificates of a file, at least one.
+    /// Reads all certificates of a file, at least one.
     ///
     /// # Errors
     /// [`FileError`]
@@ -92,11 +91,11 @@ impl Hash for Listed {
     }
 }
 
-/// Who is trusted.
+/// The trusted certificates.
 #[derive(Debug)]
 pub(super) struct Trust {
     listed: Arc<[Listed]>,
-    /// Lists of revoked certificates; where there are any, there is one of every authority.
+    /// Revocation lists. If there are any, every authority requires one.
     revoked: Vec<CertRevocationList<'static>>,
 }
 
@@ -105,11 +104,10 @@ impl Trust {
         Trust { listed, revoked }
     }
 
-    /// Whether a peer with this certificate is who the certificate says, and may be what it is. The
-    /// name of the peer is not looked at.
+    /// Verifies the certificate of a peer, for its purpose. Does not check the name.
     ///
     /// # Errors
-    /// Why not; [`TlsFailure`] tells it apart.
+    /// Why the certificate is not trusted. [`TlsFailure`] distinguishes the causes.
     pub(super) fn judge(
         &self,
         presented: &CertificateDer<'_>,
@@ -131,7 +129,7 @@ impl Trust {
         self.vouch(&Path { end_entity: &end_entity, intermediates, purpose, now })
     }
 
-    /// Looks for an authority that vouches for a certificate.
+    /// Looks for an authority that issued the certificate.
     fn vouch(&self, path: &Path<'_>) -> Result<(), Error> {
         let authorities = self.listed.iter().filter(|listed| listed.is_authority());
         let (valid, lapsed): (Vec<_>, Vec<_>) =
@@ -147,7 +145,7 @@ impl Trust {
         }
     }
 
-    /// Whether there is a path to one of the authorities.
+    /// Looks for a path to one of the authorities.
     fn leads_to(&self, path: &Path<'_>, authorities: &[&Listed]) -> Result<(), webpki::Error> {
         let anchors = authorities.iter().filter_map(|listed| listed.anchor.as_ref());
         let anchors: Vec<TrustAnchor<'_>> = anchors.map(borrowed).collect();
@@ -166,7 +164,7 @@ impl Trust {
     }
 }
 
-/// What leads from a peer's certificate to an authority, if anything does.
+/// A presented certificate, and what is needed to find a path to an authority.
 struct Path<'p> {
     end_entity: &'p EndEntityCert<'p>,
     intermediates: &'p [CertificateDer<'p>],
@@ -192,8 +190,8 @@ fn borrowed<'a>(anchor: &'a TrustAnchor<'static>) -> TrustAnchor<'a> {
     }
 }
 
-/// The rules along a path that webpki leaves open: who is an authority, and the `pathLenConstraint`
-/// of a listed one.
+/// The rules along a path that webpki does not check: which certificates are authorities, and the
+/// `pathLenConstraint` of a listed one.
 fn is_allowed(path: &VerifiedPath<'_>, authorities: &[&Listed]) -> Result<(), webpki::Error> {
     let mut len = 0;
     for intermediate in path.intermediate_certificates() {
@@ -218,7 +216,7 @@ fn is_allowed(path: &VerifiedPath<'_>, authorities: &[&Listed]) -> Result<(), we
     }
 }
 
-/// Every authority of a path needs a list; how old one is does not matter.
+/// Every authority of a path requires a list. The age of a list does not matter.
 fn revocation<'l>(lists: &'l [&'l CertRevocationList<'l>]) -> Option<RevocationOptions<'l>> {
     let options = RevocationOptionsBuilder::new(lists).ok()?;
     let options = options
@@ -228,8 +226,8 @@ fn revocation<'l>(lists: &'l [&'l CertRevocationList<'l>]) -> Option<RevocationO
     Some(options.build())
 }
 
-/// What webpki found, once the presented certificate itself was looked at: dates and purposes are
-/// those of one above it.
+/// Converts an error of webpki. The presented certificate has already passed the checks of its
+/// dates and purpose, so these errors concern a certificate above it.
 fn refused(error: webpki::Error) -> Error {
     use webpki::Error as Found;
     match error {
@@ -278,7 +276,7 @@ fn violated(constraint: &'static str) -> Error {
     told(TlsFailure::ConstraintViolated { constraint })
 }
 
-/// What a date is of, if it is not of the presented certificate.
+/// Converts an error of dates that concerns an issuer.
 fn of_issuer(flaw: CertificateError) -> TlsFailure {
     match flaw {
         CertificateError::ExpiredContext { time, not_after } => {
@@ -291,7 +289,7 @@ fn of_issuer(flaw: CertificateError) -> TlsFailure {
     }
 }
 
-/// A signature in the path with an algorithm that is not supported.
+/// The failure for a signature with an unsupported algorithm.
 fn unsupported(algorithm: &[u8]) -> TlsFailure {
     let oid = SliceReader::new(algorithm).and_then(|mut reader| reader.decode());
     let found = match oid.map(|oid: ObjectIdentifier| oid.to_string()).as_deref() {
@@ -309,7 +307,7 @@ fn unsupported(algorithm: &[u8]) -> TlsFailure {
     TlsFailure::UnsupportedCertificate { flaw }
 }
 
-/// A failure that rustls carries through.
+/// Wraps a failure, so that rustls carries it through.
 fn told(failure: TlsFailure) -> Error {
     CertificateError::Other(OtherError(Arc::new(failure))).into()
 }
@@ -360,7 +358,8 @@ mod tests {
         Trust::new(listed.collect::<Result<_, _>>().unwrap(), Vec::new())
     }
 
-    /// Why the first of a chain is not trusted in that year, or nothing.
+    /// The reason why the first certificate of a chain is not trusted in that year; empty when it
+    /// is.
     fn judged(trust: &Trust, chain: &[&Owner], purpose: Purpose, year: u64) -> &'static str {
         let ders: Vec<_> = chain.iter().map(|owner| owner.certificate.der().clone()).collect();
         let now = UnixTime::since_unix_epoch(Duration::from_secs((year - 1970) * YEAR + YEAR / 2));
@@ -371,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn dates_count_of_every_certificate_of_a_path() {
+    fn dates_of_every_certificate_of_a_path_are_checked() {
         let valid = |from, to| {
             move |params: &mut CertificateParams| {
                 params.is_ca = CA;
@@ -394,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn an_authority_that_expired_harms_nobody_whom_another_vouches_for() {
+    fn an_expired_authority_does_not_affect_the_certificates_of_others() {
         let former = Owner::new("root", None, |params| {
             params.is_ca = CA;
             params.not_after = date_time_ymd(2020, 1, 1);
@@ -414,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_answer_is_given_to_servers_and_to_clients() {
+    fn the_same_checks_apply_to_servers_and_clients() {
         let root = Owner::authority("root", None);
         let server = [ExtendedKeyUsagePurpose::ServerAuth];
         let any = [ExtendedKeyUsagePurpose::Any];
@@ -434,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn who_may_not_sign_is_no_authority_wherever_it_is() {
+    fn an_issuer_without_key_cert_sign_is_not_an_authority() {
         let root = Owner::authority("root", None);
         let no_signer = |params: &mut CertificateParams| {
             params.is_ca = CA;
@@ -453,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn a_listed_authority_vouches_only_as_far_as_its_path_may_be() {
+    fn the_path_length_of_a_listed_authority_is_limited() {
         let root = Owner::new("root", None, |params| {
             params.is_ca = IsCa::Ca(BasicConstraints::Constrained(1));
         });
@@ -468,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_that_was_changed_is_refused() {
+    fn a_modified_certificate_is_refused() {
         let root = Owner::authority("root", None);
         let leaf = Owner::new("leaf", Some(&root), |_| {});
         let (trust, good) = (trust(&[&root]), leaf.certificate.der().to_vec());
