@@ -60,7 +60,7 @@ def test_a_write_that_is_not_confirmed_has_a_fault(
 
 def test_a_write_to_nobody_is_refused_at_once(poller: Poller) -> None:
     fake = Fake(data)
-    with pytest.raises(ValueError, match="device a: there is none of that name"):
+    with pytest.raises(ValueError, match="device a: there is no device of that name"):
         poller.write("a", Request.write_register(0, 1))
     poller.add(device(fake))
     with pytest.raises(ValueError, match="device a: function 3 does not write"):
@@ -158,7 +158,7 @@ def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: Poller) -> Non
     for count, forward in ((65535, [receiver]), (65536, None)):
         poller.add(device(fake, str(count), reads=[("coils", 0, count, None)], forward=forward))
     reads = [("coils", 0, 1, None), ("coils", 0, 65536, None)]
-    with pytest.raises(ValueError, match="device c: read 1 has 65536 items, a packet that is"):
+    with pytest.raises(ValueError, match="device c: read 1 has 65536 items, a forwarded packet"):
         poller.add(device(fake, "c", reads=reads, forward=[receiver]))
     assert sorted(poller.counters()) == ["65535", "65536"]
 
@@ -198,8 +198,8 @@ def test_what_can_not_be_replaced_stays(poller: Poller) -> None:
     with Fake(data) as fake:
         poller.add(device(fake))
         poller.add(device(fake, "b"))
-        with pytest.raises(ValueError, match="device c: there is none of that name"):
+        with pytest.raises(ValueError, match="device c: there is no device of that name"):
             poller.replace("c", device(fake, "d"))
-        with pytest.raises(ValueError, match="device b: there is one of that name"):
+        with pytest.raises(ValueError, match="device b: the name is already in use"):
             poller.replace("a", device(fake, "b"))
         assert sorted(poller.counters()) == ["a", "b"]

@@ -1,18 +1,18 @@
-//! Pauses after failures: 1 s, doubled with each, up to a limit, and never quite the same.
+//! Pauses after failures: 1 s, doubled with each failure up to a limit, and randomized.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
 
 const FIRST: Duration = Duration::from_secs(1);
 
-/// The longest pause of those who are asked.
+/// The longest pause before a device is asked again.
 pub(super) const MAX_PAUSE: Duration = Duration::from_secs(60);
 
-/// The pause after `failures` failures in a row, at least one: up to a quarter shorter by chance, so
-/// that those who failed together don't come back together.
+/// The pause after `failures` consecutive failures, at least one. It is up to a quarter shorter at
+/// random, so that devices that failed together are not retried together.
 pub(super) fn pause(failures: u32, longest: Duration) -> Duration {
     let doubled = FIRST.saturating_mul(1u32 << failures.saturating_sub(1).min(6)).min(longest);
-    // A hasher's keys are random, which is all the chance that is needed.
+    // The keys of a hasher are random, which suffices here.
     let chance = RandomState::new().hash_one(failures) as u32;
     doubled.mul_f64(1.0 - 0.25 * f64::from(chance) / f64::from(u32::MAX))
 }

@@ -1,4 +1,4 @@
-//! Panics of a device's tasks: they are seen, and the other devices go on.
+//! Catches panics in the tasks of a device, so that other devices continue.
 
 use std::future::poll_fn;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -9,11 +9,11 @@ use tokio::task::{AbortHandle, spawn_local};
 
 use super::state::DeviceState;
 
-/// A future has panicked. What it worked on may be half done.
+/// A future has panicked. The state it worked on may be inconsistent.
 #[derive(Debug)]
 pub(super) struct Panicked;
 
-/// What a future comes to, unless it panics.
+/// Awaits a future and catches its panic.
 pub(super) async fn caught<F: Future>(future: F) -> Result<F::Output, Panicked> {
     let mut future = pin!(future);
     poll_fn(|context| match catch_unwind(AssertUnwindSafe(|| future.as_mut().poll(context))) {
@@ -23,7 +23,7 @@ pub(super) async fn caught<F: Future>(future: F) -> Result<F::Output, Panicked> 
     .await
 }
 
-/// Starts a task of a device. If it panics, the device is in error until it is replaced.
+/// Starts a task of a device. If the task panics, the device is in error until it is replaced.
 pub(super) fn spawn_watched(
     task: impl Future<Output = ()> + 'static,
     state: Arc<DeviceState>,

@@ -1,9 +1,9 @@
-//! What a request and a register cost a device, learned from the times of its answers.
+//! Estimates the time per request and per register of a device, from measured round trips.
 
-/// Answers that a cost is learned from, before it is told.
+/// The number of answers that an estimate requires.
 const ENOUGH: u32 = 100;
 
-/// A line through round trips by size: what a request takes, and what each 16 bits take beside it.
+/// Linear regression of round trip time by size: a constant per request, and a slope per 16 bits.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Samples {
     count: u32,
@@ -14,7 +14,7 @@ pub(super) struct Samples {
 }
 
 impl Samples {
-    /// An answer of so many registers, or sixteens of bits, that took so many milliseconds.
+    /// Adds an answer of `size` registers, or 16-bit groups of bits, that took `time` milliseconds.
     pub(super) fn add(&mut self, size: f64, time: f64) {
         self.count += 1;
         self.sum_size += size;
@@ -23,8 +23,8 @@ impl Samples {
         self.sum_product += size * time;
     }
 
-    /// Milliseconds of a request and of a register, once that is known. Of answers that were all of
-    /// one size nothing is learned about registers: `before` stands for it.
+    /// Milliseconds per request and per register, once there are enough samples. Answers of one
+    /// size do not show the cost of a register: `before` is used then.
     pub(super) fn cost(&self, before: f64) -> Option<(f64, f64)> {
         if self.count < ENOUGH {
             return None;
@@ -43,7 +43,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_price_is_that_of_the_answers() {
+    fn the_cost_is_estimated_from_the_answers() {
         let mut samples = Samples::default();
         for index in 0..ENOUGH {
             assert_eq!(samples.cost(9.0), None);
@@ -55,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn answers_of_one_size_tell_nothing_of_registers() {
+    fn answers_of_one_size_do_not_change_the_cost_of_registers() {
         let mut samples = Samples::default();
         for _ in 0..ENOUGH {
             samples.add(10.0, 7.0);
@@ -64,7 +64,7 @@ mod tests {
     }
 
     #[test]
-    fn a_price_is_never_below_nothing() {
+    fn a_cost_is_never_negative() {
         let mut samples = Samples::default();
         for index in 0..ENOUGH {
             let size = f64::from(index % 2 * 100 + 1);

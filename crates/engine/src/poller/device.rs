@@ -1,14 +1,13 @@
-//! One device: its schedule, its plan, and what it has to tell.
+//! One device: its schedule, plan and results.
 //!
-//! The schedule does not drift: polls are due at whole intervals from the start. One that can't begin
-//! in time is skipped and counted, not caught up. A unit that stays silent is asked less and less
-//! often, with one request, until it answers; behind an address that can't be reached nothing is
-//! asked before the next attempt. A poll begins behind the block that the one before it failed at,
-//! so that a block which is never answered does not keep the others waiting.
+//! The schedule does not drift: polls are due at whole intervals from the start. A poll that cannot
+//! begin in time is skipped and counted. A silent unit is polled less and less often, with one
+//! request, until it answers. While an address cannot be reached, nothing is sent before the next
+//! attempt. A poll begins after the block at which the previous one failed, so that a block that is
+//! never answered does not block the others.
 //!
-//! A device whose settings change is succeeded by another one between two polls. The successor keeps
-//! to the schedule of the one before, and knows what that one knew; if it is to, it reads once beside
-//! the schedule.
+//! When settings change, a new device replaces the old one between two polls. It keeps the schedule
+//! and what the old one learned. On demand, it also reads once outside the schedule.
 
 use std::cell::{Cell, RefCell, RefMut};
 use std::collections::HashMap;
@@ -38,37 +37,37 @@ use super::state::DeviceState;
 use super::status::{Fault, StatusSettings};
 use crate::client::Endpoint;
 
-/// How often a status block is written at least.
+/// The longest interval between writes of the status block.
 const TELLING: Duration = Duration::from_secs(1);
 
-/// Polls without an answer in a row after which a unit is held to be dead.
+/// The number of consecutive polls without an answer after which a unit counts as dead.
 const DEAD_AFTER: u32 = 3;
 
-/// Polls beside the schedule are at least so far apart, or an interval if that is shorter.
+/// The shortest interval between polls outside the schedule, unless the interval of the device is
+/// shorter.
 const OFF_SCHEDULE_INTERVAL: Duration = Duration::from_secs(1);
 
-/// A device and what is to become of what it answers.
+/// Settings of a device.
 #[derive(Debug, Clone)]
 pub struct DeviceSettings {
     pub name: String,
     pub endpoint: Endpoint,
     pub unit_id: u8,
-    /// 0 polls without a pause.
+    /// The time between polls; 0 polls without a pause.
     pub interval: Duration,
     pub timeout: Duration,
     pub reads: Vec<ReadSettings>,
     pub limits: PlanLimits,
     pub strategy: Strategy,
-    /// Whether the costs of [`Strategy::Cost`] are only what it begins with: those that the device's
-    /// own answers show take their place.
+    /// Whether the costs of [`Strategy::Cost`] are initial estimates, replaced by measurements.
     pub measured: bool,
     pub forward: Vec<ForwardSettings>,
     pub status: Option<StatusSettings>,
-    /// The first poll comes within this time, at a moment that differs from device to device.
+    /// The first poll begins within this time. Devices are spread over it.
     pub start_within: Duration,
-    /// Whether what is read goes to [`super::Results`] too.
+    /// Whether reads are also sent to [`super::Results`].
     pub report: bool,
-    /// Whether the connection is closed after each poll, for devices that have only one.
+    /// Whether the connection is closed after each poll, for devices that accept only one.
     pub release: bool,
 }
 
@@ -76,47 +75,48 @@ pub struct DeviceSettings {
 pub struct ReadSettings {
     pub area: Area,
     pub address: u16,
-    /// Any number: what does not fit into one request takes several, and is written as one step.
+    /// Any number. A read that does not fit into one request takes several, and is written
+    /// atomically.
     pub count: u32,
     pub into: Option<Destination>,
 }
 
-/// A device that is polled.
+/// A running device.
 pub(super) struct Device {
     settings: DeviceSettings,
     state: Arc<DeviceState>,
     link: Rc<Link>,
     turn: Rc<Turn>,
     forwards: Vec<Rc<Forward>>,
-    /// The parts of reads that one request can carry.
+    /// The parts of reads. Each fits into one request.
     fields: Vec<Field>,
-    /// The read that each field is a part of, and its place in it, in items.
+    /// For each field, the index of its read, and its offset in it, in items.
     parts: Vec<(usize, u32)>,
     report: Option<Arc<Results>>,
     name: Arc<str>,
     learned: RefCell<Learned>,
-    /// `None` while no plan reads the device; the state has the error.
+    /// `None` while the device has no plan. The state has the error.
     plan: RefCell<Option<Rc<Vec<Block>>>>,
-    /// The block that a poll begins with.
+    /// The index of the first block of the next poll.
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    /// Whether memory has refused something since the last poll.
+    /// Whether memory has refused a write since the last poll.
     unstored: Cell<bool>,
     silent: Cell<u32>,
-    /// When the next poll is to begin.
+    /// The due time of the next poll.
     due: Cell<Instant>,
-    /// Whether that is so late because nothing would answer before.
+    /// Whether the next poll is delayed because the device does not answer.
     backing_off: Cell<bool>,
-    /// When one is to begin beside the schedule, and when the last did.
+    /// The due time of a poll outside the schedule, and the time of the last one.
     off_schedule: Cell<Option<Instant>>,
     last_off_schedule: Cell<Option<Instant>>,
 }
 
-/// Held while a request is under way: a device gets one at a time, whoever sends it.
+/// Held during a request: a device gets one request at a time, from polls and writes alike.
 pub(super) type Turn = tokio::sync::Mutex<()>;
 
-/// What a device is told while it waits for its next poll.
+/// Messages to a device that waits for its next poll.
 #[derive(Default)]
 pub(super) struct Inbox {
     successor: RefCell<Option<Device>>,
@@ -125,9 +125,9 @@ pub(super) struct Inbox {
 }
 
 enum Told {
-    /// Another one takes its place.
+    /// A new device replaces this one.
     Successor(Box<Device>),
-    /// It answers: somebody else has asked it.
+    /// The device has answered a write.
     Awake,
 }
 
@@ -155,20 +155,20 @@ impl Inbox {
     }
 }
 
-/// A device with a plan that reads all of it.
+/// Settings of a device, with its first plan.
 #[derive(Debug)]
 pub(super) struct Planned {
     pub(super) settings: DeviceSettings,
-    /// The parts of reads that one request can carry.
+    /// The parts of reads. Each fits into one request.
     fields: Vec<Field>,
-    /// The read that each field is a part of, and its place in it, in items.
+    /// For each field, the index of its read, and its offset in it, in items.
     parts: Vec<(usize, u32)>,
     plan: Vec<Block>,
 }
 
 impl Planned {
     /// # Errors
-    /// [`PlanError`] for a read that no request may carry.
+    /// [`PlanError`] for a read that cannot be planned.
     pub(super) fn new(settings: DeviceSettings) -> Result<Planned, PlanError> {
         let (fields, parts) = parted(&settings.reads, &settings.limits);
         let plan = plan::plan(&fields, &settings.limits, settings.strategy)?;
@@ -176,15 +176,15 @@ impl Planned {
     }
 }
 
-/// The fields of reads, each no longer than a request; and for each the read that it is a part of,
-/// and its place in it.
+/// Splits reads into fields, each no longer than a request. Returns for each field the index of its
+/// read, and its offset in it.
 fn parted(reads: &[ReadSettings], limits: &PlanLimits) -> (Vec<Field>, Vec<(usize, u32)>) {
     let (mut fields, mut parts) = (Vec::new(), Vec::new());
     for (index, read) in reads.iter().enumerate() {
         let most = if read.area.is_bits() { limits.max_bits } else { limits.max_registers };
         let mut at = 0;
         while at < read.count {
-            // A limit of 0 is an error of the plan.
+            // The plan reports a limit of 0.
             let count = u32::from(most.max(1)).min(read.count - at);
             let address = (u32::from(read.address) + at) as u16;
             fields.push(Field { area: read.area, address, count: count as u16 });
@@ -229,7 +229,7 @@ impl Device {
         device
     }
 
-    /// Polls for ever, first after `phase`, and keeps the status block true meanwhile.
+    /// Polls forever, first after `phase`, and keeps the status block up to date.
     pub(super) async fn run(mut self, phase: Duration, inbox: Rc<Inbox>) {
         self.due.set(Instant::now() + phase);
         loop {
@@ -245,13 +245,13 @@ impl Device {
                     successor.follow(self);
                     *successor
                 }
-                // What it knows may be half done: the successor begins anew.
+                // Its state may be inconsistent: the new device starts from scratch.
                 Err(Panicked) => *self.wait_until_replaced(&inbox).await,
             };
         }
     }
 
-    /// Asks nothing any more, and shows that in the status block.
+    /// Sends no requests, and keeps the error in the status block, until the device is replaced.
     async fn wait_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
         self.state.set_broken(true);
         loop {
@@ -295,7 +295,7 @@ impl Device {
             self.state.counters.missed.add_many(missed);
             let rest = self.rest();
             if let Some(until) = rest {
-                // What is left out on purpose is not missed.
+                // Polls that are skipped on purpose do not count as missed.
                 (due, _) = first_from(until, due, interval);
             }
             self.backing_off.set(rest.is_some());
@@ -306,7 +306,7 @@ impl Device {
         }
     }
 
-    /// Ends a rest.
+    /// Ends a backoff.
     fn wake(&self) {
         if self.backing_off.take() {
             self.silent.set(0);
@@ -314,12 +314,12 @@ impl Device {
         }
     }
 
-    /// That a poll is wanted soon, beside the schedule.
+    /// Requests a poll soon, outside the schedule.
     pub(super) fn want_soon(&self) {
         self.off_schedule.set(Some(Instant::now()));
     }
 
-    /// Goes on where the device before it ended.
+    /// Takes over the state of the device before it.
     fn follow(&self, before: Device) {
         let now = Instant::now();
         let (old, new) = (&before.settings, &self.settings);
@@ -358,7 +358,7 @@ impl Device {
         }
     }
 
-    /// Until when nothing is asked: the address can't be reached before, or the unit is dead.
+    /// The end of a backoff, if the address cannot be reached or the unit counts as dead.
     fn rest(&self) -> Option<Instant> {
         let silent = self.silent.get();
         self.link.retry_at().or_else(|| {
@@ -368,7 +368,7 @@ impl Device {
         })
     }
 
-    /// Draws the plan from what is known; what can't be read is left out.
+    /// Plans the readable fields within the learned limits.
     fn draw_plan(&self) {
         let learned = self.learned.borrow();
         let known: Vec<usize> =
@@ -387,7 +387,7 @@ impl Device {
         }));
     }
 
-    /// Polls by a plan from now on, or not at all without one.
+    /// Uses a plan from now on. Without one, no request is sent.
     fn adopt(&self, drawn: Result<Vec<Block>, String>) {
         let (requests, plan) = match drawn {
             Ok(plan) => (Ok(plan.len()), Some(Rc::new(plan))),
@@ -401,7 +401,7 @@ impl Device {
         self.learned.borrow_mut()
     }
 
-    /// Draws the plan anew when enough answers have shown what a request costs.
+    /// Plans again when there are enough samples of the cost of a request.
     fn learn(&self) {
         let Strategy::Cost { item, .. } = self.strategy.get() else { return };
         if !self.settings.measured {
@@ -414,7 +414,7 @@ impl Device {
         }
     }
 
-    /// Reads every block, and hands on every read that came whole.
+    /// Reads every block, and passes on every complete read.
     async fn poll(&self, due: Instant) {
         if self.learned().forget(Instant::now()) {
             self.draw_plan();
@@ -437,7 +437,7 @@ impl Device {
                 }
                 Err(other) => {
                     fault = Some(other);
-                    // What one request did not bring, the next would not bring either.
+                    // If one request is not answered, the next would not be either.
                     self.first.set(index + 1);
                     break;
                 }
@@ -460,7 +460,7 @@ impl Device {
         }
     }
 
-    /// A poll without a plan: nothing is asked, and every field has the fault.
+    /// A poll without a plan: nothing is sent, and every field gets the fault.
     fn leave_out(&self, due: Instant, mut gathered: Gathered) {
         self.state.counters.unplanned.add();
         for Field { area, address, count } in self.fields.iter().copied() {
@@ -471,7 +471,7 @@ impl Device {
         self.state.bad(Fault::Unplanned);
     }
 
-    /// Hands the blocks of a poll to whoever takes results.
+    /// Sends the blocks of a poll to the results.
     fn hand_over(&self, due: Instant, gathered: Gathered) {
         if let Some(results) = &self.report {
             let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
@@ -479,8 +479,8 @@ impl Device {
         }
     }
 
-    /// Tells of the ranges that can't be read, and tries one again from time to time; a fault of
-    /// one of them.
+    /// Reports unreadable ranges, and tries one of them again from time to time. Returns the fault
+    /// of one of them.
     async fn look_at_unreadable(
         &self,
         known: &[Unreadable],
@@ -496,7 +496,7 @@ impl Device {
                 match self.ask(&block).await {
                     Err(fault) => found = fault,
                     Ok(_) => {
-                        // It is read with the next poll.
+                        // The next poll reads it.
                         *self.learned() = Learned::default();
                         self.draw_plan();
                         continue;
@@ -525,7 +525,7 @@ impl Device {
         }
     }
 
-    /// Hands on what a block brought.
+    /// Passes on the bytes of a block.
     fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
         self.spread(block, &bytes, gathered);
         gathered.note(block, Ok(bytes));
@@ -541,7 +541,7 @@ impl Device {
             }
             Area::InputRegisters => Range::new(address, quantity).map(Request::ReadInputRegisters),
         };
-        // The limits of a device are those of a request at most, and no block is beyond them.
+        // The limits of a device are at most those of a request, and every block is within them.
         let request = EncodedRequest::new(&request.expect("a block is a valid request"));
         let _turn = self.turn.lock().await;
         let counters = &self.state.counters;
@@ -567,7 +567,7 @@ impl Device {
         answer
     }
 
-    /// Takes the fields of a block out of its bytes; reads that are whole then are handed on.
+    /// Extracts the fields of a block, and passes on the reads that are complete.
     fn spread(&self, block: &Block, bytes: &[u8], gathered: &mut Gathered) {
         for index in &block.fields {
             let field = self.fields[*index];
@@ -613,15 +613,14 @@ impl Device {
         }
     }
 
-    /// Memory has refused something: that is counted, and makes the poll one that failed.
+    /// Counts a refusal of memory. The poll counts as failed.
     fn count_unstored(&self) {
         self.state.counters.unstored.add();
         self.unstored.set(true);
     }
 }
 
-/// The first time that is not before `now`, of those at whole intervals from `due`; and how many
-/// come before it.
+/// The first due time that is not before `now`, and the number of due times before it.
 fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) {
     let late = now.saturating_duration_since(due).as_nanos();
     let passed = late.div_ceil(interval.as_nanos().max(1));
@@ -629,8 +628,8 @@ fn first_from(now: Instant, due: Instant, interval: Duration) -> (Instant, u64) 
     (due + Duration::from_nanos(skipped as u64), if interval.is_zero() { 0 } else { passed as u64 })
 }
 
-/// What one poll brings together: reads that come in parts, and how many items are missing; and
-/// all blocks, where somebody wants them.
+/// The data of one poll: reads with several parts, with the number of missing items; and all
+/// blocks, if they are reported.
 #[derive(Default)]
 struct Gathered {
     parts: HashMap<usize, (Vec<u8>, u32)>,
@@ -647,7 +646,7 @@ impl Gathered {
         }
     }
 
-    /// Puts a field into its read; all of the read when nothing is missing any more.
+    /// Adds a field to its read. Returns the read when it is complete.
     fn put(
         &mut self,
         settings: &ReadSettings,
@@ -670,7 +669,7 @@ impl Gathered {
             whole[at * 2..(at + count) * 2]
                 .copy_from_slice(&block[offset * 2..(offset + count) * 2]);
         }
-        assert!(*missing >= u32::from(field.count), "each field of a read comes once a poll");
+        assert!(*missing >= u32::from(field.count), "each field of a read arrives once per poll");
         *missing -= u32::from(field.count);
         if *missing > 0 {
             return None;
@@ -679,7 +678,7 @@ impl Gathered {
     }
 }
 
-/// A device while a block that it refused is searched.
+/// A device whose refused block is being searched.
 struct Search<'a> {
     device: &'a Device,
     gathered: &'a mut Gathered,

@@ -1,5 +1,5 @@
-//! Forwarding: what was read goes on as Raw Ingest packets. A target that is down costs the device
-//! nothing; when it is back, it gets the newest of each read.
+//! Forwards reads as Raw Ingest packets. A target that is down does not delay the device. When the
+//! target is back, it receives the newest bytes of each read.
 
 use std::cell::{Cell, RefCell};
 use std::collections::{HashMap, VecDeque};
@@ -29,20 +29,20 @@ pub struct ForwardSettings {
     pub host: String,
     pub port: u16,
     pub format: Format,
-    /// The unit id (v1) or memory id (crc) that packets name.
+    /// The unit id (v1) or memory id (crc) in packets.
     pub target: u16,
     pub timeout: Duration,
 }
 
-/// What became of packets.
+/// Counters of forwarded packets.
 #[derive(Debug, Default)]
 pub struct ForwardCounters {
     pub sent: Counter,
-    /// The receiver answered that it did not write.
+    /// The receiver did not write the packet.
     pub refused: Counter,
-    /// There was no connection, or no reply.
+    /// Connecting failed, or no reply arrived.
     pub failed: Counter,
-    /// Replaced by newer bytes of the same read before they were sent.
+    /// Packets replaced by newer bytes of the same read before they were sent.
     pub replaced: Counter,
 }
 
@@ -55,7 +55,7 @@ pub(super) struct Forward {
     failures: Cell<u32>,
 }
 
-/// The newest packet of each read that has not been sent, and their order: first come, first sent.
+/// The newest unsent packet of each read, in the order of arrival.
 #[derive(Default)]
 struct Waiting {
     order: VecDeque<usize>,
@@ -63,7 +63,7 @@ struct Waiting {
 }
 
 impl Waiting {
-    /// Whether it took the place of an older one.
+    /// Queues a packet. Returns whether it replaced an older one.
     fn put(&mut self, read: usize, packet: Vec<u8>) -> bool {
         let replaced = self.newest.insert(read, packet).is_some();
         if !replaced {
@@ -72,7 +72,7 @@ impl Waiting {
         replaced
     }
 
-    /// Takes a packet back that was not sent; whether there is a newer one by now.
+    /// Puts back a packet that was not sent. Returns whether there is already a newer one.
     fn put_back(&mut self, read: usize, packet: Vec<u8>) -> bool {
         let outdated = self.newest.contains_key(&read);
         if !outdated {
@@ -101,7 +101,7 @@ impl Forward {
         })
     }
 
-    /// Takes the bytes of a read, in place of older ones. Never waits.
+    /// Queues the bytes of a read, in place of older ones. Never waits.
     pub(super) fn offer(
         &self,
         read: usize,
@@ -114,14 +114,14 @@ impl Forward {
         let header = Header { area, target: self.settings.target, address, count };
         let mut packet = Vec::with_capacity(self.settings.format.packet_len(&header));
         let encoded = self.settings.format.encode(&header, bytes, &mut packet);
-        encoded.expect("a read brings as many bytes as its count says");
+        encoded.expect("the length of a read matches its count");
         if self.waiting.borrow_mut().put(read, packet) {
             self.counters.replaced.add();
         }
         self.news.notify_one();
     }
 
-    /// Sends what was offered, one packet after the other, for ever.
+    /// Sends the queued packets, one after another, forever.
     pub(super) async fn run(self: Rc<Forward>) {
         loop {
             let next = self.waiting.borrow_mut().take();
@@ -160,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_read_has_its_turn_and_newer_bytes_take_the_place_of_older_ones() {
+    fn reads_take_turns_and_newer_bytes_replace_older_ones() {
         let mut waiting = Waiting::default();
         assert!(!waiting.put(0, vec![1]) && !waiting.put(1, vec![2]));
         let (read, packet) = waiting.take().unwrap();

@@ -1,4 +1,4 @@
-//! Agreeing on TLS over a connection that was just made.
+//! The TLS handshake over a new connection.
 
 use std::io::{self, ErrorKind};
 
@@ -8,11 +8,11 @@ use tokio::net::TcpStream;
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const CHUNK: usize = 4096;
 
 /// # Errors
-/// The connection is to be closed; the peer was told why.
+/// The handshake failed: close the connection. An alert has been sent.
 pub(super) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result<Channel> {
     let failed = |error| io::Error::other(TlsFailure::from(&error));
     let mut channel = tls.channel().map_err(failed)?;
@@ -34,6 +34,6 @@ pub(super) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result
             return Err(failed(error));
         }
     }
-    // Nobody has asked for anything yet.
+    // Data before the first request is an error.
     if plain.is_empty() { Ok(channel) } else { Err(ErrorKind::InvalidData.into()) }
 }

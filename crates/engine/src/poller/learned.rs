@@ -1,5 +1,5 @@
-//! What a device has taught by its refusals: what can't be read, what not together, and how much at
-//! once. It is remembered for a while, then tried again.
+//! The limits that refusals of a device have shown: unreadable ranges, cuts between ranges, and the
+//! size of a request. They are remembered for a while, then tried again.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use tokio::time::Instant;
 use super::plan::{Block, Cut, Field, PlanLimits};
 use super::status::Fault;
 
-/// How long it is remembered.
+/// How long the limits are remembered.
 const REMEMBERED: Duration = Duration::from_secs(600);
 
-/// How often something that can't be read is tried again.
+/// The interval between attempts to read an unreadable range.
 const RETRY: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Default)]
@@ -21,7 +21,7 @@ pub(super) struct Learned {
     max_bits: Option<u16>,
     cuts: Vec<Cut>,
     unreadable: Vec<Unreadable>,
-    /// When all of it is forgotten.
+    /// When everything is forgotten.
     until: Option<Instant>,
 }
 
@@ -40,7 +40,7 @@ impl Unreadable {
         u32::from(self.address) + u32::from(self.count)
     }
 
-    /// It as a request.
+    /// The range as a request.
     pub(super) fn block(&self) -> Block {
         let Unreadable { area, address, count, .. } = *self;
         Block { area, address, count, fields: Vec::new(), gaps: 0 }
@@ -50,7 +50,7 @@ impl Unreadable {
         (self.area, self.address, self.count) == (other.area, other.address, other.count)
     }
 
-    /// Whether a field is in it.
+    /// Whether a field is inside the range.
     fn holds(&self, field: &Field) -> bool {
         let end = u32::from(field.address) + u32::from(field.count);
         field.area == self.area && self.address <= field.address && end <= self.end()
@@ -58,7 +58,7 @@ impl Unreadable {
 }
 
 impl Learned {
-    /// Forgets everything when its time has come; whether it has.
+    /// Forgets everything when its time is over. Returns whether it has.
     pub(super) fn forget(&mut self, now: Instant) -> bool {
         let over = self.until.is_some_and(|until| until <= now);
         if over {
@@ -67,15 +67,15 @@ impl Learned {
         over
     }
 
-    /// A device bears fewer items in one request.
+    /// The device accepts at most this many items per request.
     pub(super) fn lower(&mut self, area: Area, most: u16) {
-        debug_assert!(most > 0, "no limit is below one item");
+        debug_assert!(most > 0, "a limit is at least one item");
         let known = if area.is_bits() { &mut self.max_bits } else { &mut self.max_registers };
         *known = Some(known.map_or(most, |known| known.min(most)));
         self.remember();
     }
 
-    /// What ends before an address is not read together with what begins there.
+    /// Fields that end before this address are not read together with fields that begin at it.
     pub(super) fn cut(&mut self, area: Area, address: u32) {
         let cut = Cut { area, address };
         if !self.cuts.contains(&cut) {
@@ -84,7 +84,7 @@ impl Learned {
         self.remember();
     }
 
-    /// A block can't be read at all.
+    /// The device refuses this block.
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
         let Block { area, address, count, .. } = *block;
         debug_assert!(count > 0);
@@ -93,7 +93,7 @@ impl Learned {
         self.remember();
     }
 
-    /// Forgets what can't be read of what nobody wants any more; it stays apart from its neighbours.
+    /// Forgets unreadable ranges without a field. Each leaves a cut at its start.
     pub(super) fn keep(&mut self, fields: &[Field]) {
         let wanted = |range: &Unreadable| fields.iter().any(|field| range.holds(field));
         let (kept, unwanted) = std::mem::take(&mut self.unreadable).into_iter().partition(wanted);
@@ -108,7 +108,8 @@ impl Learned {
         &self.unreadable
     }
 
-    /// The range that is to be tried again, if its time has come, or in any case: each in its turn.
+    /// The range that has waited longest for its next attempt, if that is due or `in_any_case` is
+    /// set.
     pub(super) fn retry(&mut self, now: Instant, in_any_case: bool) -> Option<Unreadable> {
         let range = self.unreadable.iter_mut().min_by_key(|range| range.retry_at)?;
         if range.retry_at > now && !in_any_case {
@@ -118,12 +119,12 @@ impl Learned {
         Some(range.clone())
     }
 
-    /// Whether a field is known not to be readable.
+    /// Whether a field is known to be unreadable.
     pub(super) fn is_refused(&self, field: &Field) -> bool {
         self.unreadable.iter().any(|range| range.holds(field))
     }
 
-    /// The limits of a device with these fields, none of which is made unreadable by them.
+    /// The limits of a device with these fields. They never make a field unreadable.
     pub(super) fn limits(&self, of: &PlanLimits, fields: &[Field]) -> PlanLimits {
         let longest = |bits: bool| {
             let alike = fields.iter().filter(|field| field.area.is_bits() == bits);

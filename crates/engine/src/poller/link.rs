@@ -1,9 +1,9 @@
-//! A link: one connection to one address, or one serial line, shared by all devices behind it.
+//! A link: one connection or one serial line, shared by all devices behind it.
 //!
-//! Over Modbus TCP several requests are in flight, so that a unit that is dead does not hold up the
-//! others behind the same gateway. All other transports carry one request at a time, in a thread of
-//! their own. A link that can't be connected fails at once until its pause is over. What ends a
-//! connection is decided by [`Connection`]; the next request makes a new one.
+//! Over Modbus TCP, several requests are in flight, so that a dead unit does not delay others
+//! behind the same gateway. Other transports carry one request at a time, in a thread of their own.
+//! After a failed connect, requests fail immediately until the backoff is over. [`Connection`]
+//! decides when a connection ends. The next request opens a new one.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -27,26 +27,26 @@ use crate::client::{BlockingClient, ClientError, Endpoint};
 use crate::tls::Channel;
 use crate::tls::client::ClientTls;
 
-/// Requests in flight on one connection.
+/// The most requests in flight on one connection.
 const IN_FLIGHT: usize = 8;
 
-/// Of these, doubtful ones.
+/// The most doubtful requests among them.
 const DOUBTFUL: usize = 4;
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const CHUNK: usize = 16 * 1024;
 
-/// The bytes of a read, none of a write, or why it was not answered.
+/// The bytes of a read, empty for a write; or the fault.
 pub(super) type Answer = Result<Vec<u8>, Fault>;
 
-/// How much a request matters beside others.
+/// The priority of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Priority {
     Usual,
-    /// To a unit that was silent the last time: it leaves room for the others.
+    /// To a unit that did not answer the last request. It leaves room for the others.
     Doubtful,
-    /// Somebody waits for it: it goes first where requests go one at a time, and tries an address
-    /// whose pause is not over.
+    /// A caller waits for it. It goes first where requests are sent one at a time, and ignores the
+    /// backoff.
     Urgent,
 }
 
@@ -56,7 +56,7 @@ pub(super) enum Link {
 }
 
 impl Link {
-    /// In the context of a `LocalSet`.
+    /// Must be called in the context of a `LocalSet`.
     pub(super) fn new(endpoint: Endpoint) -> Rc<Link> {
         Rc::new(match endpoint {
             Endpoint::Tcp { host, port, tls } => Link::Tcp(TcpLink::new(host, port, tls)),
@@ -64,7 +64,7 @@ impl Link {
         })
     }
 
-    /// Sends a read or a write, and waits for the answer.
+    /// Sends a read or a write and waits for the answer.
     pub(super) async fn call(
         &self,
         unit_id: u8,
@@ -80,7 +80,7 @@ impl Link {
 }
 
 impl Link {
-    /// When an address that could not be reached is tried again; until then polls fail at once.
+    /// When an unreachable address is tried again. Until then polls fail immediately.
     pub(super) fn retry_at(&self) -> Option<Instant> {
         let failed = match self {
             Link::Tcp(link) => link.failed.get().map(|(until, _)| until),
@@ -89,7 +89,7 @@ impl Link {
         failed.filter(|until| Instant::now() < *until)
     }
 
-    /// Ends the connection if nobody waits for a reply; the next request makes a new one.
+    /// Closes the connection if no request is in flight. The next request opens a new one.
     pub(super) fn release(&self) {
         match self {
             Link::Tcp(link) => {
@@ -113,20 +113,20 @@ pub(super) struct TcpLink {
     doubtful: Semaphore,
     connecting: Mutex<()>,
     failures: Cell<u32>,
-    /// When the next attempt may be made after one that failed, and why it did.
+    /// The earliest time of the next attempt after a failed one, and the fault.
     failed: Cell<Option<(Instant, Fault)>>,
     open: Rc<RefCell<Option<Open>>>,
 }
 
-/// A connection that is open.
+/// An open connection.
 struct Open {
     connection: Connection,
-    /// The zero of the connection's clock.
+    /// The zero of the clock of the connection.
     epoch: Instant,
     waiting: HashMap<Ticket, oneshot::Sender<Answer>>,
     writer: tokio::net::tcp::OwnedWriteHalf,
     tls: Option<Channel>,
-    /// What the socket did not take yet.
+    /// Bytes that the socket has not accepted yet.
     unsent: Vec<u8>,
     reader: Option<AbortHandle>,
 }
@@ -169,7 +169,7 @@ impl TcpLink {
         }
     }
 
-    /// Makes the connection, once for all who wait for it.
+    /// Opens the connection, once for all requests that wait for it.
     async fn connect(&self, deadline: Instant, priority: Priority) -> Result<(), Fault> {
         let _alone = timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
         if self.open.borrow().is_some() {
@@ -249,37 +249,38 @@ impl TcpLink {
         }
     }
 
-    /// Ends the requests whose time is over, and the connection if that was too much.
+    /// Ends the requests whose timeout has expired. Closes the connection if that was one timeout
+    /// too many.
     fn advance(&self, ticket: Ticket) {
         let mut open = self.open.borrow_mut();
         let Some(found) = open.as_mut() else { return };
         let Open { connection, waiting, .. } = found;
         connection.advance(found.epoch.elapsed(), |done| hand_on(waiting, &done));
-        debug_assert!(!connection.is_waiting_for(ticket), "its time is over");
+        debug_assert!(!connection.is_waiting_for(ticket), "an expired request is not in flight");
         if connection.closed().is_some() {
             *open = None;
         }
     }
 }
 
-/// Gives a result to who waits for it.
+/// Passes a result to its caller.
 fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Answer>>, done: &Done<'_>) {
     if let Some(sender) = waiting.remove(&done.ticket) {
-        // A device that was stopped does not wait any more.
+        // A stopped device no longer waits.
         let _ = sender.send(answer(done.outcome));
     }
 }
 
 impl Drop for TcpLink {
-    /// The task that reads holds the connection too.
+    /// The task that reads also holds the connection.
     fn drop(&mut self) {
         self.open.borrow_mut().take();
     }
 }
 
 impl Open {
-    /// Sends without waiting; what the socket does not take goes with the next. Whether the
-    /// connection still works.
+    /// Sends without waiting. Bytes that the socket does not accept are sent later. Returns whether
+    /// the connection still works.
     fn write(&mut self) -> bool {
         let frames = self.connection.outgoing();
         match &mut self.tls {
@@ -293,7 +294,7 @@ impl Open {
                 self.unsent.drain(..len);
                 true
             }
-            // A device that takes nothing lets its requests time out; a bounded number of them.
+            // If a device does not read, its requests time out. Their number is limited.
             Err(error) => error.kind() == ErrorKind::WouldBlock && self.unsent.len() < CHUNK,
         }
     }
@@ -340,14 +341,14 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
                 lasts && connection.closed().is_none()
             }
         };
-        // What the socket did not take earlier, it may take now.
+        // The socket may now accept bytes that it did not accept before.
         if intact && (found.unsent.is_empty() || found.write()) {
             continue;
         }
         let lost = open.take();
         drop(open);
         if let Some(mut lost) = lost {
-            // This task is the reader: it ends by itself.
+            // This task is the reader, so it must not abort itself.
             lost.reader = None;
             let Open { connection, waiting, .. } = &mut lost;
             connection.close(Closed::ByPeer, |done| hand_on(waiting, &done));
@@ -356,7 +357,7 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
     }
 }
 
-/// The bytes that a response carries; the echo of a write was checked, and says no more.
+/// The bytes of a response; empty for a write, whose echo has been checked.
 fn bytes(response: Response<'_>) -> Vec<u8> {
     match response {
         Response::Bits(bits) => bits.as_bytes().to_vec(),
@@ -374,17 +375,17 @@ fn answer(outcome: Result<Response<'_>, Failure>) -> Answer {
     })
 }
 
-/// One request at a time, by blocking calls in a thread that ends with the link.
+/// A link that sends one request at a time, by blocking calls in a thread that ends with the link.
 pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
-    /// Calls that go before all jobs.
+    /// Calls that precede all jobs.
     urgent: mpsc::Sender<Call>,
     retry_at: Cell<Option<Instant>>,
 }
 
 enum Job {
     Call(Call),
-    /// There is an urgent call.
+    /// An urgent call is waiting.
     Look,
     Release,
 }
@@ -394,7 +395,7 @@ struct Call {
     request: Box<EncodedRequest>,
     timeout: Duration,
     urgent: bool,
-    /// And when an endpoint that could not be opened is tried again.
+    /// The result, and when an endpoint that could not be opened is tried again.
     answer: oneshot::Sender<(Answer, Option<Instant>)>,
 }
 
@@ -406,7 +407,7 @@ impl BlockingLink {
         let work = move || {
             let (mut failures, mut retry_at) = (0, None);
             let mut carry_out = |call: Call| {
-                // Nobody waits any more for a read whose device was stopped.
+                // A stopped device no longer waits for its read.
                 if !call.answer.is_closed() {
                     let answer = carried_out(&client, &call, &mut failures, &mut retry_at);
                     let _ = call.answer.send((answer, retry_at));
@@ -421,7 +422,7 @@ impl BlockingLink {
                 }
             }
         };
-        // Without a thread every job fails, which its device tells.
+        // If the thread does not start, every job fails, and the device reports the fault.
         let _ = std::thread::Builder::new().name("holdfast-line".into()).spawn(work);
         BlockingLink { jobs, urgent, retry_at: Cell::new(None) }
     }

@@ -1,11 +1,10 @@
-//! The poller: reads devices on schedule, and hands what they answered to memory and to others.
+//! The poller: reads devices on schedule, and passes the results to memory and to other receivers.
 //!
-//! * A device is a task: its schedule, its plan, its counters and its status ([`device`]).
-//! * Devices behind the same address share a link, and a link knows no device ([`link`]).
-//! * What is read is written as it came, byte for byte, one read as one step; a read that fails
-//!   writes nothing ([`sink`]).
+//! * A device is a task with its schedule, plan, counters and status ([`device`]).
+//! * Devices behind the same address share a link. A link does not know its devices ([`link`]).
+//! * A read is written to memory unchanged and atomically. A failed read writes nothing ([`sink`]).
 //!
-//! All tasks of a poller live on one thread, so that they share without locks.
+//! All tasks of a poller run on one thread, so that they share state without locks.
 
 mod backoff;
 mod caught;

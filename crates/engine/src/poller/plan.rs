@@ -1,38 +1,39 @@
-//! Which requests read a set of fields: a pure function, and how a plan changes when a device refuses.
+//! Plans the requests that read a set of fields, as a pure function, and changes a plan when a
+//! device refuses a block.
 //!
-//! The rules this file keeps: a field is never split; a block is within the device's limits; a gap is
-//! read only where that is allowed. Two ways to choose are built in. [`Strategy::Gap`] crosses every
-//! gap up to a size. [`Strategy::Cost`] finds the cheapest plan for what a request and a register
-//! cost: at a high cost of requests it crosses all gaps that it may, at cost 0 none.
+//! The rules of this file: a field is never split; a block is within the limits of the device; a
+//! gap is read only where that is allowed. [`Strategy::Gap`] reads every gap up to a size.
+//! [`Strategy::Cost`] finds the cheapest plan for a given cost of a request and of a register: with
+//! a high cost of a request it reads all allowed gaps, with cost 0 none.
 
 use holdfast_memory::Area;
 use thiserror::Error;
 
-/// Bits that take the room of a register.
+/// Bits that count as one register.
 const BITS: f64 = 16.0;
 
-/// Something to read as a whole.
+/// A range that is read as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Field {
     pub area: Area,
     pub address: u16,
-    /// At least 1.
+    /// The number of items, at least 1.
     pub count: u16,
 }
 
-/// One request, and the fields that it reads.
+/// One request, and the fields in it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Block {
     pub area: Area,
     pub address: u16,
     pub count: u16,
-    /// Indexes of the fields, by address.
+    /// Indexes of the fields, sorted by address.
     pub fields: Vec<usize>,
-    /// Items that are read though no field wants them.
+    /// Items that belong to no field.
     pub gaps: u32,
 }
 
-/// A range of one area: `start` to `end`, `end` not included.
+/// A range of one area, from `start` to before `end`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stretch {
     pub area: Area,
@@ -40,7 +41,8 @@ pub struct Stretch {
     pub end: u32,
 }
 
-/// What ends at an address or before is not read together with what begins there or behind.
+/// Fields that end at or before this address are not read together with fields that begin at or
+/// after it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Cut {
     pub area: Area,
@@ -49,21 +51,21 @@ pub struct Cut {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strategy {
-    /// Holes of up to `max_gap` items are read.
+    /// Reads gaps of up to `max_gap` items.
     Gap { max_gap: u16 },
-    /// Any gap is read if that is cheaper: `request` for each request and `item` for each register
-    /// or 16 bits.
+    /// Reads a gap if that is cheaper, with a cost for each `request` and for each `item`: a
+    /// register or 16 bits.
     Cost { request: f64, item: f64 },
 }
 
-/// What a device bears.
+/// What a device accepts.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlanLimits {
     pub max_registers: u16,
     pub max_bits: u16,
-    /// Holes are read only inside these, if there are any for the area.
+    /// Gaps are read only inside these ranges, if there are any for the area.
     pub readable: Vec<Stretch>,
-    /// Never read, not even as a gap.
+    /// Ranges that are never read, not even as a gap.
     pub forbidden: Vec<Stretch>,
     pub cuts: Vec<Cut>,
 }
@@ -93,10 +95,10 @@ impl PlanError {
 }
 
 impl Block {
-    /// The offset of a field of the block from its start, in items.
+    /// The offset of a field from the start of the block, in items.
     ///
     /// # Panics
-    /// For a field that is not inside: with its bytes another field would be written.
+    /// If the field is not inside the block: its bytes would belong to another field.
     pub(super) fn offset(&self, field: &Field) -> usize {
         let (start, end) = (u32::from(self.address), self.end());
         let inside = field.area == self.area && start <= field.address.into() && field.end() <= end;
@@ -126,8 +128,8 @@ impl PlanLimits {
         if area.is_bits() { self.max_bits } else { self.max_registers }
     }
 
-    /// Whether what ends at `end` may be read together with what begins at `start`. What overlaps
-    /// always may.
+    /// Whether a field that ends at `end` may be read together with one that begins at `start`.
+    /// Overlapping fields always may.
     fn joins(&self, area: Area, end: u32, start: u32) -> bool {
         let between = |cut: &Cut| cut.area == area && end <= cut.address && cut.address <= start;
         start < end
@@ -153,10 +155,10 @@ impl Field {
     }
 }
 
-/// The blocks that read all fields, in the order of areas and addresses.
+/// Plans the blocks that read all fields, in the order of areas and addresses.
 ///
 /// # Errors
-/// [`PlanError`] for a field that no request may read.
+/// [`PlanError`] for a field that cannot be read by one request.
 pub fn plan(
     fields: &[Field],
     limits: &PlanLimits,
@@ -189,11 +191,11 @@ pub fn plan(
             }
         }
     }
-    // A field in two blocks would stand for one that is missing from a read of several.
+    // A field that is missing, or in two blocks, would corrupt a read with several parts.
     assert!(holds_once(fields, &blocks), "each field is in one block: {blocks:?}");
     debug_assert!(
         blocks.iter().all(|block| block.count <= limits.most(block.area) && block.end() <= 65_536),
-        "no block is beyond the limits: {blocks:?}"
+        "every block is within the limits: {blocks:?}"
     );
     Ok(blocks)
 }
@@ -207,7 +209,7 @@ fn holds_once(fields: &[Field], blocks: &[Block]) -> bool {
     held.iter().all(|times| *times == 1)
 }
 
-/// Greedy from the left: a block ends where the gap is too large, or the block would be.
+/// Greedy from the left: a new block starts where the gap, or the block, would become too large.
 fn by_gap(
     fields: &[Field],
     order: &[usize],
@@ -237,8 +239,8 @@ fn by_gap(
     }
 }
 
-/// The cheapest way to cut the fields into blocks, by dynamic programming: `best[n]` is that of
-/// the first `n` fields.
+/// Finds the cheapest blocks by dynamic programming: `best[n]` is the best plan for the first `n`
+/// fields.
 fn by_cost(
     fields: &[Field],
     order: &[usize],
@@ -246,7 +248,7 @@ fn by_cost(
     (request, item): (f64, f64),
     blocks: &mut Vec<Block>,
 ) {
-    // Where all fields up to each one end: what a later field leaves between is a gap.
+    // The end of all fields up to each one: the space between it and the next field is a gap.
     let ends = order.iter().scan(0, |end, index| {
         *end = fields[*index].end().max(*end);
         Some(*end)
@@ -271,7 +273,7 @@ fn by_cost(
             }
             next_start = Some(start);
             let cost = best[from].0 + request + item * f64::from(end - start);
-            // With equal cost the longer block is taken: it has fewer requests.
+            // With equal costs, the longer block wins: it saves requests.
             if cost <= cheapest.0 {
                 cheapest = (cost, from);
             }
@@ -288,7 +290,7 @@ fn by_cost(
     blocks.extend(cuts.iter().rev().map(|(from, upto)| block(fields, &order[*from..*upto])));
 }
 
-/// Where the last of some fields ends.
+/// The end of the last of some fields.
 fn reach(fields: &[Field], order: &[usize]) -> u32 {
     order.iter().map(|index| fields[*index].end()).fold(0, u32::max)
 }
@@ -307,9 +309,9 @@ fn block(fields: &[Field], order: &[usize]) -> Block {
     Block { area: first.area, address: first.address, count, fields: order.to_vec(), gaps }
 }
 
-/// The two blocks to try in place of one that the device refused; `None` for a block of one field.
+/// Splits a refused block in two; `None` for a block of one field.
 pub fn halves(fields: &[Field], refused: &Block) -> Option<[Block; 2]> {
-    // Fields that overlap stay together: only a cut between fields helps.
+    // Overlapping fields stay together: only a cut between fields helps.
     let cut = (1..refused.fields.len())
         .filter(|cut| {
             let (left, right) = refused.fields.split_at(*cut);
@@ -320,7 +322,7 @@ pub fn halves(fields: &[Field], refused: &Block) -> Option<[Block; 2]> {
     Some([block(fields, left), block(fields, right)])
 }
 
-/// One block in the place of two neighbours.
+/// Merges two neighbouring blocks.
 pub fn joined(fields: &[Field], left: &Block, right: &Block) -> Block {
     block(fields, &[&left.fields[..], &right.fields[..]].concat())
 }
@@ -338,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_up_to_the_gap_are_read_and_larger_ones_are_not() {
+    fn gaps_up_to_max_gap_are_read_and_larger_ones_are_not() {
         let fields = [field(20, 2), field(0, 4), field(6, 2), field(11, 1)];
         let strategy = Strategy::Gap { max_gap: 3 };
         let blocks = plan(&fields, &PlanLimits::default(), strategy).unwrap();
@@ -347,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_and_forbidden_ranges_cut() {
+    fn limits_and_forbidden_ranges_split_blocks() {
         let area = Area::HoldingRegisters;
         let limits = PlanLimits {
             max_registers: 10,
@@ -363,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_outside_readable_ranges_are_not_read() {
+    fn gaps_outside_readable_ranges_are_not_read() {
         let area = Area::HoldingRegisters;
         let readable = vec![Stretch { area, start: 0, end: 10 }];
         let limits = PlanLimits { readable, ..PlanLimits::default() };
@@ -375,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn the_price_of_a_request_decides_which_holes_are_read() {
+    fn the_cost_of_a_request_decides_which_gaps_are_read() {
         let fields = [field(0, 1), field(11, 1), field(100, 1)];
         let of = |request: f64| {
             let strategy = Strategy::Cost { request, item: 1.0 };
@@ -387,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn a_refused_block_is_halved_until_one_field_is_alone() {
+    fn a_refused_block_is_halved_until_one_field_is_left() {
         let fields = [field(0, 1), field(1, 1), field(2, 2), field(9, 1)];
         let all = plan(&fields, &PlanLimits::default(), Strategy::Gap { max_gap: 9 }).unwrap();
         assert_eq!(spans(&all), [(0, 10)]);
@@ -413,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_that_no_request_can_read_is_told() {
+    fn a_field_that_no_request_can_read_is_an_error() {
         let strategy = Strategy::Gap { max_gap: 0 };
         for (bad, error) in [
             (field(0, 126), PlanError::TooLong { index: 0, count: 126, most: 125 }),

@@ -1,8 +1,8 @@
-//! What was read and written, for whoever takes it in another thread: woken once a batch, not once a
-//! block.
+//! Results of polls and writes, for a receiver in another thread. The receiver is woken once per
+//! batch, not once per block.
 //!
-//! The queue is bounded. When nobody takes what it holds, the oldest polls are dropped and counted;
-//! what became of a write never is.
+//! The queue is bounded. When it is full, the oldest polls are dropped and counted. Results of
+//! writes are never dropped.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,45 +13,45 @@ use holdfast_memory::Area;
 
 use super::status::Fault;
 
-/// Polls that may wait to be taken.
+/// The most polls in the queue.
 const CAPACITY: usize = 16_384;
 
 /// One poll of one device.
 #[derive(Debug, Clone)]
 pub struct Poll {
     pub device: Arc<str>,
-    /// When the schedule wanted it, counted from the poller's start; a poll beside the schedule has
+    /// The scheduled time, counted from the start of the poller. A poll outside the schedule has
     /// the time when it began.
     pub due: Duration,
-    /// In the order in which they were asked; those behind one that was not answered are missing.
+    /// In the order of their requests. Blocks after one without an answer are missing.
     pub blocks: Vec<BlockResult>,
 }
 
-/// One block: its bytes, or why there are none.
+/// One block: its bytes, or the fault.
 #[derive(Debug, Clone)]
 pub struct BlockResult {
     pub area: Area,
     pub address: u16,
     pub count: u16,
     pub outcome: Result<Vec<u8>, Fault>,
-    /// When that was known.
+    /// The time of the result.
     pub time: SystemTime,
 }
 
-/// What became of a write.
+/// The result of a write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Written {
-    /// The number that it was given.
+    /// The number that [`super::Poller::write`] returned.
     pub ticket: u64,
     pub outcome: Result<(), Fault>,
 }
 
-/// What is taken at once.
+/// All results that waited.
 #[derive(Debug, Default)]
 pub struct Batch {
     pub polls: VecDeque<Poll>,
     pub writes: Vec<Written>,
-    /// Nothing will come any more.
+    /// Whether the poller has ended: no more results will come.
     pub ended: bool,
 }
 
@@ -61,7 +61,7 @@ impl Batch {
     }
 }
 
-/// The queue between the poller's thread and the taker's.
+/// The queue between the thread of the poller and the receiver.
 #[derive(Debug)]
 pub struct Results {
     began: Instant,
@@ -82,7 +82,7 @@ impl Default for Results {
 }
 
 impl Results {
-    /// A time as polls tell it.
+    /// Converts a time to the clock of polls.
     pub(super) fn counted(&self, time: Instant) -> Duration {
         time.saturating_duration_since(self.began)
     }
@@ -108,7 +108,7 @@ impl Results {
 
     fn put(&self, put: impl FnOnce(&mut Batch)) {
         let mut batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
-        debug_assert!(!batch.ended, "nothing comes after the end");
+        debug_assert!(!batch.ended, "no result follows the end");
         let first = batch.is_empty();
         put(&mut batch);
         drop(batch);
@@ -117,7 +117,7 @@ impl Results {
         }
     }
 
-    /// All that waits; when nothing does, waits up to `timeout` for the first.
+    /// Takes all results that wait. If there are none, waits up to `timeout` for the first.
     pub fn take(&self, timeout: Duration) -> Batch {
         let batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
         let (mut batch, _) = self
@@ -128,7 +128,7 @@ impl Results {
         std::mem::replace(&mut *batch, Batch { ended, ..Batch::default() })
     }
 
-    /// Polls that nobody took in time.
+    /// The number of polls that were dropped because the queue was full.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }

@@ -1,5 +1,5 @@
-//! What becomes of a block that a device refuses: it is halved until what can't be read is alone, and
-//! then put together again as far as the device bears. That takes a few requests, once.
+//! Bisects a refused block until each unreadable field is isolated, then merges what the device
+//! accepts. The search costs a few requests, once.
 
 use std::cell::RefMut;
 
@@ -7,47 +7,47 @@ use super::learned::Learned;
 use super::plan::{self, Block, Field};
 use super::status::Fault;
 
-/// The exceptions that speak of what was asked for, not of the device.
+/// Exceptions that depend on the request, not on the state of the device.
 const ILLEGAL: [u8; 2] = [2, ILLEGAL_VALUE];
 const ILLEGAL_VALUE: u8 = 3;
 
-/// Whether a fault says that there is no such address, or that it is too much at once.
+/// Whether a fault means that an address does not exist, or that the request is too large.
 pub(super) fn is_illegal(fault: Fault) -> bool {
     matches!(fault, Fault::Exception(code) if ILLEGAL.contains(&code))
 }
 
-/// A part of a block that was refused.
+/// A part of a refused block.
 struct Part {
     block: Block,
-    /// Why it can't be read, even alone.
+    /// The fault if the part cannot be read, even alone.
     refused: Option<Fault>,
 }
 
-/// What a search needs of a device.
+/// The operations of a device that a search uses.
 pub(super) trait Searched {
-    /// The parts of reads that one request can carry.
+    /// The parts of reads. Each fits into one request.
     fn fields(&self) -> &[Field];
 
-    /// What is known of the device, which a search adds to.
+    /// What the device has taught, which a search adds to.
     fn learned(&self) -> RefMut<'_, Learned>;
 
-    /// Draws the plan from what is known.
+    /// Plans again from what has been learned.
     fn draw_plan(&self);
 
-    /// Reads a block, with one request.
+    /// Reads a block with one request.
     async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault>;
 
-    /// Hands on what a block brought.
+    /// Passes on the bytes of a block.
     fn take(&mut self, block: &Block, bytes: Vec<u8>);
 
-    /// Notes that a block brought nothing.
+    /// Records the fault of a block.
     fn note(&mut self, block: &Block, fault: Fault);
 }
 
-/// Reads what can be read of a block that was refused, and learns from it.
+/// Reads the readable fields of a refused block, and remembers the others.
 ///
 /// # Errors
-/// The fault of what can't be read; or another one, that ended the search.
+/// The fault of an unreadable field, or another fault that ended the search.
 pub(super) async fn search(
     device: &mut impl Searched,
     block: &Block,
@@ -63,7 +63,7 @@ pub(super) async fn search(
     );
     let refused = parts.iter().find_map(|part| part.refused);
     if refused.is_none() && fault == Fault::Exception(ILLEGAL_VALUE) {
-        // All of it can be read, only not at once.
+        // All parts can be read, but not in one request.
         let most = parts.iter().map(|part| part.block.count).fold(1, u16::max);
         device.learned().lower(block.area, most);
     } else {
@@ -80,7 +80,7 @@ pub(super) async fn search(
     refused.map_or(Ok(()), Err)
 }
 
-/// Halves a block that was refused, and what is refused of that, until one field is alone.
+/// Halves a refused block recursively, until one field is left.
 async fn divide(
     device: &mut impl Searched,
     block: &Block,
@@ -110,7 +110,7 @@ async fn divide(
     Ok(())
 }
 
-/// Finds out which neighbours can be read together, and cuts between the others.
+/// Finds which neighbours can be read together, and adds cuts between the others.
 async fn join(device: &impl Searched, refused: &Block, run: &[Part]) -> Result<(), Fault> {
     let Some((first, others)) = run.split_first() else { return Ok(()) };
     let mut whole = first.block.clone();

@@ -1,4 +1,4 @@
-//! Where the bytes of a read go.
+//! The destination of a read.
 
 use std::sync::Arc;
 
@@ -13,10 +13,10 @@ pub struct Destination {
 }
 
 impl Destination {
-    /// Writes all of a read, as one step.
+    /// Writes the whole read, atomically.
     ///
     /// # Errors
-    /// [`Refusal::OutOfRange`], when the read does not fit; then nothing has changed.
+    /// [`Refusal::OutOfRange`] when the read does not fit. Nothing has changed then.
     pub(super) fn write(&self, count: u32, bytes: &[u8]) -> Result<(), Refusal> {
         let Destination { area, address, .. } = *self;
         let write = Write { area, address, count: count as usize, bytes };

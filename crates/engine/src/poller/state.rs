@@ -1,4 +1,4 @@
-//! What a device counted, and how it does: written by its task, read from any thread.
+//! Counters and health of a device: written by its task, read from any thread.
 
 use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -11,18 +11,18 @@ use crate::counter::Counter;
 #[derive(Debug, Default)]
 pub struct DeviceState {
     pub counters: DeviceCounters,
-    /// Milliseconds: the age at which the last answer is out of date.
+    /// The age, in milliseconds, at which the last answer is stale.
     stale_after: AtomicU64,
     health: AtomicU16,
     last_error: AtomicU16,
     failures: AtomicU32,
     most_failures: AtomicU32,
-    /// Microseconds of the last answer.
+    /// The round trip of the last answer, in microseconds.
     round_trip: AtomicU64,
     requests_per_poll: AtomicU32,
     since: Mutex<Times>,
     plan_error: Mutex<Option<String>>,
-    /// Whether a task of the device has panicked since it was made or replaced.
+    /// Whether a task of the device has panicked since the device was created or replaced.
     broken: AtomicBool,
 }
 
@@ -39,13 +39,13 @@ pub struct DeviceCounters {
     pub exceptions: Counter,
     pub timeouts: Counter,
     pub transport_errors: Counter,
-    /// Polls that were carried out.
+    /// Polls carried out.
     pub polls: Counter,
     /// Polls that could not begin in time.
     pub missed: Counter,
-    /// Polls that were not carried out, because no plan reads the device.
+    /// Polls not carried out because the device has no plan.
     pub unplanned: Counter,
-    /// Reads that came whole and were stored, if they have a destination; and the values in them.
+    /// Complete reads that were stored, or have no destination; and the values in them.
     pub reads: Counter,
     pub values: Counter,
     /// Reads and status blocks that memory refused.
@@ -53,7 +53,7 @@ pub struct DeviceCounters {
 }
 
 impl DeviceState {
-    /// An answer is out of date after three intervals and the time that a reply may take.
+    /// An answer is stale after three intervals plus the timeout.
     pub(super) fn set_stale_after(&self, interval: Duration, timeout: Duration) {
         let after = interval.saturating_mul(3).saturating_add(timeout).as_millis();
         self.stale_after.store(u64::try_from(after).unwrap_or(u64::MAX), Ordering::Relaxed);
@@ -74,7 +74,8 @@ impl DeviceState {
         }
     }
 
-    /// As in the status block: an exception code, or 0x8000 and a class.
+    /// The last error as in the status block: an exception code, or 0x8000 plus the number of a
+    /// fault.
     pub fn last_error(&self) -> u16 {
         if self.broken.load(Ordering::Relaxed) {
             return Fault::Internal.code();
@@ -82,19 +83,20 @@ impl DeviceState {
         self.last_error.load(Ordering::Relaxed)
     }
 
-    /// Why no plan reads the device.
+    /// Why the device has no plan.
     pub fn plan_error(&self) -> Option<String> {
         self.plan_error.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// The plan has so many requests, or there is none, for a reason.
+    /// Records the number of requests of the plan, or why there is none.
     pub(super) fn planned(&self, requests: Result<usize, String>) {
         let count = *requests.as_ref().unwrap_or(&0);
         self.requests_per_poll.store(count as u32, Ordering::Relaxed);
         *self.plan_error.lock().unwrap_or_else(PoisonError::into_inner) = requests.err();
     }
 
-    /// A task of the device has panicked: the device is in error until it is replaced.
+    /// Records whether a task of the device has panicked. If so, the device is in error until it is
+    /// replaced.
     pub(super) fn set_broken(&self, broken: bool) {
         self.broken.store(broken, Ordering::Relaxed);
         if broken {
@@ -114,7 +116,7 @@ impl DeviceState {
         self.requests_per_poll.load(Ordering::Relaxed)
     }
 
-    /// How long ago the last valid answer came.
+    /// The time since the last valid answer.
     pub fn age(&self) -> Option<Duration> {
         self.times().last_good.map(|time| time.elapsed())
     }
@@ -131,14 +133,14 @@ impl DeviceState {
         self.since.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A valid answer came.
+    /// Records a valid answer.
     pub(super) fn answered(&self, round_trip: Duration) {
         self.counters.valid.add();
         self.round_trip.store(round_trip.as_micros() as u64, Ordering::Relaxed);
         self.times().last_good = Some(Instant::now());
     }
 
-    /// A whole poll was answered.
+    /// Records a complete poll.
     pub(super) fn good(&self) {
         self.times().error_since = None;
         self.failures.store(0, Ordering::Relaxed);

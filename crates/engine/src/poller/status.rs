@@ -1,4 +1,4 @@
-//! The status block: 30 registers that tell how a device does.
+//! The status block: 30 registers with health and counters of a device.
 
 use std::sync::Arc;
 
@@ -7,13 +7,13 @@ use holdfast_memory::{Access, Area, Memory, Refusal, Write};
 /// Registers of one block.
 pub const STATUS_BLOCK_LEN: u16 = 30;
 
-/// Bytes of the name in it.
+/// The size of the device name, in bytes.
 const NAME: usize = 16;
 
-/// Errors above this code are not exceptions of the device.
+/// Errors from this code on are not exceptions.
 const NO_EXCEPTION: u16 = 0x8000;
 
-/// Where the block of a device is: at `slot` × 30 of an area of registers.
+/// The place of the block of a device: at `slot` × 30 of an area of registers.
 #[derive(Debug, Clone)]
 pub struct StatusSettings {
     pub memory: Arc<Memory>,
@@ -37,12 +37,12 @@ impl StatusSettings {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Health {
-    /// Not asked yet.
+    /// The device has not been polled yet.
     #[default]
     Unknown,
     Ok,
     Error,
-    /// The device answers, but its polls fall behind their schedule.
+    /// The device answers, but its polls are late.
     Stale,
 }
 
@@ -66,7 +66,7 @@ impl Health {
     }
 }
 
-/// Why a request or a poll failed, as the block shows it.
+/// Why a request or a poll failed, as in the status block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     Exception(u8),
@@ -74,19 +74,19 @@ pub enum Fault {
     Refused,
     Reset,
     Invalid,
-    /// No plan reads the device: nothing is asked.
+    /// The device has no plan, so no request is sent.
     Unplanned,
-    /// Memory refused what was read, or the status block.
+    /// Memory refused the read or the status block.
     Unstored,
     /// A task of the device has panicked.
     Internal,
 }
 
-/// Exceptions of a gateway that did not reach the unit.
+/// Exceptions of a gateway that could not reach the unit.
 const UNREACHED: [u8; 2] = [0x0A, 0x0B];
 
 impl Fault {
-    /// Whether the device has answered, if only with an exception.
+    /// Whether the device has answered, even if only with an exception.
     pub(super) fn is_answer(self) -> bool {
         matches!(self, Fault::Exception(code) if !UNREACHED.contains(&code))
     }
@@ -105,7 +105,7 @@ impl Fault {
     }
 }
 
-/// What a block tells.
+/// The content of a status block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Status {
     pub health: Health,
@@ -141,10 +141,10 @@ impl Status {
         block
     }
 
-    /// Writes the block, as one step.
+    /// Writes the block, atomically.
     ///
     /// # Errors
-    /// [`Refusal::OutOfRange`] when the block does not fit; nothing has changed then.
+    /// [`Refusal::OutOfRange`] when the block does not fit. Nothing has changed then.
     pub fn write(&self, name: &str, to: &StatusSettings) -> Result<(), Refusal> {
         let bytes: Vec<u8> =
             self.registers(name).iter().flat_map(|register| register.to_be_bytes()).collect();
@@ -163,7 +163,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_block_has_everything_in_its_place() {
+    fn the_block_has_the_documented_layout() {
         let status = Status {
             health: Health::Error,
             last_error: Fault::Timeout.code(),

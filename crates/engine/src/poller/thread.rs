@@ -1,4 +1,4 @@
-//! All devices on one thread: they come and go, and are stopped together.
+//! Runs all devices on one thread. Devices can be added and removed, and are stopped together.
 
 use std::collections::HashMap;
 use std::io;
@@ -35,15 +35,13 @@ pub enum PollerError {
     Status { device: String },
     #[error("device {device}: read {read} has no items, or goes beyond address 65535")]
     Beyond { device: String, read: usize },
-    #[error(
-        "device {device}: read {read} has 65536 items, a packet that is forwarded at most 65535"
-    )]
+    #[error("device {device}: read {read} has 65536 items, a forwarded packet has at most 65535")]
     Forward { device: String, read: usize },
     #[error("device {device}: max_{items} is {found}, allowed are 1 to {most}")]
     Limit { device: String, items: &'static str, found: u16, most: u16 },
-    #[error("device {device}: there is one of that name")]
+    #[error("device {device}: the name is already in use")]
     Taken { device: String },
-    #[error("device {device}: there is none of that name")]
+    #[error("device {device}: there is no device of that name")]
     Unknown { device: String },
     #[error("device {device}: function {function} does not write")]
     NoWrite { device: String, function: u8 },
@@ -53,7 +51,7 @@ pub enum PollerError {
     Thread(io::Error),
 }
 
-/// One device as it can be looked at from outside.
+/// A polled device, as seen from outside.
 #[derive(Clone)]
 pub struct Polled {
     pub name: String,
@@ -69,7 +67,7 @@ impl Polled {
     }
 }
 
-/// Devices that are polled, until it is stopped or dropped. They may come and go.
+/// A running poller, until it is stopped or dropped. Devices can be added and removed.
 pub struct Poller {
     polled: Mutex<Vec<Polled>>,
     orders: mpsc::UnboundedSender<Order>,
@@ -78,10 +76,10 @@ pub struct Poller {
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-/// What the poller's thread is told; it ends when nobody can tell it anything any more.
+/// Orders to the thread of the poller. The thread ends when all senders are dropped.
 enum Order {
     Add(Box<Planned>, Polled),
-    /// The device of that name gives way to another one.
+    /// Replaces the device of that name.
     Replace {
         name: String,
         device: Box<Planned>,
@@ -98,10 +96,10 @@ enum Order {
 }
 
 impl Poller {
-    /// Checks all devices, then starts to poll. Their first polls are spread.
+    /// Checks all devices, then starts to poll. First polls are spread over time.
     ///
     /// # Errors
-    /// [`PollerError`], with nothing left running.
+    /// [`PollerError`]. Nothing is left running then.
     pub fn start(devices: Vec<DeviceSettings>) -> Result<Poller, PollerError> {
         let devices = devices.into_iter().map(checked).collect::<Result<Vec<_>, _>>()?;
         let (orders, told) = mpsc::unbounded_channel();
@@ -115,7 +113,7 @@ impl Poller {
         let work = move || {
             LocalSet::new().block_on(&runtime, obey(told, Arc::clone(&to)));
             to.end();
-            // A name that is being looked up is not waited for.
+            // Does not wait for name resolution in progress.
             runtime.shutdown_background();
         };
         let thread = thread::Builder::new()
@@ -138,7 +136,7 @@ impl Poller {
     /// Polls one more device.
     ///
     /// # Errors
-    /// [`PollerError`] for one that can't be polled, or whose name is taken.
+    /// [`PollerError`] if the device cannot be polled, or its name is in use.
     pub fn add(&self, device: DeviceSettings) -> Result<(), PollerError> {
         self.begin(checked(device)?)
     }
@@ -159,12 +157,12 @@ impl Poller {
         self.orders.send(order).map_err(|_| PollerError::Stopped)
     }
 
-    /// Polls a device in the place of the one called `name`, whose poll under way is completed. It
-    /// may have the same name. It keeps counters, connection and schedule. `at_once` it reads once
-    /// beside the schedule; not more often than each second, or each interval if that is shorter.
+    /// Replaces the device called `name` after its current poll. The new device may have the same
+    /// name. It keeps counters, connection and schedule. With `at_once`, it also reads once outside
+    /// the schedule; at most once per second, or per interval if that is shorter.
     ///
     /// # Errors
-    /// [`PollerError`]; then nothing has changed.
+    /// [`PollerError`]. Nothing has changed then.
     pub fn replace(
         &self,
         name: &str,
@@ -187,11 +185,11 @@ impl Poller {
         Ok(())
     }
 
-    /// Sends a write to a device by its own connection. What becomes of it comes by
-    /// [`Poller::results`] under the number that is returned.
+    /// Sends a write over the connection of a device. Returns a number; [`Poller::results`] reports
+    /// the result under this number.
     ///
     /// # Errors
-    /// [`PollerError`] for a device that is not there, or a request that is no write.
+    /// [`PollerError`] if there is no such device, or the request is not a write.
     pub fn write(&self, name: &str, request: Box<EncodedRequest>) -> Result<u64, PollerError> {
         let function = request.request().function();
         if !function.is_write() {
@@ -208,21 +206,21 @@ impl Poller {
         Ok(ticket)
     }
 
-    /// Stops polling a device; its connection is closed when no other device uses it. Whether there
-    /// was one of that name.
+    /// Stops polling a device. Its connection is closed when no other device uses it. Returns
+    /// whether there was a device of that name.
     pub fn remove(&self, name: &str) -> bool {
         let mut all = self.polled();
         let before = all.len();
         all.retain(|device| device.name != name);
         let known = all.len() < before;
         if known {
-            // A poller that has been stopped polls nothing.
+            // A stopped poller polls nothing.
             let _ = self.order(Order::Remove(name.to_owned()));
         }
         known
     }
 
-    /// The devices as they are now.
+    /// The current devices.
     pub fn devices(&self) -> Vec<Polled> {
         self.polled().clone()
     }
@@ -231,14 +229,14 @@ impl Poller {
         self.polled.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What devices with `report` answered, and what became of writes.
+    /// The results of devices with `report`, and of writes.
     pub fn results(&self) -> &Results {
         &self.results
     }
 
-    /// Stops polling. What was read has been handed on; a read under way is given up.
+    /// Stops polling. Complete reads have been passed on. A read in progress is abandoned.
     pub fn stop(&self) {
-        // It may have been stopped before.
+        // The poller may already be stopped.
         let _ = self.order(Order::Stop);
         if let Some(thread) = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take() {
             let ended = thread.join();
@@ -253,7 +251,7 @@ impl Drop for Poller {
     }
 }
 
-/// What the poller's thread knows of a device that is polled.
+/// A device as the thread of the poller sees it.
 struct Running {
     link: Rc<Link>,
     turn: Rc<Turn>,
@@ -272,10 +270,11 @@ impl Drop for Running {
     }
 }
 
-/// Orders are sent under the lock of the list of devices: they come as the list changes.
-const IN_ORDER: &str = "what runs is what the list of devices has";
+/// Orders are sent under the lock of the list of devices, so they arrive in the order of its
+/// changes.
+const IN_ORDER: &str = "the running devices are those in the list";
 
-/// Starts and ends the tasks of devices, until it is told to stop.
+/// Starts and stops the tasks of devices, until `Order::Stop`.
 async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
     let mut links: HashMap<Address, Weak<Link>> = HashMap::new();
     let mut running: HashMap<String, Running> = HashMap::new();
@@ -308,7 +307,7 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                         device.replace(*planned, polled, link, at_once, &results);
                         device
                     }
-                    // A task that has panicked takes no successor.
+                    // A panicked task cannot hand over to a new device.
                     _ => Running::start(*planned, polled, link, Duration::ZERO, &results),
                 };
                 running.insert(name, device);
@@ -341,7 +340,7 @@ impl Running {
         Running { link, turn, unit_id, timeout, release, inbox, device, forwards }
     }
 
-    /// Whether the device's task has panicked; it does not end otherwise.
+    /// Whether the task of the device has panicked. It does not end otherwise.
     fn has_ended(&self) -> bool {
         self.device.is_finished()
     }
@@ -366,7 +365,8 @@ impl Running {
         self.inbox.succeed(device);
     }
 
-    /// Writes between two reads, as soon as it can; the end of the device does not break it off.
+    /// Sends a write between two reads, as soon as possible. Removing the device does not cancel
+    /// it.
     fn write(&self, ticket: u64, request: Box<EncodedRequest>, results: &Arc<Results>) {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
@@ -393,7 +393,7 @@ impl Running {
     }
 }
 
-/// A device, and the tasks that forward what it reads.
+/// Creates a device, and starts the tasks that forward its reads.
 fn made(
     planned: Planned,
     polled: Polled,
@@ -418,7 +418,7 @@ fn made(
     (Device::new(planned, polled.state, to, forwards, report), tasks)
 }
 
-/// The link to an endpoint, shared with all other devices there.
+/// Returns the link to an endpoint, which all its devices share.
 fn link_to(endpoint: &Endpoint, links: &mut HashMap<Address, Weak<Link>>) -> Rc<Link> {
     let known = links.entry(address(endpoint)).or_default();
     known.upgrade().unwrap_or_else(|| {
@@ -428,13 +428,12 @@ fn link_to(endpoint: &Endpoint, links: &mut HashMap<Address, Weak<Link>>) -> Rc<
     })
 }
 
-/// When the device that was started as number `number` begins: by the golden ratio, which spreads
-/// any number of them evenly.
+/// The phase of the device with this number: the golden ratio spreads any number of devices evenly.
 fn spread(within: Duration, number: u32) -> Duration {
     within.mul_f64((f64::from(number) * 0.618_033_988_749_895).fract())
 }
 
-/// What devices share a link by: where it goes to, and whom it trusts there.
+/// The key of a shared link: its address, and its TLS identity.
 type Address = (String, Option<Arc<Identity>>);
 
 fn address(endpoint: &Endpoint) -> Address {
@@ -449,7 +448,7 @@ fn address(endpoint: &Endpoint) -> Address {
     }
 }
 
-/// A device with its first plan, if it can be polled.
+/// Checks the settings of a device and plans its reads.
 fn checked(device: DeviceSettings) -> Result<Planned, PollerError> {
     let name = || device.name.clone();
     let PlanLimits { max_registers, max_bits, .. } = device.limits;
@@ -521,11 +520,11 @@ mod tests {
     fn refused(change: impl FnOnce(&mut DeviceSettings)) -> String {
         let mut changed = settings();
         change(&mut changed);
-        checked(changed).expect_err("it is refused").to_string()
+        checked(changed).expect_err("the settings are invalid").to_string()
     }
 
     #[test]
-    fn limits_beyond_those_of_a_request_are_refused() {
+    fn limits_above_those_of_a_request_are_refused() {
         for limit in [0, 126, u16::MAX] {
             let expected = format!("device meter: max_registers is {limit}, allowed are 1 to 125");
             assert_eq!(refused(|device| device.limits.max_registers = limit), expected);
@@ -546,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn what_memory_has_no_room_for_is_refused() {
+    fn a_destination_that_is_too_small_is_refused() {
         for (area, address) in
             [(AREA, 9), (AREA, 77), (Area::InputRegisters, 10), (Area::Coils, 10)]
         {

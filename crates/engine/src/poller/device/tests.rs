@@ -1,5 +1,5 @@
-//! What a device does in states that its checks rule out: nothing wrong reaches memory, and it
-//! shows.
+//! Tests a device in states that its checks normally exclude: it writes nothing wrong to memory,
+//! and reports an error.
 
 use holdfast_memory::{Access, Layout, Memory, Read, Span};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -13,7 +13,7 @@ use crate::poller::caught::spawn_watched;
 use crate::poller::status::Health;
 
 #[test]
-fn polls_are_due_at_whole_intervals_whatever_was_missed() {
+fn polls_stay_due_at_whole_intervals_after_missed_polls() {
     let (due, interval) = (Instant::now(), Duration::from_millis(100));
     let of = |now: u64| {
         let (next, missed) = first_from(due + Duration::from_millis(now), due, interval);
@@ -29,7 +29,7 @@ fn polls_are_due_at_whole_intervals_whatever_was_missed() {
 }
 
 #[test]
-fn reads_are_parted_into_what_one_request_can_carry() {
+fn reads_are_split_into_parts_that_fit_into_one_request() {
     let of = |area, count, limits: &PlanLimits| {
         let read = ReadSettings { area, address: 5, count, into: None };
         let (fields, parts) = parted(&[read], limits);
@@ -44,7 +44,7 @@ fn reads_are_parted_into_what_one_request_can_carry() {
 
 const TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Runs a test with a device of its own, whose registers are all 0x0102.
+/// Runs a test with a device whose registers are all 0x0102.
 fn with_device<F: Future<Output = ()>>(test: impl FnOnce(Endpoint) -> F) {
     let runtime = Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async {
@@ -89,7 +89,7 @@ fn registers(memory: &Memory) -> Vec<u8> {
     out
 }
 
-/// Reads registers 10 to 13 of the device, into `address` and those behind it.
+/// Settings that read registers 10 to 13 of the device into `address` and the registers after it.
 fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSettings {
     let into = Destination { memory: Arc::clone(memory), area: AREA, address };
     DeviceSettings {
@@ -156,7 +156,7 @@ fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
             assert_eq!(state.counters.unstored.get(), 1);
             device.poll(Instant::now()).await;
             assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8006));
-            // The read itself was stored, and a poll after which nothing is refused is good.
+            // The read itself was stored. A later poll without a refusal is good.
             assert_eq!(state.counters.reads.get(), 1);
             device.poll(Instant::now()).await;
             assert_eq!(state.health(), Health::Ok);
@@ -166,7 +166,7 @@ fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
 }
 
 #[test]
-fn a_device_without_a_plan_asks_nothing_and_is_in_error() {
+fn a_device_without_a_plan_sends_nothing_and_is_in_error() {
     with_device(async |endpoint| {
         let memory = memory();
         let (mut device, state, results) = device(settings(endpoint, &memory, 0));
@@ -204,7 +204,7 @@ fn a_device_that_panics_writes_nothing_and_is_in_error_until_it_is_replaced() {
         let blocks = Arc::clone(&status.memory);
         let settings = DeviceSettings { status: Some(status), ..settings(endpoint, &memory, 0) };
         let (device, state, results) = device(settings.clone());
-        // The field of this block is not inside it.
+        // The block does not contain its field.
         let block = Block { area: AREA, address: 11, count: 4, fields: vec![0], gaps: 0 };
         device.adopt(Ok(vec![block]));
         let inbox = Rc::new(Inbox::default());
