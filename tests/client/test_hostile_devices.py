@@ -112,7 +112,7 @@ def half(then: Behaviour) -> Behaviour:
 # What is no reply: the tests read registers 7 and 8, whose reply is 03 04 0007 0008
 
 WRONG_PDUS = {
-    "another function": ("0404 0007 0008", "function code 0x04 instead of 0x03"),
+    "another function": ("0404 0007 0008", "function code 0x04, expected 0x03"),
     "a register too few": ("0302 0007", "length"),
     "a register too many": ("0306 0007 0008 0009", "length"),
     "a byte count too small": ("0302 0007 0008", "length"),
@@ -120,11 +120,11 @@ WRONG_PDUS = {
     "an odd byte count": ("0303 0007 08", "length"),
     "a byte too many": ("0304 0007 0008 00", "length"),
     "no data": ("03", "length"),
-    "an exception of another function": ("8402", "function code 0x84 instead of 0x03"),
+    "an exception of another function": ("8402", "function code 0x84, expected 0x03"),
     "an exception without a code": ("83", "length"),
     "an exception and more": ("8302 00", "length"),
     "the request itself": ("0300 0700 02", "length"),
-    "an unknown function": ("6e", "function code 0x6e instead of 0x03"),
+    "an unknown function": ("6e", "function code 0x6e, expected 0x03"),
 }
 
 TCP_ONLY: dict[str, tuple[Behaviour, str]] = {
@@ -231,8 +231,8 @@ def test_characters_without_an_end_are_no_ascii_frame(make: Make, dial: Dial) ->
 @pytest.mark.parametrize(
     ("sent_back", "text"),
     [
-        ("06 0003 0008", "not what was sent"),
-        ("06 0004 0007", "not what was sent"),
+        ("06 0003 0008", "does not repeat the values"),
+        ("06 0004 0007", "does not repeat the values"),
         ("06 0003", "length"),
         ("10 0003 0007", "function code 0x10"),
     ],
@@ -993,7 +993,7 @@ def test_a_reply_that_breaks_off_ends_the_connection_of_all() -> None:
                 second = asyncio.create_task(plc.read_holding_registers(2, 1))
                 with pytest.raises(holdfast.RequestTimeout):
                     await first
-                with pytest.raises(holdfast.ConnectionLost, match="a reply broke off"):
+                with pytest.raises(holdfast.ConnectionLost, match="a reply was cut off"):
                     await second
                 assert await plc.read_holding_registers(3, 1) == [3]
                 assert device.connections == 2

@@ -7,8 +7,8 @@
 //! * [`frame`]: what each transport puts around a PDU. [`frame::mbap`] for TCP and UDP,
 //!   [`frame::rtu`] for serial lines and RTU over TCP, [`frame::ascii`] for serial lines.
 //! * [`raw_ingest`]: Raw Ingest packets.
-//! * `client`: a connection of a client: requests in flight, timeouts and late replies, without I/O
-//!   (feature `alloc`).
+//! * `client`: the client side of a connection: requests in flight, timeouts and late replies,
+//!   without I/O (feature `alloc`).
 //!
 //! # Rules that this crate keeps
 //!

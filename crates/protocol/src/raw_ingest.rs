@@ -46,7 +46,7 @@ const MAX_HEADER_LEN: usize = 12;
 /// Bytes of a CRC-32.
 const CRC_LEN: usize = 4;
 
-/// How packets are laid out. Sender and receiver agree on the format; it is never guessed from the
+/// The layout of packets. Sender and receiver agree on the format; it is never guessed from the
 /// bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
@@ -61,7 +61,7 @@ pub enum Format {
 }
 
 codes! {
-    /// What a packet writes to: one of the four areas of the Modbus data model.
+    /// The area that a packet writes: one of the four areas of the Modbus data model.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
     Area: u8 {
         Coils = 1, "coils";
@@ -72,8 +72,8 @@ codes! {
 }
 
 codes! {
-    /// Why a packet is refused. A receiver counts and logs it and never sends it. The code is only
-    /// its place among the counters.
+    /// Why a receiver refused a packet. It counts and logs the refusal and never sends it. The code
+    /// is only an index for counters.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
     #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
     #[error("packet refused: {}", self.name())]
@@ -96,11 +96,11 @@ codes! {
         NotGranted = 7, "not_granted";
         /// The memory lacks some of the addresses.
         Range = 8, "range";
-        /// The CRC does not fit the bytes before it.
+        /// The CRC does not match the bytes before it.
         Crc = 9, "crc";
         /// The packet ended before its last byte.
         Short = 10, "short";
-        /// The packet was not whole in time.
+        /// The packet was not complete in time.
         Late = 11, "late";
         /// Bytes follow the packet.
         Extra = 12, "extra";
@@ -111,7 +111,7 @@ codes! {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum EncodeError {
-    /// The payload has another length than the header requires.
+    /// The payload does not have the length that the header requires.
     #[error("payload has {found} bytes, the header requires {expected}")]
     Payload {
         /// The length that was given, in bytes.
@@ -119,7 +119,7 @@ pub enum EncodeError {
         /// The length that is required, in bytes.
         expected: usize,
     },
-    /// There is not enough room for the packet.
+    /// The buffer is too short for the packet.
     #[error("packet has {expected} bytes, there is room for {found}")]
     Room {
         /// The room that was given, in bytes.
@@ -129,16 +129,16 @@ pub enum EncodeError {
     },
 }
 
-/// What a packet writes.
+/// The header of a packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Header {
-    /// The area that is written.
+    /// The area to write.
     pub area: Area,
     /// A unit id (v1) or a memory id (crc).
     pub target: u16,
     /// The first address.
     pub address: u16,
-    /// How many bits or registers.
+    /// The number of bits or registers.
     pub count: NonZeroU16,
 }
 
@@ -180,11 +180,11 @@ impl Format {
     }
 
     /// The header at the start of `bytes`, which may end anywhere. `None` when the header is
-    /// incomplete and right so far.
+    /// incomplete and valid so far.
     ///
     /// # Errors
     /// [`Refusal::Magic`], [`Refusal::Version`], [`Refusal::Flags`], [`Refusal::Area`] or
-    /// [`Refusal::Count`], as soon as the wrong byte is there.
+    /// [`Refusal::Count`], as soon as the wrong byte has arrived.
     pub fn header(self, bytes: &[u8]) -> Result<Option<Header>, Refusal> {
         let is = |at: usize, expected: u8| bytes.get(at).is_none_or(|byte| *byte == expected);
         if !is(0, MAGIC[0]) || !is(1, MAGIC[1]) {
@@ -211,11 +211,11 @@ impl Format {
         Ok(Some(Header { area, target, address, count }))
     }
 
-    /// The payload of a whole packet.
+    /// The payload of a complete packet.
     ///
     /// # Errors
-    /// [`Refusal::Short`] or [`Refusal::Extra`] when `packet` has another length than its header
-    /// says, [`Refusal::Crc`] for a wrong CRC.
+    /// [`Refusal::Short`] or [`Refusal::Extra`] when `packet` does not have the length that its
+    /// header requires, [`Refusal::Crc`] for a wrong CRC.
     pub fn payload<'p>(self, header: &Header, packet: &'p [u8]) -> Result<&'p [u8], Refusal> {
         match packet.len().cmp(&self.packet_len(header)) {
             Ordering::Less => return Err(Refusal::Short),

@@ -1,4 +1,5 @@
-//! The client's connection: what it sends, what it makes of what comes, and when it ends.
+//! Tests the client side of a connection: what it sends, how it handles received bytes, and when it
+//! ends.
 
 #![cfg(feature = "alloc")]
 
@@ -20,7 +21,7 @@ const SECOND: Duration = Duration::from_secs(1);
 const SILENCE: Duration = Duration::from_millis(2);
 const LINE: Line = Line { silence: SILENCE, echo: false };
 
-/// What a request came to: registers as bytes, empty for a write.
+/// The result of a request: registers as bytes, empty for a write.
 type Got = (Ticket, Result<Vec<u8>, Failure>);
 
 fn noted(got: &mut Vec<Got>, done: &Done<'_>) {
@@ -32,7 +33,7 @@ fn noted(got: &mut Vec<Got>, done: &Done<'_>) {
     got.push((done.ticket, outcome));
 }
 
-/// A connection, the time, and what has come of its requests.
+/// A connection, the time, and the results of its requests.
 struct Client {
     connection: Connection,
     now: Duration,
@@ -92,7 +93,7 @@ fn ascii_frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn replies_in_any_order_and_any_pieces_find_their_requests() {
+fn replies_in_any_order_and_pieces_match_their_requests() {
     let mut client = Client::new(Transport::Tcp);
     let tickets = [(); 3].map(|()| client.send(read()));
     assert_eq!(client.outgoing().len(), 36);
@@ -114,7 +115,7 @@ fn replies_in_any_order_and_any_pieces_find_their_requests() {
 }
 
 #[test]
-fn a_late_reply_is_dropped_and_counted_and_comes_once() {
+fn a_late_reply_is_dropped_and_counted_and_a_second_one_is_an_error() {
     let mut client = Client::new(Transport::Tcp);
     let [first, second] = [(); 2].map(|()| client.send(read()));
     client.connection.cancel(first);
@@ -128,7 +129,7 @@ fn a_late_reply_is_dropped_and_counted_and_comes_once() {
 }
 
 #[test]
-fn what_does_not_fit_ends_the_connection() {
+fn an_invalid_reply_ends_the_connection() {
     let cases: [(Vec<u8>, InvalidResponse); 6] = [
         (mbap_frame(9, 7, &[3, 2, 0, 1]), InvalidResponse::TransactionId(9)),
         (mbap_frame(0, 8, &[3, 2, 0, 1]), InvalidResponse::UnitId { expected: 7, found: 8 }),
@@ -152,7 +153,7 @@ fn what_does_not_fit_ends_the_connection() {
 }
 
 #[test]
-fn what_breaks_the_connection_behind_a_reply_does_not_make_the_reply_worse() {
+fn an_error_after_a_reply_does_not_affect_the_reply() {
     let mut client = Client::new(Transport::Tcp);
     let ticket = client.send(read());
     client.receive(&[mbap_frame(0, 7, &[3, 2, 0, 1]), vec![0xFF; 9]].concat());
@@ -161,7 +162,7 @@ fn what_breaks_the_connection_behind_a_reply_does_not_make_the_reply_worse() {
 }
 
 #[test]
-fn ids_of_requests_that_wait_are_not_used_again() {
+fn transaction_ids_in_use_are_not_reused() {
     let mut client = Client::new(Transport::Tcp);
     for _ in 0..65_536 {
         let ticket = client.send(read());
@@ -175,7 +176,7 @@ fn ids_of_requests_that_wait_are_not_used_again() {
 }
 
 #[test]
-fn a_request_times_out_alone_and_its_connection_goes_on() {
+fn a_timeout_ends_one_request_and_not_the_connection() {
     let mut client = Client::new(Transport::Tcp);
     let first = client.send(read());
     client.after(SECOND / 2);
@@ -190,11 +191,11 @@ fn a_request_times_out_alone_and_its_connection_goes_on() {
 }
 
 #[test]
-fn a_connection_that_has_gone_silent_ends_after_three_timeouts() {
+fn a_silent_connection_ends_after_three_timeouts() {
     let mut client = Client::new(Transport::Tcp);
     for round in 0..3 {
         assert_eq!(client.connection.closed(), None);
-        // Requests that were under way together count as one.
+        // Requests in flight at the same time count as one.
         client.send(read());
         client.send(read());
         client.after(SECOND);
@@ -204,7 +205,7 @@ fn a_connection_that_has_gone_silent_ends_after_three_timeouts() {
 }
 
 #[test]
-fn any_byte_shows_that_the_other_side_is_there() {
+fn any_received_byte_resets_the_timeouts() {
     let mut client = Client::new(Transport::Tcp);
     for round in 0..10 {
         client.send(read());
@@ -227,7 +228,7 @@ fn a_timeout_in_the_middle_of_its_reply_ends_the_connection() {
 }
 
 #[test]
-fn a_timeout_in_the_middle_of_another_reply_does_not() {
+fn a_timeout_in_the_middle_of_another_reply_does_not_end_the_connection() {
     let mut client = Client::new(Transport::Tcp);
     let first = client.send(read());
     client.after(SECOND / 2);
@@ -241,7 +242,7 @@ fn a_timeout_in_the_middle_of_another_reply_does_not() {
 }
 
 #[test]
-fn when_the_driver_closes_everybody_gets_to_know() {
+fn closing_fails_every_request_in_flight() {
     for why in [Closed::ByPeer, Closed::BySelf] {
         let mut client = Client::new(Transport::Tcp);
         let ticket = client.send(read());
@@ -279,7 +280,7 @@ fn a_read_is_sent_three_times_as_a_datagram_and_a_write_once() {
 }
 
 #[test]
-fn a_datagram_of_another_request_is_counted_and_one_that_is_no_frame_ends_it() {
+fn a_datagram_of_another_request_is_counted_and_a_malformed_one_ends_the_connection() {
     let mut client = Client::new(Transport::Udp);
     let ticket = client.send(read());
     client.receive(&mbap_frame(5, 7, &[3, 2, 0, 1]));
@@ -293,7 +294,7 @@ fn a_datagram_of_another_request_is_counted_and_one_that_is_no_frame_ends_it() {
 }
 
 #[test]
-fn rtu_in_a_stream_carries_one_request_after_the_other() {
+fn rtu_in_a_stream_carries_one_request_at_a_time() {
     let mut client = Client::new(Transport::RtuOverTcp);
     let ticket = client.send(read());
     assert!(!client.connection.has_room());
@@ -308,7 +309,7 @@ fn rtu_in_a_stream_carries_one_request_after_the_other() {
 }
 
 #[test]
-fn rtu_in_a_stream_can_not_outlive_doubt() {
+fn an_error_ends_rtu_in_a_stream() {
     let other_unit = InvalidResponse::UnitId { expected: 7, found: 8 };
     let cases = [
         (rtu_frame(8, &[3, 2, 0, 1]), other_unit),
@@ -334,7 +335,7 @@ fn rtu_in_a_stream_can_not_outlive_doubt() {
 }
 
 #[test]
-fn a_serial_line_is_silent_before_a_request_and_what_came_before_is_thrown_away() {
+fn a_serial_line_waits_for_silence_and_discards_earlier_bytes() {
     let mut client = Client::new(Transport::SerialRtu(LINE));
     client.receive(&[1, 2, 3]);
     let ticket = client.send(read());
@@ -353,7 +354,7 @@ fn a_serial_line_is_silent_before_a_request_and_what_came_before_is_thrown_away(
 }
 
 #[test]
-fn a_serial_line_that_is_never_silent_lets_the_request_time_out_unsent() {
+fn on_a_line_that_is_never_silent_a_request_times_out_unsent() {
     let mut client = Client::new(Transport::SerialRtu(LINE));
     client.receive(&[0]);
     let ticket = client.send(read());
@@ -367,7 +368,7 @@ fn a_serial_line_that_is_never_silent_lets_the_request_time_out_unsent() {
 }
 
 #[test]
-fn nobody_replies_to_a_broadcast_of_a_serial_line() {
+fn a_broadcast_on_a_serial_line_has_no_reply() {
     for transport in [Transport::SerialRtu(LINE), Transport::SerialAscii(LINE)] {
         let mut client = Client::new(transport);
         let request = EncodedRequest::new(&WRITE);
@@ -383,7 +384,7 @@ fn nobody_replies_to_a_broadcast_of_a_serial_line() {
 }
 
 #[test]
-fn a_serial_line_outlives_every_invalid_reply() {
+fn an_invalid_reply_does_not_end_a_serial_line() {
     for (transport, bad, good) in [
         (Transport::SerialRtu(LINE), rtu_frame(8, &[3, 2, 0, 1]), rtu_frame(7, &[3, 2, 0, 1])),
         (
@@ -409,7 +410,7 @@ fn a_serial_line_outlives_every_invalid_reply() {
 }
 
 #[test]
-fn an_echo_is_taken_away_where_one_is_expected_or_can_be_no_reply() {
+fn an_echo_is_removed_if_it_is_expected_or_cannot_be_a_reply() {
     for (echo, request) in [(false, read()), (true, read()), (true, WRITE)] {
         let line = Line { silence: SILENCE, echo };
         for ascii in [false, true] {
@@ -430,7 +431,7 @@ fn an_echo_is_taken_away_where_one_is_expected_or_can_be_no_reply() {
 }
 
 #[test]
-fn a_request_that_is_dropped_on_a_line_keeps_its_reply_from_others() {
+fn the_reply_to_a_dropped_request_on_a_line_is_not_taken_for_another() {
     let mut client = Client::new(Transport::RtuOverTcp);
     let ticket = client.send(read());
     client.connection.cancel(ticket);
@@ -452,7 +453,7 @@ fn transports() -> impl Strategy<Value = Transport> {
 
 proptest! {
     #[test]
-    fn whatever_comes_every_request_has_one_result_and_nothing_grows(
+    fn for_any_bytes_every_request_has_one_result_and_memory_is_bounded(
         transport in transports(),
         steps in prop::collection::vec(
             prop_oneof![
@@ -481,7 +482,7 @@ proptest! {
             let Some(deadline) = client.connection.deadline() else { break };
             let now = deadline.max(client.now);
             client.after(now - client.now);
-            // What was due is done: a driver that waits for the deadline never spins.
+            // After `advance`, nothing is due: a driver that waits for the deadline never spins.
             prop_assert!(client.connection.deadline().is_none_or(|deadline| deadline > now));
         }
         prop_assert_eq!((client.connection.in_flight(), client.connection.deadline()), (0, None));
@@ -491,7 +492,7 @@ proptest! {
     }
 
     #[test]
-    fn a_right_reply_in_any_pieces_is_taken(
+    fn a_valid_reply_in_any_pieces_is_accepted(
         transport in transports(),
         registers in prop::collection::vec(any::<u16>(), 1..=125),
         cuts in prop::collection::vec(1usize..20, 0..200),

@@ -1,4 +1,4 @@
-//! The examples, against each other.
+//! Runs the examples against each other.
 
 use std::net::TcpListener;
 use std::thread;

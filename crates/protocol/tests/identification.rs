@@ -1,4 +1,4 @@
-//! Read Device Identification, from the objects of a server to those a client reads.
+//! Tests Read Device Identification, from the objects of a server to the client.
 #![cfg(feature = "alloc")]
 
 use holdfast_protocol::pdu::identification::{MAX_VALUE_LEN, ObjectError, Objects, ReadCode};
@@ -7,7 +7,7 @@ use proptest::prelude::*;
 
 proptest! {
     #[test]
-    fn a_stream_of_objects_is_read_whole(
+    fn a_stream_of_objects_is_read_completely(
         values in prop::collection::btree_map(
             prop_oneof![0..7u8, 0x80..=0xFFu8],
             prop::collection::vec(any::<u8>(), 0..=MAX_VALUE_LEN),
@@ -41,7 +41,7 @@ fn objects(ids: &[u8]) -> Result<Objects, ObjectError> {
 }
 
 #[test]
-fn objects_that_no_device_can_have_are_refused() {
+fn invalid_objects_are_refused() {
     assert_eq!(objects(&[0, 1]), Err(ObjectError::Missing(2)));
     assert_eq!(objects(&[0, 1, 2, 2]), Err(ObjectError::Twice(2)));
     assert_eq!(objects(&[0, 1, 2, 7]), Err(ObjectError::Reserved(7)));

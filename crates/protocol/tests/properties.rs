@@ -1,4 +1,4 @@
-//! What holds for all bytes and all requests.
+//! Tests properties that hold for all bytes and all requests.
 
 mod support;
 
@@ -17,11 +17,11 @@ proptest! {
         let mut buffer = [0; pdu::MAX_LEN];
         let len = request.encode(&mut buffer);
         prop_assert_eq!(Request::parse(&buffer[..len]), Ok(request));
-        prop_assert!(buffer[len..].iter().all(|byte| *byte == 0), "nothing behind the PDU");
+        prop_assert!(buffer[len..].iter().all(|byte| *byte == 0), "nothing after the PDU");
     }
 
     #[test]
-    fn a_pdu_cut_or_stretched_is_never_carried_out(parts in a_request(), more in 1..5usize) {
+    fn a_pdu_that_is_too_short_or_too_long_is_never_carried_out(parts in a_request(), more in 1..5usize) {
         let mut buffer = [0; pdu::MAX_LEN];
         let request = parts.request();
         let len = request.encode(&mut buffer);
@@ -75,7 +75,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_end_in_a_frame_a_wait_or_an_end(
+    fn any_bytes_are_a_frame_incomplete_or_broken(
         bytes in prop::collection::vec(prop_oneof![Just(0), Just(6), any::<u8>()], 0..300),
     ) {
         match mbap::next(&bytes) {
@@ -99,7 +99,7 @@ proptest! {
     }
 
     #[test]
-    fn frames_carry_any_pdu_and_serial_ones_lose_no_flipped_bit(
+    fn frames_carry_any_pdu_and_serial_frames_detect_a_flipped_bit(
         transaction_id: u16,
         unit: u8,
         pdu in prop::collection::vec(any::<u8>(), 1..=pdu::MAX_LEN),
@@ -148,7 +148,7 @@ proptest! {
     }
 }
 
-/// Each quantity, and whether it makes a range, bits and registers.
+/// Checks for each quantity whether it makes a valid range, bits and registers.
 fn is_limited_to<const MAX: u16>() {
     let bytes = [0; 2 * 65_536];
     for quantity in 0..=u16::MAX {
@@ -210,7 +210,7 @@ fn a_range_that_ends_beyond_the_last_address_parses_for_the_memory_to_refuse() {
 }
 
 #[test]
-fn every_code_of_an_enum_is_one_of_all_of_them() {
+fn every_code_of_an_enum_is_in_all() {
     let functions = (0..=u8::MAX).filter_map(Function::from_code).collect::<Vec<_>>();
     assert_eq!(functions, Function::ALL);
     let sub_functions = (0..=u16::MAX).filter_map(SubFunction::from_code).collect::<Vec<_>>();
@@ -221,6 +221,6 @@ fn every_code_of_an_enum_is_one_of_all_of_them() {
 
 #[test]
 #[should_panic(expected = "a PDU has 1 to 253 bytes")]
-fn a_header_of_a_pdu_that_is_too_long_is_not_made() {
+fn a_header_of_a_pdu_that_is_too_long_panics() {
     let _ = mbap::header(1, 1, pdu::MAX_LEN + 1);
 }

@@ -1,4 +1,4 @@
-//! Raw Ingest packets of any content.
+//! Tests Raw Ingest packets with any content.
 
 use std::num::NonZeroU16;
 
@@ -52,7 +52,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_a_header_a_wait_or_a_refusal(
+    fn any_bytes_are_a_header_incomplete_or_refused(
         bytes in prop::collection::vec(prop_oneof![Just(0), Just(1), any::<u8>()], 0..40),
         format in a_format(),
         starts_well: bool,

@@ -1,4 +1,4 @@
-//! The README says what the crate does.
+//! Checks that the README describes the crate.
 
 use holdfast_protocol::pdu::{Function, SubFunction, limit};
 

@@ -1,4 +1,4 @@
-//! What a server replies, parsed against the request that it answers.
+//! Tests that the replies of a server parse as responses to their requests.
 
 mod support;
 
@@ -9,8 +9,8 @@ use holdfast_protocol::pdu::{
 use proptest::prelude::*;
 use support::a_request;
 
-/// What a server answers whose memory has the same byte everywhere; `None` for Read Device
-/// Identification, which has a test of its own.
+/// A reply from a memory with the same byte everywhere; `None` for Read Device Identification,
+/// which has a test of its own.
 #[allow(unreachable_patterns, reason = "the feature `exhaustive` ends the need for a wildcard")]
 fn a_reply(request: &Request<'_>, byte: u8) -> Option<Vec<u8>> {
     let mut pdu = [0; pdu::MAX_LEN];
@@ -92,7 +92,7 @@ proptest! {
     }
 
     #[test]
-    fn a_reply_cut_or_stretched_is_never_taken(
+    fn a_reply_that_is_too_short_or_too_long_is_never_accepted(
         parts in a_request(),
         byte: u8,
         more in 1..5usize,
@@ -107,7 +107,7 @@ proptest! {
     }
 
     #[test]
-    fn a_reply_is_taken_for_another_request_only_where_both_ask_the_same(
+    fn a_reply_is_accepted_for_another_request_only_if_both_ask_the_same(
         parts in a_request(),
         other in a_request(),
         byte: u8,
@@ -142,7 +142,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_taken_only_when_they_fit_the_request(
+    fn any_bytes_are_accepted_only_if_they_match_the_request(
         parts in a_request(),
         same_function: bool,
         body in prop::collection::vec(prop_oneof![Just(0), Just(2), any::<u8>()], 0..260),
@@ -157,7 +157,7 @@ proptest! {
 }
 
 #[test]
-fn a_write_of_other_values_is_not_the_one_that_was_asked_for() {
+fn an_echo_of_other_values_is_refused() {
     let request = Request::WriteSingleRegister { address: 1, value: 2 };
     for reply in [[6, 0, 1, 0, 3], [6, 0, 2, 0, 2]] {
         assert_eq!(request.response(&reply), Err(ResponseError::Echo));
@@ -168,7 +168,7 @@ fn a_write_of_other_values_is_not_the_one_that_was_asked_for() {
 }
 
 #[test]
-fn registers_of_another_quantity_are_not_those_that_were_asked_for() {
+fn registers_of_another_quantity_are_refused() {
     let request = Request::ReadInputRegisters(RegisterRange::new(0, 2).unwrap());
     for reply in [&[4, 2, 0, 1][..], &[4, 4, 0, 1], &[4, 2, 0, 1, 0, 2], &[4, 6, 0, 1, 0, 2, 0, 3]]
     {
@@ -177,7 +177,7 @@ fn registers_of_another_quantity_are_not_those_that_were_asked_for() {
 }
 
 #[test]
-fn the_answer_of_another_sub_function_is_not_the_one_that_was_asked_for() {
+fn an_answer_of_another_sub_function_is_refused() {
     let asked = pdu::Diagnostics::new(SubFunction::ReturnBusMessageCount, &[0, 0]).unwrap();
     let request = Request::Diagnostics(asked);
     let mut pdu = [0; pdu::MAX_LEN];

@@ -1,4 +1,4 @@
-//! RTU requests one behind the other in a stream, as RTU over TCP carries them.
+//! Tests RTU requests in a stream, as in RTU over TCP.
 
 use holdfast_protocol::frame::rtu::{self, Next, next_request};
 use proptest::prelude::*;
@@ -9,7 +9,8 @@ fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
     frame[..len].to_vec()
 }
 
-/// The PDU of an unknown function whose last byte is the first of the CRC of those before it.
+/// A PDU of an unknown function. Its last byte equals the first byte of the CRC of the bytes before
+/// it.
 fn misleading(unit_id: u8, function_code: u8, data: &[u8]) -> Vec<u8> {
     let head = [&[unit_id, function_code], data].concat();
     let [low, _] = rtu::crc(&head).to_le_bytes();
@@ -17,7 +18,7 @@ fn misleading(unit_id: u8, function_code: u8, data: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn an_unknown_function_whose_crc_fits_too_early_ends_where_it_ends() {
+fn an_unknown_function_whose_crc_matches_too_early_has_the_right_length() {
     let pdu = misleading(7, 0x63, &[1, 2, 3]);
     for next in [frame(1, &[3, 0, 0, 0, 1]), frame(0, &[17]), vec![]] {
         let sent = [frame(7, &pdu), next].concat();
@@ -27,7 +28,7 @@ fn an_unknown_function_whose_crc_fits_too_early_ends_where_it_ends() {
 }
 
 #[test]
-fn a_frame_for_unit_0_behind_an_unknown_function_keeps_its_first_byte() {
+fn a_frame_for_unit_0_after_an_unknown_function_keeps_its_first_byte() {
     let (unknown, next) = (frame(7, &[0x63]), frame(0, &[3, 0, 0, 0, 1]));
     let sent = [&unknown[..], &next].concat();
     let len = unknown.len();
@@ -36,7 +37,7 @@ fn a_frame_for_unit_0_behind_an_unknown_function_keeps_its_first_byte() {
 
 proptest! {
     #[test]
-    fn any_bytes_leave_a_frame_within_them(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+    fn a_frame_never_exceeds_the_received_bytes(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
         match next_request(&bytes) {
             Next::Frame { len, .. } | Next::Damaged { len } => {
                 prop_assert!((4..=bytes.len().min(rtu::MAX_LEN)).contains(&len));

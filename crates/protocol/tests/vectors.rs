@@ -1,4 +1,4 @@
-//! The shared vectors, as far as they can be judged without a memory.
+//! Tests the shared vectors, except for what depends on a memory.
 
 use std::path::Path;
 
@@ -86,7 +86,7 @@ fn requests_parse_encode_and_answer_as_the_vectors_say() {
                 assert_eq!(buffer[..len], request, "{}", case.name);
                 assert!(parsed.response(&response).is_ok(), "{}", case.name);
             }
-            // Whether an address is there is for a memory to say.
+            // A memory decides whether an address exists.
             Some(code @ ExceptionCode::IllegalDataAddress) => {
                 let answer = parsed.unwrap().response(&response);
                 assert_eq!(answer, Err(ResponseError::Exception(code)), "{}", case.name);
@@ -164,7 +164,7 @@ fn raw_packets_are_refused_as_the_vectors_say() {
                 "the other format" if format == Format::V1 => Some(Refusal::Area),
                 "the other format" | "flags not zero" | "reserved not zero" => Some(Refusal::Flags),
                 "wrong CRC" => Some(Refusal::Crc),
-                // What only a listener can judge: units, memories, ranges.
+                // Only a listener can check these: units, memories, ranges.
                 _ => None,
             };
             assert_eq!(found, expected, "{} {format:?}", case.name);

@@ -1,4 +1,4 @@
-//! The connection itself: what is the same for every transport, and which part does the rest.
+//! The connection: the part that is the same for every transport.
 
 use core::time::Duration;
 
@@ -9,7 +9,7 @@ use super::stream::Stream;
 use super::{Closed, Time, Transport};
 use crate::pdu::EncodedRequest;
 
-/// One connection, from its beginning to its end.
+/// One connection, from start to end.
 ///
 /// ```
 /// use core::time::Duration;
@@ -47,7 +47,7 @@ enum Wire {
 }
 
 impl Connection {
-    /// A connection that was just made.
+    /// A new connection.
     pub fn new(transport: Transport) -> Connection {
         let one = |framing, line| Wire::OneAtATime(OneAtATime::new(framing, line));
         let wire = match transport {
@@ -60,13 +60,13 @@ impl Connection {
         Connection { wire, flights: Flights::default() }
     }
 
-    /// Sends a request, or queues it until the line is silent. `timeout` runs from now.
+    /// Sends a request, or queues it until the line is silent. `timeout` starts now.
     ///
     /// # Errors
-    /// Why the connection has ended, or [`Closed::NoTransactionId`].
+    /// [`Closed`]: the reason why the connection has ended, or [`Closed::NoTransactionId`].
     ///
     /// # Panics
-    /// While another request is in flight on a transport that carries one at a time: see
+    /// If another request is in flight on a transport that carries one at a time: see
     /// [`Connection::has_room`].
     pub fn send(
         &mut self,
@@ -96,27 +96,27 @@ impl Connection {
         matches!(self.wire, Wire::Stream(_)) || self.flights.len() == 0
     }
 
-    /// Requests that wait for their replies.
+    /// The number of requests in flight.
     pub fn in_flight(&self) -> usize {
         self.flights.len()
     }
 
-    /// Whether a request waits for its reply.
+    /// Whether a request is in flight.
     pub fn is_waiting_for(&self, ticket: Ticket) -> bool {
         self.flights.contains(ticket)
     }
 
-    /// The bytes to be sent; over UDP, exactly one datagram.
+    /// The bytes to send; over UDP, exactly one datagram.
     pub fn outgoing(&self) -> &[u8] {
         &self.flights.out
     }
 
-    /// The first `len` bytes of [`Connection::outgoing`] were sent.
+    /// Reports that the first `len` bytes of [`Connection::outgoing`] have been sent.
     pub fn sent(&mut self, len: usize) {
         self.flights.out.drain(..len);
     }
 
-    /// Takes received bytes, which may end anywhere; over UDP, exactly one datagram.
+    /// Processes received bytes, which may end anywhere; over UDP, exactly one datagram.
     pub fn receive(&mut self, bytes: &[u8], now: Time, mut sink: impl FnMut(Done<'_>)) {
         let datagram = matches!(self.wire, Wire::Datagrams(_));
         if self.flights.closed.is_some() || (bytes.is_empty() && !datagram) {
@@ -130,7 +130,7 @@ impl Connection {
         }
     }
 
-    /// When [`Connection::advance`] is to be called, if nothing happens before.
+    /// When to call [`Connection::advance`], unless another call comes first.
     pub fn deadline(&self) -> Option<Time> {
         if self.flights.closed.is_some() {
             return None;
@@ -142,7 +142,8 @@ impl Connection {
         }
     }
 
-    /// Does what is due: ends requests whose time is over, sends again, or sends at last.
+    /// Performs what is due: ends requests whose timeout has expired, repeats a datagram, or sends
+    /// a queued request.
     pub fn advance(&mut self, now: Time, mut sink: impl FnMut(Done<'_>)) {
         if self.flights.closed.is_some() {
             return;
@@ -155,8 +156,8 @@ impl Connection {
         }
     }
 
-    /// Drops a request: it gets no [`Done`]. Where replies have no transaction ids, it stays under
-    /// way until its reply or its timeout, so that nobody else gets its reply.
+    /// Drops a request: it gets no [`Done`]. Without transaction ids, it stays in flight until its
+    /// reply or timeout, so that its reply is not taken for another one.
     pub fn cancel(&mut self, ticket: Ticket) {
         match &mut self.wire {
             Wire::Stream(stream) => stream.cancel(&mut self.flights, ticket),
@@ -164,17 +165,17 @@ impl Connection {
         }
     }
 
-    /// Ends the connection: every request in flight fails.
+    /// Ends the connection. Every request in flight fails.
     pub fn close(&mut self, why: Closed, mut sink: impl FnMut(Done<'_>)) {
         self.flights.close(why, &mut sink);
     }
 
-    /// Why the connection has ended, if it has.
+    /// The reason why the connection has ended; `None` while it is open.
     pub fn closed(&self) -> Option<Closed> {
         self.flights.closed
     }
 
-    /// Replies that were dropped because their requests had been given up.
+    /// The number of late replies, which were dropped.
     pub fn late(&self) -> u64 {
         self.flights.late
     }

@@ -1,4 +1,4 @@
-//! One MBAP frame a datagram. One request at a time; a read that is not answered is sent again.
+//! One MBAP frame per datagram, one request at a time. An unanswered read is sent again.
 
 use core::time::Duration;
 
@@ -10,7 +10,7 @@ use crate::pdu::EncodedRequest;
 #[derive(Debug, Default)]
 pub(super) struct Datagrams {
     next_id: u16,
-    /// When the request is sent again, and how often still.
+    /// When to send the request again, and how many times.
     repeat: Option<Repeat>,
 }
 
@@ -88,7 +88,7 @@ impl Datagrams {
     }
 }
 
-/// The datagram of the request that waits.
+/// Writes the datagram of the request in flight.
 fn write(flights: &mut Flights) {
     if let Some(flight) = flights.first() {
         let pdu = flight.request.pdu();

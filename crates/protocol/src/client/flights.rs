@@ -1,4 +1,4 @@
-//! The requests in flight on a connection, and what all transports do alike with them.
+//! The requests in flight on a connection, and what all transports do with them.
 
 use alloc::collections::VecDeque;
 use alloc::vec::Vec;
@@ -11,18 +11,18 @@ use crate::pdu::{EncodedRequest, Response, ResponseError};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Ticket(pub u64);
 
-/// A request that has its result.
+/// A completed request.
 #[derive(Debug)]
 pub struct Done<'d> {
-    /// The number that [`super::Connection::send`] gave it.
+    /// The ticket that [`super::Connection::send`] returned.
     pub ticket: Ticket,
-    /// What [`super::Connection::send`] was given.
+    /// The timeout that [`super::Connection::send`] was given.
     pub timeout: Duration,
-    /// The response, or why there is none.
+    /// The response, or why the request failed.
     pub outcome: Result<Response<'d>, Failure>,
 }
 
-/// A request that waits for its reply.
+/// A request in flight.
 #[derive(Debug)]
 pub(super) struct Flight {
     pub(super) ticket: Ticket,
@@ -32,18 +32,18 @@ pub(super) struct Flight {
     pub(super) sent: Time,
     timeout: Duration,
     pub(super) deadline: Time,
-    /// Nobody wants the result any more.
+    /// Whether the result is to be dropped.
     abandoned: bool,
 }
 
-/// All of them, in the order in which they were sent.
+/// All requests in flight, in the order in which they were sent.
 #[derive(Debug, Default)]
 pub(super) struct Flights {
     waiting: VecDeque<Flight>,
-    /// Bytes to be sent.
+    /// Bytes to send.
     pub(super) out: Vec<u8>,
     pub(super) closed: Option<Closed>,
-    /// Replies that were dropped because their requests had been given up.
+    /// The number of late replies, which were dropped.
     pub(super) late: u64,
     next_ticket: u64,
 }
@@ -86,7 +86,7 @@ impl Flights {
         ticket
     }
 
-    /// The place of the request with that transaction id.
+    /// The position of the request with this transaction id.
     pub(super) fn position(&self, transaction_id: u16) -> Option<usize> {
         self.waiting.iter().position(|flight| flight.transaction_id == transaction_id)
     }
@@ -99,27 +99,27 @@ impl Flights {
         self.waiting.iter().any(|flight| flight.ticket == ticket)
     }
 
-    /// Takes out the request with that number.
+    /// Removes the request with this ticket.
     pub(super) fn take(&mut self, ticket: Ticket) -> Option<Flight> {
         let position = self.waiting.iter().position(|flight| flight.ticket == ticket)?;
         self.waiting.remove(position)
     }
 
-    /// Leaves the request under way, and drops its result.
+    /// Leaves the request in flight, and drops its result.
     pub(super) fn abandon(&mut self, ticket: Ticket) {
         if let Some(flight) = self.waiting.iter_mut().find(|flight| flight.ticket == ticket) {
             flight.abandoned = true;
         }
     }
 
-    /// Takes out the first request whose time is over.
+    /// Removes the first request whose timeout has expired.
     pub(super) fn expired(&mut self, now: Time) -> Option<Flight> {
         let position = self.waiting.iter().position(|flight| flight.deadline <= now)?;
         self.waiting.remove(position)
     }
 
-    /// Judges a PDU that answers the request at this place, and hands the result on. A PDU that
-    /// can't be its response is returned.
+    /// Checks a PDU that answers the request at this position, and reports the result. Returns the
+    /// error if the PDU cannot be its response.
     pub(super) fn answer(
         &mut self,
         position: usize,
@@ -144,7 +144,7 @@ impl Flights {
         invalid
     }
 
-    /// Ends the first request with a result that is no reply.
+    /// Ends the first request with a result other than a reply.
     pub(super) fn finish(
         &mut self,
         outcome: Result<Response<'_>, Failure>,
@@ -155,7 +155,7 @@ impl Flights {
         }
     }
 
-    /// Ends the connection, and with it all requests.
+    /// Ends the connection and all its requests.
     pub(super) fn close(&mut self, why: Closed, sink: &mut impl FnMut(Done<'_>)) {
         if self.closed.is_some() {
             return;

@@ -1,7 +1,7 @@
-//! RTU and ASCII frames, on a serial line or in a stream: one request at a time, and no transaction
-//! ids. What keeps replies apart is silence: on a serial line, bytes that nobody asked for are
-//! thrown away, and a request waits until the line is silent. A stream can't be silenced: there, such
-//! bytes, and a timeout, end the connection.
+//! RTU and ASCII frames, on a serial line or in a stream: one request at a time, without
+//! transaction ids. On a serial line, silence separates replies: unrequested bytes are discarded,
+//! and a request waits until the line is silent. A stream has no silence: there, unrequested bytes
+//! or a timeout end the connection.
 
 use alloc::vec::Vec;
 use core::time::Duration;
@@ -20,14 +20,14 @@ pub(super) enum Framing {
 #[derive(Debug)]
 pub(super) struct OneAtATime {
     framing: Framing,
-    /// The silence between frames of a serial line; `None` for a stream.
+    /// The silence between frames on a serial line; `None` for a stream.
     silence: Option<Duration>,
-    /// The adapter hands back what is sent.
+    /// Whether the adapter echoes sent bytes.
     echo: bool,
     state: State,
-    /// When the line was used last.
+    /// When the line was last used.
     used: Time,
-    /// The frame that is to be sent, or was.
+    /// The frame of the request.
     frame: Vec<u8>,
     received: Vec<u8>,
 }
@@ -39,7 +39,7 @@ enum State {
     Quieting {
         until: Time,
     },
-    /// The request was sent; `echoed` says whether it has come back already.
+    /// The request was sent. `echoed` says whether its echo has been received.
     Sent {
         echoed: bool,
     },
@@ -62,7 +62,7 @@ impl OneAtATime {
         }
     }
 
-    /// Bytes of the longest reply, with an echo before it.
+    /// The length of the longest reply with an echo before it, in bytes.
     fn max_received(&self) -> usize {
         2 * match self.framing {
             Framing::Rtu => rtu::MAX_LEN,
@@ -94,7 +94,7 @@ impl OneAtATime {
         ticket
     }
 
-    /// When something is to be done.
+    /// When to call `advance`.
     pub(super) fn deadline(&self, flights: &Flights) -> Option<Time> {
         match self.state {
             State::Turnaround { until } => Some(until),
@@ -103,7 +103,7 @@ impl OneAtATime {
         }
     }
 
-    /// Sends the request if the line has been silent for long enough.
+    /// Sends the request if the line has been silent long enough.
     fn transmit(&mut self, flights: &mut Flights, now: Time) {
         if let State::Quieting { until } = self.state
             && until <= now
@@ -144,7 +144,7 @@ impl OneAtATime {
         }
     }
 
-    /// Bytes that nobody waits for: too late, or of somebody else.
+    /// Handles bytes without a request in flight: a late reply, or data from another sender.
     fn unrequested(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
         match self.silence {
             None => flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink),
@@ -222,7 +222,7 @@ impl OneAtATime {
         self.transmit(flights, now);
     }
 
-    /// The reply at the start of what was received; `None` while more bytes are needed.
+    /// Parses the reply at the start of the received bytes; `None` while more bytes are needed.
     fn rtu(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
         let Some(flight) = flights.first() else { return Ok(None) };
         let may_be_echo = !*echoed
@@ -234,7 +234,7 @@ impl OneAtATime {
         if self.echo && !*echoed {
             return Ok(None);
         }
-        // The beginning of an echo is no damaged reply.
+        // The beginning of an echo is not a damaged reply.
         let echo_begun = may_be_echo && !*echoed && self.frame.starts_with(&self.received);
         let len = rtu::response_len(&self.received, flight.request.pdu().len());
         let reply = len.and_then(|len| {
@@ -247,7 +247,7 @@ impl OneAtATime {
         }
     }
 
-    /// The reply in what was received; `None` while more characters are needed.
+    /// Parses the reply in the received characters; `None` while more are needed.
     fn ascii(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
         let Some(flight) = flights.first() else { return Ok(None) };
         while let Some(end) = self.received.windows(2).position(|pair| pair == b"\r\n") {
@@ -266,7 +266,7 @@ impl OneAtATime {
     }
 }
 
-/// A reply that was taken out of its frame.
+/// A reply without its frame.
 struct Reply {
     unit_id: u8,
     pdu: Vec<u8>,
@@ -278,7 +278,7 @@ impl Reply {
     }
 }
 
-/// Appends what `write` makes in a buffer.
+/// Appends the frame that `write` encodes.
 fn encode<const N: usize>(
     frame: &mut Vec<u8>,
     mut buffer: [u8; N],
@@ -287,7 +287,7 @@ fn encode<const N: usize>(
     match write(&mut buffer) {
         Some(len) => frame.extend_from_slice(&buffer[..len]),
         None => {
-            unreachable!("an encoded request has 1 to 253 bytes, which every frame has room for")
+            unreachable!("an encoded request has 1 to 253 bytes, which fit into every frame")
         }
     }
 }

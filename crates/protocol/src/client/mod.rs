@@ -1,22 +1,22 @@
-//! One connection of a client, without I/O: requests in, bytes out; bytes in, results out.
+//! The client side of one connection, without I/O: requests in, bytes out; bytes in, results out.
 //!
-//! A [`Connection`] is driven by whoever owns the socket, blocking or not. The driver hands it
-//! requests, received bytes and the time, sends what [`Connection::outgoing`] holds, and calls
-//! [`Connection::advance`] when [`Connection::deadline`] has come. Each of these calls hands results
-//! to a closure, as a [`Done`] each. The same machine serves every [`Transport`].
+//! The owner of the socket, blocking or not, drives a [`Connection`]. The driver passes it
+//! requests, received bytes and the time, sends the bytes of [`Connection::outgoing`], and calls
+//! [`Connection::advance`] at [`Connection::deadline`]. Each call passes its results to a closure,
+//! as [`Done`] values. The same state machine serves every [`Transport`].
 //!
-//! The rules it keeps:
+//! The rules of a connection:
 //!
-//! * A reply counts only when transaction id (where there is one), unit id, function and length are
-//!   those of the request. On a stream, anything else ends the connection: the two sides no longer
-//!   mean the same thing.
-//! * A request that timed out is given up. Its late reply is dropped and counted where transaction
-//!   ids tell it apart; where they do not, the connection ends, and a serial line is silenced first.
-//! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
-//!   the other side may have gone without a word.
-//! * Only reads are ever sent twice, and only as datagrams.
+//! * A reply is accepted only if its transaction id (if any), unit id, function and length match
+//!   the request. On a stream, any other reply ends the connection, because the two sides are out
+//!   of step.
+//! * A request that timed out is abandoned. With transaction ids, its late reply is dropped and
+//!   counted. Without them, the connection ends; a serial line waits for silence instead.
+//! * A connection ends when a reply was cut off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a
+//!   received byte: the other side may be gone.
+//! * Only reads are sent twice, and only as datagrams.
 //!
-//! A connection that has ended stays so: the driver makes a new one.
+//! An ended connection cannot be used again: the driver creates a new one.
 
 mod connection;
 mod datagram;
@@ -34,27 +34,27 @@ use thiserror::Error;
 use crate::frame::FrameError;
 use crate::pdu::ResponseError;
 
-/// The driver's clock: the time since any fixed moment. It never runs backwards.
+/// The clock of the driver: the time since any fixed moment. It never runs backwards.
 pub type Time = Duration;
 
-/// Timeouts one after the other, without a byte between them, after which a connection ends.
-/// Requests that were under way together count as one.
+/// The number of consecutive timeouts, without a received byte, after which a connection ends.
+/// Requests in flight at the same time count as one.
 pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
 
-/// How often a read is sent over UDP within its timeout.
+/// How many times a read is sent over UDP within its timeout.
 pub const UDP_ATTEMPTS: u32 = 3;
 
-/// How long the units of a serial line have to carry out a broadcast (Modbus over Serial Line
+/// The time that the units of a serial line have to carry out a broadcast (Modbus over Serial Line
 /// V1.02, 2.4.1).
 pub const TURNAROUND: Duration = Duration::from_millis(100);
 
-/// How requests travel.
+/// The transport of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Transport {
     /// MBAP frames in a stream: TCP, with TLS or without.
     Tcp,
-    /// One MBAP frame a datagram. One request at a time.
+    /// One MBAP frame per datagram. One request at a time.
     Udp,
     /// RTU frames in a stream. One request at a time.
     RtuOverTcp,
@@ -64,26 +64,26 @@ pub enum Transport {
     SerialAscii(Line),
 }
 
-/// What is known of a serial line.
+/// Settings of a serial line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Line {
-    /// What separates two frames.
+    /// The silence between two frames.
     pub silence: Duration,
-    /// The adapter hands back what is sent. One that does is also noticed by itself.
+    /// Whether the adapter echoes sent bytes. An echo is also detected without this setting.
     pub echo: bool,
 }
 
-/// Why a request has no response.
+/// Why a request failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum Failure {
-    /// The device answered with an exception: its code.
+    /// The device answered with an exception, with this code.
     #[error("exception {0:#04x}")]
     Exception(u8),
-    /// No reply within the request's timeout.
+    /// No reply arrived within the timeout.
     #[error("no reply in time")]
     Timeout,
-    /// A reply that can't be the reply to the request.
+    /// The reply cannot belong to the request.
     #[error("invalid response: {0}")]
     Invalid(InvalidResponse),
     /// The connection ended before the reply.
@@ -91,14 +91,14 @@ pub enum Failure {
     Closed(Closed),
 }
 
-/// What is wrong with received bytes.
+/// Why received bytes are invalid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum InvalidResponse {
     /// A header with a protocol id other than 0.
     #[error("protocol id {0}, expected 0")]
     ProtocolId(u16),
-    /// A header with a length that no frame has.
+    /// A header with an invalid length.
     #[error("length {0} in the header, expected 2 to 254")]
     Length(u16),
     /// A transaction id that no request in flight has.
@@ -112,7 +112,7 @@ pub enum InvalidResponse {
         /// The unit that replied.
         found: u8,
     },
-    /// A PDU that does not answer the request.
+    /// A PDU that is not a response to the request.
     #[error("{0}")]
     Pdu(ResponseError),
     /// A damaged frame.
@@ -121,16 +121,16 @@ pub enum InvalidResponse {
     /// A datagram that is not exactly one frame.
     #[error("the datagram is not one frame")]
     Datagram,
-    /// More bytes than any reply has.
+    /// More bytes than a reply can have.
     #[error("more bytes than a reply can have")]
     TooLong,
-    /// Bytes that no request asked for.
+    /// Bytes without a request.
     #[error("bytes without a request")]
     Unrequested,
 }
 
 impl InvalidResponse {
-    /// What is wrong, in a word for programs.
+    /// The reason as a word for programs.
     pub const fn reason(self) -> &'static str {
         match self {
             InvalidResponse::ProtocolId(_) => "protocol_id",
@@ -155,23 +155,23 @@ impl InvalidResponse {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum Closed {
-    /// The driver said so: the peer closed it, or I/O failed.
+    /// The driver reports that the peer closed the connection, or that I/O failed.
     #[error("closed by the peer")]
     ByPeer,
-    /// The driver said so: nobody needs it any more.
+    /// The driver closed the connection.
     #[error("closed by this side")]
     BySelf,
-    /// Received bytes can't be trusted.
+    /// The received bytes are invalid.
     #[error("invalid response: {0}")]
     Invalid(InvalidResponse),
     /// Several requests timed out, and no byte was received meanwhile.
     #[error("no byte received during {MAX_CONSECUTIVE_TIMEOUTS} timeouts")]
     Silent,
     /// A request timed out in the middle of its reply.
-    #[error("a reply broke off")]
+    #[error("a reply was cut off")]
     BrokenOff,
-    /// A request timed out where a late reply could be taken for the next one's.
-    #[error("a request timed out, and its reply may still come")]
+    /// A request timed out, and its late reply could be taken for the next one.
+    #[error("a request timed out, and its reply may still arrive")]
     TimedOut,
     /// All transaction ids are in use.
     #[error("no transaction id is free")]
@@ -179,7 +179,7 @@ pub enum Closed {
 }
 
 impl Closed {
-    /// What the end of the connection means to a request.
+    /// The failure of a request in flight when the connection ends.
     pub const fn failure(self) -> Failure {
         match self {
             Closed::Invalid(invalid) => Failure::Invalid(invalid),

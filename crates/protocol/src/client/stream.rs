@@ -10,17 +10,17 @@ use super::{Closed, Failure, InvalidResponse, MAX_CONSECUTIVE_TIMEOUTS, Time};
 use crate::frame::mbap::{self, Next};
 use crate::pdu::EncodedRequest;
 
-/// All transaction ids.
+/// The number of transaction ids.
 const IDS: usize = 65_536;
 
 #[derive(Debug, Default)]
 pub(super) struct Stream {
     next_id: u16,
-    /// Requests that were given up: their replies may still come.
+    /// Transaction ids of abandoned requests, whose replies may still arrive.
     given_up: BTreeSet<u16>,
-    /// The beginning of a frame.
+    /// The beginning of an incomplete frame.
     partial: Vec<u8>,
-    /// Timeouts since something was received, and when the last of them was.
+    /// The number of timeouts since the last received byte, and the time of the last one.
     timeouts: u32,
     timed_out: Time,
 }
@@ -47,7 +47,7 @@ impl Stream {
         Some(flights.push(unit_id, request, id, now, timeout))
     }
 
-    /// Gives a request up: its reply, should it come, is dropped.
+    /// Abandons a request. A late reply to it is dropped.
     pub(super) fn cancel(&mut self, flights: &mut Flights, ticket: Ticket) {
         if let Some(flight) = flights.take(ticket) {
             self.given_up.insert(flight.transaction_id);
@@ -136,8 +136,8 @@ impl Stream {
         }
     }
 
-    /// Whether the reply that has begun belongs to a request that was given up: if its rest never
-    /// comes, the next reply is taken for it.
+    /// Whether the incomplete reply belongs to an abandoned request: if the rest never arrives, the
+    /// next reply would be taken for it.
     fn has_broken_off(&self, flights: &Flights) -> bool {
         match self.partial.first_chunk::<2>() {
             Some(id) => self.given_up.contains(&u16::from_be_bytes(*id)),

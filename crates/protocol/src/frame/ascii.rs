@@ -18,7 +18,7 @@ use crate::pdu;
 /// The longest frame, in characters.
 pub const MAX_LEN: usize = 1 + 2 * MAX_BODY_LEN + 2;
 
-/// The most bytes that the digits of a frame stand for: unit id, PDU, LRC.
+/// The most bytes that a frame encodes: unit id, PDU, LRC.
 pub const MAX_BODY_LEN: usize = 1 + pdu::MAX_LEN + 1;
 
 /// Writes a frame at the start of `frame` and returns its length; `None` for a PDU that is empty or
@@ -40,8 +40,8 @@ pub fn encode(unit_id: u8, pdu: &[u8], frame: &mut [u8; MAX_LEN]) -> Option<usiz
     Some(len + 2)
 }
 
-/// The unit id and PDU of a whole frame, decoded into `body`. Digits above 9 may be capital or small
-/// letters.
+/// The unit id and PDU of a complete frame, decoded into `body`. Digits above 9 may be uppercase or
+/// lowercase letters.
 ///
 /// # Errors
 /// [`FrameError::Length`] for a frame that is too short or too long, [`FrameError::Character`] when

@@ -1,8 +1,8 @@
 //! The MBAP header of Modbus TCP and UDP (Messaging on TCP/IP Implementation Guide V1.0b, 3.1.3):
 //! transaction id, protocol id 0, length of all that follows, unit id. Big-endian.
 //!
-//! A stream is read frame by frame. What [`next`] leaves over is the start of a frame, which the
-//! caller keeps until more bytes arrive:
+//! A stream is read frame by frame. Bytes that [`next`] leaves over are the start of a frame: keep
+//! them until more bytes arrive:
 //!
 //! ```
 //! use holdfast_protocol::frame::mbap::{self, Next};
@@ -42,11 +42,11 @@ const UNCOUNTED: usize = 6;
 pub enum Next<'a> {
     /// The start of a frame: wait for more bytes.
     Incomplete,
-    /// A whole frame.
+    /// A complete frame.
     Frame {
         /// Pairs a response with its request.
         transaction_id: u16,
-        /// The device behind the address that was connected to.
+        /// The unit that the frame is for.
         unit_id: u8,
         /// The PDU, 1 to [`pdu::MAX_LEN`] bytes.
         pdu: &'a [u8],
@@ -60,7 +60,7 @@ pub enum Next<'a> {
         /// Bytes of the frame.
         len: usize,
     },
-    /// A length that no frame has. The start of the next frame is unknown: close the connection.
+    /// An invalid length. The start of the next frame is unknown: close the connection.
     Broken {
         /// The length field.
         length: u16,
@@ -115,7 +115,7 @@ pub fn encode(
     Some(len)
 }
 
-/// The header of a frame whose PDU has `pdu_len` bytes: for PDUs that are written in place, behind
+/// The header of a frame whose PDU has `pdu_len` bytes, for PDUs that are written in place after
 /// the header.
 ///
 /// # Panics

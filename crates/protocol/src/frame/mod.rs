@@ -13,22 +13,22 @@ pub mod rtu;
 
 use crate::pdu;
 
-/// Why bytes are not a frame of a serial line.
+/// Why bytes are not a valid frame of a serial line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum FrameError {
     /// The frame is too short or too long.
     #[error("the frame is too short or too long")]
     Length,
-    /// The CRC or LRC does not fit the bytes before it.
-    #[error("the check sum is wrong")]
+    /// The CRC or LRC does not match the bytes before it.
+    #[error("the checksum is wrong")]
     CheckSum,
     /// An ASCII frame has no colon, no CR LF, or something other than digits between them.
-    #[error("the frame has a character that does not belong there")]
+    #[error("the frame has an invalid character")]
     Character,
 }
 
-/// Unit id and PDU, when the PDU has 1 to [`pdu::MAX_LEN`] bytes.
+/// Splits unit id and PDU, if the PDU has 1 to [`pdu::MAX_LEN`] bytes.
 fn split(body: &[u8]) -> Result<(u8, &[u8]), FrameError> {
     match body.split_first() {
         Some((unit, pdu)) if (1..=pdu::MAX_LEN).contains(&pdu.len()) => Ok((*unit, pdu)),

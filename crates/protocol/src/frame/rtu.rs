@@ -1,8 +1,8 @@
 //! RTU frames (Modbus over Serial Line V1.02, 2.5.1): unit id, PDU, CRC-16 low byte first.
 //!
-//! On a serial line a silence ends a frame: the caller measures it and calls [`decode`] with what
-//! arrived before it. In a stream, as RTU over TCP has it, there is no silence: a server calls
-//! [`next_request`], a client [`response_len`].
+//! On a serial line, a silence ends a frame: the caller measures it and calls [`decode`] with the
+//! bytes before it. RTU over TCP has no silence between frames: a server calls [`next_request`], a
+//! client [`response_len`].
 //!
 //! ```
 //! use holdfast_protocol::frame::rtu;
@@ -33,7 +33,7 @@ pub fn encode(unit_id: u8, pdu: &[u8], frame: &mut [u8; MAX_LEN]) -> Option<usiz
     Some(body + 2)
 }
 
-/// The unit id and PDU of a whole frame.
+/// The unit id and PDU of a complete frame.
 ///
 /// # Errors
 /// [`FrameError::Length`] unless the frame has 4 to 256 bytes, [`FrameError::CheckSum`] for a wrong
@@ -75,7 +75,7 @@ const TABLE: [u16; 256] = {
 pub enum Next<'a> {
     /// The start of a frame: wait for more bytes.
     Incomplete,
-    /// A whole frame.
+    /// A complete frame.
     Frame {
         /// The device that the request is for.
         unit_id: u8,
@@ -94,8 +94,8 @@ pub enum Next<'a> {
 }
 
 /// Looks at the start of `bytes`, which may end anywhere. A stream has no silence between frames:
-/// the length of a request follows from its function code. For an unknown function, the frame ends
-/// where the CRC first fits.
+/// the length of a request follows from its function code. A frame of an unknown function ends
+/// where the CRC first matches.
 ///
 /// ```
 /// use holdfast_protocol::frame::rtu::{self, Next};
@@ -126,12 +126,12 @@ pub fn next_request(bytes: &[u8]) -> Next<'_> {
 
 enum DataLen {
     Known(usize),
-    /// More bytes will tell.
+    /// The length is in a later byte.
     Incomplete,
     Unknown,
 }
 
-/// Bytes between function code and CRC (V1.1b3, 6).
+/// Returns the length of the data between function code and CRC (V1.1b3, 6).
 fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
     let counted = |at: usize| {
         data.get(at)
@@ -159,8 +159,9 @@ fn first_fit(bytes: &[u8]) -> Next<'_> {
     let Some(first) = (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) else {
         return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
     };
-    // When the last byte of the data is the first byte of the CRC of the bytes before it, the CRC
-    // fits one byte too early. A 0 is left over then, and no frame for unit 0 starts with it.
+    // When the last byte of the data equals the first byte of the CRC of the bytes before it, the
+    // CRC matches one byte too early. The remaining byte is 0, and no frame for unit 0 starts with
+    // it.
     let longer = first < longest && bytes[first] == 0 && !is_known_and_whole(&bytes[first..]);
     let len = first + usize::from(longer);
     match decode(&bytes[..len]) {
@@ -169,7 +170,7 @@ fn first_fit(bytes: &[u8]) -> Next<'_> {
     }
 }
 
-/// Whether bytes start with a whole frame of a known function.
+/// Whether bytes start with a complete frame of a known function.
 fn is_known_and_whole(bytes: &[u8]) -> bool {
     let [_, function_code, data @ ..] = bytes else {
         return false;
@@ -180,8 +181,8 @@ fn is_known_and_whole(bytes: &[u8]) -> bool {
     }
 }
 
-/// The length of the frame at the start of `bytes`, as its function code says. The frame answers a
-/// request whose PDU has `request_len` bytes. `None` while more bytes are required.
+/// The length of the frame at the start of `bytes`, according to its function code. The frame
+/// answers a request whose PDU has `request_len` bytes. `None` while more bytes are required.
 ///
 /// ```
 /// use holdfast_protocol::frame::rtu;
@@ -192,7 +193,7 @@ fn is_known_and_whole(bytes: &[u8]) -> bool {
 /// ```
 ///
 /// # Errors
-/// [`FrameError::Length`] for a function that is unknown, or a count that no frame has.
+/// [`FrameError::Length`] for an unknown function, or an invalid count.
 pub fn response_len(bytes: &[u8], request_len: usize) -> Result<Option<usize>, FrameError> {
     let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
         return Ok(None);

@@ -28,7 +28,7 @@ impl<'a, const MAX: u16> Bits<'a, MAX> {
     ///
     /// # Errors
     /// [`RequestError::Quantity`] unless `quantity` is 1 to `MAX`, [`RequestError::Length`] when
-    /// `bytes` are not as many as the bits take.
+    /// `bytes` does not have the length that the bits require.
     #[inline]
     pub const fn new(quantity: u16, bytes: &'a [u8]) -> Result<Bits<'a, MAX>, RequestError> {
         if quantity == 0 || quantity > MAX {
@@ -64,13 +64,13 @@ impl<'a, const MAX: u16> Bits<'a, MAX> {
         self.bytes
     }
 
-    /// One bit, counted from 0; `None` from [`Bits::quantity`] on.
+    /// One bit, counted from 0; `None` if `index` is [`Bits::quantity`] or more.
     pub fn get(&self, index: u16) -> Option<bool> {
         let byte = self.bytes.get(usize::from(index / 8)).filter(|_| index < self.quantity)?;
         Some(byte >> (index % 8) & 1 == 1)
     }
 
-    /// The bits in their order.
+    /// The bits, in order.
     pub fn iter(&self) -> impl Iterator<Item = bool> + use<'a, MAX> {
         let each = |byte: &'a u8| (0..8).map(move |bit| byte >> bit & 1 == 1);
         self.bytes.iter().flat_map(each).take(usize::from(self.quantity))
@@ -78,7 +78,7 @@ impl<'a, const MAX: u16> Bits<'a, MAX> {
 }
 
 impl<'a> Bits<'a, { limit::READ_BITS }> {
-    /// The bits of a range; `bytes` are as many as the range takes.
+    /// The bits of a range. `bytes` has the length that the range requires.
     #[inline]
     pub(super) const fn in_range(range: BitRange, bytes: &'a [u8]) -> Self {
         debug_assert!(bytes.len() == range.byte_len());
@@ -107,10 +107,10 @@ pub struct Registers<'a, const MAX: u16> {
 }
 
 impl<'a, const MAX: u16> Registers<'a, MAX> {
-    /// Registers that are big-endian bytes already, two for each.
+    /// Registers in big-endian bytes, two for each.
     ///
     /// # Errors
-    /// [`RequestError::Length`] for an odd number of bytes, [`RequestError::Quantity`] unless they
+    /// [`RequestError::Length`] for an odd number of bytes, [`RequestError::Quantity`] unless there
     /// are 1 to `MAX` registers.
     #[inline]
     pub const fn new(bytes: &'a [u8]) -> Result<Registers<'a, MAX>, RequestError> {
@@ -147,12 +147,12 @@ impl<'a, const MAX: u16> Registers<'a, MAX> {
         self.bytes
     }
 
-    /// One register, counted from 0; `None` from [`Registers::quantity`] on.
+    /// One register, counted from 0; `None` if `index` is [`Registers::quantity`] or more.
     pub fn get(&self, index: u16) -> Option<u16> {
         self.pairs().get(usize::from(index)).copied().map(u16::from_be_bytes)
     }
 
-    /// The registers in their order.
+    /// The registers, in order.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = u16> + use<'a, MAX> {
         self.pairs().iter().copied().map(u16::from_be_bytes)
     }
@@ -163,7 +163,7 @@ impl<'a, const MAX: u16> Registers<'a, MAX> {
 }
 
 impl<'a> Registers<'a, { limit::READ_REGISTERS }> {
-    /// The registers of a range; `bytes` are as many as the range takes.
+    /// The registers of a range. `bytes` has the length that the range requires.
     #[inline]
     pub(super) const fn in_range(range: RegisterRange, bytes: &'a [u8]) -> Self {
         debug_assert!(bytes.len() == range.byte_len());
@@ -171,7 +171,7 @@ impl<'a> Registers<'a, { limit::READ_REGISTERS }> {
     }
 }
 
-/// A number of values, when a PDU can have as many.
+/// Converts a number of values to a quantity, if it is 1 to `max`.
 fn quantity(found: usize, max: u16) -> Result<u16, RequestError> {
     match u16::try_from(found) {
         Ok(quantity) if (1..=max).contains(&quantity) => Ok(quantity),
@@ -190,7 +190,7 @@ fn quantity(found: usize, max: u16) -> Result<u16, RequestError> {
 /// ```
 ///
 /// # Panics
-/// When `bytes` are not as many as the bits take.
+/// When `bytes` does not have the length that the bits require.
 pub fn pack_bits(values: &[bool], bytes: &mut [u8]) {
     assert_eq!(bytes.len(), values.len().div_ceil(8), "bytes for {} bits", values.len());
     for (byte, bits) in bytes.iter_mut().zip(values.chunks(8)) {
@@ -209,7 +209,7 @@ pub fn pack_bits(values: &[bool], bytes: &mut [u8]) {
 /// ```
 ///
 /// # Panics
-/// When `bytes` are not two for each register.
+/// When `bytes` does not have two bytes for each register.
 pub fn pack_registers(values: &[u16], bytes: &mut [u8]) {
     assert_eq!(bytes.len(), values.len() * 2, "bytes for {} registers", values.len());
     for (pair, value) in bytes.as_chunks_mut().0.iter_mut().zip(values) {

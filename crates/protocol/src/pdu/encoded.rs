@@ -1,10 +1,10 @@
-//! A request that has been encoded: checked once, sent as it is, and what its reply is judged by.
+//! An encoded request that owns its PDU.
 
 use core::fmt;
 
 use super::{Buffer, ExceptionCode, MAX_LEN, Request};
 
-/// The PDU of a request that a server may not refuse for its form.
+/// The PDU of a valid request: a server cannot refuse its form, quantity or values.
 #[derive(Clone, PartialEq, Eq)]
 pub struct EncodedRequest {
     pdu: Buffer,
@@ -19,7 +19,7 @@ impl EncodedRequest {
         EncodedRequest { pdu, len: len as u8 }
     }
 
-    /// Takes a PDU that was encoded elsewhere.
+    /// Checks and copies a PDU that was encoded elsewhere.
     ///
     ///
     /// # Errors
@@ -32,7 +32,7 @@ impl EncodedRequest {
         Ok(EncodedRequest { pdu, len: encoded.len() as u8 })
     }
 
-    /// 1 to [`MAX_LEN`] bytes.
+    /// The PDU, 1 to [`MAX_LEN`] bytes.
     #[inline]
     pub fn pdu(&self) -> &[u8] {
         &self.pdu[..usize::from(self.len)]
@@ -43,7 +43,9 @@ impl EncodedRequest {
     pub fn request(&self) -> Request<'_> {
         match Request::parse(self.pdu()) {
             Ok(request) => request,
-            Err(code) => unreachable!("an encoded request was refused with {code}"),
+            Err(code) => {
+                unreachable!("an encoded request is valid, but parsing failed with {code}")
+            }
         }
     }
 }

@@ -16,11 +16,11 @@ const CONFORMITY_LEVEL: u8 = 0x83;
 /// Function, MEI type, read code, conformity, more follows, next object, number of objects.
 const HEAD_LEN: usize = 7;
 
-/// The longest value that fits a reply of its own, in bytes.
+/// The longest value that fits into a reply, in bytes.
 pub const MAX_VALUE_LEN: usize = super::MAX_LEN - HEAD_LEN - 2;
 
 codes! {
-    /// Which objects are asked for: a category as a stream of objects, or one object.
+    /// The objects to read: a category as a stream of objects, or one object.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
     ReadCode: u8 {
         /// Objects 0x00 to 0x02.
@@ -44,13 +44,13 @@ impl ReadCode {
     }
 }
 
-/// Why objects cannot be the identification of a device.
+/// Why objects are not a valid identification.
 #[cfg(feature = "alloc")]
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum ObjectError {
-    /// An id comes twice.
-    #[error("object {0:#04x} is named twice")]
+    /// An id occurs twice.
+    #[error("object {0:#04x} occurs twice")]
     Twice(u8),
     /// A value is longer than [`MAX_VALUE_LEN`].
     #[error("object {id:#04x} has {len} bytes, at most {MAX_VALUE_LEN} are allowed")]
@@ -61,15 +61,15 @@ pub enum ObjectError {
         len: usize,
     },
     /// A mandatory object, 0x00 to 0x02, is missing.
-    #[error("object {0:#04x} is mandatory")]
+    #[error("mandatory object {0:#04x} is missing")]
     Missing(u8),
     /// The id is one of 0x07 to 0x7F.
     #[error("object {0:#04x} is reserved")]
     Reserved(u8),
 }
 
-/// The identification of one device: objects by id, the mandatory 0x00 to 0x02 among them. Requires
-/// the feature `alloc`.
+/// The identification of one device: objects by id, with at least the mandatory 0x00 to 0x02.
+/// Requires the feature `alloc`.
 ///
 /// ```
 /// use holdfast_protocol::pdu::identification::{Objects, ReadCode};
@@ -98,8 +98,8 @@ impl Objects {
     /// Objects by id, in any order.
     ///
     /// # Errors
-    /// [`ObjectError`] when an id comes twice, is reserved (0x07 to 0x7F), a mandatory one is
-    /// missing or a value is longer than [`MAX_VALUE_LEN`].
+    /// [`ObjectError`] when an id occurs twice or is reserved (0x07 to 0x7F), a mandatory object is
+    /// missing, or a value is longer than [`MAX_VALUE_LEN`].
     pub fn new(objects: impl IntoIterator<Item = (u8, Box<[u8]>)>) -> Result<Objects, ObjectError> {
         let mut objects: Vec<_> = objects.into_iter().collect();
         objects.sort_by_key(|(id, _)| *id);
@@ -130,12 +130,12 @@ impl Objects {
         self.0.iter().find(|(known, _)| *known == id).map(|(_, value)| value.as_ref())
     }
 
-    /// Writes the reply at the start of `pdu` and returns its length. A stream holds as many objects
-    /// as fit, and the reply says where the rest starts. A stream that is to start at an unknown
-    /// object starts at the first.
+    /// Writes the reply at the start of `pdu` and returns its length. A stream holds as many
+    /// objects as fit, and the reply contains the id of the next object. A stream from an unknown
+    /// object starts at the first object.
     ///
     /// # Errors
-    /// [`ExceptionCode::IllegalDataAddress`] for an individual object that is unknown.
+    /// [`ExceptionCode::IllegalDataAddress`] for an unknown individual object.
     pub fn reply(
         &self,
         code: ReadCode,
@@ -182,10 +182,10 @@ pub(super) fn parse_request(body: &[u8]) -> Result<(ReadCode, u8), ExceptionCode
     }
 }
 
-/// What a device answered: some of its objects, and where the rest starts.
+/// An answer of a device: some of its objects, and the id of the next one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Answer<'a> {
-    /// The categories that the device has, 0x01 to 0x03; plus 0x80 with access to single objects.
+    /// The supported categories, 0x01 to 0x03; plus 0x80 with access to single objects.
     pub conformity_level: u8,
     /// The object to ask for next; `None` after the last.
     pub next: Option<u8>,
@@ -193,7 +193,7 @@ pub struct Answer<'a> {
 }
 
 impl<'a> Answer<'a> {
-    /// Parses the body of a reply, behind the function code. `None` when it is malformed.
+    /// Parses the body of a reply, after the function code. `None` when it is malformed.
     pub(super) fn parse(asked: ReadCode, body: &'a [u8]) -> Option<Answer<'a>> {
         let [MEI_TYPE, code, conformity_level, more, next, count, objects @ ..] = body else {
             return None;
@@ -209,7 +209,7 @@ impl<'a> Answer<'a> {
         (*code == asked.code() && whole && counted).then_some(answer)
     }
 
-    /// The objects of this answer: id and value.
+    /// The objects of this answer, as id and value.
     pub fn iter(&self) -> impl Iterator<Item = (u8, &'a [u8])> + use<'a> {
         let mut rest = self.objects;
         core::iter::from_fn(move || {

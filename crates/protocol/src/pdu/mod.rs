@@ -30,10 +30,10 @@ pub use sub_function::SubFunction;
 /// The longest PDU, in bytes (V1.1b3, 4.1).
 pub const MAX_LEN: usize = 253;
 
-/// Room for one PDU of any kind.
+/// A buffer for one PDU of any kind.
 pub type Buffer = [u8; MAX_LEN];
 
-/// The most items of one request (V1.1b3, 6).
+/// The most items per request (V1.1b3, 6).
 pub mod limit {
     /// Coils or discrete inputs that functions 1 and 2 read.
     pub const READ_BITS: u16 = 2000;
@@ -43,6 +43,6 @@ pub mod limit {
     pub const WRITE_BITS: u16 = 1968;
     /// Registers that function 16 writes.
     pub const WRITE_REGISTERS: u16 = 123;
-    /// Registers that function 23 writes: its request carries a read beside the write.
+    /// Registers that function 23 writes. Its request also carries a read.
     pub const READ_WRITE_REGISTERS: u16 = 121;
 }

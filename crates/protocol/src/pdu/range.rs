@@ -1,13 +1,13 @@
-//! Which items a request reads: an address and a quantity that its function allows.
+//! The range of items that a request reads: an address and a quantity that its function allows.
 
 use super::{RequestError, limit};
 
 /// `quantity` items from `address`, 1 to `MAX` of them.
 ///
 /// `MAX` is the limit of the function and follows from the [`Request`](super::Request) that the
-/// range is for. The end of a range can be beyond the last address, 65535: the memory decides about
-/// addresses, and a server answers
-/// [`IllegalDataAddress`](super::ExceptionCode::IllegalDataAddress) then.
+/// range is for. The end of a range can be beyond the last address, 65535. The memory decides about
+/// addresses: a server answers [`IllegalDataAddress`](super::ExceptionCode::IllegalDataAddress)
+/// then.
 ///
 /// ```
 /// use holdfast_protocol::pdu::{Range, Request, RequestError};
@@ -32,10 +32,10 @@ pub struct Range<const MAX: u16> {
     quantity: u16,
 }
 
-/// What functions 1 and 2 read: 1 to 2000 coils or discrete inputs.
+/// The range of functions 1 and 2: 1 to 2000 coils or discrete inputs.
 pub type BitRange = Range<{ limit::READ_BITS }>;
 
-/// What functions 3, 4 and 23 read: 1 to 125 registers.
+/// The range of functions 3, 4 and 23: 1 to 125 registers.
 pub type RegisterRange = Range<{ limit::READ_REGISTERS }>;
 
 impl<const MAX: u16> Range<MAX> {

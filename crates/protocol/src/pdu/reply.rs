@@ -1,5 +1,5 @@
 //! Replies, written by a server at the start of the buffer that is sent. Each function returns the
-//! length of the PDU it wrote. Arguments are the parts of the request that the reply repeats.
+//! length of the PDU. The arguments are the parts of the request that the reply repeats.
 
 use super::request::{coil, put_words};
 use super::{
@@ -7,13 +7,13 @@ use super::{
     Registers, Request, SubFunction, limit,
 };
 
-/// The most bytes that [`server_id`] takes.
+/// The most bytes of a [`server_id`].
 pub const MAX_SERVER_ID_LEN: usize = MAX_LEN - HEAD_LEN;
 
 /// Function code and byte count.
 const HEAD_LEN: usize = 2;
 
-/// Refuses a request: the function code with its high bit set, and why (V1.1b3, 7).
+/// Refuses a request: the function code with its high bit set, and the exception code (V1.1b3, 7).
 ///
 /// ```
 /// use holdfast_protocol::pdu::{self, ExceptionCode, reply};
@@ -86,7 +86,7 @@ pub fn read_write_multiple_registers(range: RegisterRange, pdu: &mut Buffer) -> 
     counted(Function::ReadWriteMultipleRegisters, range.byte_len(), pdu)
 }
 
-/// Answers function 5, whose request has this address and value.
+/// Answers function 5 with the address and value of its request.
 ///
 /// ```
 /// use holdfast_protocol::pdu::{self, Request, reply};
@@ -104,13 +104,13 @@ pub fn write_single_coil(address: u16, value: bool, pdu: &mut Buffer) -> usize {
     words(Function::WriteSingleCoil, [address, coil(value)], pdu)
 }
 
-/// Answers function 6, whose request has this address and value.
+/// Answers function 6 with the address and value of its request.
 #[inline]
 pub fn write_single_register(address: u16, value: u16, pdu: &mut Buffer) -> usize {
     words(Function::WriteSingleRegister, [address, value], pdu)
 }
 
-/// Answers function 15, whose request has this address and these bits.
+/// Answers function 15 with the address and quantity of its request.
 ///
 /// ```
 /// use holdfast_protocol::pdu::{self, Request, reply};
@@ -132,7 +132,7 @@ pub fn write_multiple_coils(
     words(Function::WriteMultipleCoils, [address, bits.quantity()], pdu)
 }
 
-/// Answers function 16, whose request has this address and these registers.
+/// Answers function 16 with the address and quantity of its request.
 #[inline]
 pub fn write_multiple_registers(
     address: u16,
@@ -142,7 +142,7 @@ pub fn write_multiple_registers(
     words(Function::WriteMultipleRegisters, [address, registers.quantity()], pdu)
 }
 
-/// Answers function 22, whose request has this address and these masks.
+/// Answers function 22 with the address and masks of its request.
 #[inline]
 pub fn mask_write_register(address: u16, and_mask: u16, or_mask: u16, pdu: &mut Buffer) -> usize {
     words(Function::MaskWriteRegister, [address, and_mask, or_mask], pdu)
@@ -176,8 +176,8 @@ pub fn diagnostics(sub_function: SubFunction, data: u16, pdu: &mut Buffer) -> us
     words(Function::Diagnostics, [sub_function.code(), data], pdu)
 }
 
-/// Answers function 11: status and event count. `busy` says that a program command is still
-/// processed.
+/// Answers function 11: status and event count. `busy` says whether the server still processes a
+/// program command.
 ///
 /// ```
 /// use holdfast_protocol::pdu::{self, reply};

@@ -1,8 +1,8 @@
 //! Requests: parsed by a server, encoded by a client (V1.1b3, 6).
 //!
-//! Parsing makes the first two checks in the order that the standard draws: the function must be
-//! known (exception 01), then form, quantity and value must be right (exception 03). The types of a
-//! request carry the same checks, so that encoding cannot fail.
+//! Parsing makes the first two checks of the standard, in its order: the function must be known
+//! (exception 01), then form, quantity and value must be right (exception 03). The types of a
+//! request enforce the same checks, so encoding cannot fail.
 
 use super::identification::{self, ReadCode};
 use super::{
@@ -88,7 +88,7 @@ pub enum Request<'a> {
     },
     /// Function 43 with MEI type 14.
     ReadDeviceIdentification {
-        /// Which objects are asked for.
+        /// The objects to read.
         code: ReadCode,
         /// The object, or the first object of a stream.
         object_id: u8,
@@ -212,11 +212,11 @@ impl<'a> Request<'a> {
                 put(pdu, 1, &[identification::MEI_TYPE, code.code(), object_id])
             }
         };
-        debug_assert_eq!(Request::parse(&pdu[..len]), Ok(*self), "servers accept what is encoded");
+        debug_assert_eq!(Request::parse(&pdu[..len]), Ok(*self), "an encoded request parses");
         len
     }
 
-    /// Whether it only reads: carrying it out twice changes nothing.
+    /// Whether the request only reads: repeating it changes nothing.
     pub const fn is_read(&self) -> bool {
         !self.function().is_write() && !matches!(self, Request::Diagnostics(_))
     }
@@ -247,12 +247,12 @@ const ON: u16 = 0xFF00;
 /// A coil that is off, in function 5.
 const OFF: u16 = 0x0000;
 
-/// A coil as function 5 writes it.
+/// A coil value of function 5.
 pub(super) const fn coil(value: bool) -> u16 {
     if value { ON } else { OFF }
 }
 
-/// Exactly `N` big-endian words.
+/// Parses exactly `N` big-endian words.
 #[inline]
 fn words<const N: usize>(body: &[u8]) -> Result<[u16; N], ExceptionCode> {
     let (pairs, rest) = body.as_chunks::<2>();
@@ -262,14 +262,14 @@ fn words<const N: usize>(body: &[u8]) -> Result<[u16; N], ExceptionCode> {
     }
 }
 
-/// Exactly an address and a quantity of 1 to `MAX`.
+/// Parses exactly an address and a quantity of 1 to `MAX`.
 #[inline]
 fn range<const MAX: u16>(body: &[u8]) -> Result<Range<MAX>, ExceptionCode> {
     let [address, quantity] = words(body)?;
     Range::new(address, quantity).or(Err(ExceptionCode::IllegalDataValue))
 }
 
-/// Address and quantity, a byte count, and as many bytes as it says.
+/// Parses address, quantity, byte count, and exactly that many bytes.
 #[inline]
 fn counted(body: &[u8]) -> Result<([u16; 2], &[u8]), ExceptionCode> {
     match body {
@@ -280,7 +280,7 @@ fn counted(body: &[u8]) -> Result<([u16; 2], &[u8]), ExceptionCode> {
     }
 }
 
-/// 1 to `MAX` registers, as many as the quantity says.
+/// Parses 1 to `MAX` registers, as many as the quantity says.
 #[inline]
 fn registers<const MAX: u16>(
     quantity: u16,
@@ -296,7 +296,7 @@ fn empty(body: &[u8]) -> Result<(), ExceptionCode> {
     if body.is_empty() { Ok(()) } else { Err(ExceptionCode::IllegalDataValue) }
 }
 
-/// Writes words behind the function code; the length of the PDU so far.
+/// Writes words after the function code. Returns the length of the PDU so far.
 #[inline]
 pub(super) fn put_words<const N: usize>(pdu: &mut Buffer, words: [u16; N]) -> usize {
     let (pairs, _) = pdu[1..].as_chunks_mut::<2>();
@@ -306,7 +306,7 @@ pub(super) fn put_words<const N: usize>(pdu: &mut Buffer, words: [u16; N]) -> us
     1 + 2 * N
 }
 
-/// Writes bytes at `at`; the length of the PDU so far.
+/// Writes bytes at `at`. Returns the length of the PDU so far.
 #[inline]
 fn put(pdu: &mut Buffer, at: usize, bytes: &[u8]) -> usize {
     let end = at + bytes.len();
@@ -314,7 +314,7 @@ fn put(pdu: &mut Buffer, at: usize, bytes: &[u8]) -> usize {
     end
 }
 
-/// Writes a byte count and the bytes at `at`; the length of the PDU so far.
+/// Writes a byte count and the bytes at `at`. Returns the length of the PDU so far.
 #[inline]
 fn put_counted(pdu: &mut Buffer, at: usize, bytes: &[u8]) -> usize {
     pdu[at] = bytes.len() as u8;

@@ -1,10 +1,10 @@
-//! Why a request cannot be made: the checks that the types of requests carry.
+//! Errors of invalid requests.
 
 use thiserror::Error;
 
 use super::SubFunction;
 
-/// Why a request cannot be made.
+/// Why a request is invalid.
 ///
 /// ```
 /// use holdfast_protocol::pdu::BitRange;
@@ -23,7 +23,7 @@ pub enum RequestError {
         /// The limit of the function.
         max: u16,
     },
-    /// The data has another length than its quantity requires.
+    /// The data does not have the length that its quantity requires.
     #[error("data has {found} bytes, {expected} are required")]
     Length {
         /// The length that was given, in bytes.

@@ -1,4 +1,4 @@
-//! Responses, as a client parses them: against the request they answer.
+//! Responses. A client parses a response against the request that it answers.
 
 use thiserror::Error;
 
@@ -6,7 +6,7 @@ use super::identification::Answer;
 use super::request::coil;
 use super::{Bits, ExceptionCode, Registers, Request, limit};
 
-/// What a server answered. Bits and registers are exactly as many as the request asked for.
+/// A response. Bits and registers are exactly as many as the request asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum Response<'a> {
@@ -14,7 +14,7 @@ pub enum Response<'a> {
     Bits(Bits<'a, { limit::READ_BITS }>),
     /// Registers (functions 3, 4 and 23).
     Registers(Registers<'a, { limit::READ_REGISTERS }>),
-    /// The write was carried out: the server sent back what the standard requires (functions 5, 6,
+    /// The write was carried out: the response repeats what the standard requires (functions 5, 6,
     /// 15, 16 and 22).
     Written,
     /// The data field of Diagnostics (function 8).
@@ -33,29 +33,29 @@ pub enum Response<'a> {
     Identification(Answer<'a>),
 }
 
-/// Why a PDU is not a response to a request, or which exception it is.
+/// Why a PDU is not a response to the request, or its exception.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
 #[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum ResponseError {
     /// The server refused the request.
     #[error("{0}")]
     Exception(ExceptionCode),
-    /// The server refused the request with a code that the standard does not have.
+    /// The server refused the request with a code that is not in the standard.
     #[error("exception with the unknown code {0:#04x}")]
     UnknownException(u8),
-    /// The response is one to another function.
-    #[error("function code {found:#04x} instead of {expected:#04x}")]
+    /// The response belongs to another function.
+    #[error("function code {found:#04x}, expected {expected:#04x}")]
     Function {
         /// The function code of the request.
         expected: u8,
         /// The function code of the response.
         found: u8,
     },
-    /// The response has another length or count than the request requires.
-    #[error("the length or a count does not fit the request")]
+    /// The response does not have the length or count that the request requires.
+    #[error("the length or a count does not match the request")]
     Length,
-    /// The server sent back other values than those it was sent.
-    #[error("what the server sent back is not what was sent")]
+    /// The response does not repeat the values of the request.
+    #[error("the response does not repeat the values of the request")]
     Echo,
 }
 
@@ -142,7 +142,7 @@ impl Request<'_> {
     }
 }
 
-/// A byte count and exactly `len` bytes.
+/// Returns the data after a byte count, if both have the length `len`.
 fn counted(body: &[u8], len: usize) -> Result<&[u8], ResponseError> {
     match body {
         [count, data @ ..] if usize::from(*count) == len && data.len() == len => Ok(data),
@@ -150,7 +150,7 @@ fn counted(body: &[u8], len: usize) -> Result<&[u8], ResponseError> {
     }
 }
 
-/// Exactly these words.
+/// Checks that the body is exactly these words.
 fn echoed(body: &[u8], words: &[u16]) -> Result<Response<'static>, ResponseError> {
     if body.len() != words.len() * 2 {
         return Err(ResponseError::Length);

@@ -32,7 +32,7 @@ codes! {
 }
 
 impl SubFunction {
-    /// The sub-function of a PDU of function 8, whatever its data field.
+    /// The sub-function of a PDU of function 8, with any data field.
     ///
     /// ```
     /// use holdfast_protocol::pdu::SubFunction;

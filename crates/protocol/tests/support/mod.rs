@@ -1,4 +1,4 @@
-//! Requests and bytes to test with.
+//! Generates requests and bytes for tests.
 #![allow(dead_code, reason = "not every test uses all of it")]
 
 use holdfast_protocol::pdu::identification::ReadCode;
@@ -7,7 +7,7 @@ use holdfast_protocol::pdu::{
 };
 use proptest::prelude::*;
 
-/// A request as parts that own their data.
+/// A request whose parts own their data.
 #[derive(Debug, Clone)]
 pub enum Parts {
     Whole(Request<'static>),
@@ -69,7 +69,7 @@ fn a_sub_function() -> impl Strategy<Value = Parts> {
     })
 }
 
-/// A request of every function, with any values that it can have.
+/// Requests of every function, with all values that they can have.
 pub fn a_request() -> impl Strategy<Value = Parts> {
     let code = prop::sample::select(ReadCode::ALL);
     let whole = prop_oneof![
@@ -103,7 +103,7 @@ pub fn a_request() -> impl Strategy<Value = Parts> {
     ]
 }
 
-/// Mostly known functions, so that the checks behind the first byte are reached.
+/// Mostly PDUs of known functions, so that the checks after the first byte are reached.
 pub fn bytes_like_a_pdu() -> impl Strategy<Value = Vec<u8>> {
     let code = prop_oneof![
         9 => prop::sample::select(Function::ALL).prop_map(Function::code),

@@ -13,7 +13,8 @@ fn panicked(_: &PanicInfo<'_>) -> ! {
     loop {}
 }
 
-/// The length of the reply in `frame`, which holds a request of `len` bytes; 0 when none is due.
+/// Answers a request of `len` bytes in `frame`. Returns the length of the reply in `frame`, 0 when
+/// there is none.
 #[unsafe(no_mangle)]
 pub extern "C" fn answer(frame: &mut [u8; rtu::MAX_LEN], len: usize) -> usize {
     let Some(Ok((unit_id, request))) = frame.get(..len).map(rtu::decode) else {
@@ -38,7 +39,7 @@ fn serve(request: &[u8], out: &mut pdu::Buffer) -> Result<usize, ExceptionCode> 
     }
 }
 
-/// Whether a Raw Ingest packet is whole and its CRC fits.
+/// Whether a Raw Ingest packet is complete and its CRC is right.
 #[unsafe(no_mangle)]
 pub extern "C" fn check(packet: &[u8; 64], len: usize) -> bool {
     let format = Format::Crc { required: true };
@@ -47,7 +48,7 @@ pub extern "C" fn check(packet: &[u8; 64], len: usize) -> bool {
     header.is_some_and(|header| format.payload(&header, packet).is_ok())
 }
 
-/// Where the feature `alloc` puts what it holds.
+/// The allocator that the feature `alloc` requires.
 #[cfg(feature = "alloc")]
 mod heap {
     extern crate alloc;
@@ -71,7 +72,7 @@ mod heap {
     #[global_allocator]
     static ALLOCATOR: NoMemory = NoMemory;
 
-    /// Whether empty objects are an identification.
+    /// Whether objects with empty values are valid.
     #[unsafe(no_mangle)]
     pub extern "C" fn identify() -> bool {
         Objects::new([0, 1, 2].map(|id| (id, Box::default()))).is_ok()
