@@ -1,8 +1,8 @@
-//! The limit: a server that answers the same bytes without looking at the request. It only counts
-//! bytes, to know how many requests there were.
+//! The limit: a server that sends the same reply without reading the request. It only counts bytes,
+//! to count requests.
 //!
-//! A write may block: what a closed-loop load has in flight fits into the buffers of its sockets, so
-//! it never does while the load reads.
+//! Writes are blocking. They never block here: all replies in flight to a closed-loop load fit into
+//! the buffers of its sockets.
 
 use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write};
@@ -13,12 +13,12 @@ use crate::{Failure, options, unhex};
 
 const LISTENER: usize = usize::MAX;
 
-/// Bytes taken from a socket at once, as the server that is compared takes them.
+/// Bytes per read of a socket, as in the server that it is compared with.
 const INPUT: usize = 4096;
 
 struct Peer {
     stream: TcpStream,
-    /// Bytes of a request that is not whole yet.
+    /// Bytes of an incomplete request.
     part: usize,
 }
 

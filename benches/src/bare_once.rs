@@ -1,5 +1,5 @@
-//! The limit of one connection a packet: a server that accepts, reads as many bytes as it was told
-//! that a packet has, answers one byte without looking at any, and closes.
+//! The limit with one connection per packet: a server that accepts, reads a given number of bytes,
+//! answers one byte without looking at them, and closes.
 
 use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write};
@@ -13,7 +13,7 @@ use crate::{Failure, options};
 
 const LISTENER: usize = usize::MAX;
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const INPUT: usize = 16384;
 
 const REPLY: [u8; 1] = [0];
@@ -40,7 +40,7 @@ struct Peer {
 }
 
 impl Peer {
-    /// Reads until nothing is there; whether this peer is done with.
+    /// Reads until no bytes are available. Returns whether the connection is done.
     fn receive(&mut self, input: &mut [u8]) -> bool {
         loop {
             match self.stream.read(input) {
@@ -84,7 +84,7 @@ fn serve(listener: &TcpListener, packet_len: usize) -> Result<(), Failure> {
                 Err(Errno::CONNABORTED) => continue,
                 Err(error) => return Err(error.into()),
             };
-            // Most packets are there already, and need not be waited for.
+            // Most packets have already arrived.
             let mut peer = Peer { stream, missing: packet_len };
             if !peer.receive(&mut input) {
                 poller.add(&peer.stream, next)?;

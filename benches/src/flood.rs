@@ -1,4 +1,5 @@
-//! An MQTT publisher that never pauses: the same message, QoS 0, as fast as the broker takes it.
+//! An MQTT publisher that never pauses: it sends the same message, QoS 0, as fast as the broker
+//! accepts it.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -11,7 +12,7 @@ const CONNECT: &[u8] = b"\x10\x11\x00\x04MQTT\x04\x02\x00\x00\x00\x05flood";
 const ACCEPTED: [u8; 4] = [0x20, 2, 0, 0];
 const PUBLISH: u8 = 0x30;
 
-/// Messages that are sent at once.
+/// Messages per write.
 const TOGETHER: usize = 32;
 
 /// `--address A --topic T --message FILE`: runs until it is killed.

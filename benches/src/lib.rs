@@ -1,7 +1,7 @@
-//! What servers are measured with: loads, and loops that show the limit.
+//! Tools to measure servers: loads, and loops that show the limit of the machine.
 //!
-//! A load and the loop that it is compared with make the same system calls a request where they
-//! can, so that what differs between two runs is the server.
+//! A load and the loop that it is compared with make the same system calls per request where
+//! possible, so that two runs differ only by the server.
 
 #![forbid(unsafe_code)]
 #![cfg(target_os = "linux")]
@@ -20,13 +20,13 @@ use std::time::Duration;
 
 use lexopt::ValueExt;
 
-/// Something went wrong that makes a measurement worthless.
+/// An error that makes a measurement worthless.
 pub type Failure = Box<dyn std::error::Error>;
 
-/// A server that is silent for so long fails the run.
+/// A run fails if the server does not answer within this time.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Runs the load or the loop that the first argument names; the others are its options.
+/// Runs the load or the loop that the first argument names. The other arguments are its options.
 pub fn main() -> Result<(), Failure> {
     let mut arguments = lexopt::Parser::from_env();
     match arguments.value()?.string()?.as_str() {
@@ -37,11 +37,11 @@ pub fn main() -> Result<(), Failure> {
         "load-once" => load_once::main(arguments),
         "polite" => polite::main(arguments),
         "post" => post::main(arguments),
-        other => Err(format!("no load or loop {other}").into()),
+        other => Err(format!("unknown load or loop {other}").into()),
     }
 }
 
-/// Hands each option to `set`, which says whether there is one of that name.
+/// Passes each option to `set`, which returns whether the option exists.
 fn options(
     mut arguments: lexopt::Parser,
     mut set: impl FnMut(&str, String) -> Result<bool, Failure>,

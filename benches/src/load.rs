@@ -1,8 +1,8 @@
 //! A closed-loop Modbus TCP load: every connection keeps a number of requests in flight, and sends
-//! as many new ones as it gets replies. Every reply must be the same bytes as the first.
+//! a new one for each reply. Every reply must equal the first.
 //!
-//! Replies come in the order of the requests, so a queue of the times of sending gives the latency of
-//! each. What is in flight at the end is waited for: a request without a reply fails the run.
+//! Replies arrive in the order of the requests, so a queue of send times gives the latency of each.
+//! At the end, the load waits for the requests in flight: a request without a reply fails the run.
 
 use std::collections::VecDeque;
 use std::io::{ErrorKind, Read, Write};
@@ -16,10 +16,11 @@ use crate::outcome::{Outcome, Period};
 use crate::poller::Poller;
 use crate::{Failure, PATIENCE, options};
 
-/// Every request has it, so that every reply is the same.
+/// The same for every request, so that all replies are equal.
 const TRANSACTION_ID: u16 = 0x1234;
 
-/// What is in flight must fit into a socket's buffers, or both sides wait for the other to read.
+/// Requests in flight must fit into the buffers of a socket, or both sides wait for the other to
+/// read.
 const MAX_IN_FLIGHT: usize = 4096;
 
 struct Options {
@@ -33,11 +34,11 @@ struct Options {
 
 struct Connection {
     stream: TcpStream,
-    /// Bytes of a reply that is not whole yet.
+    /// Bytes of an incomplete reply.
     part: usize,
-    /// Requests without a reply yet.
+    /// Requests in flight.
     open: usize,
-    /// When they were sent, and how many at once, the oldest first.
+    /// The send times, and the number of requests sent together, oldest first.
     sent: VecDeque<(Instant, usize)>,
 }
 
@@ -68,7 +69,7 @@ pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
 struct Load {
     poller: Poller,
     connections: Vec<Connection>,
-    /// As many as can be in flight, as one piece of bytes.
+    /// The requests in flight of a connection, as bytes.
     requests: Vec<u8>,
     replies: Vec<u8>,
     buffer: Vec<u8>,
@@ -94,14 +95,14 @@ impl Load {
         Ok(())
     }
 
-    /// Keeps the requests in flight until the period ends.
+    /// Keeps requests in flight until the period ends.
     fn run(&mut self, outcome: &mut Outcome) -> Result<(), Failure> {
         let end = outcome.end();
         let mut now = Instant::now();
         while now < end {
             let ready = self.poller.wait(Some(PATIENCE))?;
             if ready.len() == 0 {
-                return Err("the server is silent".into());
+                return Err("the server does not answer".into());
             }
             for number in ready {
                 let connection = &mut self.connections[number];
@@ -119,7 +120,7 @@ impl Load {
         Ok(())
     }
 
-    /// Waits for the replies that are still to come.
+    /// Waits for the outstanding replies.
     fn finish(&mut self, outcome: &mut Outcome) -> Result<(), Failure> {
         let deadline = Instant::now() + PATIENCE;
         let mut open: usize = self.connections.iter().map(|connection| connection.open).sum();
@@ -151,7 +152,7 @@ impl Connection {
         Ok(())
     }
 
-    /// When the oldest of `left` answered requests were sent, and how many of them at once.
+    /// Takes the send time of the oldest of `left` answered requests, and the number sent together.
     fn take(&mut self, left: &mut usize) -> Option<(Instant, usize)> {
         let (sent, together) = self.sent.front_mut().filter(|_| *left > 0)?;
         let (sent, count) = (*sent, (*together).min(*left));
@@ -163,7 +164,7 @@ impl Connection {
         Some((sent, count))
     }
 
-    /// Reads once; how many replies are whole.
+    /// Reads once. Returns the number of complete replies.
     fn receive(
         &mut self,
         replies: &[u8],
@@ -177,11 +178,13 @@ impl Connection {
         let len = match self.stream.read(&mut buffer[..room]) {
             Ok(0) => return Err("the server closed a connection".into()),
             Ok(len) => len,
-            Err(error) if error.kind() == ErrorKind::WouldBlock => return Err("silence".into()),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                return Err("the server does not answer".into());
+            }
             Err(error) => return Err(error.into()),
         };
         if buffer[..len] != replies[self.part..self.part + len] {
-            return Err("a reply is not what it was at first".into());
+            return Err("a reply differs from the first one".into());
         }
         let bytes = self.part + len;
         self.part = bytes % reply_len;
@@ -211,12 +214,15 @@ fn parse(arguments: lexopt::Parser) -> Result<Options, Failure> {
         Ok(true)
     })?;
     if parsed.connections == 0 || !(1..=MAX_IN_FLIGHT).contains(&parsed.in_flight) {
-        return Err(format!("1 connection or more, 1 to {MAX_IN_FLIGHT} in flight").into());
+        return Err(format!(
+            "at least 1 connection and 1 to {MAX_IN_FLIGHT} requests in flight are required"
+        )
+        .into());
     }
     Ok(parsed)
 }
 
-/// One frame: `quantity` items from address 0 of unit 1. What is written is 0, 1, 2, ...
+/// One frame: `quantity` items from address 0 of unit 1. A write writes 0, 1, 2, ...
 pub(crate) fn request(kind: &str, quantity: u16) -> Result<Vec<u8>, Failure> {
     let registers: Vec<u8> = (0..quantity).flat_map(u16::to_be_bytes).collect();
     let request = match kind {
@@ -233,7 +239,7 @@ pub(crate) fn request(kind: &str, quantity: u16) -> Result<Vec<u8>, Failure> {
     Ok([&mbap::header(TRANSACTION_ID, 1, len)[..], &buffer[..len]].concat())
 }
 
-/// What the server answers, which must not be an exception.
+/// The first reply of the server, which must not be an exception.
 pub(crate) fn first_reply(address: SocketAddr, request: &[u8]) -> Result<Vec<u8>, Failure> {
     let mut stream = TcpStream::connect(address)?;
     stream.set_read_timeout(Some(PATIENCE))?;

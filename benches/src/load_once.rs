@@ -1,9 +1,9 @@
-//! A closed-loop load of one connection a packet: connect, send, read the byte of reply, close. Every
-//! reply must be 00.
+//! A closed-loop load with one connection per packet: connect, send, read the reply byte, close.
+//! Every reply must be 00.
 //!
-//! The server closes first, so it is the server's side that would stay behind in TIME_WAIT, and its
-//! address with the client's port could not be used again for a minute. The load ends each connection
-//! with a reset, which ends the server's side as well: however long it runs, nothing stays behind.
+//! The server closes first, so its side of the connection would stay in TIME_WAIT, and the port of
+//! the client could not be used again for a minute. The load ends each connection with a reset,
+//! which also ends the server's side. So nothing stays behind, however long the load runs.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -28,8 +28,8 @@ struct Attempt {
     began: Instant,
 }
 
-/// `--address A --in-flight K --packet HEX --warmup S --seconds S`: the latency is that of all from
-/// the start of connecting to the reply.
+/// `--address A --in-flight K --packet HEX --warmup S --seconds S`: the latency is the time from
+/// connecting to the reply.
 pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
     let (mut in_flight, mut period) = (1, Period::DEFAULT);
     let address = SocketAddr::from(([127, 0, 0, 1], 9000));
@@ -50,7 +50,7 @@ pub(crate) fn main(arguments: lexopt::Parser) -> Result<(), Failure> {
 }
 
 impl Load {
-    /// Keeps as many packets in flight until the period ends, and waits for the last ones.
+    /// Keeps packets in flight until the period ends, and waits for the last ones.
     fn run(&mut self, in_flight: usize, outcome: &mut Outcome) -> Result<(), Failure> {
         let mut attempts: Vec<Option<Attempt>> = Vec::with_capacity(in_flight);
         for number in 0..in_flight {
@@ -97,7 +97,9 @@ impl Attempt {
             Ok(1) if reply[0] == DONE => Ok(()),
             Ok(1) => Err(format!("the reply is {:02x}", reply[0]).into()),
             Ok(_) => Err("the server closed a connection without a reply".into()),
-            Err(error) if error.kind() == ErrorKind::WouldBlock => Err("silence".into()),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                Err("the server does not answer".into())
+            }
             Err(error) => Err(error.into()),
         }
     }

@@ -1,4 +1,4 @@
-//! `holdfast_benches`, as a program.
+//! The program for `holdfast_benches`.
 
 use std::process::ExitCode;
 
@@ -15,6 +15,6 @@ fn main() -> ExitCode {
 
 #[cfg(not(target_os = "linux"))]
 fn main() -> ExitCode {
-    eprintln!("the benchmarks need Linux");
+    eprintln!("the benchmarks require Linux");
     ExitCode::FAILURE
 }

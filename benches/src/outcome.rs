@@ -1,4 +1,4 @@
-//! What a load measured.
+//! The result of a load.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use rustix::time::{ClockId, clock_gettime};
 
 use crate::{Failure, seconds};
 
-/// How long a load runs: at first to warm up, then what counts.
+/// The duration of a load: a warm-up, then the measured time.
 #[derive(Clone, Copy)]
 pub(crate) struct Period {
     warmup: Duration,
@@ -18,7 +18,7 @@ impl Period {
     pub(crate) const DEFAULT: Period =
         Period { warmup: Duration::from_millis(300), measured: Duration::from_secs(2) };
 
-    /// Takes `--warmup` and `--seconds`.
+    /// Parses `--warmup` and `--seconds`.
     pub(crate) fn set(&mut self, name: &str, value: &str) -> Result<bool, Failure> {
         match name {
             "warmup" => self.warmup = seconds(value)?,
@@ -35,24 +35,24 @@ pub(crate) struct Outcome {
     period: Period,
     busy: f64,
     latencies: Histogram<u64>,
-    /// Requests that got their reply, whether they count or not.
+    /// Requests with a reply, inside the measured time or not.
     answered: usize,
 }
 
 impl Outcome {
-    /// The period begins.
+    /// Starts the period.
     pub(crate) fn new(period: Period) -> Result<Outcome, Failure> {
         let latencies = Histogram::new_with_bounds(1, 60_000_000_000, 3)?;
         let (began, cpu_before) = (Instant::now(), cpu_seconds());
         Ok(Outcome { began, cpu_before, period, busy: 0.0, latencies, answered: 0 })
     }
 
-    /// When the period ends.
+    /// The end of the period.
     pub(crate) fn end(&self) -> Instant {
         self.began + self.period.warmup + self.period.measured
     }
 
-    /// `count` replies that came at `now`.
+    /// Records `count` replies that arrived at `now`.
     pub(crate) fn record(
         &mut self,
         sent: Instant,
@@ -66,17 +66,17 @@ impl Outcome {
         Ok(())
     }
 
-    /// Replies that came after the end.
+    /// Records replies after the end of the period.
     pub(crate) fn late(&mut self, count: usize) {
         self.answered += count;
     }
 
-    /// The period is over: what share of it the load was busy.
+    /// Ends the period, and records the share of it that the load was busy.
     pub(crate) fn ended(&mut self) {
         self.busy = (cpu_seconds() - self.cpu_before) / self.began.elapsed().as_secs_f64();
     }
 
-    /// Takes what another connection of the same period had.
+    /// Adds the result of another connection in the same period.
     pub(crate) fn merge(&mut self, other: &Outcome) -> Result<(), Failure> {
         self.answered += other.answered;
         Ok(self.latencies.add(&other.latencies)?)
@@ -101,7 +101,7 @@ impl Outcome {
     }
 }
 
-/// Processor time of this process so far.
+/// The processor time of this process.
 fn cpu_seconds() -> f64 {
     let cpu = clock_gettime(ClockId::ProcessCPUTime);
     cpu.tv_sec as f64 + cpu.tv_nsec as f64 / 1e9

@@ -1,8 +1,8 @@
-//! One client that has one request in flight: at a fixed rate, or the next as soon as it has its
-//! reply. Every reply must be the same bytes as the first.
+//! One client with one request in flight: at a fixed rate, or the next request as soon as the reply
+//! arrives. Every reply must equal the first.
 //!
-//! The latency is that from sending to the reply. A request that is due while another is in flight is
-//! left out.
+//! The latency is the time from sending to the reply. A request that is due while another is in
+//! flight is skipped.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -57,7 +57,7 @@ fn run(
         stream.read_exact(&mut reply)?;
         now = Instant::now();
         if reply != expected {
-            return Err("a reply is not what it was at first".into());
+            return Err("a reply differs from the first one".into());
         }
         outcome.record(sent, now, 1)?;
         while !pause.is_zero() && due <= now {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use rustix::event::{Timespec, epoll};
 
-/// Level-triggered readiness to read, by number.
+/// Level-triggered readiness to read. Sources are numbered.
 pub(crate) struct Poller {
     epoll: OwnedFd,
     events: Vec<epoll::Event>,
@@ -18,13 +18,14 @@ impl Poller {
         Ok(Poller { epoll, events: Vec::with_capacity(256) })
     }
 
-    /// A source that is closed is forgotten.
+    /// Adds a source. Closing it removes it.
     pub(crate) fn add(&self, source: impl AsFd, number: usize) -> io::Result<()> {
         let data = epoll::EventData::new_u64(number as u64);
         Ok(epoll::add(&self.epoll, source, data, epoll::EventFlags::IN)?)
     }
 
-    /// Waits until something can be read, and says what: nothing, when `patience` ends first.
+    /// Waits until a source is readable. Returns the numbers of readable sources; none when
+    /// `patience` ends first.
     pub(crate) fn wait(
         &mut self,
         patience: Option<Duration>,

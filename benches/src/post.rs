@@ -1,5 +1,5 @@
-//! A closed-loop load of one HTTP request: every connection is kept, and has one request in flight.
-//! Every reply must be 200, with the same body as the first.
+//! A closed-loop load of one HTTP request: every connection stays open, with one request in flight.
+//! Every reply must be 200 with the same body as the first.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -10,11 +10,11 @@ use std::time::Instant;
 use crate::outcome::{Outcome, Period};
 use crate::{Failure, PATIENCE, options};
 
-/// The longest reply that is read.
+/// The length limit of a reply.
 const REPLY: usize = 4096;
 
-/// Bytes that are sent at once. The system copies them without a break, and whoever shares the core
-/// waits for that.
+/// Bytes per write. The system copies them without interruption, which delays other processes on
+/// the core.
 const PIECE: usize = 16384;
 
 struct Options {
@@ -53,7 +53,7 @@ fn run(options: &Options, request: &[u8], expected: &[u8]) -> Result<Outcome, Fa
     while now < outcome.end() {
         let sent = now;
         if client.ask(request)? != expected {
-            return Err("a reply is not what it was at first".into());
+            return Err("a reply differs from the first one".into());
         }
         now = Instant::now();
         outcome.record(sent, now, 1)?;
@@ -75,7 +75,7 @@ impl Client {
         Ok(Client { stream, buffer: vec![0; REPLY] })
     }
 
-    /// The body of the reply.
+    /// Sends a request and returns the body of the reply.
     fn ask(&mut self, request: &[u8]) -> Result<Vec<u8>, Failure> {
         for piece in request.chunks(PIECE) {
             self.stream.write_all(piece)?;
@@ -83,7 +83,7 @@ impl Client {
         let mut len = 0;
         loop {
             match self.stream.read(&mut self.buffer[len..])? {
-                0 => return Err("the server closed a connection, or answers too much".into()),
+                0 => return Err("the server closed a connection, or the reply is too long".into()),
                 more => len += more,
             }
             if let Some(body) = body(&self.buffer[..len])? {
@@ -93,7 +93,7 @@ impl Client {
     }
 }
 
-/// The body of a reply, when it is whole.
+/// The body of a reply, if it is complete.
 fn body(reply: &[u8]) -> Result<Option<&[u8]>, Failure> {
     let Some(head_len) = reply.windows(4).position(|four| four == b"\r\n\r\n") else {
         return Ok(None);
@@ -103,10 +103,10 @@ fn body(reply: &[u8]) -> Result<Option<&[u8]>, Failure> {
         return Err(String::from_utf8_lossy(reply).into());
     }
     let len = head.lines().find_map(|line| line.strip_prefix("content-length:"));
-    let len: usize = len.ok_or("the reply has no length")?.trim().parse()?;
+    let len: usize = len.ok_or("the reply has no content-length")?.trim().parse()?;
     let body = &reply[head_len + 4..];
     if body.len() > len {
-        return Err("the reply has more bytes than it says".into());
+        return Err("the reply is longer than its content-length".into());
     }
     Ok((body.len() == len).then_some(body))
 }
