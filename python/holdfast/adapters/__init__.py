@@ -1,11 +1,12 @@
-"""Adapters: ways into memory in Python, each supervised for itself.
+"""Adapters connect memories to other protocols. Each is written in Python and supervised alone.
 
-An adapter is made by a factory, `factory(context) -> Adapter`, and lives in a thread of its own:
-`run` works until it is stopped. When it raises, or ends by itself, it is logged and made anew after
-a pause; the others don't notice. Adapters must never reach past their door to memory.
+A factory, `factory(context) -> Adapter`, creates an adapter. `run` runs in a thread of its own
+until it is stopped. When an adapter raises an exception or returns, the supervisor logs it, waits,
+and creates a new one; other adapters are not affected. Adapters must use memory only through their
+`MemoryAccess`.
 
-`rest`, `mqtt`, `nats`, `gateway` and `metrics` are built in. Others are found by the entry point
-group `holdfast.adapters`, see docs/adapters.md.
+`rest`, `mqtt`, `nats`, `gateway` and `metrics` are built in. Other packages provide adapters with
+the entry point group `holdfast.adapters`, see docs/adapters.md.
 """
 
 from __future__ import annotations
@@ -26,33 +27,33 @@ ENTRY_POINTS = "holdfast.adapters"
 
 
 class Adapter(Protocol):
-    """What the appliance runs."""
+    """The interface of an adapter."""
 
     def run(self, stop: Stop) -> None:
-        """Works until `stop`. Called once, in a thread of its own."""
+        """Runs until `stop` is set. Called once, in a thread of its own."""
 
     def status(self) -> Mapping[str, object]:
-        """What diagnostics show of it, from any thread: plain data, nothing secret."""
+        """Returns plain data for diagnostics, without secrets. Called from any thread."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """What an adapter is given."""
+    """The arguments of an adapter's factory."""
 
     name: str
-    """Its name in the configuration."""
+    """The adapter's name in the configuration."""
     memory_access: MemoryAccess
-    """Its way to memory."""
+    """Reads and writes memories."""
     grant: Grant
-    """What the configuration lets it do."""
+    """The permissions that the configuration grants."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Its own part of the configuration."""
+    """The adapter's own options in the configuration."""
 
     @property
     def door(self) -> MemoryAccess:
-        """The former name of `memory_access`. Deprecated: it goes with the next release."""
+        """The former name of `memory_access`. Deprecated: the next release removes it."""
         warnings.warn(
-            "Context.door is now Context.memory_access; the old name goes with the next release",
+            "Context.door is deprecated: use Context.memory_access",
             DeprecationWarning,
             stacklevel=2,
         )

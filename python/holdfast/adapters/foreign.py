@@ -1,4 +1,4 @@
-"""Adapters of others, found by their entry points."""
+"""Adapters of other packages, found by their entry points."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 class UnknownAdapter(ValueError):
-    """An adapter of the configuration that is not installed."""
+    """The configuration names an adapter that is not installed."""
 
 
 def entry_point(name: str, settings: AdapterConfig) -> EntryPoint:
-    """Where the adapter's code is, which is not loaded yet.
+    """Returns the adapter's entry point without loading its code.
 
-    Raises `UnknownAdapter` when no installed package has an entry point of that type.
+    Raises `UnknownAdapter` when no installed package provides the type.
     """
     known = entry_points(group=ENTRY_POINTS)
     for entry in known:
@@ -36,9 +36,10 @@ def entry_point(name: str, settings: AdapterConfig) -> EntryPoint:
 def factory(
     name: str, settings: AdapterConfig, memory_access: MemoryAccess
 ) -> Callable[[], Adapter]:
-    """What makes the adapter. Its code is loaded when it is made: a fault of it is its own.
+    """Returns the adapter's factory.
 
-    Raises `UnknownAdapter`, as `entry_point`.
+    The factory loads the adapter's code, so an error in that code only stops this adapter.
+    Raises `UnknownAdapter` as `entry_point` does.
     """
     found = entry_point(name, settings)
     grant = Grant(name, settings.memories, settings.areas, settings.access == "read-write")

@@ -1,4 +1,4 @@
-"""Metrics: everything that diagnostics count, for Prometheus, see docs/metrics.md."""
+"""Exports the diagnostics as Prometheus metrics, see docs/metrics.md."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ PATH = "/metrics"
 STATES = ("running", "failed", "stopped")
 HEALTH = ("unknown", "ok", "error", "stale", "disabled")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
-"""What becomes of requests to a device."""
+"""The outcomes of requests to a device."""
 
 
 class Metrics:
-    """The metrics adapter, on a socket that listens already."""
+    """The metrics adapter, on a listening socket."""
 
     def __init__(
         self, settings: MetricsConfig, diagnostics: DiagnosticsSource, listener: socket.socket
@@ -56,11 +56,11 @@ class Metrics:
         )
 
     def run(self, stop: Stop) -> None:
-        """Serves until `stop`."""
+        """Serves until `stop` is set."""
         self._host.run(stop)
 
     def status(self) -> dict[str, object]:
-        """Where it listens, and what became of connections."""
+        """Returns the address and the counts of connections."""
         return {"address": self._host.address, "connections": self._host.counts()}
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -75,7 +75,7 @@ class Metrics:
             await self._export(scope, receive, send)
 
     async def _export(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The exporter's answer, with a length and the headers of every answer."""
+        """Sends the exporter's response with a length and the security headers."""
         start: MutableMapping[str, Any] = {}
 
         async def sent(message: MutableMapping[str, Any]) -> None:
@@ -90,32 +90,34 @@ class Metrics:
 
 
 class Figures(Collector):
-    """Turns the diagnostics of the moment into metrics."""
+    """Turns the current diagnostics into metrics."""
 
     def __init__(self, diagnostics: DiagnosticsSource) -> None:
         self._diagnostics = diagnostics
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing is known before it is asked for."""
+        """Returns no metrics: their names depend on the diagnostics at the time of a scrape."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """All metrics of this moment."""
+        """Yields all metrics with their current values."""
         stats = self._diagnostics.stats()
-        yield InfoMetricFamily("holdfast_build", "The program.", {"version": __version__})
-        yield GaugeMetricFamily("holdfast_uptime_seconds", "Since the start.", stats["uptime"])
+        yield InfoMetricFamily(
+            "holdfast_build", "The version of Holdfast.", {"version": __version__}
+        )
+        yield GaugeMetricFamily("holdfast_uptime_seconds", "Time since start.", stats["uptime"])
         yield CounterMetricFamily(
             "holdfast_events_lost",
-            "Events of listeners that were not logged.",
+            "Listener events that were not logged.",
             stats["events_lost"],
         )
         if stats["audit"] is not None:
             yield CounterMetricFamily(
-                "holdfast_audit_lines", "Lines of the audit log.", stats["audit"]["lines"]
+                "holdfast_audit_lines", "Lines written to the audit log.", stats["audit"]["lines"]
             )
             yield CounterMetricFamily(
                 "holdfast_audit_failed",
-                "Lines that the audit log's file did not take.",
+                "Lines that could not be written to the audit log.",
                 stats["audit"]["failed"],
             )
         yield from _of_listeners(stats["listeners"])
@@ -127,11 +129,9 @@ class Figures(Collector):
 def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     requests = _counter("requests", "Modbus requests, by function code.", "listener", "function")
     exceptions = _counter("exceptions", "Modbus exceptions, by exception code.", "listener", "code")
-    more = _counter("listener", "What else a listener counted.", "listener", "counter")
-    opened = _gauge("connections_open", "Connections that are open.", "listener")
-    connections = _counter(
-        "connections", "Connections, by what became of them.", "listener", "outcome"
-    )
+    more = _counter("listener", "Other counters of a listener.", "listener", "counter")
+    opened = _gauge("connections_open", "Open connections.", "listener")
+    connections = _counter("connections", "Connections, by outcome.", "listener", "outcome")
     for name, counters in listeners.items():
         for key, counted in counters.items():
             if key == "requests":
@@ -146,34 +146,44 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
 
 
 def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
-    health = _gauge("device_health", "1 for how the device does.", "device", "state")
-    requests = _counter("device_requests", "By what became of them.", "device", "outcome")
+    health = _gauge("device_health", "1 for the current health state.", "device", "state")
+    requests = _counter("device_requests", "Requests, by outcome.", "device", "outcome")
     forward = _counter(
         "device_forward",
-        "Packets to a receiver, by what became of them.",
+        "Packets forwarded to a receiver, by outcome.",
         "device",
         "receiver",
         "outcome",
     )
     counters = {
-        "polls": _counter("device_polls", "Polls that were carried out.", "device"),
-        "missed": _counter("device_missed_polls", "Polls that could not begin in time.", "device"),
-        "unplanned": _counter(
-            "device_unplanned_polls", "Polls left out because no plan reads the device.", "device"
+        "polls": _counter("device_polls", "Polls performed.", "device"),
+        "missed": _counter(
+            "device_missed_polls", "Polls skipped because they were late.", "device"
         ),
-        "reads": _counter("device_reads", "Reads that came whole.", "device"),
-        "values": _counter("device_values", "Bits and registers in them.", "device"),
+        "unplanned": _counter(
+            "device_unplanned_polls", "Polls skipped because no plan can read the device.", "device"
+        ),
+        "reads": _counter("device_reads", "Complete reads.", "device"),
+        "values": _counter("device_values", "Bits and registers read.", "device"),
         "unstored": _counter(
             "device_unstored", "Reads and status blocks that memory refused.", "device"
         ),
     }
     gauges = {
-        "age": _gauge("device_age_seconds", "Since the last valid answer.", "device"),
-        "seconds_in_error": _gauge("device_error_seconds", "Since polls began to fail.", "device"),
-        "failures": _gauge("device_failures", "Polls in a row that failed.", "device"),
-        "last_error": _gauge("device_last_error", "As in the status block.", "device"),
-        "round_trip": _gauge("device_round_trip_seconds", "Of the last answer.", "device"),
-        "requests_per_poll": _gauge("device_requests_per_poll", "By the plan of now.", "device"),
+        "age": _gauge("device_age_seconds", "Time since the last valid response.", "device"),
+        "seconds_in_error": _gauge(
+            "device_error_seconds", "Time since polls began to fail.", "device"
+        ),
+        "failures": _gauge("device_failures", "Consecutive failed polls.", "device"),
+        "last_error": _gauge(
+            "device_last_error", "The last error code, as in the status block.", "device"
+        ),
+        "round_trip": _gauge(
+            "device_round_trip_seconds", "Round trip of the last response.", "device"
+        ),
+        "requests_per_poll": _gauge(
+            "device_requests_per_poll", "Requests per poll in the current plan.", "device"
+        ),
     }
     for name, told in devices.items():
         _add(health, name, {known: known == told["health"] for known in HEALTH})
@@ -191,17 +201,15 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
 
 
 def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
-    accepted = _counter("ingest_accepted", "Messages that were carried out.", "adapter")
-    values = _counter("ingest_values", "Values that were written.", "adapter")
-    reads = _counter("ingest_reads", "Reads that were answered.", "adapter")
-    refused = _counter("ingest_refused", "Messages that were refused.", "adapter", "reason")
-    restarts = _counter("adapter_restarts", "How often it was made anew.", "adapter")
-    states = _gauge("adapter_state", "1 for the state that it is in.", "adapter", "state")
-    opened = _gauge("adapter_connections_open", "Connections that are open.", "adapter")
-    connections = _counter(
-        "adapter_connections", "Connections, by what became of them.", "adapter", "outcome"
-    )
-    status = _gauge("adapter_status", "What an adapter says of itself.", "adapter", "field")
+    accepted = _counter("ingest_accepted", "Accepted messages.", "adapter")
+    values = _counter("ingest_values", "Values written.", "adapter")
+    reads = _counter("ingest_reads", "Reads answered.", "adapter")
+    refused = _counter("ingest_refused", "Refused messages, by reason.", "adapter", "reason")
+    restarts = _counter("adapter_restarts", "Restarts of the adapter.", "adapter")
+    states = _gauge("adapter_state", "1 for the current state.", "adapter", "state")
+    opened = _gauge("adapter_connections_open", "Open connections.", "adapter")
+    connections = _counter("adapter_connections", "Connections, by outcome.", "adapter", "outcome")
+    status = _gauge("adapter_status", "Other figures of an adapter.", "adapter", "field")
     plain = {"accepted": accepted, "values": values, "reads": reads, "restarts": restarts}
     for name, fields in adapters.items():
         state = fields.get("state")
@@ -219,9 +227,9 @@ def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
 
 
 def _of_memories(memories: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
-    sealed = _gauge("memory_sealed", "Whether Modbus clients are refused for now.", "memory")
-    opened = _counter("memory_seal_opened", "How often the seal opened.", "memory")
-    closed = _counter("memory_seal_closed", "How often the seal closed again.", "memory")
+    sealed = _gauge("memory_sealed", "1 while the memory refuses Modbus clients.", "memory")
+    opened = _counter("memory_seal_opened", "How many times the seal opened.", "memory")
+    closed = _counter("memory_seal_closed", "How many times the seal closed again.", "memory")
     size = _gauge("memory_size", "Bits or registers of an area.", "memory", "area")
     for name, memory in memories.items():
         sealed.add_metric([name], memory["sealed"])
@@ -257,7 +265,7 @@ def _add_connections(
 
 
 def _flat(key: str, value: object) -> Iterator[tuple[str, float]]:
-    """The numbers in something that was counted; the keys of what is nested are joined."""
+    """Yields the numbers of nested counters, with their keys joined by underscores."""
     if isinstance(value, dict):
         for inner, more in value.items():
             yield from _flat(f"{key}_{inner}", more)

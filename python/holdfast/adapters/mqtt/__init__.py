@@ -1,4 +1,4 @@
-"""MQTT: JSON commands from the topics of a broker, each subscription with a grant of its own."""
+"""MQTT: JSON commands from topics of a broker. Each subscription has its own grant."""
 
 from __future__ import annotations
 

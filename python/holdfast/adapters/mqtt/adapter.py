@@ -1,4 +1,4 @@
-"""The adapter: one broker, for ever; it comes back by itself whatever happens to the connection."""
+"""The MQTT adapter: stays connected to one broker and reconnects after any failure."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from holdfast.stop import Stop
 
 WELCOME = 10.0
-"""Seconds that the broker has to answer the introduction."""
+"""Seconds to wait for the broker's CONNACK."""
 
 SILENCE = 600.0
-"""Seconds for which a failure to connect is not logged again when its reason is the same."""
+"""Seconds before a failure to connect with the same reason is logged again."""
 
 MAX_PASSWORD = MAX_TEXT
 
 _TICK = 1.0
-"""Seconds between looks at the keep-alive."""
+"""Seconds between checks of the keep-alive."""
 
 
 class Mqtt:
-    """Takes messages from a broker, and hands them to the memory access."""
+    """Receives messages from a broker and passes them to the memory access."""
 
     def __init__(self, settings: MqttConfig, memory_access: MemoryAccess) -> None:
         self._settings = settings
@@ -62,14 +62,14 @@ class Mqtt:
         self._last_error: str | None = None
 
     def run(self, stop: Stop) -> None:
-        """Stays connected until `stop`, and comes back when the connection ends."""
+        """Stays connected until `stop` is set; reconnects when the connection ends."""
         backoff = Backoff()
         with Waiter(stop) as waiter, contextlib.suppress(Ended):
             while not stop.wait(backoff.pause(self._connection(waiter))):
                 pass
 
     def status(self) -> dict[str, object]:
-        """Whether it is connected, to which broker, and what the broker granted."""
+        """Returns the state of the connection, the broker, and the granted subscriptions."""
         return {
             "connected": self._connected_at is not None,
             "broker": self._broker,
@@ -86,7 +86,7 @@ class Mqtt:
         }
 
     def _connection(self, waiter: Waiter) -> float:
-        """One connection, from dialing to its end; the seconds that it held."""
+        """Runs one connection to its end. Returns the seconds that it was connected."""
         self._ending = None
         link: BrokerConnection | None = None
         try:
@@ -149,7 +149,7 @@ class Mqtt:
         self._ending = link.trouble or self._ending
 
     def _ended(self) -> float:
-        """Tells of the end of a connection, or of the attempt; how long it held."""
+        """Logs the end of a connection or attempt. Returns the seconds that it was connected."""
         began, self._connected_at = self._connected_at, None
         reason = self._ending or "the broker closed the connection"
         for topic in self._topics:
@@ -197,8 +197,10 @@ class Mqtt:
         self._connected_at = time.monotonic()
 
     def _subscribe(self, link: BrokerConnection, topic: _Topic, *, resumed: bool) -> None:
-        """Asks for a topic. With MQTT 3.1.1 to ask again is to get retained messages again, so what
-        this process was granted in a session that still exists is not asked for.
+        """Subscribes to a topic, unless the resumed session already has the subscription.
+
+        With MQTT 3.1.1, subscribing again would deliver retained messages again. With MQTT 5 the
+        retain handling option prevents that.
         """
         again = resumed and topic.known is not None
         if again and self._settings.version != "5":
@@ -252,7 +254,7 @@ class Mqtt:
 
 
 class _Topic:
-    """A subscription, and the quality of service it was granted."""
+    """A subscription and the quality of service that the broker granted."""
 
     def __init__(self, entry: SubscriptionConfig) -> None:
         self.entry = entry
@@ -263,7 +265,7 @@ class _Topic:
 
 
 class _Failures:
-    """Logs attempts that failed, but not the same reason again and again."""
+    """Logs failed attempts, with a limit on repeats of the same reason."""
 
     def __init__(self, broker: str) -> None:
         self._broker = broker
@@ -272,7 +274,7 @@ class _Failures:
         self._attempts = 0
 
     def tell(self, reason: str) -> None:
-        """An attempt failed."""
+        """Records a failed attempt."""
         self._attempts += 1
         now = time.monotonic()
         if reason == self._reason and now - self._logged < SILENCE:
@@ -287,12 +289,12 @@ class _Failures:
         )
 
     def forget(self) -> None:
-        """An attempt was successful."""
+        """Records a successful attempt."""
         self._reason, self._attempts = None, 0
 
 
 def _password(file: Path | None) -> bytes | None:
-    """Read at each attempt, so that a new password is taken."""
+    """Reads the password at each attempt, so that a new password needs no restart."""
     if file is None:
         return None
     with file.open("rb") as opened:

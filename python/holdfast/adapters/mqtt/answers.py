@@ -1,8 +1,8 @@
-"""Answers, to those who ask for one with a response topic (MQTT 5).
+"""Answers to messages with a response topic (MQTT 5, section 4.10).
 
-An answer is a courtesy: it must neither hold up the messages behind it nor fill memory. It is
-dropped, and counted, when the broker is slow in taking the ones before, and when it could come back
-as a message.
+Answers are best effort: they must neither delay later messages nor fill memory. An answer is
+dropped and counted when too many answers are unsent, when it is larger than the broker accepts,
+and when the response topic matches a subscription, so that the answer would come back as a message.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Answers:
-    """Sends answers, and counts them."""
+    """Sends and counts answers."""
 
     def __init__(self, filters: Filters) -> None:
         self._filters = filters
@@ -33,7 +33,7 @@ class Answers:
         self.dropped = 0
 
     def send(self, link: BrokerConnection, message: Publish, answer: Mapping[str, object]) -> None:
-        """Answers a message, if it asks for that."""
+        """Answers a message, if it has a response topic."""
         if message.response_topic is None:
             return
         if self._sent(link, message, message.response_topic, answer):

@@ -1,4 +1,4 @@
-"""How long to wait before the next attempt to reach the broker."""
+"""The pauses between attempts to connect to the broker."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import random
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 60.0
-"""Seconds: doubled with each failure, up to the longest."""
+"""Seconds. Each failure doubles the pause, up to the maximum."""
 
 JITTER = 0.25
-"""The part of a pause that is left to chance, so that clients don't all come at once."""
+"""A pause varies randomly by this fraction, so that clients do not all reconnect at once."""
 
 PROVEN = 10.0
-"""Seconds after which a connection that held is held to be good: the pauses begin anew."""
+"""After a connection of at least this many seconds, the pauses start from the first again."""
 
 
 class Backoff:
-    """The pauses between attempts."""
+    """An exponential backoff with jitter."""
 
     def __init__(self) -> None:
         self._next = FIRST_PAUSE
 
     def pause(self, held: float) -> float:
-        """Seconds to wait, after a connection that held so long, 0 when there was none."""
+        """Returns the seconds to wait after a connection of `held` seconds, 0 for none."""
         if held >= PROVEN:
             self._next = FIRST_PAUSE
         pause, self._next = self._next, min(2 * self._next, MAX_PAUSE)

@@ -1,4 +1,4 @@
-"""Opening a connection to a broker, TCP or TLS; a stop ends every step of it."""
+"""Opens a TCP or TLS connection to a broker. A stop interrupts every step."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from holdfast.net.resolver import SocketAddress
 
 CONNECT_TIMEOUT = 10.0
-"""Seconds that one address of the broker has to accept the connection, and TLS to be agreed on."""
+"""Seconds for the connection to one address of the broker, including the TLS handshake."""
 
 CHECK_INTERVAL = 0.1
-"""Seconds between looks whether it is to stop, while a name is looked up."""
+"""Seconds between checks for a stop during a name lookup."""
 
 _RESOLVER = Resolver()
 _UNDER_WAY = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
 
 
 def dial(host: str, port: int, context: ssl.SSLContext | None, waiter: Waiter) -> socket.socket:
-    """A connection that doesn't block, to the first address that takes it.
+    """Returns a non-blocking connection to the first address that accepts one.
 
-    Raises `OSError` when none does, and `Ended`.
+    Raises `OSError` when no address does, and `Ended` after a stop.
     """
     failure = OSError(f"{host} has no address")
     for family, address in _addresses(host, port, waiter):

@@ -1,8 +1,7 @@
-"""Which grant a message has: that of the first subscription whose filter its topic matches.
+"""Finds the grant of a message: the grant of the first subscription whose filter matches the topic.
 
-It is the topic alone that decides, not what a broker says of how it found the message: so it is the
-same with every version of MQTT, and whether a broker delivers a message once or once for each
-filter.
+Only the topic decides, not the subscription identifier that a broker may send. So the result is the
+same with every MQTT version, and with brokers that deliver a message once for each matching filter.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Filters:
-    """The filters of a configuration, in its order."""
+    """The topic filters of the subscriptions, in the order of the configuration."""
 
     def __init__(self, subscriptions: Sequence[SubscriptionConfig]) -> None:
         self._grants = [
@@ -32,14 +31,14 @@ class Filters:
             self._matcher[_without_share(entry.topic)] = place
 
     def grant(self, topic: str) -> Grant | None:
-        """What a message of this topic may do; `None` when no filter matches it."""
+        """Returns the grant for messages of this topic; `None` when no filter matches."""
         places = self._matcher.iter_match(topic)  # type: ignore[no-untyped-call]
         first: int | None = min(places, default=None)
         return None if first is None else self._grants[first]
 
 
 def _without_share(topic: str) -> str:
-    """`$share/group/filter` shares the messages of `filter` among the clients of a group."""
+    """Returns the filter of a shared subscription, `$share/group/filter`; other filters as is."""
     share, _, rest = topic.partition("/")
     group, _, shared = rest.partition("/")
     return shared if share == "$share" and group and shared else topic

@@ -1,4 +1,4 @@
-"""What becomes of a message: written by the memory access, or refused."""
+"""Handles a message: the memory access writes it, or it is refused."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from holdfast.ingest import MemoryAccess
 
 MAX_BYTES = 8 * 2**20
-"""The largest payload that is looked at."""
+"""The largest accepted payload, in bytes."""
 
 MAX_TOPIC = 200
-"""How much of a topic is logged."""
+"""Characters of a topic that are logged."""
 
 _NOBODY = Grant("no subscription", (), (), writes=False)
 
 
 class Inbox:
-    """Takes messages, one after the other; none of them can stop the next."""
+    """Handles messages one by one. An error in one does not affect the next."""
 
     def __init__(self, memory_access: MemoryAccess, filters: Filters, broker: str) -> None:
         self._memory_access = memory_access
@@ -31,7 +31,7 @@ class Inbox:
         self.received = 0
 
     def take(self, message: Publish) -> dict[str, object]:
-        """Carries out a message; what its sender is told."""
+        """Carries out a message. Returns the answer for its sender."""
         self.received += 1
         topic = message.topic
         shown = topic if len(topic) <= MAX_TOPIC else f"{topic[:MAX_TOPIC]}…"
@@ -44,7 +44,7 @@ class Inbox:
             self._memory_access.refuse(refused, grant.name, peer)
         except Refused as error:
             refused = error
-        except Exception:  # A fault in here must not become that of the next message.
+        except Exception:  # An error in one message must not stop the adapter.
             logs.problem("mqtt_message_failed", broker=self._broker, topic=shown)
             refused = Refused("internal_error", "the message could not be carried out")
             self._memory_access.refuse(refused, grant.name, peer)
@@ -53,7 +53,7 @@ class Inbox:
 
 def _refused_unread(message: Publish, grant: Grant) -> Refused | None:
     if grant is _NOBODY:
-        return Refused("not_granted", "no subscription of the configuration has this topic")
+        return Refused("not_granted", "no configured subscription matches this topic")
     if message.size > MAX_BYTES:
         return Refused("too_large", f"{message.size} bytes, allowed are {MAX_BYTES}")
     if message.problem is not None:

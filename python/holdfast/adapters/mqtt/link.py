@@ -1,13 +1,12 @@
-"""One connection to a broker: paho's client, with four things done otherwise.
+"""One connection to a broker: paho's client with four changes.
 
-- A message is acknowledged after it was written, with every quality of service. paho sends the
-  acknowledgement of QoS 2 (PUBREC) first, and hands the message over later: a crash between the two
-  would lose it.
+- A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
+  sends PUBREC before it delivers the message, so a crash between the two would lose the message.
 - Connecting can be interrupted: `dial` opens the socket.
-- The properties of a message are read here, in linear time.
-- A packet too large to be taken is not kept in memory while it arrives.
+- The properties of a message are parsed here, in linear time.
+- A packet over the size limit is not kept in memory while it arrives.
 
-The methods that begin with an underscore are paho's own, overridden.
+Methods that begin with an underscore override methods of paho.
 """
 
 from __future__ import annotations
@@ -32,26 +31,25 @@ if TYPE_CHECKING:
     from holdfast.config import MqttConfig, SubscriptionConfig
 
 SESSION_EXPIRY = 3600
-"""Seconds that the broker keeps subscriptions and undelivered messages while this client is away.
-It can be told so with MQTT 5 only."""
+"""Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
 
 MAX_WAITING = 100
-"""Answers that the broker has not taken yet."""
+"""Limit of unsent packets. Above it answers are dropped."""
 
 MAX_UNSENT = 1000
-"""Packets waiting to be sent, mostly acknowledgements, above which nothing more is read."""
+"""Limit of unsent packets, mostly acknowledgements. Above it nothing is read from the broker."""
 
 _MAX_ON_THE_WAY = 20
-"""Answers sent and not acknowledged; the others wait."""
+"""Limit of answers that are sent and not acknowledged; further answers wait."""
 
 _KEPT = MAX_PROPERTIES + 2**17
-"""Bytes of a packet too large: enough for what stands before the payload."""
+"""Bytes kept of a packet over the size limit: enough for everything before the payload."""
 
 _LARGEST = MAX_BYTES + _KEPT
 
 
 class BrokerConnection(Client):
-    """One connection, from dialing to its end; the next one is another object."""
+    """One connection, from dialing to its end. A reconnect creates a new object."""
 
     def __init__(
         self,
@@ -62,7 +60,8 @@ class BrokerConnection(Client):
         inbox: Inbox,
         answer: Callable[[BrokerConnection, Publish, Mapping[str, object]], None],
     ) -> None:
-        """`unreleased` are packet identifiers of QoS 2, kept from one connection to the next.
+        """`unreleased` are QoS 2 packet identifiers, kept from one connection to the next.
+
         `answer` is called for each message, after its acknowledgement.
         """
         self._five = settings.version == "5"
@@ -79,15 +78,15 @@ class BrokerConnection(Client):
         self._answer = answer
         self._largest_sent: int | None = None
         self.most_qos = 1
-        """The best quality of service that the broker takes, not above 1."""
+        """The highest quality of service that the broker accepts, at most 1."""
         self.trouble: str | None = None
-        """What paho last found wrong."""
+        """The last error that paho logged."""
         self.on_log = self._note
         self.max_queued_messages = MAX_WAITING
         self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
 
     def open(self, settings: MqttConfig) -> None:
-        """Dials, and introduces itself to the broker; raises as `dial`."""
+        """Dials and sends CONNECT. Raises the exceptions of `dial`."""
         if not self._five:
             self.connect(settings.host, settings.port, settings.keep_alive)
             return
@@ -102,7 +101,7 @@ class BrokerConnection(Client):
         )
 
     def accepted(self, properties: Properties | None) -> None:
-        """The broker took the connection, and told its limits."""
+        """Applies the limits from the broker's CONNACK."""
         self.on_log = None
         most: int = getattr(properties, "ReceiveMaximum", _MAX_ON_THE_WAY)
         self._max_inflight_messages = min(most, _MAX_ON_THE_WAY)
@@ -110,7 +109,10 @@ class BrokerConnection(Client):
         self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
 
     def ask_for(self, subscription: SubscriptionConfig, *, again: bool) -> int | None:
-        """Subscribes; the packet's identifier. `again`: retained messages have been taken."""
+        """Sends SUBSCRIBE and returns its packet identifier, `None` when it could not be sent.
+
+        With `again`, the broker does not send retained messages a second time (MQTT 5).
+        """
         if not self._five:
             return self.subscribe(subscription.topic, subscription.qos)[1]
         options = SubscribeOptions(
@@ -124,12 +126,12 @@ class BrokerConnection(Client):
         return self.subscribe(subscription.topic, options=options)[1]
 
     def takes(self, size: int) -> bool:
-        """Whether the broker takes a message of this size, with some bytes around it."""
+        """Returns whether the broker accepts a message of this size, plus packet overhead."""
         return self._largest_sent is None or size + 64 <= self._largest_sent
 
     @property
     def unsent(self) -> int:
-        """How many packets wait to be sent."""
+        """The number of unsent packets."""
         return len(self._out_packet)
 
     def close(self) -> None:
@@ -156,7 +158,7 @@ class BrokerConnection(Client):
                 packet["command"], packet["packet"], packet["remaining_length"], five=self._five
             )
         except ValueError as error:
-            self.trouble = f"a malformed message: {error}"
+            self.trouble = f"malformed message: {error}"
             return MQTTErrorCode.MQTT_ERR_PROTOCOL
         if message.qos == 2 and message.identifier in self._unreleased:
             return self._send_pubrec(message.identifier)
@@ -167,8 +169,8 @@ class BrokerConnection(Client):
         elif message.qos == 2:
             self._unreleased.add(message.identifier)
             code = self._send_pubrec(message.identifier)
-        # After the acknowledgement: a broker that closes the connection for the answer's sake
-        # does not deliver the message again then.
+        # The answer follows the acknowledgement: if the broker closes the connection because of
+        # the answer, it does not deliver the message again.
         if code == MQTTErrorCode.MQTT_ERR_SUCCESS:
             self._answer(self, message, result)
         return code

@@ -1,18 +1,18 @@
-"""Reading a PUBLISH packet, in time that grows only with the size of its properties."""
+"""Parses a PUBLISH packet. The time is linear in the size of its properties."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 MAX_PROPERTIES = 2**18
-"""Bytes: response topic, correlation data and content type at their longest, and some more."""
+"""Bytes: enough for response topic, correlation data and content type of maximum length."""
 
 _FIXED = {1: 1, 2: 4, 35: 2}
-"""Properties of a fixed size: payload format, message expiry, topic alias."""
+"""Properties of a fixed size, in bytes: payload format, message expiry, topic alias."""
 
 _LENGTHS = {3: 1, 8: 1, 9: 1, 38: 2}
-"""Properties with a length before them: content type, response topic, correlation data, and user
-property, which is two texts."""
+"""The number of length-prefixed fields of a property: content type, response topic, correlation
+data, and user property, which is a pair of strings."""
 
 _SUBSCRIPTION_IDENTIFIER = 11
 _RESPONSE_TOPIC = 8
@@ -20,25 +20,25 @@ _CORRELATION_DATA = 9
 
 
 class Publish(NamedTuple):
-    """A message."""
+    """A PUBLISH packet."""
 
     topic: str
     qos: int
     identifier: int
-    """Of the packet, to acknowledge it by; 0 with QoS 0."""
+    """The packet identifier; 0 with QoS 0."""
     payload: memoryview
     size: int
-    """How many bytes the payload has, also when it was not kept to its end."""
+    """The size of the payload in bytes; `payload` is shorter if it was cut."""
     response_topic: bytes | None = None
     correlation: bytes | None = None
     problem: str | None = None
-    """What is wrong with its properties."""
+    """Why the properties are malformed; `None` if they are valid."""
 
 
 def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: bool) -> Publish:
-    """A message of MQTT 5 or 3.1.1; `length` is that of the body before it was cut short.
+    """Parses a PUBLISH packet of MQTT 5 or 3.1.1. `length` is the size of the uncut body.
 
-    Raises `ValueError` when it can't even be acknowledged.
+    Raises `ValueError` when the packet is too malformed to be acknowledged.
     """
     view = memoryview(body)
     qos = flags >> 1 & 3
@@ -60,7 +60,7 @@ def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: boo
             problem = f"properties: {error}"
         at += size
         if at > length:
-            raise ValueError("properties that don't end")
+            raise ValueError("properties: longer than the packet")
     return Publish(
         topic.decode(errors="replace"),
         qos,
@@ -74,7 +74,7 @@ def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: boo
 
 
 def _properties(view: memoryview, size: int) -> dict[int, bytes]:
-    """The value of each property with a length; of two the last."""
+    """Returns the last value of each length-prefixed property."""
     if size > MAX_PROPERTIES:
         raise ValueError(f"{size} bytes, allowed are {MAX_PROPERTIES}")
     if len(view) < size:
@@ -91,7 +91,7 @@ def _properties(view: memoryview, size: int) -> dict[int, bytes]:
             for _ in range(_LENGTHS[kind]):
                 found[kind], at = _text(view, at)
         else:
-            raise ValueError(f"{kind} is none of a message")
+            raise ValueError(f"property {kind} is not allowed in PUBLISH")
     return found
 
 
@@ -117,4 +117,4 @@ def _variable(view: memoryview, at: int) -> tuple[int, int]:
         value |= (digit & 0x7F) << 7 * place
         if digit < 0x80:
             return value, at
-    raise ValueError("a length that doesn't end")
+    raise ValueError("a variable byte integer is longer than 4 bytes")

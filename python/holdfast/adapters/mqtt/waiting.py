@@ -1,4 +1,4 @@
-"""Waiting for a socket in such a way that a stop ends it at once."""
+"""Waits for a socket. A stop ends the wait immediately."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 _Selector: type[selectors.BaseSelector] = getattr(
     selectors, "PollSelector", selectors.SelectSelector
 )
-"""Not select(), where there is something else: it can't wait for a descriptor above 1023."""
+"""poll() where available, because select() fails for descriptors above 1023."""
 
 
 class Ended(Exception):
-    """The adapter is to end."""
+    """The adapter must end."""
 
 
 class Waiter:
-    """Waits for one socket at a time, in one thread; raises `Ended` as soon as `stop` is set."""
+    """Waits for one socket at a time, in one thread. Raises `Ended` as soon as `stop` is set."""
 
     def __init__(self, stop: Stop) -> None:
         self._stop = stop
@@ -49,14 +49,14 @@ class Waiter:
             self._rope.send(b"\0")
 
     def check(self) -> None:
-        """Raises `Ended` when the adapter is to end."""
+        """Raises `Ended` if `stop` is set."""
         if self._stop.is_set():
             raise Ended
 
     def wait(
         self, for_this: socket.socket, *, read: bool, write: bool, seconds: float
     ) -> tuple[bool, bool]:
-        """Whether the socket can be read, and whether it can be written, within a time."""
+        """Waits at most `seconds`. Returns whether the socket is readable, and writable."""
         self.check()
         wanted = selectors.EVENT_READ * read | selectors.EVENT_WRITE * write
         with _Selector() as selector:

@@ -1,4 +1,4 @@
-"""REST: memory written and read as JSON over HTTP, see docs/rest.md."""
+"""REST: reads and writes memories as JSON over HTTP, see docs/rest.md."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Rest"]
 
 
 class Rest:
-    """The REST adapter, on a socket that listens already."""
+    """The REST adapter, on a listening socket."""
 
     def __init__(
         self,
@@ -38,9 +38,9 @@ class Rest:
         )
 
     def run(self, stop: Stop) -> None:
-        """Serves until `stop`."""
+        """Serves until `stop` is set."""
         self._host.run(stop)
 
     def status(self) -> dict[str, object]:
-        """Where it listens, and what became of connections."""
+        """Returns the address and the counts of connections."""
         return {"address": self._host.address, "connections": self._host.counts()}

@@ -1,7 +1,6 @@
-"""The routes: what a request asks for, who asks, and how it is answered.
+"""The ASGI application of REST: routing, authorization and responses.
 
-A plain ASGI application. All that bears on memory is the door's work; what is refused here was
-refused before it came to the memory access.
+The memory access checks everything about memories. A request that is refused here never reaches it.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ if TYPE_CHECKING:
 JSON = b"application/json"
 MAX_PARAMETERS = 8
 ANYONE = "anyone"
-"""Who asks, where there are no tokens."""
+"""The name of the client when no tokens are configured."""
 
 
 class Declined(Refused):
-    """Refused before it came to the memory access, which does not know of it yet."""
+    """A refusal before the memory access was called, which has not counted it yet."""
 
 
 class App:
@@ -109,7 +108,7 @@ class App:
         path, method = request.scope["path"], request.scope["method"]
         route = self.routes.get(path)
         if route is None:
-            raise Declined("not_found", f"there is nothing at {shown(path)}")
+            raise Declined("not_found", f"no resource at {shown(path)}")
         allowed, handler = route
         if method == allowed or (method == "HEAD" and allowed == "GET"):
             answer = handler(request)
@@ -121,7 +120,7 @@ class App:
         raise Declined("method_not_allowed", f"allowed are {methods}")
 
     async def _refuse(self, request: Request, refused: Refused, send: Send) -> None:
-        """Counts what the door does not know of, and answers."""
+        """Sends the refusal, and counts it unless the memory access has."""
         if isinstance(refused, Declined):
             asked = request.scope["path"], request.scope["method"]
             write = asked == (INGEST.path, INGEST.method)
@@ -178,12 +177,13 @@ class App:
         return page.KIND, self._page
 
     def _authorize(self, request: Request) -> Grant:
-        """Whose request it is. Raises `Declined`."""
+        """Returns the grant of the request's client. Raises `Declined` and `BadRequest`."""
         if self._anyone is not None:
             if not request.is_direct:
-                # A page of the web can make its own name lead to this machine, but not change it.
+                # DNS rebinding: a web page can point its own name at this machine, but the browser
+                # still sends that name as Host.
                 host = shown((request.header(b"host") or b"").decode("latin-1"))
-                detail = f"Host is {host}, without tokens allowed are IP addresses and localhost"
+                detail = f"Host is {host}, allowed without tokens: an IP address or localhost"
                 raise Declined("not_granted", detail)
             request.who = ANYONE
             return self._anyone
@@ -193,7 +193,7 @@ class App:
 
 
 def _given(query: bytes, parameters: Sequence[Parameter]) -> dict[str, Any]:
-    """The parameters of a query by their names, all of them. Raises `BadRequest`."""
+    """Parses a query: every parameter must be given once. Raises `BadRequest` or `Declined`."""
     known = {each.name: each for each in parameters}
     names = ", ".join(known)
     try:
@@ -201,18 +201,18 @@ def _given(query: bytes, parameters: Sequence[Parameter]) -> dict[str, Any]:
             query.decode("latin-1"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS
         )
     except ValueError:
-        more = f"there are more than {MAX_PARAMETERS} parameters"
+        more = f"more than {MAX_PARAMETERS} parameters"
         raise _malformed(f"{more}, allowed are {names}") from None
     given: dict[str, str] = {}
     for name, value in pairs:
         if name not in known:
             raise _malformed(f"{shown(name)} is not a parameter, allowed are {names}")
         if name in given:
-            raise _malformed(f"{name} is given more than once, allowed is once")
+            raise _malformed(f"{name} is given more than once")
         given[name] = value
     for name in known:
         if name not in given:
-            raise _malformed(f"{name} is missing, needed are {names}")
+            raise _malformed(f"{name} is missing, required: {names}")
     return {name: each.read(given[name]) for name, each in known.items()}
 
 
@@ -221,5 +221,5 @@ def _malformed(detail: str) -> Declined:
 
 
 def _encoded(document: Any) -> bytes:
-    """JSON of what adapters say of themselves, whatever that is."""
+    """Encodes the status of adapters as JSON; values of other types as their text."""
     return msgspec.json.encode(document, enc_hook=str)

@@ -1,4 +1,4 @@
-"""The OpenAPI document, made from what the routes say of themselves."""
+"""The OpenAPI document, generated from the routes."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 TOKEN = {
     "type": "http",
     "scheme": "bearer",
-    "description": "A token that the configuration names by its SHA-256.",
+    "description": "A token whose SHA-256 is in the configuration.",
 }
 
 
 def document(version: str, max_body: int, *, secured: bool) -> dict[str, Any]:
-    """The document of a server with this limit, `secured` by tokens or not."""
+    """Returns the document of a server with this limit in bytes. `secured`: tokens are required."""
     return {
         "openapi": "3.1.0",
         "info": {
             "title": "Holdfast REST",
             "version": version,
-            "summary": "Writes and reads Modbus memories.",
-            "description": "A write is checked as a whole and then done as one step, or not at "
-            "all: no reader ever sees a part of it, also where a batch touches several memories. "
-            "Nothing is converted, cut or wrapped. An integer is written as one: `1.0` and "
-            "`1e2` are refused. "
+            "summary": "Reads and writes Modbus memories.",
+            "description": "A write is atomic, even a batch that writes to several memories: "
+            "either all of it is carried out or nothing, and no reader sees only a part of it. "
+            "Values are never converted, truncated or wrapped. An integer has no fraction and no "
+            "exponent: `1.0` and `1e2` are refused. "
             f"A body has at most {max_body} bytes.",
         },
         "servers": [{"url": "/"}],
@@ -71,7 +71,7 @@ def _operation(route: Route, *, secured: bool) -> dict[str, Any]:
 
 
 def _reasons(route: Route, *, secured: bool) -> tuple[str, ...]:
-    """Why a request of a route may be refused."""
+    """Returns the reasons for which a route can refuse a request."""
     asking = "unauthorized" if secured else "not_granted"
     return (*route.refusals, *EVERYWHERE, *(() if route.is_open else (asking,)))
 

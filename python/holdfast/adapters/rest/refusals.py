@@ -1,4 +1,4 @@
-"""What REST refuses: each reason and its status."""
+"""The reasons of refusals of REST, and their status codes."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ REFUSALS = Refusals(
     Refusal(
         400,
         ("invalid_value", "malformed", "invalid_area", "out_of_range"),
-        "Not what is asked for: the text, a parameter, an area, an address or a value",
+        "The JSON, a parameter, an area, an address or a value is invalid",
         "values[2] is 70000, outside 0..65535",
     ),
     Refusal(
         401,
         ("unauthorized",),
-        "No token, or one that is not known",
+        "The token is missing or unknown",
         "the token is not known",
     ),
     Refusal(
         403,
         ("not_granted",),
-        "The token does not reach this memory or area, or may not write",
+        "The token does not grant this memory or area, or does not grant writes",
         "area coils is not granted to edge-gateway",
     ),
     Refusal(
         404,
         ("unknown_memory", "not_found", "not_configured"),
-        "There is no such thing",
+        "The resource or the memory does not exist",
         'no memory "plant_z"',
     ),
     Refusal(
         405,
         ("method_not_allowed",),
-        "Not with this method",
+        "The resource does not support this method",
         "allowed are POST, OPTIONS",
     ),
     Refusal(
         408,
         ("timeout",),
         "The body did not arrive in time; the connection is closed",
-        "1024 bytes came in time, more were announced",
+        "1024 bytes arrived in time, Content-Length is larger",
     ),
     Refusal(
         413,
@@ -50,7 +50,7 @@ REFUSALS = Refusals(
     Refusal(
         415,
         ("not_json",),
-        "Not `application/json`, or compressed",
+        "The body is not `application/json`, or is compressed",
         'Content-Type is "text/plain", allowed is application/json',
     ),
 )
@@ -59,6 +59,6 @@ EVERYWHERE = ("method_not_allowed",)
 BODY = ("malformed", "timeout", "too_large", "not_json")
 QUERY = ("malformed",)
 MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
-"""What the memory access says of a range."""
+"""Refusals of a range by the memory access."""
 
 VALUES = ("invalid_value",)

@@ -1,6 +1,6 @@
-"""The routes: what each takes, what it answers, and why it may refuse.
+"""The routes of REST: parameters, responses and refusals of each.
 
-The application serves these and nothing else, and the OpenAPI document is made of them.
+The application serves exactly these, and the OpenAPI document is generated from them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from holdfast.web.requests import BadRequest, shown
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a query, which is needed."""
+    """A required query parameter."""
 
     name: str
     text: str
@@ -34,19 +34,19 @@ class Parameter:
     example: object
 
     def read(self, given: str) -> Any:
-        """Its value: a number where the schema says so. Raises `BadRequest`."""
+        """Parses a value: an integer or a string, as in the schema. Raises `BadRequest`."""
         if self.schema.get("type") != "integer":
             return given
         least, most = self.schema["minimum"], self.schema["maximum"]
         if re.fullmatch("[0-9]{1,10}", given) and least <= int(given) <= most:
             return int(given)
-        allowed = f"allowed is a number from {least} to {most}"
+        allowed = f"allowed is an integer from {least} to {most}"
         raise BadRequest("malformed", f"{self.name} is {shown(given)}, {allowed}")
 
 
 @dataclass(frozen=True)
 class Body:
-    """JSON that is needed, with examples by a word, each with a title."""
+    """A required JSON body. The examples have a key, a title and a value."""
 
     schema: Schema
     examples: dict[str, tuple[str, Any]]
@@ -54,19 +54,19 @@ class Body:
 
 @dataclass(frozen=True)
 class Route:
-    """One path, with its one method; GET stands for HEAD too."""
+    """A path and its method. GET includes HEAD."""
 
     path: str
     method: Literal["GET", "POST"]
     name: str
-    """What the document and the application know it by."""
+    """The `operationId`, and the key of the application's handler."""
     summary: str
     answer: dict[str, Any]
-    """The answer of status 200, as the document has it."""
+    """The OpenAPI response of status 200."""
     refusals: tuple[str, ...] = ()
-    """Its own reasons to refuse, beside those of every route and of tokens."""
+    """The reasons of refusals that only this route has."""
     is_open: bool = False
-    """Whether everybody may ask, also where there are tokens."""
+    """Whether the route never requires a token."""
     description: str | None = None
     parameters: tuple[Parameter, ...] = ()
     body: Body | None = None
@@ -80,15 +80,15 @@ INGEST = Route(
     "/api/v1/ingest",
     "POST",
     "ingest",
-    "Write one command, or several as one step",
+    "Write one command, or a batch of commands atomically",
     json_answer(
-        "Written",
+        "All values were written",
         {"oneOf": [ref("Accepted"), ref("BatchAccepted")]},
         {"status": "accepted", "memory": "plant_a", "written": 3},
     ),
     (*BODY, *MEMORY, *VALUES),
-    description="In a refusal, `command` is the place of the command in the batch and `index` the "
-    "place of the value in the command, both from 0. Where ranges of a batch overlap, the later "
+    description="In a refusal, `command` is the index of the command in the batch and `index` the "
+    "index of the value in the command, both from 0. Where ranges of a batch overlap, the later "
     "command wins.",
     body=Body(
         {"oneOf": [ref("Command"), ref("Batch")]},
@@ -96,7 +96,7 @@ INGEST = Route(
             "registers": ("Three registers", _command("holding_registers", 0, [100, 200, 300])),
             "bits": ("Two bits", _command("coils", 8, [True, 0])),
             "batch": (
-                "Two commands as one step",
+                "Two commands, written atomically",
                 [_command("input_registers", 0, [7]), _command("discrete_inputs", 3, [1])],
             ),
         },
@@ -107,14 +107,14 @@ READ = Route(
     "/api/v1/memory/read",
     "GET",
     "read",
-    "Read a range, all of one moment",
-    json_answer("The values, bits as 0 and 1", ref("Values"), {"values": [100, 200, 300]}),
+    "Read a range atomically",
+    json_answer("The values; bits are 0 or 1", ref("Values"), {"values": [100, 200, 300]}),
     (*QUERY, *MEMORY),
     parameters=(
-        Parameter("memory", "The memory", TEXT, "plant_a"),
+        Parameter("memory", "The name of the memory", TEXT, "plant_a"),
         Parameter("area", "The area", ref("Area"), "holding_registers"),
         Parameter("address", "The first address", ADDRESS, 0),
-        Parameter("count", "How many bits or registers", integer(1, ADDRESSES), 3),
+        Parameter("count", "The number of bits or registers", integer(1, ADDRESSES), 3),
     ),
 )
 
@@ -125,17 +125,17 @@ ROUTES = (
         "/api/v1/health",
         "GET",
         "health",
-        "Whether the server answers",
-        json_answer("It does", ref("Health"), {"status": "ok"}),
+        "Check that the server is running",
+        json_answer("The server is running", ref("Health"), {"status": "ok"}),
         is_open=True,
     ),
     Route(
         "/api/v1/diagnostics/memory",
         "GET",
         "memories",
-        "The memories that the token reaches",
+        "List the memories that the token grants",
         json_answer(
-            "Their areas, and their seals",
+            "The areas and the seal of each memory",
             ref("Memories"),
             {
                 "memories": {
@@ -156,9 +156,9 @@ ROUTES = (
         "/api/v1/diagnostics/stats",
         "GET",
         "stats",
-        "Every counter since the start",
+        "Get all counters since the start",
         json_answer(
-            "Listeners, devices, adapters, log and audit",
+            "Counters of listeners, devices, adapters, log and audit log",
             ref("Stats"),
             {
                 "uptime": 3600.25,
@@ -199,9 +199,9 @@ ROUTES = (
         "/api/v1/diagnostics/mqtt",
         "GET",
         "mqtt",
-        "The connection to the MQTT broker",
+        "Get the state of the MQTT connection",
         json_answer(
-            "How it is",
+            "The state of the connection to the broker",
             ref("Mqtt"),
             {
                 "connected": True,
@@ -216,9 +216,9 @@ ROUTES = (
         DOCUMENT,
         "GET",
         "openapi",
-        "This document",
-        json_answer("OpenAPI 3.1", {"type": "object"}),
+        "Get this document",
+        json_answer("The OpenAPI 3.1 document", {"type": "object"}),
         is_open=True,
     ),
-    Route(PAGE, "GET", "docs", "This document as a page", html_answer(), is_open=True),
+    Route(PAGE, "GET", "docs", "Get this document as a web page", html_answer(), is_open=True),
 )

@@ -1,4 +1,4 @@
-"""The JSON of REST: what commands and answers are, as schemas with names."""
+"""The JSON schemas of commands, answers and diagnostics of REST."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ ANSWERS: dict[str, Schema] = {
         "properties": {
             "status": {"const": "rejected"},
             "reason": {"enum": list(REFUSALS.reasons)},
-            "command": COUNTER | {"description": "The place of the command in the batch"},
-            "index": COUNTER | {"description": "The place of the value in the command"},
-            "detail": TEXT | {"description": "A sentence for people"},
+            "command": COUNTER | {"description": "The index of the command in the batch"},
+            "index": COUNTER | {"description": "The index of the value in the command"},
+            "detail": TEXT | {"description": "A message for people"},
         },
         "additionalProperties": False,
     },
@@ -69,10 +69,10 @@ DIAGNOSTICS: dict[str, Schema] = {
             },
             "sealed": {
                 "type": "boolean",
-                "description": "Whether Modbus clients are refused for now",
+                "description": "Whether the memory refuses Modbus clients",
             },
-            "opened": COUNTER | {"description": "How often the seal opened"},
-            "closed": COUNTER | {"description": "How often it closed again"},
+            "opened": COUNTER | {"description": "How many times the seal opened"},
+            "closed": COUNTER | {"description": "How many times it closed again"},
         }
     ),
     "Stats": object_of(
@@ -80,14 +80,14 @@ DIAGNOSTICS: dict[str, Schema] = {
             "uptime": {"type": "number", "description": "Seconds"},
             "listeners": {
                 "type": "object",
-                "description": "By the name of the listener: requests by function code, "
+                "description": "By name of the listener: requests by function code, "
                 "exceptions by code, connections, frames",
                 "additionalProperties": {"type": "object"},
             },
             "devices": {
                 "type": "object",
-                "description": "By the name of the device: health, seconds since the last "
-                "valid answer, requests by their outcomes, polls, reads, packets forwarded",
+                "description": "By name of the device: health, seconds since the last "
+                "valid response, requests by outcome, polls, reads, packets forwarded",
                 "additionalProperties": {
                     "type": "object",
                     "required": ["health"],
@@ -98,8 +98,8 @@ DIAGNOSTICS: dict[str, Schema] = {
             },
             "adapters": {
                 "type": "object",
-                "description": "By the name of the adapter: messages accepted, values written, "
-                "reads, refusals by reason, and what it says of itself",
+                "description": "By name of the adapter: messages accepted, values written, "
+                "reads, refusals by reason, and its own status",
                 "additionalProperties": {
                     "type": "object",
                     "required": ["state", "restarts", "last_error"],
