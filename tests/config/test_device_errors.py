@@ -97,8 +97,7 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("tcp://10.0.0.9", "tls://plc?cert=p.yaml&key=/",
          "5: url: found key='/', which can't be read: Is a directory"),
         ("tcp://10.0.0.9", "tls://plc?cert=p.yaml",
-         "5: url: 'tls://plc?cert=p.yaml': cert is alone, allowed are cert and key, or none of "
-         "both"),
+         "5: url: 'tls://plc?cert=p.yaml': cert without key: give both, or neither"),
         ("tcp://10.0.0.9", "rtu:///dev/a%00",
          "5: url: found 'rtu:///dev/a%00', allowed: a URL without NUL"),
         ("    unit: 1\n", "", "4: unit: missing, allowed: an integer from 0 to 255"),

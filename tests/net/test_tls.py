@@ -19,7 +19,8 @@ def test_a_certificate_and_its_key_go_together() -> None:
 
 @pytest.mark.parametrize(("files", "given"), [({"cert": "c"}, "cert"), ({"key": "k"}, "key")])
 def test_one_without_the_other_can_not_be(files: dict[str, str], given: str) -> None:
-    message = f"{given} is alone, allowed are cert and key, or none of both"
+    other = {"cert": "key", "key": "cert"}[given]
+    message = f"{given} without {other}: give both, or neither"
     with pytest.raises(ValueError, match=f"^{message}$"):
         Tls(**files)
     with pytest.raises(ValueError, match=message):

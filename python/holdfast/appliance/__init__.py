@@ -1,4 +1,4 @@
-"""From a configuration to something that runs: assembly, supervision, diagnostics."""
+"""The appliance runs a configuration: assembly, supervision and diagnostics."""
 
 from __future__ import annotations
 

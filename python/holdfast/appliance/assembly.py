@@ -1,7 +1,7 @@
-"""From a configuration to the native parts: memories, rules, listeners, devices, identity; and to
-what gateway and scanner are told.
+"""Converts a configuration to native objects and to the settings of gateway and scanner.
 
-It converts, and starts nothing. Gateway and scanner are imported only where they are wanted.
+The native objects are memories, rules, listeners, devices and the identity. Nothing is started
+here. Gateway and scanner are imported only if they are configured.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 SPREAD = 10.0
-"""Seconds over which the first polls of devices are spread, unless their interval is shorter."""
+"""Seconds over which the first polls of devices are spread; at most the polling interval."""
 
 DISABLED = 4
-"""The health of a device that is not polled, in its status block."""
+"""The health code of a device that is not polled, in its status block."""
 
 STATUS_NAME = 16
-"""Bytes of the name in a status block."""
+"""The size of the name in a status block, in bytes."""
 
 
 def memory(settings: MemoryConfig) -> Memory:
-    """The memory that a configuration describes, with its initial values."""
+    """Creates the memory that the settings describe, with its initial values."""
     seal = settings.seal
     made = _core.Memory(
         **{area: (span.start, span.size) for area, span in settings.areas().items()},
@@ -71,7 +71,7 @@ def memory(settings: MemoryConfig) -> Memory:
 
 
 def identity(settings: IdentityConfig) -> Identity:
-    """What the appliance says of itself."""
+    """Returns the device identification that Modbus clients read."""
     return Identity(
         vendor_name=settings.vendor_name,
         product_code=settings.product_code,
@@ -86,7 +86,7 @@ def identity(settings: IdentityConfig) -> Identity:
 
 
 def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.Listener:
-    """The native listener of that name."""
+    """Creates the native listener of that name."""
     settings: Listener = config.listeners[name]
     match settings:
         case ModbusTcpListener() | ModbusTlsListener() | ModbusRtuOverTcpListener():
@@ -134,7 +134,7 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
 
 
 def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
-    """The certificates of a listener. Raises `ValueError` for a file that can't be used."""
+    """Loads the certificates of a listener. Raises `ValueError` for an unusable file."""
     return _core.ServerTls(
         cert_file=settings.cert_file,
         key_file=settings.key_file,
@@ -144,7 +144,7 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
 
 
 def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.PolledDevice:
-    """The native poller's device of that name. Raises `OSError` for files it can't use."""
+    """Creates the native poller's device of that name. Raises `OSError` for unusable files."""
     settings = config.devices[name]
     status = settings.status
     try:
@@ -173,14 +173,14 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
 
 
 def disabled_status(name: str) -> list[int]:
-    """The status block of a device that is not polled."""
+    """Returns the registers of the status block of a device that is not polled."""
     text = name.encode("ascii", "replace")[:STATUS_NAME].ljust(STATUS_NAME, b"\0")
     told = [DISABLED, 0, 0, *struct.unpack(f">{STATUS_NAME // 2}H", text)]
     return told + [0] * (STATUS_BLOCK - len(told))
 
 
 def gateway(settings: GatewayConfig) -> GatewaySettings:
-    """What the gateway is told."""
+    """Returns the settings of the gateway."""
     from holdfast.gateway import GatewayLimits, Settings
 
     tokens = () if settings.tokens == "none" else settings.tokens
@@ -195,12 +195,12 @@ def gateway(settings: GatewayConfig) -> GatewaySettings:
 
 
 def gateway_tls(settings: GatewayConfig) -> Tls:
-    """Whom the gateway trusts among devices, and what it shows them."""
+    """Returns the certificates that the gateway uses for TLS devices."""
     return NO_FILES if settings.tls is None else settings.tls.files
 
 
 def scanner(settings: NatsConfig) -> ScannerSettings:
-    """What the scanner is told."""
+    """Returns the settings of the scanner."""
     from holdfast.scanner import ScannerLimits, Servers, Settings
 
     servers = Servers(

@@ -1,4 +1,4 @@
-"""What an appliance says of itself while it runs: one snapshot for REST, metrics and logs."""
+"""The diagnostics of a running appliance, for REST, metrics and logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Diagnostics:
-    """Looks at the parts of a running appliance, from any thread, and changes nothing."""
+    """Reads counters and states of a running appliance. Thread-safe; changes nothing."""
 
     def __init__(self, memories: Mapping[str, Memory], engine: Engine) -> None:
         self._memories = memories
@@ -28,7 +28,7 @@ class Diagnostics:
         """Devices that are not polled."""
 
     def memories(self) -> dict[str, Any]:
-        """Each memory: its areas with start and size, sealed or not, how often it opened."""
+        """Returns, for each memory, the start and size of its areas and the state of its seal."""
         return {
             name: {
                 "areas": {
@@ -43,7 +43,7 @@ class Diagnostics:
         }
 
     def stats(self) -> dict[str, Any]:
-        """Every counter, since the start: of listeners, devices, adapters, the log, the audit."""
+        """Returns all counters of listeners, devices, adapters, log and audit log."""
         return {
             "uptime": round(time.monotonic() - self._began, 3),
             "listeners": self._engine.counters(),
@@ -54,12 +54,12 @@ class Diagnostics:
         }
 
     def devices(self) -> dict[str, dict[str, Any]]:
-        """How each device does, and what was counted of it."""
+        """Returns the health and the counters of each device."""
         polled = {} if self.poller is None else self.poller.counters()
         return {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
 
     def adapter(self, name: str) -> dict[str, Any] | None:
-        """How one adapter does, and what came in by its door; `None` when there is none."""
+        """Returns the state and the counters of one adapter; `None` if it does not exist."""
         if name not in self.adapters:
             return None
         supervisor, memory_access = self.adapters[name]

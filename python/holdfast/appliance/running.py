@@ -1,8 +1,6 @@
-"""The appliance: memories, listeners, devices and adapters of a configuration, started, logged and
-stopped.
+"""The appliance starts, logs and stops the memories, listeners, devices and adapters.
 
-It wires parts that know their work. It parses no protocol, and once started it takes no part in
-answering a request.
+It only connects these parts. It parses no protocol, and takes no part in answering requests.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ if TYPE_CHECKING:
         RestConfig,
     )
 
-# Everything else that a listener reports is a refusal or a fault.
+# All other events of a listener are refusals or faults.
 LEVELS = {
     "opened": logging.DEBUG,
     "closed": logging.DEBUG,
@@ -49,19 +47,19 @@ LEVELS = {
     "line_back": logging.INFO,
 }
 
-# How many writes the audit log takes at once.
+# The most writes that are moved to the audit log at once.
 AUDIT_BATCH = 1000
 
-# How often it is looked whether the health of a device has changed, in seconds.
+# Seconds between checks of the health of devices.
 HEALTH_CHECK_INTERVAL = 1.0
 
-# How long a thread waits for the next event or write before it looks around, in seconds.
+# Seconds that a thread waits for the next write before it checks for a stop.
 WAIT_TIMEOUT = 0.2
 
 
 @dataclass(frozen=True)
 class ListenAddress:
-    """Where a part of the configuration is served: a socket, or a serial device."""
+    """Where a listener or an HTTP service listens: a socket address or a serial device."""
 
     name: str
     type: str
@@ -72,10 +70,10 @@ class ListenAddress:
 
 
 class Appliance:
-    """One configuration, running from `start` (or `with`) to `stop`.
+    """Runs one configuration, from `start` (or `with`) to `stop`.
 
-    Raises `OSError` from `start` when something can't be bound or opened, `UnknownAdapter` for an
-    adapter that is not installed; nothing is left running then.
+    `start` raises `OSError` if an address can't be bound or a file can't be opened, and
+    `UnknownAdapter` if an adapter is not installed. Nothing is left running then.
     """
 
     def __init__(self, config: Config) -> None:
@@ -86,9 +84,9 @@ class Appliance:
         self._running: _Running | None = None
 
     def start(self) -> Self:
-        """Binds everything and serves. Raises `RuntimeError` when it runs already."""
+        """Binds all addresses and serves. Raises `RuntimeError` if already running."""
         if self._running is not None:
-            raise RuntimeError("the appliance runs already")
+            raise RuntimeError("the appliance is already running")
         self._running = _Running(self.config, self.memories)
         for endpoint in self.endpoints():
             host, port = endpoint.host, endpoint.port
@@ -97,7 +95,7 @@ class Appliance:
         return self
 
     def stop(self) -> None:
-        """Answers what was received and ends."""
+        """Answers the requests already received, then stops."""
         running, self._running = self._running, None
         if running is not None:
             running.stop()
@@ -105,20 +103,23 @@ class Appliance:
 
     @property
     def diagnostics(self) -> Diagnostics:
-        """What it says of itself. Raises `RuntimeError` when it does not run."""
+        """The diagnostics. Raises `RuntimeError` if not running."""
         return self._parts().diagnostics
 
     def endpoints(self) -> list[ListenAddress]:
-        """Where everything is served, in the order of the configuration."""
+        """Returns the addresses of all listeners and services, in configuration order."""
         return self._parts().endpoints
 
     def log_events(self, timeout: float) -> None:
-        """Waits up to `timeout` seconds for an event, and logs it; also seals and devices."""
+        """Waits up to `timeout` seconds for a listener event and logs it.
+
+        Also logs changes of seals and of the health of devices.
+        """
         self._parts().log_events(timeout)
 
     def _parts(self) -> _Running:
         if self._running is None:
-            raise RuntimeError("the appliance does not run")
+            raise RuntimeError("the appliance is not running")
         return self._running
 
     def __enter__(self) -> Self:
@@ -129,7 +130,7 @@ class Appliance:
 
 
 class _Running:
-    """The parts of a running appliance; making it starts them all, or none."""
+    """The parts of a running appliance. The constructor starts all of them or none."""
 
     def __init__(self, config: Config, memories: dict[str, _core.Memory]) -> None:
         self._config = config
@@ -141,8 +142,7 @@ class _Running:
         self._plan_errors: dict[str, str | None] = {}
         self._unstored: dict[str, int] = {}
         self._looked = time.monotonic()
-        # An adapter that is not installed, and a file that TLS of devices can't use, are told
-        # before any socket is opened.
+        # Missing adapters and unusable TLS files are reported before any socket is opened.
         for name, settings in config.adapters.items():
             foreign.entry_point(name, settings)
         if config.gateway is not None and config.gateway.tls is not None:
@@ -176,7 +176,7 @@ class _Running:
             supervisor.start()
 
     def stop(self) -> None:
-        """Tells all parts to end, then waits for each."""
+        """Requests the stop of all parts, then waits for each."""
         if self._poller is not None:
             self._poller.stop()
         for supervisor in self._supervisors:
@@ -214,7 +214,7 @@ class _Running:
                 self._log_device(name, told)
 
     def _log_device(self, name: str, told: Mapping[str, Any]) -> None:
-        """Logs what has changed for a device since the last look."""
+        """Logs changes of a device since the last check."""
         health, plan_error, unstored = told["health"], told["plan_error"], told["unstored"]
         if plan_error is not None and plan_error != self._plan_errors.get(name):
             logs.write(logging.ERROR, "device_unplanned", device=name, error=plan_error)
@@ -249,7 +249,7 @@ class _Running:
         return audit
 
     def _bound_sockets(self, undo: ExitStack) -> dict[str, socket.socket]:
-        """The sockets of what is served over HTTP."""
+        """Binds the sockets of the HTTP services."""
         sockets: dict[str, socket.socket] = {}
         config = self._config
         services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
@@ -272,7 +272,7 @@ class _Running:
         )
 
     def _tell_disabled(self) -> list[str]:
-        """Writes the status blocks of the devices that are not polled; their names."""
+        """Writes the status blocks of disabled devices. Returns the names of these devices."""
         devices = self._config.devices
         disabled = [name for name, settings in devices.items() if not settings.enabled]
         for name in disabled:
@@ -347,7 +347,7 @@ class _Running:
         self.diagnostics.adapters[name] = (supervisor, memory_access)
 
     def _take_writes(self) -> None:
-        """Brings the writes of listeners into the audit log, until all have stopped."""
+        """Moves the writes of listeners to the audit log until the appliance has stopped."""
         audit, lost = self._audit, 0
         assert audit is not None
         while True:
@@ -365,7 +365,7 @@ class _Running:
 
 
 def _listening(name: str, bind: Bind) -> socket.socket:
-    """The socket of a service. Raises `OSError`, which names both."""
+    """Returns a listening socket. Raises `OSError` with the service and the address."""
     from holdfast.web import host
 
     try:
@@ -376,7 +376,7 @@ def _listening(name: str, bind: Bind) -> socket.socket:
 
 
 def _check_files(name: str, tls: Tls) -> None:
-    """Raises `OSError`, which names them, for files that can't be used."""
+    """Raises `OSError` with the setting's name if a file can't be used."""
     try:
         check_files(tls)
     except (OSError, ValueError) as error:

@@ -1,7 +1,7 @@
-"""Keeps an adapter running: in a thread of its own, made anew when it fails.
+"""Runs each adapter in a thread of its own, and restarts it after a failure.
 
-Adapter threads step back behind the threads that serve Modbus: where the system lets a thread lower
-its own priority, they do.
+Adapter threads have a lower priority than the threads that serve Modbus, on systems where a thread
+can lower its own priority.
 """
 
 from __future__ import annotations
@@ -24,30 +24,33 @@ if TYPE_CHECKING:
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 60.0
-"""Seconds before an adapter is made anew: doubled with each failure, up to the longest."""
+"""Seconds before a failed adapter restarts. Each failure doubles the pause, up to the maximum."""
 
 PROVEN = 60.0
-"""Seconds after which an adapter that ran is held to be well again."""
+"""After running at least this many seconds, the pauses start from the first again."""
 
 STOP_TIMEOUT = 5.0
-"""Seconds that an adapter has to end."""
+"""Seconds to wait for an adapter to stop."""
 
 POLITENESS = 19
-"""The nice value of adapter threads: with less, the scheduler lets them finish a tick now and then
-while a request waits."""
+"""The nice value of adapter threads. With a lower value the scheduler sometimes lets them finish a
+tick while a Modbus request waits."""
 
 SWITCH_INTERVAL = 0.05
-"""Seconds that a thread may keep the interpreter while others wait for it. Each handover wakes one,
-and gives the scheduler a reason to run it before the threads that serve Modbus."""
+"""Seconds that a thread may hold the interpreter lock while others wait for it. Each switch wakes a
+thread, which the scheduler may run before the threads that serve Modbus."""
 
 
 def give_way() -> None:
-    """Lets this process hand its interpreter on less often: for one that serves Modbus beside."""
+    """Makes this process switch threads of the interpreter less often, in favor of native ones."""
     sys.setswitchinterval(SWITCH_INTERVAL)
 
 
 class Supervisor:
-    """One adapter, from `start` to `stop`. With `may_end` it may end by itself, for good."""
+    """Supervises one adapter from `start` to `stop`.
+
+    With `may_end`, an adapter that returns is not restarted.
+    """
 
     def __init__(self, name: str, factory: Callable[[], Adapter], *, may_end: bool = False) -> None:
         self.name = name
@@ -65,11 +68,11 @@ class Supervisor:
         self._thread.start()
 
     def stop(self) -> None:
-        """Tells the adapter to end; `join` waits for it."""
+        """Requests the stop of the adapter; `join` waits for it."""
         self._stop.set()
 
     def join(self) -> None:
-        """Waits for the adapter to end, for a while."""
+        """Waits for the adapter to stop, at most `STOP_TIMEOUT`."""
         if self._thread.ident is None:
             return
         self._thread.join(STOP_TIMEOUT)
@@ -77,11 +80,11 @@ class Supervisor:
             logs.write(logging.ERROR, "adapter_does_not_stop", adapter=self.name)
 
     def status(self) -> dict[str, object]:
-        """How it does, and what it says of itself."""
+        """Returns the state of the supervision and the adapter's own status."""
         adapter = self._adapter
         try:
             own = {} if adapter is None else dict(adapter.status())
-        except Exception:  # A foreign adapter's fault must not become that of diagnostics.
+        except Exception:  # A faulty adapter must not break diagnostics.
             logs.problem("adapter_status_failed", adapter=self.name)
             own = {}
         return {
@@ -103,7 +106,7 @@ class Supervisor:
                 logs.write(logging.WARNING, "adapter_stopped", adapter=self.name)
                 break
             if ended:
-                self._last_error = "ended by itself"
+                self._last_error = "the adapter returned before it was stopped"
                 logs.write(logging.ERROR, "adapter_ended", adapter=self.name)
             if time.monotonic() - began >= PROVEN:
                 pause = FIRST_PAUSE
@@ -114,7 +117,7 @@ class Supervisor:
         self._state = "stopped"
 
     def _once(self) -> bool:
-        """Makes the adapter and runs it to its end; whether it came there without an error."""
+        """Creates and runs the adapter. Returns whether it ended without an exception."""
         try:
             self._adapter = self._factory()
             self._state = "running"
@@ -129,7 +132,7 @@ class Supervisor:
 
 
 def _step_back() -> None:
-    """Linux has priorities of threads; elsewhere they are those of the whole process."""
+    """Lowers the priority of this thread. Only Linux has a nice value for each thread."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), POLITENESS)

@@ -1,6 +1,6 @@
-"""The one way by which Python code reads and writes memory: checks, counters, audit.
+"""The only way for adapters to read and write memories: checks, counters and audit log.
 
-Nothing here knows HTTP or MQTT.
+This package does not know HTTP or MQTT.
 """
 
 from __future__ import annotations

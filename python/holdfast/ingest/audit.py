@@ -1,8 +1,8 @@
-"""The audit log: one JSON object a line for every write, done or refused.
+"""The audit log: one line with a JSON object for every write, done or refused.
 
-A line is in the hands of the system before the writer gets its answer; for Modbus writes, which
-native threads serve, it follows at once, and a gap is told in a line of its own. A file that grew
-too large is renamed to `.1`, `.2` and so on.
+A line is written to the file before the writer gets its answer. The lines of Modbus writes follow
+shortly after the answer, because native threads serve them; lost lines are reported in a line of
+their own. A file that is too large is renamed to `.1`, `.2` and so on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Audit:
-    """Appends to one file, from any thread; raises `OSError` when it can't be opened."""
+    """Appends lines to a file. Thread-safe. Raises `OSError` if the file can't be opened."""
 
     def __init__(self, file: Path, *, max_bytes: int, keep: int) -> None:
         self._file = _File(file, maxBytes=max_bytes, backupCount=keep, encoding="utf-8")
@@ -30,7 +30,7 @@ class Audit:
         self._lock = threading.Lock()
 
     def write(self, **fields: object) -> None:
-        """One line: the time, then the fields."""
+        """Writes one line: the time, then the fields."""
         line = {"time": logs.timestamp(time.time()), **fields}
         text = msgspec.json.encode(line).decode()
         self._file.handle(logging.makeLogRecord({"msg": text}))
@@ -38,7 +38,7 @@ class Audit:
             self._lines += 1
 
     def counts(self) -> dict[str, int]:
-        """Lines written, and lines that the file did not take."""
+        """Returns the numbers of lines written, and of lines that could not be written."""
         failed = self._file.failed
         return {"lines": self._lines - failed, "failed": failed}
 
@@ -48,7 +48,7 @@ class Audit:
 
 
 class _File(RotatingFileHandler):
-    """A rotating file that counts what it could not write, and says so in the log."""
+    """A rotating file that counts and logs failed writes."""
 
     failed = 0
 

@@ -1,8 +1,8 @@
-"""The door that data comes in by: commands, checked, then written as one step.
+"""Memory access for adapters: checks commands, then writes them atomically.
 
-Every adapter has a door of its own, which knows what its sources may touch. All of a batch is
-checked before memory is touched, and all of it is written as one step, also over several memories.
-A door counts and audits; it knows nothing of HTTP or MQTT.
+Every adapter has its own `MemoryAccess`, and passes the grant of the source with each call. A batch
+is checked completely before anything is written, and written atomically, even to several memories.
+Accesses are counted, and writes are audited.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ Write: TypeAlias = "tuple[Memory, str, int, list[Any]]"
 
 
 class Refused(Exception):
-    """A command that is not carried out; nothing has changed.
+    """A command was refused; nothing has changed.
 
-    `reason` is one word for programs, `detail` a sentence for people. `command` is the place of the
-    command in a batch, `index` the place of the value in the command. `memory`, `area`, `address`
-    and `value` are what the command says, as far as it was understood.
+    `reason` is a word for programs, `detail` a message for people. `where` locates the error:
+    `command` is the index of the command in a batch, `index` the index of the value in the command.
+    `memory`, `area`, `address` and `value` are from the command, as far as they could be parsed.
     """
 
     def __init__(self, reason: str, detail: str, **where: Any) -> None:
@@ -46,7 +46,7 @@ class Refused(Exception):
         self.where = where
 
     def answer(self) -> dict[str, object]:
-        """What the source is told."""
+        """Returns the answer for the source."""
         places: dict[str, object] = {
             key: self.where[key] for key in ("command", "index") if key in self.where
         }
@@ -55,10 +55,10 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Grant:
-    """What a source may do: to which memories and areas, and whether it may write."""
+    """The permissions of a source: memories, areas, and whether it may write."""
 
     name: str
-    """Whom it is given to, for logs."""
+    """The name of the source, for logs."""
     memories: Collection[str]
     areas: Collection[str]
     writes: bool = True
@@ -66,15 +66,15 @@ class Grant:
 
 @dataclass(frozen=True)
 class Written:
-    """What was written: one command, or a batch."""
+    """The result of a write of one command or a batch."""
 
     commands: int
     values: int
     memory: str | None
-    """The memory, when it was one command outside of any batch."""
+    """The memory of a single command; `None` for a batch."""
 
     def answer(self) -> dict[str, object]:
-        """What the source is told."""
+        """Returns the answer for the source."""
         if self.memory is not None:
             return {"status": "accepted", "memory": self.memory, "written": self.values}
         return {"status": "accepted", "commands": self.commands, "written": self.values}
@@ -82,7 +82,7 @@ class Written:
 
 @dataclass
 class Counts:
-    """What became of the messages that came to the memory access."""
+    """Counters of one memory access: accepted messages, values written, reads, refusals."""
 
     accepted: int = 0
     values: int = 0
@@ -90,7 +90,7 @@ class Counts:
     refused: Counter[str] = field(default_factory=Counter)
 
     def snapshot(self) -> dict[str, object]:
-        """The numbers so far."""
+        """Returns a copy of the counters."""
         return {
             "accepted": self.accepted,
             "values": self.values,
@@ -100,7 +100,7 @@ class Counts:
 
 
 class MemoryAccess:
-    """Writes and reads memories on behalf of one adapter."""
+    """Reads and writes memories for one adapter. Thread-safe."""
 
     def __init__(
         self, name: str, memories: Mapping[str, Memory], audit: Audit | None = None
@@ -112,7 +112,7 @@ class MemoryAccess:
         self._lock = threading.Lock()
 
     def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
-        """Carries out the JSON of one command, or of an array of them. Raises `Refused`."""
+        """Carries out JSON: one command, or an array of commands. Raises `Refused`."""
         try:
             return self._written(_decoded(body), grant, peer)
         except Refused as refused:
@@ -120,7 +120,7 @@ class MemoryAccess:
             raise
 
     def write(self, commands: Sequence[Mapping[str, object]], grant: Grant, peer: str) -> Written:
-        """Carries out commands, each with memory, area, address and values, as one step.
+        """Carries out commands atomically, each with memory, area, address and values.
 
         Raises `Refused`.
         """
@@ -133,7 +133,7 @@ class MemoryAccess:
     def read(
         self, memory: str, area: str, address: int, count: int, grant: Grant, peer: str
     ) -> list[int]:
-        """`count` values of one moment. Raises `Refused`."""
+        """Reads `count` values atomically. Raises `Refused`."""
         try:
             target = self._granted(memory, area, address, grant)
             try:
@@ -148,7 +148,7 @@ class MemoryAccess:
         return values
 
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
-        """Counts, logs and audits a write that is refused, also one that never came in here."""
+        """Counts, logs and audits a refused write. Adapters call it for writes they refuse."""
         self.note(refused, who, peer)
         if self._audit is not None:
             self._audit.write(
@@ -161,7 +161,7 @@ class MemoryAccess:
             )
 
     def note(self, refused: Refused, who: str, peer: str) -> None:
-        """Counts and logs a refusal; what is no write is not audited."""
+        """Counts and logs a refusal without auditing it, such as the refusal of a read."""
         with self._lock:
             self._counts.refused[refused.reason] += 1
         logs.refused(
@@ -175,7 +175,7 @@ class MemoryAccess:
         )
 
     def counts(self) -> dict[str, object]:
-        """What became of all that came."""
+        """Returns the counters."""
         with self._lock:
             return self._counts.snapshot()
 
@@ -188,7 +188,7 @@ class MemoryAccess:
             batch = [document]
         single = batch is not document
         try:
-            # A command that is refused ends the batch before native code has seen the next one.
+            # Commands are checked one by one: native code stops at the first refused command.
             values = _core.write_across(
                 self._checked(command, grant, None if single else index)  # type: ignore[misc]
                 for index, command in enumerate(batch)
@@ -215,7 +215,7 @@ class MemoryAccess:
         return Written(len(batch), values, batch[0]["memory"] if single else None)
 
     def _checked(self, command: object, grant: Grant, index: int | None) -> Write:
-        """All of a command but its range and its values, which native code checks."""
+        """Checks a command, except its range and its values, which native code checks."""
         if not isinstance(command, dict):
             raise _malformed(index, f"is {_shown(command)}, not an object")
         keys = command.keys()
@@ -230,7 +230,7 @@ class MemoryAccess:
             raise Refused("not_granted", f"{grant.name} may not write", **where)
         if "bools" in command and area not in BIT_AREAS:
             where = _where(index, memory, area, address)
-            raise _malformed(index, f"bools are for bits, {area} has registers", where)
+            raise _malformed(index, f"bools are only for bits; {area} has registers", where)
         values = _values(command)
         if type(values) is not list:
             where = _where(index, memory, area, address)
@@ -258,7 +258,7 @@ class MemoryAccess:
     def _refused(
         self, command: Mapping[str, Any], refused: _core.BatchRefused, index: int | None
     ) -> Refused:
-        """Words for what native code refused; raises a refusal that no command can have."""
+        """Converts a refusal of native code. Raises it again if no command can cause it."""
         memory, area, address = command["memory"], command["area"], command["address"]
         values, where = _values(command), _where(index, memory, area, address)
         match refused.reason:
@@ -304,13 +304,13 @@ def _keys_wrong(command: Mapping[str, object]) -> str:
     if unknown:
         return f"has the unknown key {_shown(unknown[0])}"
     if "values" in command and "bools" in command:
-        return "has values and bools, allowed is one of both"
+        return "has both values and bools, allowed is only one"
     missing = [key for key in ("memory", "area", "address", "values") if key not in command]
     return f"lacks {missing[0]}"
 
 
 def _type_wrong(command: Mapping[str, object]) -> str:
-    """Which of memory, area and address is of the wrong type."""
+    """Describes the first of memory, area and address that has the wrong type."""
     for key in ("memory", "area"):
         if type(command[key]) is not str:
             return f"{key} is {_shown(command[key])}, not text"
@@ -326,7 +326,7 @@ def _of(index: int | None) -> str:
 
 
 def _where(index: int | None, memory: str, area: str, address: int) -> dict[str, Any]:
-    """What a command aims at, for logs: no longer than a log can take."""
+    """Returns the target of a command for logs, with limited lengths."""
     return {
         **({} if index is None else {"command": index}),
         "memory": memory[:MAX_SHOWN],
@@ -342,7 +342,7 @@ def _malformed(index: int | None, detail: str, where: Mapping[str, Any] | None =
 
 
 def _shown(value: object) -> str:
-    """A value as JSON, cut short: it comes from outside, and goes into logs."""
+    """Formats an untrusted value for logs: as JSON, cut to a limited length."""
     if isinstance(value, dict | list):
         return "an object" if isinstance(value, dict) else "an array"
     text = msgspec.json.encode(value, enc_hook=repr).decode()

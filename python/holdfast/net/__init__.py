@@ -1,10 +1,10 @@
-"""Addresses, allow lists and name resolution: whom this process may connect to, and where that is.
+"""Addresses, allow lists and name resolution for outgoing connections, and their TLS settings.
 
-`addresses` says what an address is, `allow_list` which of them may be connected to, `resolver`
-which a name has. Every service judges by these; what differs is what a service allows by default,
-and how it words a refusal.
+`addresses` defines addresses and networks, `allow_list` decides which of them a service may connect
+to, `resolver` finds the addresses of a name. All services use these; they differ in the default
+allow list and in the wording of a refusal.
 
-This room must never read a configuration, and never connect.
+This package must never read a configuration, and never connect.
 """
 
 from __future__ import annotations

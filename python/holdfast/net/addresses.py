@@ -1,7 +1,7 @@
-"""IP addresses and networks of them.
+"""IP addresses and networks.
 
-An IPv4 address that is mapped into IPv6 (`::ffff:10.0.0.7`) is that IPv4 address, everywhere: it is
-`unmapped` before it is compared with anything.
+An IPv4-mapped IPv6 address (`::ffff:10.0.0.7`) is treated as the IPv4 address everywhere: it is
+`unmapped` before any comparison.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LOOPBACK: tuple[Network, ...] = (IPv4Network("127.0.0.0/8"), IPv6Network("::1/12
 """This machine."""
 
 MAPPED = IPv6Network("::ffff:0:0/96")
-"""The IPv4 addresses in IPv6."""
+"""The IPv4-mapped IPv6 addresses."""
 
 
 @overload
@@ -34,7 +34,7 @@ def unmapped(found: Network) -> Network: ...
 
 
 def unmapped(found: Address | Network) -> Address | Network:
-    """The IPv4 form of an address, or a network, that is mapped into IPv6; any other as it is."""
+    """Returns the IPv4 form of an IPv4-mapped address or network; any other is unchanged."""
     if isinstance(found, IPv6Address):
         return found.ipv4_mapped or found
     if isinstance(found, IPv6Network) and found.subnet_of(MAPPED):
@@ -44,14 +44,12 @@ def unmapped(found: Address | Network) -> Address | Network:
 
 
 def parse_address(text: str) -> Address:
-    """An address. Raises `ValueError`."""
+    """Parses an address. Raises `ValueError` if it is not one."""
     return unmapped(ipaddress.ip_address(text))
 
 
 def address_in(host: str) -> Address | None:
-    """The address that a host is, with or without the brackets that IPv6 has in a URL; `None` for
-    a name.
-    """
+    """Parses a host that is an address, IPv6 with or without brackets; `None` for a name."""
     try:
         return parse_address(unbracketed(host))
     except ValueError:
@@ -59,13 +57,13 @@ def address_in(host: str) -> Address | None:
 
 
 def holds(networks: Iterable[Network], address: Address) -> bool:
-    """Whether one of the networks has an address."""
+    """Returns whether one of the networks contains the address."""
     plain = unmapped(address)
     return any(plain in network for network in networks)
 
 
 def covers(networks: Iterable[Network], network: Network) -> bool:
-    """Whether all addresses of `network` are in some of `networks`."""
+    """Returns whether `networks` together contain every address of `network`."""
     if isinstance(network, IPv4Network):
         four = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
         return any(network.subnet_of(wider) for wider in four)
@@ -74,27 +72,27 @@ def covers(networks: Iterable[Network], network: Network) -> bool:
 
 
 def bracketed(host: str) -> str:
-    """A host as a URL has it: IPv6 in brackets."""
+    """Returns a host for a URL: an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def unbracketed(host: str) -> str:
-    """A host without the brackets of a URL."""
+    """Returns a host without the brackets of a URL."""
     return host.removeprefix("[").removesuffix("]")
 
 
 def joined(host: str, port: int) -> str:
-    """`10.0.0.9:502`, `[fd00::9]:502` or `plc.local:502`."""
+    """Joins host and port: `10.0.0.9:502`, `[fd00::9]:502` or `plc.local:502`."""
     return f"{bracketed(host)}:{port}"
 
 
 def reachable(host: str) -> str:
-    """The address that a client on this machine connects to, of one that is listened on."""
+    """Returns the address at which a local client reaches a listening address."""
     return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
 
 
 def certificate_name(host: str) -> str:
-    """What a certificate has for a host: an address without brackets, a name in lower case."""
+    """Returns a host as a certificate names it: without brackets, in lower case."""
     address = address_in(host)
     if address is not None:
         return str(address)

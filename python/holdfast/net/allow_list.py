@@ -1,8 +1,8 @@
-"""Whom a service may connect to: a list of networks with ports, and of serial devices.
+"""The targets that a service may connect to: networks with ports, and serial devices.
 
-A name is resolved once. What is judged is each address that it has, and the connection is made to
-one that was allowed, never to the name: what it means to a name server a moment later does not
-matter. Multicast and unspecified addresses are in no list, as they lead to everybody or to nobody.
+A name is resolved once. Each of its addresses is checked, and the connection is made to an allowed
+address, never to the name. So a DNS answer that changes after the check has no effect. Multicast
+and unspecified addresses are never allowed.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ ALL_PORTS = (1, LAST_PORT)
 
 @dataclass(frozen=True, slots=True)
 class AllowedNetwork:
-    """A network and the ports in it."""
+    """An allowed network and its allowed ports."""
 
     network: Network
     ports: tuple[int, int] | None = None
-    """The first and the last; without them it is 502 over every transport, and 802 over TLS."""
+    """The first and the last port. `None`: port 502 over every transport, and 802 over TLS."""
 
     def holds(self, address: Address, port: int, transport: Transport) -> bool:
-        """Whether a connection to this port of this address is one of them."""
+        """Returns whether this entry allows a connection to the address and port."""
         if self.ports is None:
             fits = port in (PORT, usual_port(transport))
         else:
@@ -48,7 +48,7 @@ class AllowedNetwork:
         return fits and holds((self.network,), address)
 
     def __str__(self) -> str:
-        """`NETWORK[:PORTS]`, as the gateway's list has it."""
+        """Returns `NETWORK[:PORTS]`, the form of the gateway's allow list."""
         network = self.network
         whole = network.prefixlen == network.max_prefixlen
         prefix = "" if whole else f"/{network.prefixlen}"
@@ -66,7 +66,7 @@ class AllowedNetwork:
 
 @dataclass(frozen=True, slots=True)
 class AllowedDevice:
-    """A serial device, by the path that callers name."""
+    """An allowed serial device; requests must name exactly this path."""
 
     path: str
 
@@ -78,17 +78,17 @@ AllowEntry: TypeAlias = AllowedNetwork | AllowedDevice
 
 
 class NotAllowed(Exception):
-    """None of the addresses of a host is in the list."""
+    """The list allows none of the addresses of a host."""
 
     def __init__(self, host: str, found: tuple[str, ...]) -> None:
         self.host = host
         self.found = found
-        """The addresses of a name; none where the host is an address."""
+        """The addresses of a name; empty if the host is an address."""
         super().__init__(f"{host} is not allowed")
 
 
 class AllowList:
-    """What may be connected to."""
+    """The targets that a service may connect to."""
 
     def __init__(self, entries: Iterable[AllowEntry]) -> None:
         self.entries = tuple(entries)
@@ -96,23 +96,23 @@ class AllowList:
         self._devices = {each.path for each in self.entries if isinstance(each, AllowedDevice)}
 
     def allows(self, address: Address, port: int, transport: Transport) -> bool:
-        """Whether this port of this address may be connected to."""
+        """Returns whether the list allows a connection to the address and port."""
         plain = unmapped(address)
         if plain.is_multicast or plain.is_unspecified:
             return False
         return any(entry.holds(plain, port, transport) for entry in self.networks)
 
     def allows_device(self, path: str) -> bool:
-        """Whether this serial device may be opened."""
+        """Returns whether the list allows the serial device."""
         return path in self._devices
 
     async def addresses(
         self, host: str, port: int, transport: Transport, resolve: Resolve
     ) -> tuple[str, ...]:
-        """The addresses of a host that may be connected to, at least one; IPv4 first, because a
-        device that has both seldom answers Modbus on IPv6.
+        """Returns the allowed addresses of a host, at least one.
 
-        Raises `NotAllowed`, and what `resolve` raises.
+        IPv4 is first, because devices with both families seldom answer Modbus on IPv6.
+        Raises `NotAllowed`, and the exceptions of `resolve`.
         """
         literal = address_in(host)
         named = [] if literal is not None else await resolve(host)

@@ -1,8 +1,8 @@
-"""Names to addresses, by the system's resolver.
+"""Resolves names with the system's resolver.
 
-Nothing can interrupt the system's resolver, so it is called in threads that nobody has to wait for:
-not a stop, not the end of the process, not a caller whose time is over. There are only so many of
-them; names beyond that wait for their turn, for as long as their callers do.
+A call to the system's resolver cannot be interrupted. So it runs in daemon threads, which neither a
+stop, nor the exit of the process, nor a caller with a timeout has to wait for. The number of
+threads is limited; further lookups are queued until their callers give up.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from typing import Any, TypeAlias
 from holdfast.net.addresses import address_in, unbracketed
 
 Resolve: TypeAlias = Callable[[str], Awaitable[list[str]]]
-"""The addresses of a name. Raises `NoSuchName`."""
+"""Resolves a name to its addresses. Raises `NoSuchName`."""
 
 SocketAddress: TypeAlias = tuple[int, Any]
-"""A family, and where to connect to in it."""
+"""An address family, and an address for `socket.connect`."""
 
 Lookup: TypeAlias = "Future[list[SocketAddress]]"
 
 MAX_LOOKUPS = 32
-"""Names that are looked up at once; more wait."""
+"""Limit of concurrent lookups; further ones are queued."""
 
 LOOKUP_TIMEOUT = 5.0
-"""Seconds that a name has to be looked up."""
+"""Seconds after which a lookup fails."""
 
 
 class NoSuchName(Exception):
-    """A name that means no address, or did not in time."""
+    """A name has no address, or the lookup timed out."""
 
     def __init__(self, host: str, why: str) -> None:
         self.host = host
@@ -41,9 +41,9 @@ class NoSuchName(Exception):
 
 
 class Resolver:
-    """The system's resolver, for any thread.
+    """The system's resolver. Thread-safe.
 
-    Awaited, it gives the addresses of a name, within `timeout` seconds.
+    Calling it is asynchronous and returns the addresses of a name within `timeout` seconds.
     """
 
     def __init__(self, timeout: float = LOOKUP_TIMEOUT, *, most: int = MAX_LOOKUPS) -> None:
@@ -52,10 +52,10 @@ class Resolver:
         self._lock = threading.Lock()
         self._threads = 0
         self._waiting: dict[Lookup, tuple[str, int | None]] = {}
-        """Those that nobody looks up yet, the first one first."""
+        """The queued lookups, oldest first."""
 
     async def __call__(self, host: str) -> list[str]:
-        """The addresses of a name, each once. Raises `NoSuchName`."""
+        """Returns the addresses of a name without duplicates. Raises `NoSuchName`."""
         try:
             async with asyncio.timeout(self._timeout):
                 found = await asyncio.wrap_future(self.look_up(host))
@@ -63,11 +63,11 @@ class Resolver:
             raise NoSuchName(host, f"no answer within {self._timeout:g} s") from None
         except OSError as error:
             raise NoSuchName(host, error.strerror or str(error)) from error
-        # One with a scope is of one link only: it is none that a name could mean to others.
+        # Addresses with a scope are link-local. They are valid on one link only.
         return list(dict.fromkeys(at[0] for _, at in found if "%" not in at[0]))
 
     def wait_for(self, host: str, port: int, timeout: float) -> list[SocketAddress]:
-        """What `look_up` comes to, within so many seconds. Raises `OSError`."""
+        """Returns the result of `look_up`, waiting at most `timeout` seconds. Raises `OSError`."""
         asked = self.look_up(host, port)
         try:
             return asked.result(timeout)
@@ -75,11 +75,12 @@ class Resolver:
             asked.cancel()
 
     def look_up(self, host: str, port: int | None = None) -> Lookup:
-        """Where a host is, in the order of the system. The future has `OSError` for a name that
-        means nothing; when it is cancelled before its turn, nothing is looked up.
+        """Starts a lookup. The future holds the addresses in the system's order, or `OSError`.
+
+        Cancelling the future removes a queued lookup.
         """
         asked: Lookup = Future()
-        if address_in(host) is not None:  # Which asks nobody.
+        if address_in(host) is not None:  # Needs no name server, so it returns at once.
             _settle(asked, unbracketed(host), port)
             return asked
         asked.add_done_callback(self._forget)
@@ -98,7 +99,7 @@ class Resolver:
     def _begin(self) -> None:
         try:
             threading.Thread(target=self._work, name="holdfast-resolver", daemon=True).start()
-        except RuntimeError:  # The system has no more threads; those that run go on.
+        except RuntimeError:  # No new thread can start. Running ones go on with the queue.
             with self._lock:
                 self._threads -= 1
                 left = [] if self._threads else list(self._waiting)
@@ -106,10 +107,10 @@ class Resolver:
                     del self._waiting[asked]
             for asked in left:
                 if asked.set_running_or_notify_cancel():
-                    asked.set_exception(OSError("no thread to look up a name"))
+                    asked.set_exception(OSError("can't start a thread to look up the name"))
 
     def _work(self) -> None:
-        """Looks up what waits, until nothing does."""
+        """Handles queued lookups until the queue is empty."""
         while True:
             with self._lock:
                 asked = next(iter(self._waiting), None)
@@ -124,12 +125,12 @@ def _settle(asked: Lookup, host: str, port: int | None) -> None:
     if not asked.set_running_or_notify_cancel():
         return
     try:
-        if "\0" in host:  # The system would look up what stands before it.
+        if "\0" in host:  # The system would look up only the part before the NUL.
             raise ValueError
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except OSError as error:
         asked.set_exception(error)
-    except ValueError:  # What IDNA or the system can't take, such as a label of 64 characters.
-        asked.set_exception(OSError(f"{host} can't be a host name"))
+    except ValueError:  # IDNA or the system refuses the name, such as a label of 64 characters.
+        asked.set_exception(OSError(f"{host} is not a valid host name"))
     else:
         asked.set_result([(family, address) for family, *_, address in found])

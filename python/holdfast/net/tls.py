@@ -1,6 +1,6 @@
-"""TLS with those that are connected to: which files say who is trusted, and what is shown.
+"""The TLS files of outgoing connections: trusted certificates, and the client's own.
 
-One form for devices and brokers, whether a URL, a configuration or a command line names the files.
+Devices and brokers share this form. A URL, a configuration or a command line names the files.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def alone(*, cert: bool, key: bool) -> tuple[str, str] | None:
-    """Which of certificate and key is given without the other, and that other: they go together."""
+    """Returns the given and the missing key when only one of `cert` and `key` is given."""
     if cert == key:
         return None
     return ("cert", "key") if cert else ("key", "cert")
@@ -25,22 +25,22 @@ def alone(*, cert: bool, key: bool) -> tuple[str, str] | None:
 
 @dataclass(frozen=True)
 class Tls:
-    """Who is trusted, and what is shown; the files are in PEM.
+    """The TLS files of a connection, in PEM.
 
-    Raises `ValueError` for a certificate without its key, and the other way round.
+    Raises `ValueError` for `cert` without `key`, or `key` without `cert`.
     """
 
     ca: str | None = None
-    """Certificates of authorities, or of the device itself; `None` for the system's."""
+    """Trusted CA certificates, or the device's own certificate; `None` for the system's CAs."""
     cert: str | None = None
     key: str | None = None
     name: str | None = None
-    """The name that the device's certificate has, if that is not its host."""
+    """The expected name in the device's certificate; `None` for the host."""
 
     def __post_init__(self) -> None:
         lonely = alone(cert=self.cert is not None, key=self.key is not None)
         if lonely is not None:
-            raise ValueError(f"{lonely[0]} is alone, allowed are cert and key, or none of both")
+            raise ValueError(f"{lonely[0]} without {lonely[1]}: give both, or neither")
 
     @staticmethod
     def of(
@@ -48,40 +48,40 @@ class Tls:
         cert: str | PathLike[str] | None = None,
         key: str | PathLike[str] | None = None,
     ) -> Tls:
-        """That of files, each of which may be left out."""
+        """Creates it from paths; each is optional."""
         return Tls(*(None if file is None else str(file) for file in (ca, cert, key)))
 
     @property
     def query(self) -> str:
-        """It in a URL, behind the question mark."""
+        """The query of a URL, without the question mark."""
         given = {key: value for key, value in asdict(self).items() if value is not None}
         return "&".join(f"{key}={quote(value)}" for key, value in given.items())
 
     def files(self) -> Iterator[tuple[str, str]]:
-        """The files that are given, with their keys."""
+        """Yields the key and the path of each given file."""
         for key in ("ca", "cert", "key"):
             file: str | None = getattr(self, key)
             if file is not None:
                 yield key, file
 
     def in_folder(self, folder: Path) -> Tls:
-        """The same with files that are relative to this folder made absolute."""
+        """Returns a copy with paths relative to `folder` resolved."""
         return replace(self, **{key: str(folder / file) for key, file in self.files()})
 
 
 NO_FILES = Tls()
-"""The system's authorities are trusted, and nothing is shown."""
+"""Trusts the system's CAs and presents no certificate."""
 
 
 def broker_context(tls: Tls) -> ssl.SSLContext:
-    """Checks certificate and host name of a broker; the files are read now, so a renewed one is
-    taken.
+    """Returns a context that checks the certificate and the host name of a broker.
 
-    Raises `OSError` for a file that can't be used.
+    The files are read at each call, so renewed certificates need no restart. Raises `OSError` for
+    an unusable file.
     """
     made = ssl.create_default_context(cafile=tls.ca)
     made.minimum_version = ssl.TLSVersion.TLSv1_2
     if tls.cert is not None:
-        # A password is given lest OpenSSL ask for one on the terminal.
+        # Without a password, OpenSSL would ask for one on the terminal.
         made.load_cert_chain(tls.cert, tls.key, password="")
     return made
