@@ -98,7 +98,7 @@ def test_a_broadcast_is_sent_and_not_waited_for(
     body, pdu = WRITES[path]
     answer = gateway.ask(path, to_all(line, **body, timeout=60000))
     assert (answer.status, answer.json["success"]) == (200, True)
-    assert answer.json["note"] == "a broadcast is sent, and nobody confirms it"
+    assert answer.json["note"] == "the broadcast was sent; devices do not confirm broadcasts"
     assert line.frames.get(timeout=wire.DEADLINE) == lines.rtu(pdu, unit=0)
     assert line.frames.empty()
     assert [each["outcome"] for each in log.of("gateway_write")] == ["sent"]
@@ -159,7 +159,7 @@ def test_what_needs_an_answer_is_no_broadcast(
 ) -> None:
     answer = gateway.ask(path, to_all(line, **body))
     assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
-    assert "nobody answers" in answer.json["error"]
+    assert "which has no response" in answer.json["error"]
     assert line.connections == 0
 
 
@@ -172,7 +172,7 @@ def test_over_tcp_unit_0_is_a_unit_as_any(gateway: Running) -> None:
         answer = gateway.ask("/write/register", {**body, "port": mute.port})
     assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
     assert answer.json["error"] == (
-        "Connection timeout: unit id 0 is the broadcast of serial lines, which nobody answers"
+        "Connection timeout: unit id 0 is the broadcast of serial lines, which has no response"
     )
 
 

@@ -56,7 +56,7 @@ def test_a_device_is_connected_to_and_read(
 ) -> None:
     view = opened(size, scheme)
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     view.says("Acme")
     view.says(HARMFUL)
     view.choose(quantity="8")
@@ -101,7 +101,7 @@ def test_a_register_is_written_after_old_and_new_were_seen(
     assert "" not in dialog.get_by_role("columnheader").all_text_contents()
     assert plant.read("holding_registers", 4, 1) == [1234], "not before it is confirmed"
     view.button("Write it").click()
-    view.says("Written, and read back")
+    view.says("Written and read back")
     assert plant.read("holding_registers", 4, 1) == [1237]
     expect(view.row(4).get_by_role("cell").first).to_have_text("1237")
 
@@ -116,7 +116,7 @@ def test_typed_values_are_written(opened: Opened, plant: holdfast.Memory) -> Non
     view.button("Review").click()
     expect(view.page.get_by_role("row", name="10 0 -1")).to_be_visible()
     view.button("Write it").click()
-    view.says("Written, and read back")
+    view.says("Written and read back")
     assert plant.read("holding_registers", 8, 4) == [0, 0x41AC, 0, 0xBF80]
 
 
@@ -140,7 +140,7 @@ def test_a_value_that_is_none_is_not_written(opened: Opened, plant: holdfast.Mem
     view.choose(type="uint16")
     view.button("Read").click()
     view.button("Write 4").click()
-    for text, says in (("70000", "is no register"), ("1, x", "is no register")):
+    for text, says in (("70000", "is not a register value"), ("1, x", "is not a register value")):
         view.page.get_by_role("textbox", name="New value").fill(text)
         view.button("Review").click()
         expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
@@ -214,13 +214,13 @@ def test_a_dead_device_is_told_in_plain_words(opened: Opened) -> None:
     with FakeDevice(lambda _: None) as mute:
         view.page.get_by_role("spinbutton", name="Timeout").fill("50")
         view.connect(port=mute.port)
-        view.says("No answer in time.")
+        view.says("The device did not respond in time.")
         view.says("Is the unit id right?")
         port = mute.port
     view.connect(port=port)
-    view.says("it takes no connection")
+    view.says("The connection was refused or failed.")
     view.connect(host="no-such-name.invalid")
-    view.says("Nobody knows this name.")
+    view.says("The name can't be resolved.")
 
 
 @both
@@ -233,7 +233,7 @@ def test_a_device_with_tls_is_connected_to_and_read(
         view = opened(size, scheme, tls=Tls(ca=str(authority.ca)))
         transport = view.page.get_by_role("combobox", name="Transport")
         port = view.page.get_by_role("spinbutton", name="Port")
-        name = view.page.get_by_role("textbox", name="Name in its certificate")
+        name = view.page.get_by_role("textbox", name="Name in certificate")
         expect(name).to_be_hidden()
         transport.select_option("tls")
         expect(port).to_have_value("802")
@@ -243,30 +243,30 @@ def test_a_device_with_tls_is_connected_to_and_read(
         transport.select_option("tls")
         expect(port).to_have_value("1502")
         view.connect(port=relay.address[1])
-        view.says("TLS was not agreed on.")
+        view.says("The TLS handshake failed.")
         view.says("the certificate is for 'drive-7', not for '127.0.0.1'")
         view.check()
         name.fill("drive-7")
         view.button("Connect").click()
-        view.says("The device answers")
+        view.says("The device responded")
         view.choose(quantity="4", interval="50")
         view.button("Watch").click()
         view.says("Watching holding registers")
         view.page.reload()
         expect(name).to_have_value("drive-7")
         view.button("Connect").click()
-        view.says("The device answers")
+        view.says("The device responded")
         transport.select_option("tcp")
         expect(name).to_be_hidden()
         view.connect(port=opened.port)
-        view.says("The device answers")
+        view.says("The device responded")
         assert "drive-7" not in view.page.url
 
 
 def test_a_refused_target_is_told_in_plain_words(opened: Opened) -> None:
     view = opened(allow=["10.0.0.0/8"])
     view.connect()
-    view.says("This gateway may not connect there.")
+    view.says("The gateway does not allow this target.")
     view.says("--allow")
 
 
@@ -275,7 +275,7 @@ def test_an_address_that_is_not_there_is_told_in_plain_words(opened: Opened) -> 
     view.connect()
     view.choose(address="5000")
     view.button("Read").click()
-    view.says("The device has no such address.")
+    view.says("The device does not have this address.")
     view.says("this page counts from 0")
 
 
@@ -284,7 +284,7 @@ def test_a_gateway_that_only_reads_offers_no_writing(opened: Opened) -> None:
     view.says("reads only")
     view.connect()
     view.button("Read").click()
-    view.says("This gateway only reads")
+    view.says("Writes are disabled")
     expect(view.button("Plot 0")).to_be_visible()
     expect(view.button("Write 0")).to_have_count(0)
 
@@ -294,12 +294,12 @@ def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
     box = view.page.get_by_label("Token", exact=True)
     box.fill("wrong")
     view.page.keyboard.press("Enter")
-    view.says("The gateway does not know this token.")
+    view.says("Unknown token.")
     box.fill(SECRET)
     view.page.keyboard.press("Enter")
     view.says("reads and writes")
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     view.choose(interval="50")
     view.button("Watch").click()
     view.says("Watching holding registers")
@@ -315,7 +315,7 @@ def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
 def test_a_device_is_part_of_the_address_of_the_page(opened: Opened) -> None:
     view = opened()
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     view.page.reload()
     expect(view.page.get_by_role("spinbutton", name="Port")).to_have_value(str(view.port))
     assert view.page.get_by_role("textbox", name="Device").input_value() == "127.0.0.1"
@@ -331,7 +331,7 @@ def test_the_keyboard_is_enough(opened: Opened, plant: holdfast.Memory) -> None:
     keyboard.type(str(view.port))
     page.get_by_role("button", name="Connect").focus()
     keyboard.press("Enter")
-    view.says("The device answers")
+    view.says("The device responded")
     expect(view.button("Connect")).to_be_focused()
     keyboard.press("Tab")
     expect(page.get_by_role("tab", name="Values")).to_be_focused()
@@ -354,7 +354,7 @@ def test_the_keyboard_is_enough(opened: Opened, plant: holdfast.Memory) -> None:
     expect(view.button("Write it")).to_be_focused()
     assert plant.read("holding_registers", 0, 1) != [4711]
     keyboard.press("Enter")
-    view.says("Written, and read back")
+    view.says("Written and read back")
     assert plant.read("holding_registers", 0, 1) == [4711]
     expect(view.button("Write 0")).to_be_focused()
     keyboard.press("Shift+Tab")
@@ -484,7 +484,7 @@ class Registers:
 def read_registers(view: View, port: int) -> None:
     """Connects and reads the ten registers."""
     view.connect(port=port)
-    view.says("The device answers")
+    view.says("The device responded")
     view.choose(type="uint16", quantity="10")
     view.button("Read").click()
     view.says("Holding registers 0 to 9: read in")
@@ -507,15 +507,15 @@ def test_a_write_that_is_refused_is_not_told_as_written(opened: Opened, leave: s
         read_registers(view, refusing.port)
         alert = write_4711(view).get_by_role("alert")
         expect(alert).to_contain_text("Not written.")
-        expect(alert).to_contain_text("The device failed at this.")
-        expect(alert).to_contain_text("look at the device")
-        expect(alert).to_contain_text("Read back: it is as it was before.")
+        expect(alert).to_contain_text("The device failed to carry out the request.")
+        expect(alert).to_contain_text("check the device")
+        expect(alert).to_contain_text("Read back: unchanged.")
         if leave == "escape":
             view.page.keyboard.press("Escape")
         else:
             view.button("Cancel").click()
-        view.says("Not written. Read back")
-        expect(view.page.get_by_text("what has changed is marked")).to_be_hidden()
+        view.says("Not written. The table shows the values read back.")
+        expect(view.page.get_by_text("Changes are marked")).to_be_hidden()
         expect(view.row(1).get_by_role("cell").first).to_have_text("1234")
         assert len(device.writes) == 1
 
@@ -534,12 +534,12 @@ def test_a_write_without_a_reply_is_told_as_unknown_and_read_back(
         view.page.get_by_role("spinbutton", name="Timeout").fill("300")
         read_registers(view, mute.port)
         alert = write_4711(view).get_by_role("alert")
-        expect(alert).to_contain_text("Not known whether it was written.")
-        expect(alert).to_contain_text("No answer in time.")
-        told = "what was to be written" if carried_out else "as it was before"
-        expect(alert).to_contain_text(f"Read back: it is {told}.")
+        expect(alert).to_contain_text("Unknown whether it was written.")
+        expect(alert).to_contain_text("The device did not respond in time.")
+        told = "the new values are there" if carried_out else "unchanged"
+        expect(alert).to_contain_text(f"Read back: {told}.")
         view.page.keyboard.press("Escape")
-        view.says("Not known whether it was written. Read back")
+        view.says("Unknown whether it was written. The table shows")
         expect(view.row(1).get_by_role("cell").first).to_have_text(
             "4711" if carried_out else "1234"
         )
@@ -556,10 +556,10 @@ def test_a_write_that_can_not_be_read_back_says_so(opened: Opened) -> None:
         expect(view.button("Write it")).to_be_visible()
         device.values = []
         view.button("Write it").click()
-        view.says("It could not be read back: read it before you go on.")
+        view.says("Reading back failed: read the values before you continue.")
         view.page.keyboard.press("Escape")
-        view.says("Not known whether it was written. It could not be read back.")
-        view.says("Old values of 127.0.0.1")
+        view.says("Unknown whether it was written. Reading back failed.")
+        view.says("Stale values of 127.0.0.1")
 
 
 def test_a_write_that_is_left_alone_is_told_when_it_ends(opened: Opened) -> None:
@@ -571,7 +571,7 @@ def test_a_write_that_is_left_alone_is_told_when_it_ends(opened: Opened) -> None
         dialog = write_4711(view)
         view.page.keyboard.press("Escape")
         expect(dialog).to_be_hidden()
-        view.says("Not known whether it was written. Read back")
+        view.says("Unknown whether it was written. The table shows")
 
 
 def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:
@@ -583,7 +583,7 @@ def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:
         view.button("Write 1").click()
         view.page.get_by_role("textbox", name="New value").fill("4711")
         view.button("Review").click()
-        view.says("The device has no such address.")
+        view.says("The device does not have this address.")
         view.says("this page counts from 0")
         assert device.writes == []
 
@@ -597,18 +597,18 @@ def test_a_change_of_the_device_makes_what_is_shown_old(opened: Opened) -> None:
         expect(view.page.get_by_text(f"Values of 127.0.0.1:{a.port}, unit 1")).to_be_visible()
         port = view.page.get_by_role("spinbutton", name="Port")
         port.fill(str(b.port))
-        view.says("Not connected: connect to go on.")
-        view.says(f"Old values of 127.0.0.1:{a.port}, unit 1")
+        view.says("Not connected: connect to continue.")
+        view.says(f"Stale values of 127.0.0.1:{a.port}, unit 1")
         for name in ("Write 1", "Read", "Watch", "Plot 1"):
             expect(view.button(name)).to_be_disabled()
-        expect(view.page.get_by_text("The device answers")).to_be_hidden()
+        expect(view.page.get_by_text("The device responded")).to_be_hidden()
         port.fill("1")
         view.button("Connect").click()
-        view.says("it takes no connection")
+        view.says("The connection was refused or failed.")
         expect(view.button("Write 1")).to_be_disabled()
-        view.says(f"Old values of 127.0.0.1:{a.port}, unit 1")
+        view.says(f"Stale values of 127.0.0.1:{a.port}, unit 1")
         view.connect(port=b.port)
-        view.says("The device answers")
+        view.says("The device responded")
         expect(view.button("Write 1")).to_have_count(0)
         view.button("Read").click()
         expect(view.row(1).get_by_role("cell").first).to_have_text("7")
@@ -626,7 +626,7 @@ def test_a_write_goes_to_the_device_of_the_table(opened: Opened) -> None:
         view.page.get_by_role("textbox", name="New value").fill("4711")
         view.button("Review").click()
         view.button("Write it").click()
-        view.says("Written, and read back")
+        view.says("Written and read back")
         assert (first.values[1], second.heard) == (4711, [])
 
 
@@ -639,13 +639,13 @@ def test_a_change_of_the_device_gives_up_what_is_under_way(opened: Opened) -> No
         view.says("Not connected")
         expect(view.button("Read")).to_be_hidden()
         view.connect()
-        view.says("The device answers")
+        view.says("The device responded")
         view.choose(interval="50")
         view.button("Watch").click()
         view.says("Watching holding registers")
         view.page.get_by_role("spinbutton", name="Unit id").fill("2")
         view.says("Stopped.")
-        view.says("Old values of")
+        view.says("Stale values of")
 
 
 def only(*there: range) -> Callable[[bytes], bytes]:
@@ -692,7 +692,7 @@ def test_a_click_on_a_range_reads_no_more_than_that(
         view.says(f"Holding registers 1000 to {999 + asked}: read in")
         assert device.asked[-1] == bytes([3]) + (1000).to_bytes(2) + asked.to_bytes(2)
         expect(view.page.get_by_role("combobox", name="Type")).to_have_value(kind)
-        expect(view.page.get_by_text("one read does not take")).to_be_visible(
+        expect(view.page.get_by_text("one read covers only a part of it")).to_be_visible(
             visible=len(there) > asked
         )
 
@@ -702,11 +702,11 @@ def test_a_map_of_samples_says_so_and_offers_all(opened: Opened) -> None:
         view = opened()
         view.connect(port=device.port)
         survey(view, 980, 1149)
-        view.says("gaps may hide more")
+        view.says("gaps may contain more")
         expect(view.page.get_by_role("button", name="Read holding registers")).to_have_count(1)
-        view.button("Ask every address (slow)").click()
+        view.button("Read every address (slow)").click()
         expect(view.button("Read holding registers 1120–1121")).to_be_visible()
-        expect(view.page.get_by_text("gaps may hide more")).to_be_hidden()
+        expect(view.page.get_by_text("gaps may contain more")).to_be_hidden()
         asked = {int.from_bytes(pdu[1:3]) for pdu in device.asked}
         assert set(range(980, 1000)) <= asked
 
@@ -723,13 +723,13 @@ def test_a_device_without_function_3_can_be_read(opened: Opened, answer: str) ->
         view.page.get_by_role("spinbutton", name="Timeout").fill("200")
         view.connect(port=device.port)
         if answer == "nothing":
-            view.says("No answer in time.")
+            view.says("The device did not respond in time.")
             view.page.get_by_role("spinbutton", name="Timeout").fill("201")
-            expect(view.button("Go on all the same")).to_be_hidden()
+            expect(view.button("Continue anyway")).to_be_hidden()
             view.button("Connect").click()
-            view.button("Go on all the same").click()
+            view.button("Continue anyway").click()
             expect(view.page.get_by_role("tab", name="Values")).to_be_focused()
-        view.says("It did not answer this probe, holding register 0; other areas may")
+        view.says("It can't read holding register 0, but other areas may work")
         view.choose(area="4", type="uint16", quantity="2")
         view.button("Read").click()
         view.says("Input registers 0 to 1: read in")
@@ -785,18 +785,18 @@ def test_any_type_is_written(
     view.page.get_by_role("textbox", name="New value").fill(given)
     view.button("Review").click()
     view.button("Write it").click()
-    view.says("Written, and read back")
+    view.says("Written and read back")
     assert plant.read("holding_registers", 8, len(held)) == held
 
 
 @pytest.mark.parametrize(
     ("fields", "given", "says"),
     [
-        ({"type": "string", "size": "4"}, "abcde", "up to 4 characters of ASCII"),
-        ({"type": "string", "size": "4"}, "5 °C", "up to 4 characters of ASCII"),
+        ({"type": "string", "size": "4"}, "abcde", "up to 4 ASCII characters"),
+        ({"type": "string", "size": "4"}, "5 °C", "up to 4 ASCII characters"),
         ({"type": "bytes", "size": "4"}, "0a0b", "4 pairs of hexadecimal digits"),
-        ({"type": "bit", "size": "3"}, "2", "is no bit"),
-        ({"type": "bit", "size": "3"}, "1, 0", "One bit at a time"),
+        ({"type": "bit", "size": "3"}, "2", "is not a bit"),
+        ({"type": "bit", "size": "3"}, "1, 0", "Write one bit at a time"),
     ],
 )
 def test_a_value_that_is_none_of_a_type_is_told(
@@ -815,8 +815,8 @@ def test_a_value_that_is_none_of_a_type_is_told(
 @pytest.mark.parametrize(
     ("kind", "letters", "says"),
     [
-        ("int64", "ABCDEFGG", "has A to H once each"),
-        ("int64", "ACBDEFGH", "A register stays whole"),
+        ("int64", "ABCDEFGG", "contains each of A to H once"),
+        ("int64", "ACBDEFGH", "The bytes of a register stay together"),
         ("int64", "CDEFGHAB", "applied twice"),
         ("int32", "EFGHABCD", "int32 has 4"),
     ],
@@ -826,7 +826,7 @@ def test_letters_that_are_no_order_are_told(
 ) -> None:
     view = opened()
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     view.choose(type=kind, order="letters", letters=letters)
     told = view.page.locator("#letters").evaluate("(each) => each.validationMessage")
     assert says in told
@@ -855,20 +855,20 @@ def test_all_orders_of_eight_bytes_are_shown(opened: Opened, plant: holdfast.Mem
 def test_a_field_that_the_gateway_refuses_is_marked(opened: Opened) -> None:
     view = opened()
     view.connect(host="no name")
-    view.says("The gateway can't take this request.")
+    view.says("The request is malformed.")
     view.says("Check the marked value.")
     host = view.page.get_by_role("textbox", name="Device")
     expect(host).to_have_attribute("aria-invalid", "true")
     assert host.evaluate("(each) => getComputedStyle(each).borderColor") == "rgb(164, 39, 27)"
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     expect(host).not_to_have_attribute("aria-invalid", "true")
 
 
 def test_a_range_is_checked_before_it_is_watched_or_read(opened: Opened) -> None:
     view = opened(limits={"interval": 0.1})
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     for fields, wrong in (
         ({"interval": "5"}, "interval"),
         ({"interval": "100", "address": ""}, "address"),
@@ -886,10 +886,10 @@ def test_whole_values_are_read_and_that_is_told(opened: Opened) -> None:
     view.connect()
     view.choose(quantity="125")
     view.button("Read").click()
-    view.says("Each float32 takes 2 registers: 124 rather than 125.")
+    view.says("Each float32 has 2 registers: 124 instead of 125.")
     view.choose(quantity="1")
     view.button("Watch").click()
-    view.says("Each float32 takes 2 registers: 2 rather than 1.")
+    view.says("Each float32 has 2 registers: 2 instead of 1.")
 
 
 def test_a_plot_that_can_not_be_is_told(opened: Opened) -> None:
@@ -901,21 +901,21 @@ def test_a_plot_that_can_not_be_is_told(opened: Opened) -> None:
     box = view.page.get_by_role("spinbutton", name="Plot address")
     box.fill("5000")
     view.button("Add plot").click()
-    view.says("5000 is not watched: 0 to 19 are.")
+    view.says("5000 is not watched, only 0 to 19.")
     for address in range(9):
         box.fill(str(address))
         view.button("Add plot").click()
-    view.says("There are 8 plots, which is the most.")
+    view.says("There can be at most 8 plots.")
     box.fill("3")
     view.button("Add plot").click()
-    view.says("3 is plotted.")
+    view.says("3 is already plotted.")
     expect(view.button("Remove the plot of 3")).to_be_visible()
 
 
 def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
     view = opened()
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     view.choose(quantity="2", interval="50")
     told = {"time": 0, "rtt": 0, "address": 0, "quantity": 2, "format": "registers"}
     body = json.dumps({**told, "values": [0, 0], "typed": [0.0], "typedText": ["0"]})
@@ -930,8 +930,8 @@ def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
 
     view.page.route("**/api/modbus/watch*", gone)
     view.button("Watch").click()
-    view.says("The gateway has ended the watch, or is gone. It goes on by itself")
-    view.says("Old values of")
+    view.says("The gateway ended the watch or does not answer. The watch resumes")
+    view.says("Stale values of")
     view.page.unroute("**/api/modbus/watch*")
     view.says("Watching holding registers 0 to 1")
     expect(view.row(0).locator(".typed")).to_have_text("21.5")
@@ -973,18 +973,18 @@ def test_old_values_can_be_read(opened: Opened) -> None:
             view.button("Read").click()
             view.says("read in")
             view.page.get_by_role("spinbutton", name="Unit id").fill("2")
-            view.says("Old values")
+            view.says("Stale values")
             assert view.page.evaluate(MIN_CONTRAST, f"#table :is({selector})") >= 4.5
             view.page.get_by_role("spinbutton", name="Unit id").fill("1")
             view.button("Connect").click()
-            view.says("The device answers")
+            view.says("The device responded")
 
 
 @both
 def test_no_choice_is_cut(opened: Opened, size: Any, scheme: Literal["light", "dark"]) -> None:
     view = opened(size, scheme)
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     assert view.page.evaluate(CUT) == []
 
 

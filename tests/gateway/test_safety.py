@@ -366,8 +366,8 @@ def test_a_token_line_shows_its_secret_once() -> None:
         (f"{SECRET}\n", ":1: no token"),
         ("a b " + "a" * 64, ":1: no token"),
         ("/x " + "a" * 64, "name"),
-        ("x " + "a" * 64 + "\nx " + "b" * 64, ":2: the same"),
-        ("x " + "a" * 64 + "\ny " + "A" * 64, ":2: the same"),
+        ("x " + "a" * 64 + "\nx " + "b" * 64, ":2: duplicate name or token"),
+        ("x " + "a" * 64 + "\ny " + "A" * 64, ":2: duplicate name or token"),
     ],
 )
 def test_what_is_no_token_file_is_refused(tmp_path: Path, text: str, says: str) -> None:
@@ -500,7 +500,7 @@ def test_a_dead_device_leaves_places_for_others(server: holdfast.Server) -> None
             assert asked.acquire(timeout=wire.DEADLINE)
         answer = running.ask("/read", body)
         assert answer.headers["holdfast-reason"] == "busy"
-        assert f"2 requests to 127.0.0.1:{device.port} are under way" in answer.json["error"]
+        assert f"too many requests to 127.0.0.1:{device.port}: 2 are active" in answer.json["error"]
         live = {"host": "127.0.0.1", "port": server.address[1]}
         assert running.ask("/connect", live).status == 200
         assert [each.result(wire.DEADLINE).status for each in waiting] == [500, 500]
@@ -523,7 +523,7 @@ def test_a_request_that_had_no_turn_says_that_it_was_not_sent() -> None:
         answer = running.ask("/read", read(device, timeout=50))
         assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
         assert answer.json["error"] == (
-            "Connection timeout: it waited for its turn behind other requests to this device, "
+            "Connection timeout: the request waited behind other requests to this device, "
             "and was not sent"
         )
         assert waiting.result(wire.DEADLINE).json["error"] == "Connection timeout"

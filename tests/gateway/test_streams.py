@@ -305,7 +305,7 @@ def test_a_map_has_a_longest_time() -> None:
         FakeDevice(lambda pdu: exception(pdu, 2)) as device,
     ):
         result = mapped(gateway, device.port, exact=True).next("result")
-    assert (result["success"], result["error"]) == (False, "not done within 0.1 s")
+    assert (result["success"], result["error"]) == (False, "not finished within 0.1 s")
     assert result["reason"] == "unfinished"
 
 

@@ -50,7 +50,7 @@ def connect(opened: Opened, scheme: Scheme) -> View:
     """A device that answers."""
     view = opened(DESK, scheme)
     view.connect()
-    view.says("The device answers")
+    view.says("The device responded")
     return view
 
 
@@ -109,7 +109,7 @@ def dead(opened: Opened, scheme: Scheme) -> View:
         view = opened(LOW, scheme)
         view.page.get_by_role("spinbutton", name="Timeout").fill("200")
         view.connect(port=mute.port)
-        view.says("No answer in time.")
+        view.says("The device did not respond in time.")
         return view
 
 
@@ -117,7 +117,7 @@ def refused(opened: Opened, scheme: Scheme) -> View:
     """A device that the gateway may not connect to."""
     view = opened(LOW, scheme, allow=["10.0.0.0/8"])
     view.connect(host="192.168.7.20", port=502)
-    view.says("This gateway may not connect there.")
+    view.says("The gateway does not allow this target.")
     return view
 
 

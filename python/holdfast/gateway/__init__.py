@@ -1,4 +1,4 @@
-"""The gateway: Modbus devices over HTTP, and a console, see docs/gateway.md."""
+"""The gateway: access to Modbus devices over HTTP, with a console, see docs/gateway.md."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 
 
 class Gateway:
-    """A gateway on a socket that listens already.
+    """A gateway on a listening socket.
 
-    `resolve` makes a name addresses, `dial` makes the client of an address.
+    `resolve` resolves names, `dial` creates the client for an address.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Gateway:
     ) -> None:
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
-        """Where it listens."""
+        """The address it listens on."""
         self._app = App(settings, self.address, resolve=resolve, dial=dial)
         self._host = Host(
             "gateway",
@@ -50,14 +50,14 @@ class Gateway:
         )
 
     def run(self, stop: Stop) -> None:
-        """Serves in this thread until `stop`."""
+        """Serves in this thread until `stop` is set."""
         stop.then(self._app.end)
         self._host.run(stop)
 
     def counts(self) -> dict[str, int]:
-        """What became of connections, from any thread."""
+        """Returns the counts of connections. Thread-safe."""
         return self._host.counts()
 
     def status(self) -> dict[str, object]:
-        """Where it listens, and what became of connections and requests, from any thread."""
+        """Returns the address and the counts of connections and requests. Thread-safe."""
         return {"address": self.address, "connections": self.counts(), **self._app.counts()}

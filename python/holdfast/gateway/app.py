@@ -1,7 +1,6 @@
-"""The routes: who asks for what, and how that is answered.
+"""The ASGI application of the gateway: routing, authorization, limits and responses.
 
-A plain ASGI application. Nothing here talks to a device: that is `device`'s work, for as long as
-the client is there.
+Only `device` communicates with devices. A request is cancelled when its client disconnects.
 """
 
 from __future__ import annotations
@@ -47,10 +46,10 @@ ENDPOINTS: tuple[Operation, ...] = (*reading.ENDPOINTS, *writing.ENDPOINTS, *ide
 JSON = b"application/json"
 REASON = b"holdfast-reason"
 FORM = b"application/x-www-form-urlencoded"
-"""What curl calls a body when it is not told: taken for JSON, as if it said so."""
+"""The default Content-Type of `curl -d`. The gateway treats it as JSON."""
 
-STOPPING = "the gateway stops; a write that was under way may have been carried out"
-WRITES_ON = "--writes, or access: read-write in the configuration, lets this gateway write"
+STOPPING = "the gateway is stopping; a pending write may have been carried out"
+WRITES_ON = "enable them with --writes, or with access: read-write in the configuration"
 
 
 class App:
@@ -66,7 +65,7 @@ class App:
     ) -> None:
         self._settings = settings
         limits = self._limits = settings.limits
-        # A request has no more time than this in any case.
+        # A lookup never needs more time than the longest request.
         self._egress = Egress(AllowList(settings.allow), resolve or Resolver(limits.timeout))
         self._pool = Pool(
             most=limits.devices,
@@ -78,7 +77,7 @@ class App:
         )
         self._running = {"requests": 0, "streams": 0}
         self._shares: dict[tuple[str, int], int] = {}
-        """Requests that are under way by host and port."""
+        """The number of pending requests by host and port."""
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
@@ -97,10 +96,10 @@ class App:
         }
 
     def counts(self) -> dict[str, object]:
-        """How many requests came, and what became of them, from any thread.
+        """Returns the counts of requests. Thread-safe.
 
-        `refused` has them by their reason, `failed` are those whose device did not answer, `writes`
-        those that may have changed one, `devices` the connections that are kept.
+        `refused` are counts by reason. `failed` are requests without a valid response of the
+        device, `writes` are writes that were sent, `devices` are open connections to devices.
         """
         return {
             "requests": self._requests,
@@ -111,9 +110,9 @@ class App:
         }
 
     def end(self) -> None:
-        """Ends all streams. From any thread."""
+        """Ends all streams. Thread-safe."""
         if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # It has ended.
+            with contextlib.suppress(RuntimeError):  # The loop is already closed.
                 self._loop.call_soon_threadsafe(self._ending.set)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -134,7 +133,7 @@ class App:
             pass
         except Exception:
             logs.problem("request_failed", listener="gateway", peer=request.peer)
-            with contextlib.suppress(RuntimeError):  # The answer has begun: it ends unfinished.
+            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
                 body = _error("internal error, see the log")
                 status = FAILURE.status
                 await self._reply(request, send, body, status=status, reason="internal_error")
@@ -142,10 +141,10 @@ class App:
     async def _answer(self, request: Request, send: Send) -> None:
         hosts = len(request.headers(b"host"))
         if hosts > 1 or (hosts == 0 and request.scope["http_version"] == "1.1"):
-            raise malformed(f"{hosts} headers Host, HTTP/1.1 has one")
+            raise malformed(f"{hosts} Host headers, HTTP/1.1 requires exactly one")
         route = self.routes.get(request.path)
         if route is None:
-            raise BadRequest("not_found", f"there is nothing at {shown(request.path)}")
+            raise BadRequest("not_found", f"no resource at {shown(request.path)}")
         allowed, handler = route
         head = request.method == "HEAD" and allowed == "GET" and request.path != watching.PATH
         if request.method == allowed or head:
@@ -169,7 +168,7 @@ class App:
             who=request.who,
             path=request.path[:100],
             reason=unfit.reason,
-            # It may repeat values that were to be written.
+            # The detail may contain values to be written, which are never logged.
             detail="-" if unfit.reason == "malformed" else unfit.detail,
         )
         request.more_headers += headers_with(status)
@@ -196,23 +195,23 @@ class App:
             headers.append((b"connection", b"close"))
         await respond(send, status, headers, body)
 
-    # Who asks, and how much at once.
+    # Authorization and limits.
 
     def _admit(self, request: Request) -> None:
-        """Raises `BadRequest` for a request of nobody who may ask."""
+        """Raises `BadRequest` for a request of another site's page or without a valid token."""
         if request.is_foreign:
-            raise BadRequest("foreign_page", "a page of another site asks for this")
+            raise BadRequest("foreign_page", "the request is from a page of another site")
         if self._settings.tokens:
             request.who = request.owner(self._settings.tokens)
         elif not request.is_direct:
-            detail = "Host is a name, without tokens allowed are IP addresses and localhost"
+            detail = "Host is a name, allowed without tokens: an IP address or localhost"
             raise BadRequest("foreign_page", detail)
 
     @contextlib.contextmanager
     def _place(self, kind: str, most: int) -> Iterator[None]:
-        """One of the places for what runs at once. Raises `BadRequest`."""
+        """Limits how many `kind` run at once. Raises `BadRequest` above the limit."""
         if self._running[kind] >= most:
-            raise BadRequest("busy", f"{most} {kind} are under way, which is the limit")
+            raise BadRequest("busy", f"too many {kind}: {most} are active, which is the limit")
         self._running[kind] += 1
         try:
             yield
@@ -221,12 +220,12 @@ class App:
 
     @contextlib.contextmanager
     def _share(self, device: RequestedDevice) -> Iterator[None]:
-        """One of the places that requests of one device have. Raises `BadRequest`."""
+        """Limits the pending requests to one device. Raises `BadRequest` above the limit."""
         key, most = (device.host.lower(), device.port), self._limits.requests_of_device
         if self._shares.get(key, 0) >= most:
             where = f"{device.host}:{device.port}"
             raise BadRequest(
-                "busy", f"{most} requests to {where} are under way, which is the limit"
+                "busy", f"too many requests to {where}: {most} are active, which is the limit"
             )
         self._shares[key] = self._shares.get(key, 0) + 1
         try:
@@ -237,14 +236,17 @@ class App:
                 del self._shares[key]
 
     async def _end(self, grace: float) -> None:
-        """Returns when the gateway has been ending for so many seconds."""
+        """Returns `grace` seconds after the gateway began to stop."""
         await self._ending.wait()
         await asyncio.sleep(grace)
 
     async def _while_there(
         self, request: Request, work: Coroutine[Any, Any, None], *, grace: float
     ) -> None:
-        """Work that is given up when the client is gone, and `grace` after the gateway ends."""
+        """Runs work. Cancels it when the client disconnects, or `grace` seconds after a stop.
+
+        Raises `ClientDisconnected` in both cases.
+        """
         task = asyncio.create_task(work)
         others: list[asyncio.Task[Any]] = [
             asyncio.create_task(request.gone()),
@@ -260,7 +262,7 @@ class App:
                 each.cancel()
             await asyncio.gather(task, *others, return_exceptions=True)
 
-    # Requests of devices.
+    # Requests to devices.
 
     def _handler(self, endpoint: Operation) -> Handler:
         longest = round(1000 * self._limits.timeout)
@@ -273,7 +275,7 @@ class App:
                 given = from_json(await request.body(self._limits.body), fields)
                 changes = endpoint.writes(given)
                 if changes and not self._settings.writes:
-                    raise BadRequest("writes_off", f"writes are off: {WRITES_ON}")
+                    raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
                 device = RequestedDevice(
                     self._egress, self._pool, given, broadcast=endpoint.broadcast
                 )
@@ -284,7 +286,7 @@ class App:
         return handle
 
     async def _while_there_or_told(self, request: Request, work: Coroutine[Any, Any, None]) -> None:
-        """The same for a request that is answered when the gateway ends."""
+        """As `_while_there`, but a request that a stop cancels is answered with `stopping`."""
         try:
             await self._while_there(request, work, grace=self._limits.ending)
         except ClientDisconnected:
@@ -329,7 +331,7 @@ class App:
         *,
         sent: bool,
     ) -> None:
-        """Counts a write that was sent, and tells who wrote where, without the values."""
+        """Counts a write that was sent, and logs it without the values."""
         self._writes += sent
         logs.write(
             logging.INFO,
@@ -376,7 +378,7 @@ class App:
             if self._ending.is_set():
                 await stream.end()
 
-    # Everything else.
+    # Status, documents and console.
 
     async def _status(self, request: Request, send: Send) -> None:
         self._admit(request)
@@ -408,7 +410,7 @@ class App:
 
 
 def rejection(reason: str, detail: str) -> tuple[Headers, bytes]:
-    """The headers and the JSON of a refusal."""
+    """Returns the headers and the JSON of a refusal."""
     body = _error(detail)
     return [*headers_of(JSON, body), (REASON, reason.encode())], body
 

@@ -1,4 +1,4 @@
-"""The files of the console: what is at `/`, without a build step."""
+"""The static files of the console at `/`. They need no build step."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FILES = {
         if file.suffix in KINDS and file.name != "index.html"
     },
 }
-"""Files by their paths; nothing else is served."""
+"""The files by URL path. Only these are served."""
 
 HEADERS: Headers = [
     (
@@ -43,6 +43,6 @@ HEADERS: Headers = [
 
 @functools.cache
 def read(path: str) -> tuple[bytes, bytes]:
-    """The type and the content of a file."""
+    """Returns the content type and the content of a file."""
     file = FILES[path]
     return KINDS[file.suffix], file.read_bytes()

@@ -1,4 +1,4 @@
-"""Broadcasts: writes to unit id 0 of a serial line behind RTU over TCP, which nobody answers."""
+"""Broadcasts: writes to unit id 0 over RTU over TCP. Devices do not respond to them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 TURNAROUND = 0.1
-"""Seconds that devices get to carry a broadcast out (Modbus over Serial Line V1.02, 2.4.1)."""
+"""Seconds for devices to carry out a broadcast (Modbus over Serial Line V1.02, section 2.4.1)."""
 
-NOTE = "a broadcast is sent, and nobody confirms it"
+NOTE = "the broadcast was sent; devices do not confirm broadcasts"
 
 
 def broadcast(
     call: Callable[[Client], Awaitable[Result]],
 ) -> Callable[[Client], Awaitable[Result]]:
-    """The same call, of which only the request is sent, on a connection of its own."""
+    """Wraps a call so that it only sends the request, on a new connection."""
 
     async def send(client: Client) -> Result:
-        await client.close()  # The other side may take one connection only.
+        await client.close()  # The peer may accept only one connection.
         assert isinstance(client.target, NetworkTarget)
         return await call(_Broadcaster(client.target))
 
@@ -38,7 +38,7 @@ def broadcast(
 
 
 class _Broadcaster(Client):
-    """A client that waits for no reply."""
+    """A client that does not wait for a response."""
 
     def __init__(self, target: NetworkTarget) -> None:
         super().__init__(str(target))
@@ -65,11 +65,11 @@ class _Broadcaster(Client):
 
 
 def _judge(reply: bytes) -> None:
-    """Raises a `ModbusError` if the other side ended the connection, or sent an exception."""
+    """Raises a `ModbusError` if the peer closed the connection or sent an exception."""
     if not reply:
         raise ConnectionLost("connection lost: closed by the peer")
     if len(reply) > 1 and reply[1] & 0x80:
-        raise InvalidResponse(f"a broadcast was answered with an exception: {reply.hex(' ')}")
+        raise InvalidResponse(f"the peer answered a broadcast with an exception: {reply.hex(' ')}")
 
 
 def crc(body: bytes) -> bytes:

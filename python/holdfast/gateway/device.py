@@ -1,4 +1,4 @@
-"""A request's device: the only way from the gateway to the network."""
+"""The device of a request. All connections of the gateway to devices are made through it."""
 
 from __future__ import annotations
 
@@ -34,18 +34,17 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 TOO_MANY_BEFORE = (
-    "Connection timeout: it waited for its turn behind other requests to this device, and was not "
-    "sent"
+    "Connection timeout: the request waited behind other requests to this device, and was not sent"
 )
 NO_BROADCAST = (
-    "unitId 0 is the broadcast of a serial line, which nobody answers; with transport rtu+tcp "
-    f"allowed are writes by functions {listed(BROADCAST_CODES)}"
+    "unitId 0 is the broadcast of a serial line, which has no response; with transport rtu+tcp "
+    f"it allows only writes with functions {listed(BROADCAST_CODES)}"
 )
-UNIT_0 = "unit id 0 is the broadcast of serial lines, which nobody answers"
+UNIT_0 = "unit id 0 is the broadcast of serial lines, which has no response"
 
 
 class Failed(Exception):
-    """There was no connection, or no reply: why, in a word and in a sentence."""
+    """No connection, or no valid response: `reason` is a word, `detail` a sentence."""
 
     def __init__(self, reason: str, detail: str) -> None:
         self.reason = reason
@@ -54,15 +53,15 @@ class Failed(Exception):
 
 
 class RequestedDevice:
-    """The device that a request names, for as long as the request takes."""
+    """The device of one request."""
 
     def __init__(
         self, egress: Egress, pool: Pool, given: Mapping[str, Any], *, broadcast: bool = False
     ) -> None:
-        """`broadcast` says whether the request may go to all units of a serial line."""
+        """`broadcast`: whether the request may be a broadcast. Raises `BadRequest`."""
         self.transport: Transport = given["transport"]
         if given["serverName"] is not None and self.transport != "tls":
-            raise malformed("serverName goes with transport tls")
+            raise malformed("serverName requires transport tls")
         self.host: str = given["host"]
         self.port: int = given["port"] or usual_port(self.transport)
         self.unit: int = given["unitId"]
@@ -72,24 +71,25 @@ class RequestedDevice:
         self._name: str | None = given["serverName"]
         self.timeout: float = given["timeout"] / 1000
         self.rtt = 0
-        """Milliseconds that the last call took."""
+        """The duration of the last call, in milliseconds."""
         self.asked = False
-        """Whether a call has had its turn: then the device may have got something."""
+        """Whether a call was started, so that the device may have received a request."""
         self._waits = False
         self._egress = egress
         self._pool = pool
 
     @property
     def told(self) -> dict[str, Any]:
-        """Where it is, for answers."""
+        """The address of the device, for answers."""
         return {"host": self.host, "port": self.port, "unitId": self.unit}
 
     async def ask(
         self, call: Callable[[Client], Awaitable[Result]], *, repeat: bool = False
     ) -> Result:
-        """What a call comes to, within the time of the request; only reads are to be repeated.
+        """Returns the result of a call, within the timeout of the request.
 
-        Raises `Failed`, `BadRequest`, and `ModbusException` for what the device answers.
+        Set `repeat` only for reads: such a call is repeated if the connection was stale.
+        Raises `Failed`, `BadRequest`, and `ModbusException` for exception responses.
         """
         if self.is_broadcast:
             call = broadcast(call)
@@ -109,7 +109,7 @@ class RequestedDevice:
     async def attempt(
         self, call: Callable[[Client], Awaitable[Result]], *, repeat: bool = False
     ) -> Result:
-        """The same, but what goes wrong between here and the device raises a `ModbusError`."""
+        """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
         began = time.monotonic()
 
         def turn(client: Client) -> Awaitable[Result]:
@@ -127,14 +127,14 @@ class RequestedDevice:
         except NoSuchName as error:
             raise Failed("no_such_name", str(error)) from None
         except Full:
-            raise BadRequest("busy", "too many devices are talked to right now") from None
+            raise BadRequest("busy", "too many devices are in use, try again later") from None
         except Unusable as error:
             logs.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))
-            detail = "its certificates can't be used now, see the log of the gateway"
+            detail = "the gateway's TLS files can't be used, see the log of the gateway"
             raise Failed("internal_error", detail) from None
         except TimeoutError:
             raise RequestTimeout(f"no reply within {self.timeout} s") from None
-        except ValueError as error:  # The client's own checks, before anything is sent.
+        except ValueError as error:  # A check of the client, before anything is sent.
             raise malformed(str(error)) from None
         finally:
             self.rtt = round(1000 * (time.monotonic() - began))
@@ -145,23 +145,23 @@ class RequestedDevice:
         return "Connection timeout" if self.unit else f"Connection timeout: {UNIT_0}"
 
     def _reason(self, error: ConnectionLost) -> str:
-        """Why a connection could not be made or ended, in a word."""
+        """Returns the word for a failed or lost connection."""
         if isinstance(error, TlsFailed):
             return "tls_failed"
         return "connection_lost" if error.maybe_sent else "no_connection"
 
     def _explained(self, error: ConnectionLost) -> str:
-        """The same in a sentence, which has the host as the caller named it."""
+        """Returns the message for a failed or lost connection, with the host as requested."""
         if isinstance(error, ConnectFailed | TlsFailed) and not error.maybe_sent:
             return f"can't connect to {self.host}:{self.port}: {error.detail}"
         return str(error)
 
 
 def exception_name(error: ModbusException) -> str:
-    """The name of a Modbus exception."""
+    """Returns the name of a Modbus exception."""
     return error.name if error.name != "unknown" else f"Unknown exception: 0x{error.code:x}"
 
 
 def exception_text(error: ModbusException) -> str:
-    """A Modbus exception as a sentence."""
+    """Returns the message for a Modbus exception."""
     return f"Modbus exception: {exception_name(error)} (code 0x{error.code:x})"

@@ -1,4 +1,4 @@
-"""The way from the host of a request to addresses that the egress list has."""
+"""Resolves the host of a request to addresses that the egress list allows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from holdfast.types import Transport
 
 MAX_SHOWN = 4
-"""Addresses of a name that a refusal tells."""
+"""The most addresses of a name in an error message."""
 
 
 class Refused(Exception):
@@ -23,17 +23,17 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Route:
-    """A way to a device that may be gone: its addresses, each of them in the list."""
+    """The allowed addresses of a device, and how to connect to them."""
 
     transport: Transport
     addresses: tuple[str, ...]
     port: int
     name: str | None = None
-    """The name that the device's certificate must have, with TLS."""
+    """The expected name in the device's certificate; `None` without TLS."""
 
 
 class Egress:
-    """The list, and how names become addresses."""
+    """The egress list and the resolver."""
 
     def __init__(self, allowed: AllowList, resolve: Resolve) -> None:
         self._allowed = allowed
@@ -42,7 +42,7 @@ class Egress:
     async def route(
         self, transport: Transport, host: str, port: int, name: str | None = None
     ) -> Route:
-        """The way to a target; `name` is that of its certificate, if it is not the host.
+        """Returns the route to a target. `name` is the name in its certificate, default the host.
 
         Raises `Refused` and `NoSuchName`.
         """

@@ -1,4 +1,4 @@
-"""What an endpoint is: its fields, what it does, and how it is described."""
+"""The definition of an endpoint: its fields, its function and its description."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ TARGET: tuple[Field, ...] = (HOST, PORT, UNIT, TRANSPORT, SERVER_NAME)
 MILLISECONDS: Schema = {"type": "integer", "minimum": 0}
 
 EXAMPLE: dict[str, Any] = {"host": "plc.factory.local", "port": 502, "unitId": 1}
-"""The device of examples."""
+"""The device in examples."""
 
 
 def exception_answer(given: Given, device: RequestedDevice, error: ModbusException) -> Answer:
-    """What a Modbus exception is answered with."""
+    """Returns the answer for a Modbus exception."""
     about = {"address": given["address"]} if "address" in given else {}
     return {"success": False, "error": exception_text(error), **device.told, **about}
 
 
 def always(_: Given) -> bool:
-    """Every request changes something."""
+    """Every request is a write."""
     return True
 
 
 def never(_: Given) -> bool:
-    """No request changes anything."""
+    """No request is a write."""
     return False
 
 
 @dataclass(frozen=True)
 class Operation:
-    """One thing that can be asked of a device."""
+    """One operation on a device."""
 
     path: str
     name: str
@@ -62,19 +62,20 @@ class Operation:
     fields: tuple[Field, ...]
     carry_out: Callable[[Given, RequestedDevice], Awaitable[Answer]]
     properties: dict[str, Schema]
-    """The schemas of the answer's fields, but for those that all answers have."""
+    """The schemas of the answer's fields, except the fields that all answers have."""
     examples: dict[str, dict[str, Any]]
-    """Requests, by a title."""
+    """Example requests by title."""
     answer: dict[str, Any]
-    """The answer to the first example, but for what all answers have."""
+    """The answer to the first example, without the fields that all answers have."""
     description: str = ""
     writes: Callable[[Given], bool] = never
-    """Whether a request changes something on the device."""
+    """Returns whether a request is a write."""
     broadcast: bool = False
-    """Whether it may go to all units of a serial line; the answer has a `note` then."""
+    """Whether the request may be a broadcast; the answer then has a `note`."""
     timeout: int = 10_000
+    """The default timeout in milliseconds."""
     optional: tuple[str, ...] = ()
-    """Fields of the answer that are there only sometimes."""
+    """Optional fields of the answer."""
     on_exception: Callable[[Given, RequestedDevice, ModbusException], Answer] = exception_answer
 
 

@@ -1,4 +1,4 @@
-"""Server-sent events: one answer that goes on, event by event."""
+"""Server-sent events: a response that is a stream of events."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KIND = b"text/event-stream"
 
 
 class Stream:
-    """Sends events; between them a comment, so that both ends know that the other is there."""
+    """Sends events, and comments as heartbeats so that both peers notice a lost connection."""
 
     def __init__(self, send: Send, heartbeat: float) -> None:
         self._send = send
@@ -27,25 +27,25 @@ class Stream:
         self._loop = asyncio.get_running_loop()
         self._last = self._loop.time()
         self.began = False
-        """Whether there is an answer that can be ended."""
+        """Whether the response has begun."""
 
     async def begin(self) -> None:
-        """The header of the answer; it leaves with the first event."""
+        """Begins the response. The header is sent with the first event."""
         start = [(b"content-type", KIND), (b"x-accel-buffering", b"no"), *SAFE]
         self.began = True
         await self._send({"type": "http.response.start", "status": 200, "headers": start})
 
     async def event(self, name: str, data: Any) -> None:
-        """One event, whose data is JSON."""
+        """Sends one event with JSON data."""
         await self._write(b"event: %b\ndata: %b\n\n" % (name.encode(), msgspec.json.encode(data)))
 
     async def beat(self) -> None:
-        """A comment, if nothing was sent for a while."""
+        """Sends a heartbeat if nothing was sent for the heartbeat interval."""
         if self._loop.time() - self._last >= self._heartbeat:
             await self._write(b":\n\n")
 
     async def during(self, work: Coroutine[Any, Any, Result]) -> Result:
-        """What work comes to, with signs of life."""
+        """Returns the result of work, and sends heartbeats meanwhile."""
         task = asyncio.create_task(work)
         try:
             while not (await asyncio.wait([task], timeout=self._heartbeat))[0]:
@@ -56,13 +56,13 @@ class Stream:
             await asyncio.gather(task, return_exceptions=True)
 
     async def pause(self, until: float) -> None:
-        """Waits until a time of the event loop, with signs of life."""
+        """Waits until a time of the event loop, and sends heartbeats meanwhile."""
         while (left := until - self._loop.time()) > 0:
             await asyncio.sleep(min(left, self._heartbeat))
             await self.beat()
 
     async def end(self) -> None:
-        """Ends the answer."""
+        """Ends the response."""
         await self._send({"type": "http.response.body", "body": b""})
 
     async def _write(self, data: bytes) -> None:

@@ -1,7 +1,7 @@
-"""The fields of requests: what they are in JSON, in a query, and in the OpenAPI document.
+"""The fields of requests. One definition serves JSON, queries and the OpenAPI document.
 
-One description serves all three. Nothing is converted: an integer is written as one, and what is
-not a field is refused, so that no slip of the pen is taken for a default.
+Nothing is converted: an integer has no fraction or exponent. Unknown fields are refused, so that a
+misspelled field never falls back to its default.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
 REQUIRED: Any = object()
-"""In place of a default: there is none."""
+"""The default of a required field."""
 
 MAX_PARAMETERS = 32
 
@@ -35,21 +35,21 @@ _HOST = r"^(\[[0-9A-Fa-f:.]{2,45}\]|[0-9A-Fa-f:.]{2,45}|[A-Za-z0-9_]([A-Za-z0-9.
 
 @dataclass(frozen=True)
 class Field:
-    """One field, with a default unless it is `REQUIRED`; `None` means that it may be left out."""
+    """A field. It is required if `default` is `REQUIRED`; `None` means optional without default."""
 
     name: str
     schema: Schema
     text: str
     default: Any = REQUIRED
     refusal: Callable[[Any], str] | None = None
-    """What is said of a wrong value, where the usual words won't do."""
+    """Returns the error message for a wrong value; `None` for the default message."""
     allowed: str = ""
-    """What it may be, where the schema has no words for it."""
+    """The allowed values for error messages; empty to use the schema."""
     fits: Callable[[Any], bool] = lambda _: True
-    """Whether a value that fits the schema is one."""
+    """Additional check of a value that fits the schema."""
 
     def check(self, value: Any) -> Any:
-        """The value. Raises `BadRequest`."""
+        """Returns the value if it is valid. Raises `BadRequest`."""
         flaw = _flaw(value, self.schema)
         if flaw is None and self.fits(value):
             return value
@@ -58,7 +58,7 @@ class Field:
         raise malformed(f"{self.name}{flaw}" if self.refusal is None else self.refusal(value))
 
     def read(self, text: str) -> Any:
-        """A value from a query. Raises `BadRequest`."""
+        """Parses and checks a value from a query. Raises `BadRequest`."""
         kind = self.schema["type"]
         if kind == "integer" and re.fullmatch("(0|[1-9][0-9]{0,9})", text):
             return self.check(int(text))
@@ -66,18 +66,18 @@ class Field:
 
     @property
     def required(self) -> bool:
-        """Whether it must be given."""
+        """Whether the field is required."""
         return self.default is REQUIRED
 
     @property
     def described(self) -> Schema:
-        """Its schema with its text and its default."""
+        """The schema with the description and the default."""
         optional = {} if self.required or self.default is None else {"default": self.default}
         return {**self.schema, **optional, "description": self.text}
 
 
 def array(items: Schema, most: int) -> Schema:
-    """The schema of a list that is not empty."""
+    """The schema of an array with 1 to `most` elements."""
     return {"type": "array", "minItems": 1, "maxItems": most, "items": items}
 
 
@@ -90,7 +90,10 @@ ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
 
 
 def is_host(text: str) -> bool:
-    """Whether it is an IP address, or may be a name: what ends in a number is none."""
+    """Returns whether text is an IP address or a possible name.
+
+    A name must not end in a numeric label, because resolvers parse it as an IPv4 address.
+    """
     if address_in(text) is not None:
         return True
     last = text.removesuffix(".").rpartition(".")[2]
@@ -107,19 +110,19 @@ HOST = Field(
     fits=is_host,
 )
 PORT = Field(
-    "port", integer(1, LAST_PORT), f"Port; {STANDARD_PORT} if left out, {TLS_PORT} with `tls`", None
+    "port", integer(1, LAST_PORT), f"Port; default {STANDARD_PORT}, {TLS_PORT} with `tls`", None
 )
 UNIT = Field("unitId", UNIT_SCHEMA, "Unit id (slave address)", 1)
 TRANSPORT = Field(
     "transport",
     {"type": "string", "enum": list(TRANSPORTS)},
-    "How to talk to it; `tls` is Modbus TCP over TLS",
+    "Transport; `tls` is Modbus/TCP Security (Modbus TCP over TLS)",
     "tcp",
 )
 SERVER_NAME = Field(
     "serverName",
     {"type": "string", "maxLength": 253, "pattern": _HOST},
-    "With `tls`: the name or IP address that the device's certificate has, if it is not `host`",
+    "With `tls`: the name or IP address in the device's certificate; default `host`",
     None,
     allowed="a name or an IP address",
     fits=is_host,
@@ -129,14 +132,14 @@ DATATYPE = Field(
     "datatype",
     TEXT,
     "Type of the values: `int16`, `uint32`, `float32`, `bcd16`, `bit:3`, `string:20`, `bytes:4`, "
-    "`bool`, or an array as `float32[10]`",
+    "`bool`, or an array such as `float32[10]`",
     None,
-    allowed="a type as int16, float32, bcd16, bit:3, string:20 or float32[10]",
+    allowed="a type such as int16, float32, bcd16, bit:3, string:20 or float32[10]",
 )
 BYTE_ORDER = Field(
     "byteOrder",
     ORDER,
-    "Order of bytes: `ABCD`, `CDAB`, `BADC`, `DCBA`, or eight letters for eight bytes",
+    "Byte order: `ABCD`, `CDAB`, `BADC`, `DCBA`, or eight letters for eight bytes",
     "ABCD",
     allowed="ABCD, CDAB, BADC, DCBA, or eight letters A to H",
 )
@@ -149,23 +152,23 @@ AREA_LIST = Field(
         "uniqueItems": True,
         "items": {"type": "string", "enum": list(AREAS)},
     },
-    "The areas to look at; all four if left out",
+    "The areas to map; default all four",
     None,
 )
 
 
-def timeout(default: int, longest: int, text: str = "Milliseconds for all of it") -> Field:
-    """The field for a time limit."""
+def timeout(default: int, longest: int, text: str = "Timeout of the request in ms") -> Field:
+    """The field for a timeout in milliseconds."""
     return Field("timeout", integer(1, longest), text, default)
 
 
 def with_default(field: Field, default: Any) -> Field:
-    """The same field with another default."""
+    """Returns the field with another default."""
     return replace(field, default=default)
 
 
 def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
-    """The fields of a JSON object, defaults filled in. Raises `BadRequest`."""
+    """Parses the fields of a JSON object and fills in defaults. Raises `BadRequest`."""
     try:
         given = msgspec.json.decode(body)
         json.loads(body, object_pairs_hook=_without_twins)
@@ -177,7 +180,7 @@ def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> None:
-    """Raises `BadRequest` for a name that an object has twice."""
+    """Raises `BadRequest` for a duplicate name in an object."""
     seen: set[str] = set()
     for name, _ in pairs:
         if name in seen:
@@ -186,13 +189,13 @@ def _without_twins(pairs: list[tuple[str, Any]]) -> None:
 
 
 def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
-    """The fields of a query, defaults filled in. Raises `BadRequest`."""
+    """Parses the fields of a query and fills in defaults. Raises `BadRequest`."""
     try:
         pairs = parse_qsl(
             query.decode("latin-1"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS
         )
     except ValueError:
-        raise malformed(f"there are more than {MAX_PARAMETERS} parameters") from None
+        raise malformed(f"more than {MAX_PARAMETERS} parameters") from None
     known = {field.name: field for field in fields}
     given: dict[str, Any] = {}
     for name, text in pairs:
@@ -203,7 +206,7 @@ def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
 
 
 def malformed(detail: str) -> BadRequest:
-    """A wrong request."""
+    """Creates the error for a malformed request."""
     return BadRequest("malformed", detail)
 
 
@@ -223,7 +226,7 @@ def _filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]
 
 
 def _flaw(value: Any, schema: Schema) -> str | None:
-    """What is wrong with a value, to be put behind its name; `None` if nothing is."""
+    """Returns the error message after the value's name; `None` for a valid value."""
     kind = schema.get("type")
     if kind == "array":
         return _flaw_of_array(value, schema)
@@ -241,7 +244,7 @@ def _flaw(value: Any, schema: Schema) -> str | None:
         return None
     fits = isinstance(value, str) and re.fullmatch(schema.get("pattern", ".*"), value) is not None
     long = isinstance(value, str) and not 1 <= len(value) <= schema.get("maxLength", 8)
-    return f" is {told(value)}, which it can't be" if long or not fits else None
+    return f" is {told(value)}, which is not valid" if long or not fits else None
 
 
 def _flaw_of_array(value: Any, schema: Schema) -> str | None:
@@ -251,7 +254,7 @@ def _flaw_of_array(value: Any, schema: Schema) -> str | None:
     if not least <= len(value) <= most:
         return f" has {len(value)} elements, allowed are {least} to {most}"
     if schema.get("uniqueItems") and any(value.count(each) > 1 for each in value):
-        return " names something twice"
+        return " has duplicate elements"
     for index, item in enumerate(value):
         flaw = _flaw(item, schema["items"])
         if flaw is not None:
@@ -260,7 +263,7 @@ def _flaw_of_array(value: Any, schema: Schema) -> str | None:
 
 
 def told(value: Any) -> str:
-    """A value from outside, cut short."""
+    """Formats an untrusted value, cut to a limited length."""
     if isinstance(value, str):
         return shown(value)
     if isinstance(value, dict | list):
@@ -274,6 +277,6 @@ def _words(allowed: Sequence[Any]) -> str:
 
 
 def listed(entries: Iterable[object]) -> str:
-    """`5, 6 and 15`."""
+    """Joins entries: `5, 6 and 15`."""
     *most, last = map(str, entries)
     return f"{', '.join(most)} and {last}" if most else last

@@ -1,4 +1,4 @@
-"""What a device says of itself: diagnostics, its server id, its identification."""
+"""The endpoints for diagnostics, server id and device identification."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from holdfast.gateway.endpoint import Answer, Given
 
 MAX_WORDS = (MAX_PDU - 3) // 2
-"""Words that a request has room for behind its function and sub-function."""
+"""The most data words in a request, after function code and sub-function."""
 
 _NAMES = {
     name: "".join(word if at == 0 else word.title() for at, word in enumerate(name.split("_")))
@@ -70,26 +70,26 @@ ENDPOINTS = (
     Operation(
         "/api/modbus/diagnostics",
         "diagnostics",
-        "Diagnostics of a device on a serial line",
+        "Run diagnostics of a device on a serial line",
         (
             *TARGET,
             Field(
                 "subFunction", REGISTER, "0 echo, 2 diagnostic register, 11 to 18 counters, …", 0
             ),
-            Field("data", array(REGISTER, MAX_WORDS), "Words that go with it", [0]),
+            Field("data", array(REGISTER, MAX_WORDS), "Data words of the request", [0]),
         ),
         _diagnostics,
         {"subFunction": REGISTER, "data": REGISTERS, "rtt": MILLISECONDS},
         {"The echo": {**EXAMPLE, "subFunction": 0, "data": [0xA537]}},
         {**EXAMPLE, "subFunction": 0, "data": [0xA537], "rtt": 12},
-        "Function 8. Sub-functions other than 0, 2 and 11 to 18 change the device, and are refused "
-        "as writes are. 4, Force Listen Only Mode, has no reply.",
+        "Function 8. Sub-functions other than 0, 2 and 11 to 18 change the device, so they require "
+        "that writes are enabled. Sub-function 4, Force Listen Only Mode, has no response.",
         writes=lambda given: given["subFunction"] not in HARMLESS_DIAGNOSTICS,
     ),
     Operation(
         "/api/modbus/server-id",
         "serverId",
-        "What a device calls itself",
+        "Read the server id of a device",
         TARGET,
         _server_id,
         {
@@ -108,12 +108,12 @@ ENDPOINTS = (
             "data": "11ff",
             "rtt": 12,
         },
-        "Function 17. The layout is the device's own: `data` is all of it, in hex.",
+        "Function 17. The layout depends on the device: `data` is the whole response, in hex.",
     ),
     Operation(
         "/api/modbus/identify",
         "identify",
-        "Vendor, product and revision of a device",
+        "Read vendor, product and revision of a device",
         TARGET,
         _identify,
         {
@@ -122,7 +122,7 @@ ENDPOINTS = (
             "objects": {
                 "type": "object",
                 "additionalProperties": _HEX,
-                "description": "All objects by their ids, in hex",
+                "description": "All objects by id, in hex",
             },
             "rtt": MILLISECONDS,
         },
@@ -137,6 +137,6 @@ ENDPOINTS = (
             "objects": {"0": "41636d65", "1": "4637", "2": "322e31"},
             "rtt": 12,
         },
-        "Function 43/14, as many requests as the device wants.",
+        "Function 43/14. It takes several requests if the device splits its objects.",
     ),
 )

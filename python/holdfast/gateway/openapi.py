@@ -1,4 +1,4 @@
-"""The OpenAPI document, made from what the endpoints say of themselves."""
+"""The OpenAPI document, generated from the endpoints."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _DESCRIBED = (*EVERYWHERE, *ASKING, "unauthorized", *BODY, *DEVICE)
 
 
 def document(version: str, endpoints: Iterable[Operation], settings: Settings) -> dict[str, Any]:
-    """The document of a gateway with these settings."""
+    """Returns the document of a gateway with these settings."""
     secured = bool(settings.tokens)
     limits = settings.limits
     paths: dict[str, Any] = {each.path: {"post": _endpoint(each, limits)} for each in endpoints}
@@ -63,11 +63,11 @@ def document(version: str, endpoints: Iterable[Operation], settings: Settings) -
         "info": {
             "title": "Holdfast gateway",
             "version": version,
-            "summary": "Modbus devices over HTTP.",
-            "description": "Status 200 is for every reply that a device gave, a Modbus exception "
-            "among them, with `success` false then; 500 is for no connection and for no reply in "
-            "time. The header `Holdfast-Reason` has the reason of an error in a word. Addresses "
-            "count from 0. `timeout` covers connecting, sending and receiving. "
+            "summary": "Access to Modbus devices over HTTP.",
+            "description": "Every response of a device has status 200; a Modbus exception has "
+            "`success` false. A failed connection or a timeout has status 500. The header "
+            "`Holdfast-Reason` has the reason of an error as a word. Addresses count from 0. "
+            "`timeout` covers connecting, sending and receiving. "
             f"A body has at most {limits.body} bytes.",
         },
         "servers": [{"url": "/"}],
@@ -85,7 +85,7 @@ def _endpoint(endpoint: Operation, limits: GatewayLimits) -> dict[str, Any]:
     fields = (*endpoint.fields, timeout(min(endpoint.timeout, longest), longest))
     answer = {"success": {"const": True}, **_target(), **endpoint.properties}
     if endpoint.broadcast:
-        answer["note"] = {"type": "string", "description": "Of a broadcast: nobody confirms it"}
+        answer["note"] = {"type": "string", "description": "Only for a broadcast"}
     whole = object_of(answer, optional=(*endpoint.optional, "note"))
     example = {"success": True, **endpoint.answer}
     return {
@@ -95,7 +95,7 @@ def _endpoint(endpoint: Operation, limits: GatewayLimits) -> dict[str, Any]:
         "requestBody": _body(fields, endpoint.examples),
         "responses": {
             "200": json_answer(
-                "What the device answered", {"oneOf": [whole, ref("ModbusException")]}, example
+                "The device responded", {"oneOf": [whole, ref("ModbusException")]}, example
             ),
             **_refusals(*BODY, *_of_device(endpoint)),
             **FAILED,
@@ -112,10 +112,10 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
         surveying.PATH: {
             "post": {
                 "operationId": "map",
-                "summary": "Find out which addresses a device has",
-                "description": "By reading; nothing is written. Events: `progress` again and "
-                "again, then `result`. Samples are read, and ranges followed from there; with "
-                "`exact` every address is read.",
+                "summary": "Find the valid addresses of a device",
+                "description": "Reads samples, and follows each range to both ends; with `exact` "
+                "it reads every address. Nothing is written. Events: `progress` repeatedly, then "
+                "`result`.",
                 "requestBody": _body(
                     surveying.fields(limits),
                     {"Registers below 1000": {**EXAMPLE, "areas": list(AREAS[2:]), "last": 999}},
@@ -130,9 +130,9 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
         watching.PATH: {
             "get": {
                 "operationId": "watch",
-                "summary": "Poll a range, and send what changes",
-                "description": "Events: `values` with everything, `change` with what is other than "
-                "before, `problem` when there is no reply. Comments are signs of life.",
+                "summary": "Poll a range and stream changes",
+                "description": "Events: `values` with all values, `change` with the changed "
+                "values, `problem` for a Modbus exception or no response. Comments are heartbeats.",
                 "parameters": [_parameter(field) for field in watching.fields(limits)],
                 "responses": {
                     "200": _stream(values="Values", change="Change", problem="Problem"),
@@ -147,10 +147,10 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
 def _status() -> dict[str, Any]:
     return {
         "operationId": "status",
-        "summary": "What this gateway may do",
+        "summary": "Get the settings of this gateway",
         "responses": {
             "200": json_answer(
-                "Its version, and its limits",
+                "The version, settings and limits",
                 ref("Status"),
                 {
                     "version": "0.1.0",
@@ -167,8 +167,8 @@ def _status() -> dict[str, Any]:
 
 
 def _documents() -> dict[str, Any]:
-    """The document itself, as JSON and as a page, and the console."""
-    whole = json_answer("OpenAPI 3.1", {"type": "object"})
+    """The operations for the OpenAPI document, its page, and the console."""
+    whole = json_answer("The OpenAPI 3.1 document", {"type": "object"})
     return {
         path: {
             "get": {
@@ -179,9 +179,9 @@ def _documents() -> dict[str, Any]:
             }
         }
         for path, name, summary, answer in (
-            (DOCUMENT, "openapi", "This document", whole),
-            (PAGE, "docs", "This document as a page", html_answer()),
-            ("/", "console", "The console, for a browser", html_answer()),
+            (DOCUMENT, "openapi", "Get this document", whole),
+            (PAGE, "docs", "Get this document as a web page", html_answer()),
+            ("/", "console", "Open the console in a browser", html_answer()),
         )
     }
 
@@ -191,7 +191,7 @@ VALUE: Schema = {"type": ["integer", "boolean"]}
 AREA: Schema = {"enum": list(AREAS)}
 RANGES: Schema = {
     **array_of({**array_of(ADDRESS_SCHEMA), "minItems": 2, "maxItems": 2}),
-    "description": "First and last addresses",
+    "description": "The first and the last address of each range",
 }
 NOW: dict[str, Schema] = {
     "time": {**COUNT, "description": "Milliseconds since 1970"},
@@ -200,7 +200,7 @@ NOW: dict[str, Schema] = {
 
 
 def _schemas() -> dict[str, Schema]:
-    """Schemas that are named: errors, the status, and the data of events."""
+    """The schemas of errors, of the status, and of the data of events."""
     said: dict[str, Schema] = {"success": {"const": False}, "error": {"type": "string"}}
     about = {
         "functionCode": FUNCTION_SCHEMA,
@@ -228,7 +228,7 @@ def _schemas() -> dict[str, Schema]:
                 "tokens": {"type": "boolean"},
                 "allow": array_of({"type": "string"}),
                 "limits": object_of({"timeout": COUNT, "interval": COUNT}),
-                "connections": {**COUNT, "description": "Devices that it has a connection to"},
+                "connections": {**COUNT, "description": "Open connections to devices"},
             }
         ),
         **_schemas_of_watches(),
@@ -267,13 +267,13 @@ def _schemas_of_maps() -> dict[str, Schema]:
     failures = {
         "type": "object",
         "additionalProperties": RANGES,
-        "description": "By exception code, or `timeout`, `connection`, `invalid`: addresses that "
-        "are neither there nor outside",
+        "description": "By exception code, or `timeout`, `connection`, `invalid`: addresses whose "
+        "reads failed, so that it is unknown whether they are valid",
     }
     return {
         "Progress": object_of(
             {
-                "at": {**COUNT, "description": "Addresses that were dealt with"},
+                "at": {**COUNT, "description": "Addresses done so far"},
                 "total": COUNT,
                 "requests": COUNT,
                 "areas": array_of(object_of(found, optional=("ranges",))),
@@ -283,14 +283,14 @@ def _schemas_of_maps() -> dict[str, Schema]:
             {
                 "success": {"type": "boolean"},
                 "error": {"type": "string", "description": "Why it ended early"},
-                "reason": {"type": "string", "description": "The same in a word"},
+                "reason": {"type": "string", "description": "The reason as a word"},
                 "requests": COUNT,
                 "seconds": {"type": "number"},
                 "exact": {"type": "boolean"},
                 "step": {
                     "type": ["integer", "null"],
-                    "description": "Samples were read at least every so many addresses, and where "
-                    "ranges like to begin; `null` if every address was",
+                    "description": "The largest distance of two samples. Addresses where ranges "
+                    "often begin were read too. `null` if every address was read",
                 },
                 "first": ADDRESS_SCHEMA,
                 "last": ADDRESS_SCHEMA,
@@ -300,7 +300,10 @@ def _schemas_of_maps() -> dict[str, Schema]:
                             **found,
                             "failures": failures,
                             "givenUp": {"type": ["integer", "string", "null"]},
-                            "largest": {**COUNT, "description": "The most that one read returned"},
+                            "largest": {
+                                **COUNT,
+                                "description": "The largest quantity that one read returned",
+                            },
                             "requests": COUNT,
                         }
                     )
@@ -347,7 +350,7 @@ def _parameter(field: Field) -> dict[str, Any]:
 
 
 def _stream(**events: str) -> dict[str, Any]:
-    """An answer of events; each has JSON of a schema for its data."""
+    """A response of server-sent events; the value of each event is the schema of its data."""
     kinds = [
         object_of(
             {
@@ -362,16 +365,16 @@ def _stream(**events: str) -> dict[str, Any]:
         for name, schema in events.items()
     ]
     content = {"text/event-stream": {"schema": {"oneOf": kinds}}}
-    return {"description": "Server-sent events, each of which is one of these", "content": content}
+    return {"description": "A stream of these server-sent events", "content": content}
 
 
 def _refusals(*reasons: str) -> dict[str, Any]:
-    """The answers of an operation that these reasons refuse."""
+    """The responses of an operation for these reasons."""
     return refused_by(REFUSALS.of((*reasons, *EVERYWHERE)))
 
 
 def _refused(row: Refusal) -> dict[str, Any]:
-    """The answer to what is refused, or has failed."""
+    """The response to a refused or failed request."""
     said = json_answer(row.means, ref("Error"), {"success": False, "error": row.example})
-    reason = {"schema": {"enum": list(row.reasons)}, "description": "Why, in a word"}
+    reason = {"schema": {"enum": list(row.reasons)}, "description": "The reason as a word"}
     return {**said, "headers": {"Holdfast-Reason": reason}}

@@ -1,7 +1,7 @@
-"""Connections to devices, kept and shared: many requests to one device go down one of them.
+"""A pool of connections to devices. All requests to one device share one connection.
 
-A connection is made when it is needed. It is closed when nobody has used it for a while, and when
-the last request on it was given up: what state the device is in is not known then.
+A connection is opened when it is needed. It is closed when it is idle for some time, and when the
+last request on it had no response, because the state of the connection is then unknown.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from holdfast.net.tls import Tls
 
     class Dial(Protocol):
-        """Makes clients, which connect when they are first used."""
+        """Creates clients. A client connects when it is first used."""
 
         def __call__(self, target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
-            """The client of an address.
+            """Returns a client for an address.
 
-            Raises `OSError` and `ValueError` for what TLS can't use.
+            Raises `OSError` and `ValueError` for TLS files that can't be used.
             """
             ...
 
@@ -39,46 +39,49 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 CHECK_INTERVAL = 0.5
-"""Seconds between two looks for connections that nobody uses."""
+"""Seconds between checks for idle connections."""
 
 
 class Full(Exception):
-    """As many devices as there may be are talked to right now."""
+    """All connections of the pool are in use."""
 
 
 class Unusable(Exception):
-    """Files of TLS that could be used at the start, and can't now."""
+    """The TLS files, which were valid at the start, can't be used any more."""
 
 
 def dial(target: NetworkTarget, *, timeout: float, in_flight: int) -> Client:
-    """A client of an address. Raises `OSError` and `ValueError` for what TLS can't use."""
+    """Returns a client for an address.
+
+    Raises `OSError` and `ValueError` for TLS files that can't be used.
+    """
     query = f"?{target.tls.query}" if target.transport == "tls" else ""
     return Client(f"{target}{query}", timeout=timeout, max_in_flight=in_flight)
 
 
 @dataclass
 class _Entry:
-    """A client and who uses it."""
+    """A client and its users."""
 
     client: Client
     timeout: float
     turns: asyncio.Semaphore
     users: int = 0
-    """Who use it or wait for their turn."""
+    """The number of requests that use the client or wait for it."""
     active: int = 0
-    """Who have their turn."""
+    """The number of requests that use the client."""
     used: float = field(default_factory=time.monotonic)
     proven: bool = False
-    """Whether it has had a reply."""
+    """Whether the last request had a response."""
     doubtful: bool = False
-    """Whether the last request had no reply."""
+    """Whether the last request had no response."""
 
 
 class Pool:
-    """Clients by their targets; `most` of them, each idle for `idle` seconds at most.
+    """At most `most` clients, by target. A client is closed after `idle` seconds without use.
 
-    Over TCP and TLS, `in_flight` requests are on their way to a device at once, otherwise one; more
-    wait. `longest` is the most seconds that a request takes.
+    Over TCP and TLS, at most `in_flight` requests to a device are pending at once; over other
+    transports one. Further requests wait. `longest` is the longest timeout of a request in seconds.
     """
 
     def __init__(
@@ -111,12 +114,11 @@ class Pool:
         *,
         repeat: bool,
     ) -> Result:
-        """A call on the connection to a device; on the next address where none can be made.
+        """Runs a call on the connection to a device, trying its addresses in turn.
 
-        `timeout` is the time for it; it is for the caller to end it then. With `repeat` it is
-        done again if the connection turns out to have ended since it was last used.
-        Raises `Full`, `Unusable`, `ValueError` for a name that no certificate can have, and what
-        the call raises.
+        `timeout` is in seconds; the caller must cancel the call when it expires. With `repeat`, the
+        call is repeated if the peer had closed the connection since its last use. Raises `Full`,
+        `Unusable`, `ValueError` for an invalid certificate name, and the exceptions of the call.
         """
         tls = NO_FILES if route.name is None else replace(self._tls, name=route.name)
         keys = [NetworkTarget(route.transport, each, route.port, tls) for each in route.addresses]
@@ -154,7 +156,7 @@ class Pool:
     async def _call(
         self, entry: _Entry, call: Callable[[Client], Awaitable[Result]], *, repeat: bool
     ) -> Result:
-        """A call, and what it tells of the connection."""
+        """Runs a call, and updates the state of the connection."""
         before, entry.proven, entry.doubtful = entry.proven, False, True
         try:
             try:
@@ -174,7 +176,7 @@ class Pool:
             self._keeper = asyncio.create_task(self._keep())
         if key not in self._entries:
             made = await self._client(key, timeout)
-        entry = self._entries.get(key)  # Another request may have made it meanwhile.
+        entry = self._entries.get(key)  # Another request may have created it meanwhile.
         if entry is None:
             gone = self._pushed_out() if len(self._entries) >= self._most else None
             in_flight = self._in_flight if key.transport in IN_FLIGHT else 1
@@ -189,14 +191,18 @@ class Pool:
         return entry
 
     async def _client(self, key: NetworkTarget, timeout: float) -> tuple[Client, float]:
-        """A client. What can't be cancelled, which TCP can, has the timeout of the request."""
+        """Returns a client and its timeout.
+
+        Calls over TCP and TLS can be cancelled, so their client has the longest timeout. Other
+        calls can't, so their client has the timeout of the request.
+        """
         timeout = self._longest if key.transport in IN_FLIGHT else timeout
         if key.transport != "tls":
             return self._dial(key, timeout=timeout, in_flight=self._in_flight), timeout
         return await asyncio.to_thread(self._dial_tls, key, timeout), timeout
 
     def _dial_tls(self, key: NetworkTarget, timeout: float) -> Client:
-        """A client with TLS, whose files are read now, which takes its time."""
+        """Returns a client with TLS. Blocks, because it reads the TLS files."""
         try:
             return self._dial(key, timeout=timeout, in_flight=self._in_flight)
         except (OSError, ValueError):
@@ -207,14 +213,14 @@ class Pool:
             raise
 
     async def _refresh(self, key: NetworkTarget, entry: _Entry, timeout: float) -> None:
-        """Makes a client fit for a request that has its turn; files may have been renewed."""
+        """Replaces a client that is in doubt or has another timeout; reads TLS files again."""
         other = key.transport not in IN_FLIGHT and timeout != entry.timeout
         if entry.active > 1 or not (entry.doubtful or other):
             return
         made = entry.client, entry.timeout
         if other or key.transport == "tls":
             made = await self._client(key, timeout)
-        if entry.active > 1:  # Meanwhile another uses it.
+        if entry.active > 1:  # Another request uses it meanwhile.
             return
         old = entry.client
         entry.proven = entry.doubtful = False
@@ -222,14 +228,14 @@ class Pool:
         await old.close()
 
     def _pushed_out(self) -> _Entry:
-        """Takes out the one that was used longest ago, of those in no use. Raises `Full`."""
+        """Removes the least recently used idle entry. Raises `Full` if all are in use."""
         free = [key for key, entry in self._entries.items() if entry.users == 0]
         if not free:
             raise Full
         return self._entries.pop(min(free, key=lambda key: self._entries[key].used))
 
     async def _keep(self) -> None:
-        """Closes what nobody uses, and everything at the end."""
+        """Closes idle connections, and all connections at the end."""
         try:
             while True:
                 await asyncio.sleep(CHECK_INTERVAL)

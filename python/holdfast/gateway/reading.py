@@ -1,4 +1,4 @@
-"""Reading: is a device there, and what do its four areas hold?"""
+"""The endpoints that check a connection, and that read the four areas of a device."""
 
 from __future__ import annotations
 
@@ -61,15 +61,15 @@ FUNCTION = Field(
 QUANTITY = Field(
     "quantity",
     integer(1, READ_BITS),
-    f"How many, up to {READ_BITS} bits or {READ_REGISTERS} registers; 1 if left out, or what the "
-    "datatype takes",
+    f"Number of bits, up to {READ_BITS}, or registers, up to {READ_REGISTERS}; default 1, or the "
+    "size of the datatype",
     None,
     allowed=f"an integer 1 to {READ_REGISTERS} for registers, 1 to {READ_BITS} for bits",
 )
 
 
 class Range:
-    """What a request reads. Raises `BadRequest` for what can't be read at once."""
+    """The range that a request reads. Raises `BadRequest` if one read can't cover it."""
 
     def __init__(self, given: Given) -> None:
         self.function: int = given["functionCode"]
@@ -82,16 +82,16 @@ class Range:
             raise malformed(f"Quantity must be between 1 and {limit}, found {self.quantity}")
         if self.address + self.quantity > ADDRESSES:
             raise malformed(
-                f"{self.quantity} from address {self.address}: the last is {LAST_ADDRESS}"
+                f"{self.quantity} from address {self.address}: the last address is {LAST_ADDRESS}"
             )
 
     @property
     def format(self) -> str:
-        """What its values are."""
+        """The format of the values, `coils` or `registers`."""
         return "coils" if self.area in BIT_AREAS else "registers"
 
     async def read(self, device: RequestedDevice) -> list[Any]:
-        """The values of now: booleans, or integers 0 to 65535."""
+        """Reads the values: booleans, or integers 0 to 65535."""
         return await device.ask(self._call(device.unit), repeat=True)
 
     def _call(self, unit: int) -> Callable[[Client], Awaitable[list[Any]]]:
@@ -146,16 +146,16 @@ def _read_exception(given: Given, _: RequestedDevice, error: ModbusException) ->
 
 
 TYPED: dict[str, Schema] = {
-    "typed": {"type": "array", "description": "With `datatype`: the values, `null` where none is"},
+    "typed": {"type": "array", "description": "With `datatype`: the values, `null` if invalid"},
     "typedText": {
         "type": "array",
         "items": {"type": "string"},
-        "description": "The same for people: floats as short as can be",
+        "description": "The values as text; floats have the fewest digits that identify them",
     },
     "typedErrors": {
         "type": "object",
         "additionalProperties": {"type": "string"},
-        "description": "By place in `typed`: why there is no value",
+        "description": "By index in `typed`: why the value is invalid",
     },
 }
 
@@ -163,7 +163,7 @@ ENDPOINTS = (
     Operation(
         "/api/modbus/connect",
         "connect",
-        "Whether a device answers",
+        "Check whether a device responds",
         TARGET,
         _connect,
         {
@@ -173,7 +173,7 @@ ENDPOINTS = (
         },
         {"A device on port 502": {"host": "plc.factory.local", "unitId": 1}},
         {"message": "Modbus server reachable", **EXAMPLE, "testRegister": 42},
-        "Reads holding register 0. A Modbus exception is an answer too: the device is there.",
+        "Reads holding register 0. A Modbus exception also shows that the device is reachable.",
         optional=("testRegister", "exception"),
     ),
     Operation(
@@ -210,7 +210,7 @@ ENDPOINTS = (
             "format": "registers",
             "values": [1234, 0, 65535, 42, 7],
         },
-        f"Functions 1 to 4. `values` are booleans, or registers 0 to {MAX_WORD}.",
+        f"Functions 1 to 4. `values` are booleans, or register values 0 to {MAX_WORD}.",
         optional=tuple(TYPED),
         on_exception=_read_exception,
     ),

@@ -1,4 +1,4 @@
-"""What the gateway refuses, and what fails: each reason and its status."""
+"""The reasons of refusals and failures of the gateway, and their status codes."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ REFUSALS = Refusals(
     Refusal(
         400,
         ("malformed",),
-        "Not what is asked for",
+        "The request is malformed",
         "port is 0, allowed is an integer 1 to 65535",
     ),
     Refusal(
         401,
         ("unauthorized",),
-        "No token, or one that is not known",
-        "the token is not known",
+        "The token is missing or unknown",
+        "unknown token",
     ),
     Refusal(
         403,
         ("refused_target", "writes_off", "foreign_page"),
-        "The target is not in the egress list, writes are off, or a page of another site asks",
+        "The target is not in the egress list, writes are disabled, or the request is from a page "
+        "of another site",
         "192.168.7.7, port 502, is not in the egress list of this gateway",
     ),
-    Refusal(404, ("not_found",), "There is nothing at this path", 'there is nothing at "/api"'),
+    Refusal(404, ("not_found",), "The resource does not exist", 'no resource at "/api"'),
     Refusal(
         405,
         ("method_not_allowed",),
-        "Not with this method",
+        "The resource does not support this method",
         "Method not allowed: allowed are POST, OPTIONS",
     ),
     Refusal(
         408,
         ("timeout",),
         "The body did not arrive in time; the connection is closed",
-        "1024 bytes came in time, more were announced",
+        "the body is incomplete: 1024 bytes arrived in time",
     ),
     Refusal(
         413,
@@ -45,14 +46,15 @@ REFUSALS = Refusals(
     Refusal(
         415,
         ("not_json",),
-        "Neither `application/json` nor what curl says instead, or compressed",
+        "The body is not `application/json` or `application/x-www-form-urlencoded`, or is "
+        "compressed",
         'Content-Type is "text/plain", allowed is application/json',
     ),
     Refusal(
         503,
         ("busy", "stopping"),
-        "Too much at once, or the gateway stops",
-        "128 requests are under way, which is the limit",
+        "Too many requests at once, or the gateway is stopping",
+        "too many requests: 128 are active, which is the limit",
     ),
 )
 
@@ -67,18 +69,18 @@ FAILURE = Refusal(
         "invalid_reply",
         "internal_error",
     ),
-    "No connection, TLS not agreed on, or no reply in time",
+    "No connection, a failed TLS handshake, or no response in time",
     "Connection timeout",
 )
-"""There was no connection or no reply: a refusal of nobody's, whose reasons are told apart."""
+"""A failure: no connection or no valid response."""
 
 EVERYWHERE = ("method_not_allowed",)
 ASKING = ("foreign_page",)
-"""Of everything that not everybody may ask for; with tokens also `unauthorized`."""
+"""Reasons of all operations with access control; with tokens also `unauthorized`."""
 
 BODY = ("malformed", "timeout", "too_large", "not_json")
 QUERY = ("malformed",)
 DEVICE = ("refused_target", "busy", "stopping")
-"""Of everything that is asked of a device; it may fail, too."""
+"""Reasons of all operations on devices, beside those of `FAILURE`."""
 
 WRITE = ("writes_off",)

@@ -1,4 +1,4 @@
-"""What a gateway is told when it starts."""
+"""The settings of a gateway."""
 
 from __future__ import annotations
 
@@ -17,52 +17,52 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GatewayLimits:
-    """What a gateway takes and does at most. Times are in seconds."""
+    """The limits of a gateway. Times are in seconds."""
 
     body: int = 65536
-    """Bytes of a request's body."""
+    """The largest request body in bytes."""
     timeout: float = 60.0
-    """What a request may ask for as its time."""
+    """The longest `timeout` of a request."""
     requests: int = 128
-    """Requests at once; more are answered 503."""
+    """Pending requests; further ones get status 503."""
     requests_of_device: int = 64
-    """Those to one host and port, so that a dead device leaves places for others."""
+    """Pending requests to one host and port, so that a dead device does not block others."""
     streams: int = 16
-    """Maps and watches at once; more are answered 503."""
+    """Open maps and watches; further ones get status 503."""
     mapping: float = 900.0
-    """For a map, which ends unfinished then."""
+    """The longest duration of a map; then it ends unfinished."""
     interval: float = 0.1
-    """Between two polls of a watch, at least."""
+    """The shortest polling interval of a watch."""
     heartbeat: float = 5.0
-    """Between two signs of life of a stream, at most."""
+    """The longest time between two events or comments of a stream."""
     devices: int = 256
-    """Connections that are kept."""
+    """Open connections to devices."""
     idle: float = 30.0
-    """A connection that nobody uses is kept for."""
+    """The time after which an idle connection to a device is closed."""
     in_flight: int = 1
-    """Requests on their way to one device at once."""
+    """Requests in flight to one device."""
     connections: int = 128
     """Connections of HTTP clients."""
     request_timeout: float = 10.0
-    """For a request to arrive, and for an answer to be taken."""
+    """The timeout for receiving a request, and for sending a response."""
     ending: float = 0.7
-    """For requests under way when the gateway ends; then they are answered 503."""
+    """The time for pending requests when the gateway stops; then they get status 503."""
 
     @property
     def open_connections(self) -> int:
-        """The most connections, to clients and to devices."""
+        """The most open connections, of clients and to devices."""
         return self.connections + self.devices
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Whom it may talk to, what it may do, and who may ask."""
+    """The settings of a gateway: allowed targets, allowed operations and allowed clients."""
 
     allow: tuple[AllowedNetwork, ...]
     writes: bool = False
     tokens: tuple[Token, ...] = ()
-    """Without any, whoever may connect may ask."""
+    """Without tokens, every client from `sources` is allowed."""
     sources: tuple[Network, ...] = LOOPBACK
     limits: GatewayLimits = field(default_factory=GatewayLimits)
     tls: Tls = NO_FILES
-    """Whom it trusts among devices with TLS, and what it shows them; callers have no say in it."""
+    """The TLS files for connections to devices. Requests can't change them."""

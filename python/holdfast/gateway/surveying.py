@@ -1,4 +1,4 @@
-"""Mapping: which addresses a device has, told while it is being found out."""
+"""Mapping: finds the valid addresses of a device and streams the progress."""
 
 from __future__ import annotations
 
@@ -36,30 +36,30 @@ PATH = "/api/modbus/map"
 TIMEOUT = 2_000
 
 BETWEEN = 0.2
-"""Seconds between two events of progress."""
+"""Seconds between two progress events."""
 
 MAX_SHOWN = 500
-"""Ranges that an event of progress tells; the result tells all."""
+"""The most ranges in a progress event; with more, it has none. The result has all ranges."""
 
 
 def fields(limits: GatewayLimits) -> tuple[Field, ...]:
-    """What a map is asked with."""
+    """Returns the fields of a request for a map."""
     return (
         *TARGET,
         AREA_LIST,
-        Field("first", ADDRESS_SCHEMA, "The first address to look at", 0),
-        Field("last", ADDRESS_SCHEMA, "The last address to look at", LAST_ADDRESS),
-        Field("exact", {"type": "boolean"}, "Read every address, not samples", False),
-        Field("step", integer(1, ADDRESSES), "Addresses between two samples", discovery.STEP),
-        Field("maxQuantity", integer(1, READ_BITS), "The most that a read asks for", None),
-        timeout(TIMEOUT, round(1000 * limits.timeout), "Milliseconds for each read"),
+        Field("first", ADDRESS_SCHEMA, "The first address to map", 0),
+        Field("last", ADDRESS_SCHEMA, "The last address to map", LAST_ADDRESS),
+        Field("exact", {"type": "boolean"}, "Read every address instead of samples", False),
+        Field("step", integer(1, ADDRESSES), "Largest distance of two samples", discovery.STEP),
+        Field("maxQuantity", integer(1, READ_BITS), "Largest quantity of one read", None),
+        timeout(TIMEOUT, round(1000 * limits.timeout), "Timeout of each read in ms"),
     )
 
 
 def planned(given: Given) -> Survey:
-    """What a request asks for. Raises `BadRequest`."""
+    """Returns the survey of a request. Raises `BadRequest`."""
     if given["first"] > given["last"]:
-        raise malformed(f"first is {given['first']}, behind last, which is {given['last']}")
+        raise malformed(f"first is {given['first']}, greater than last, {given['last']}")
     return Survey(
         given["areas"] or AREAS,
         exact=given["exact"],
@@ -72,7 +72,7 @@ def planned(given: Given) -> Survey:
 async def survey(
     survey: Survey, device: RequestedDevice, stream: Stream, *, step: int, longest: float
 ) -> None:
-    """Maps a device. What fails before anything was answered, fails as a read does."""
+    """Maps a device. A failure before the first response raises, as for a read."""
     began = time.monotonic()
     await _find(survey, device)
     await stream.begin()
@@ -92,14 +92,14 @@ async def survey(
 
 
 async def _find(survey: Survey, device: RequestedDevice) -> None:
-    """Puts the first area that the device answers in to the front.
+    """Moves the first area in which the device responds to the front.
 
     Raises `Failed` and `BadRequest`.
     """
     for found in list(survey.areas):
         try:
             await _Reader(device).look(found.area, survey.span.start)
-        except ModbusException:  # Which is an answer: the device is there.
+        except ModbusException:  # An exception is a response: the device is reachable.
             pass
         except Failed as error:
             if error.reason != "timeout" or found is survey.areas[-1]:
@@ -111,12 +111,12 @@ async def _find(survey: Survey, device: RequestedDevice) -> None:
 
 
 async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None:
-    """Carries a survey out; why it ended early, if it did."""
+    """Carries out a survey. Returns why it ended early, or `None`."""
     try:
         async with asyncio.timeout(longest):
             await discovery.run(survey, cast("Client", reader))
     except TimeoutError:
-        return Failed("unfinished", f"not done within {longest:g} s")
+        return Failed("unfinished", f"not finished within {longest:g} s")
     except ModbusError as error:
         reason = "connection_lost" if isinstance(error, ConnectionLost) else "timeout"
         return Failed(reason, str(error))
@@ -128,20 +128,20 @@ async def _run(survey: Survey, reader: _Reader, longest: float) -> Failed | None
 
 
 class _Reader:
-    """A client as far as a survey needs one."""
+    """The part of a client that a survey uses."""
 
     def __init__(self, device: RequestedDevice) -> None:
         self._device = device
 
     async def look(self, area: Area, address: int) -> None:
-        """A first read, which fails as a request does."""
+        """Makes the first read. Raises the exceptions of `RequestedDevice.ask`."""
         kind = "bool" if area in BIT_AREAS else "uint16"
         await self._device.ask(
             lambda client: client.read(area, address, kind, unit=self._device.unit), repeat=True
         )
 
     async def read(self, area: Area, address: int, kind: str) -> Any:
-        """A read, each with the time of the request."""
+        """Makes a read, with the request's timeout for each."""
         return await self._device.attempt(
             lambda client: client.read(area, address, kind, unit=self._device.unit), repeat=True
         )

@@ -1,4 +1,4 @@
-"""The tokens of the gateway: a file of names and SHA-256 hashes, one token a line."""
+"""The token file of the gateway: names and SHA-256 hashes, one token per line."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _HASH = re.compile("[0-9a-fA-F]{64}")
 
 
 class WrongTokens(Exception):
-    """A file that is not one of tokens. Its text names the line, never what is in it."""
+    """The token file is invalid. The message has the line number, never the line."""
 
 
 def load(file: Path) -> list[Token]:
-    """The tokens of a file; `#` begins a comment. Raises `OSError` and `WrongTokens`."""
+    """Reads a token file; `#` starts a comment. Raises `OSError` and `WrongTokens`."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
@@ -39,7 +39,7 @@ def load(file: Path) -> list[Token]:
             raise WrongTokens(f"{file}:{number}: {error}") from None
         for name, digest in tokens:
             if name == token[0] or digest == token[1]:
-                raise WrongTokens(f"{file}:{number}: the same name or token as before")
+                raise WrongTokens(f"{file}:{number}: duplicate name or token")
         tokens.append(token)
     if not tokens:
         raise WrongTokens(f"{file}: no token, allowed are lines {FORM}")

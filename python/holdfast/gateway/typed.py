@@ -1,4 +1,4 @@
-"""Typed values in JSON: registers to values of a type one behind the other, and back."""
+"""Converts registers to a sequence of typed values for JSON, and back."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Typed:
-    """Any number of values of one type."""
+    """A sequence of values of one type."""
 
     element: str
     order: str
     width: int
-    """The registers that a value takes."""
+    """The number of registers of one value."""
     count: int | None
-    """How many values the type names, if it is an array."""
+    """The length of an array type; `None` for other types."""
 
     def decode(self, raw: Sequence[int]) -> dict[str, Any]:
-        """The values for programs and for people; where there is none, `null` and why."""
+        """Returns the values and their texts; for an invalid value `null` and the error."""
         found = [self._value(raw[at : at + self.width]) for at in range(0, len(raw), self.width)]
         wrong = {
             str(index): str(each)
@@ -43,11 +43,11 @@ class Typed:
         }
 
     def encode(self, given: Sequence[Any]) -> list[int]:
-        """The registers of values. Raises `BadRequest`."""
+        """Converts values to registers. Raises `BadRequest`."""
         if self.element.startswith("bit:"):
-            raise malformed("a bit of a register is written by /api/modbus/write/mask")
+            raise malformed("to write a bit of a register, use /api/modbus/write/mask")
         if self.count is not None and self.count != len(given):
-            raise malformed(f"values has {len(given)} elements, the datatype {self.count}")
+            raise malformed(f"values has {len(given)} elements, the datatype has {self.count}")
         registers: list[int] = []
         for index, value in enumerate(given):
             try:
@@ -57,7 +57,7 @@ class Typed:
         return registers
 
     def _plain(self, value: Any) -> Any:
-        """A value as the byte interpreter takes it: bytes are hex in JSON."""
+        """Converts the JSON form of a value: bytes are hex."""
         if self.element.startswith("bytes:") and isinstance(value, str):
             try:
                 return bytes.fromhex(value)
@@ -82,23 +82,26 @@ class Typed:
 
 
 def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
-    """What a request asks for; `None` if it names no type. Raises `BadRequest`."""
+    """Returns the type of a request; `None` without `datatype`. Raises `BadRequest`."""
     if datatype is None:
         if order != "ABCD":
-            raise malformed("byteOrder goes with datatype")
+            raise malformed("byteOrder requires datatype")
         return None
     try:
         type = values.codec_for(area, datatype, order).type
     except WrongArea:
         of = area.replace("_", " ")
-        raise malformed(f"datatype is {datatype}, of {of} allowed is bool") from None
+        raise malformed(f"datatype is {datatype}, allowed for {of}: bool") from None
     except ConversionError as error:
         raise malformed(str(error)) from None
     return Typed(type.element, order, type.width // 2, type.count)
 
 
 def quantity_of(given: int | None, kind: Typed | None) -> int:
-    """How many bits or registers to read: as many as were asked for, or as the type takes."""
+    """Returns the quantity to read: `given`, or by default the size of the type.
+
+    Raises `BadRequest` if `given` does not fit the type.
+    """
     if kind is None:
         return 1 if given is None else given
     whole = kind.width * (1 if kind.count is None else kind.count)
@@ -106,7 +109,7 @@ def quantity_of(given: int | None, kind: Typed | None) -> int:
         return whole
     if given % kind.width or (kind.count is not None and given != whole):
         takes = f"{whole}" if kind.count is not None else f"a multiple of {kind.width}"
-        raise malformed(f"quantity is {given}, the datatype takes {takes}")
+        raise malformed(f"quantity is {given}, the datatype requires {takes}")
     return given
 
 

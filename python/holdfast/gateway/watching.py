@@ -1,4 +1,4 @@
-"""Watching: a range is polled, and what changes is sent on."""
+"""Watching: polls a range and streams the changes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MAX_INTERVAL = 3_600_000
 
 
 def fields(limits: GatewayLimits) -> tuple[Field, ...]:
-    """What a watch is asked with."""
+    """Returns the fields of a request for a watch."""
     least = round(1000 * limits.interval)
     return (
         *TARGET,
@@ -43,15 +43,15 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         Field(
             "interval",
             integer(least, MAX_INTERVAL),
-            "Milliseconds from poll to poll",
+            "Polling interval in ms",
             max(least, INTERVAL),
         ),
-        timeout(TIMEOUT, round(1000 * limits.timeout), "Milliseconds for each poll"),
+        timeout(TIMEOUT, round(1000 * limits.timeout), "Timeout of each poll in ms"),
     )
 
 
 async def watch(given: Given, device: RequestedDevice, stream: Stream) -> None:
-    """Polls until it is cancelled. What fails before the first event, fails as a read does."""
+    """Polls until it is cancelled. A failure before the first event raises, as for a read."""
     view = _View(Range(given), device)
     interval = given["interval"] / 1000
     loop = asyncio.get_running_loop()
@@ -75,7 +75,7 @@ async def watch(given: Given, device: RequestedDevice, stream: Stream) -> None:
 
 
 class _View:
-    """What the client knows, and the events that make it know what is."""
+    """The state that the client knows, and the events that update it."""
 
     def __init__(self, asked: Range, device: RequestedDevice) -> None:
         self.asked = asked
@@ -84,7 +84,7 @@ class _View:
         self._problem = ""
 
     def all(self, found: list[Any]) -> Event:
-        """Everything."""
+        """Returns an event with all values."""
         self._values, self._problem = found, ""
         kind = self.asked.kind
         return "values", {
@@ -97,7 +97,7 @@ class _View:
         }
 
     def changed(self, found: list[Any]) -> Event | None:
-        """What is other than before; `None` if nothing is."""
+        """Returns an event with the changed values; `None` if nothing changed."""
         before = self._values
         if before is None or self._problem:
             return self.all(found)
@@ -109,7 +109,7 @@ class _View:
         return "change", {**self._now(), "changes": values, **self._typed(found, places)}
 
     def problem(self, error: Exception) -> Event | None:
-        """Why there are no values; `None` if that was told."""
+        """Returns an event with the error; `None` if the client knows it already."""
         told = exception_text(error) if isinstance(error, ModbusException) else _detail(error)
         if told == self._problem:
             return None
@@ -117,7 +117,7 @@ class _View:
         return "problem", {**self._now(), "error": told, "reason": _reason(error)}
 
     def _typed(self, found: list[Any], places: Sequence[int]) -> dict[str, Any]:
-        """The typed values that hold what has changed."""
+        """Returns the typed values that contain changed registers."""
         kind = self.asked.kind
         if kind is None:
             return {}

@@ -1,4 +1,4 @@
-"""Writing: coils and holding registers, one or many, masks, and a write with a read."""
+"""The endpoints that write coils and holding registers, with masks and combined reads."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ON = 0xFF00
 TIMEOUT = 5_000
 
 PLAIN_OR_TYPED = {"type": ["integer", "number", "string", "boolean"]}
-"""Values of any type; which, the datatype says."""
+"""Values of the type that `datatype` names."""
 
 
 async def _write_coil(given: Given, device: RequestedDevice) -> Answer:
@@ -131,7 +131,7 @@ def _written(device: RequestedDevice, address: int, quantity: int) -> Answer:
 
 
 def _registers(given: Given) -> Sequence[int]:
-    """The registers to write. Raises `BadRequest`."""
+    """Returns the registers to write. Raises `BadRequest`."""
     kind = typed(given["datatype"], given["byteOrder"], "holding_registers")
     if kind is not None:
         return kind.encode(given["values"])
@@ -163,12 +163,12 @@ ENDPOINTS = (
         {
             "address": ADDRESS_SCHEMA,
             "coilValue": {"enum": [0, ON]},
-            "written": {"type": "boolean", "description": "Whether the coil is on now"},
+            "written": {"type": "boolean", "description": "Whether the coil is now on"},
             "rtt": MILLISECONDS,
         },
         {"Coil 17 on": {**EXAMPLE, "address": 17, "value": True}},
         {**EXAMPLE, "address": 17, "coilValue": ON, "written": True, "rtt": 12},
-        "Function 5. `coilValue` is what is on the wire: 65280 is on.",
+        "Function 5. `coilValue` is the value in the Modbus frame: 65280 is on.",
         writes=always,
         broadcast=True,
         timeout=TIMEOUT,
@@ -183,8 +183,8 @@ ENDPOINTS = (
             _values(
                 PLAIN_OR_TYPED,
                 WRITE_REGISTERS,
-                f"Registers 0 to {MAX_WORD}, up to {WRITE_REGISTERS}; with `datatype` values of "
-                "that type, bytes in hex",
+                f"Up to {WRITE_REGISTERS} register values 0 to {MAX_WORD}; with `datatype`, values "
+                "of that type, bytes in hex",
             ),
             DATATYPE,
             BYTE_ORDER,
@@ -202,7 +202,7 @@ ENDPOINTS = (
             },
         },
         {**EXAMPLE, "startAddress": 100, "quantity": 3, "rtt": 14},
-        "Function 16. A value that does not fit is refused; nothing is cut or wrapped.",
+        "Function 16. A value that does not fit is refused, never truncated or wrapped.",
         writes=always,
         broadcast=True,
         timeout=TIMEOUT,
@@ -242,12 +242,12 @@ ENDPOINTS = (
     Operation(
         "/api/modbus/write/mask",
         "writeMask",
-        "Change bits of a holding register",
+        "Change bits of one holding register",
         (
             *TARGET,
             ADDRESS,
-            Field("andMask", REGISTER, "Bits that are kept"),
-            Field("orMask", REGISTER, "What the others become"),
+            Field("andMask", REGISTER, "Bits to keep"),
+            Field("orMask", REGISTER, "New values of the other bits"),
         ),
         _mask,
         {
@@ -258,7 +258,7 @@ ENDPOINTS = (
         },
         {"Set bit 3": {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8}},
         {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8, "rtt": 12},
-        "Function 22: the register becomes `(now & andMask) | (orMask & ~andMask)`, as one step.",
+        "Function 22. Atomically sets the register to `(now & andMask) | (orMask & ~andMask)`.",
         writes=always,
         broadcast=True,
         timeout=TIMEOUT,
@@ -266,11 +266,13 @@ ENDPOINTS = (
     Operation(
         "/api/modbus/readwrite",
         "readWrite",
-        "Write holding registers, then read some, as one step",
+        "Write holding registers, then read some, in one request",
         (
             *TARGET,
             Field("readAddress", ADDRESS_SCHEMA, "The first address to read"),
-            Field("readQuantity", integer(1, READ_WRITE.most_read), "How many registers to read"),
+            Field(
+                "readQuantity", integer(1, READ_WRITE.most_read), "The number of registers to read"
+            ),
             Field("writeAddress", ADDRESS_SCHEMA, "The first address to write"),
             _values(
                 REGISTER,
@@ -289,7 +291,7 @@ ENDPOINTS = (
             "rtt": MILLISECONDS,
         },
         {
-            "Two out, three in": {
+            "Write two, read three": {
                 **EXAMPLE,
                 "readAddress": 0,
                 "readQuantity": 3,

@@ -1,1 +1,1 @@
-"""HTTP for ASGI applications: the host, requests, the page of an OpenAPI document."""
+"""HTTP for ASGI applications: the host, requests, refusals, and the OpenAPI page."""

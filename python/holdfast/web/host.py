@@ -1,8 +1,8 @@
-"""A host for ASGI applications: HTTP/1.1 for peers from given networks, within limits.
+"""A host for ASGI applications: HTTP/1.1 with allowed source networks, limits and timeouts.
 
-uvicorn and httptools do the protocol. What is added here holds against peers that mean harm or are
-broken: a peer from elsewhere gets not one byte, connections are counted, a request has to arrive
-and a reply to be taken in time, and what a peer sends ahead waits as bytes.
+uvicorn and httptools implement the protocol. This module protects it from hostile and broken peers:
+a peer from another network gets no byte, the number of connections is limited, receiving a request
+and sending a reply have timeouts, and pipelined requests wait unparsed.
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ if TYPE_CHECKING:
     Rejection: TypeAlias = Callable[[str, str], tuple[Headers, bytes]]
 
 BACKLOG = 512
-"""Connections that the system holds before they are accepted."""
+"""Connections that the system queues before they are accepted."""
 
 MAX_HEADER = 65536
-"""Bytes of the header of a request; chunk extensions and trailers have as many."""
+"""The largest request header in bytes; also the limit for chunk extensions and trailers."""
 
 SLICE = 8192
-"""Bytes that are parsed at a time: it bounds the requests that wait behind another."""
+"""Bytes that are parsed at a time. This bounds the number of pipelined requests in memory."""
 
 KEEP_ALIVE = 60.0
-"""Seconds that a connection may stay open without a request."""
+"""Seconds after which an idle connection is closed."""
 
 LATE_ANSWER_TIMEOUT = 1.0
-"""Seconds that the application has to answer a request that did not arrive in time."""
+"""Seconds for the application to answer a request that did not arrive in time."""
 
 STOP_TIMEOUT = 1.0
-"""Seconds that requests under way have to end when the host is stopped."""
+"""Seconds for pending requests to finish when the host stops."""
 
 SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
-"""Headers of every answer: nothing is kept, nothing is taken for what it does not say it is."""
+"""Headers of every response: no caching, no guessing of content types."""
 
-# uvicorn's own log goes nowhere: what matters is logged here, in the project's form.
+# uvicorn's own log is discarded. This module logs events in the project's format.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 logging.getLogger("uvicorn").propagate = False
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens on an IP address; `::` takes IPv4 too. Raises `OSError`."""
+    """Returns a socket that listens on an IP address; `::` includes IPv4. Raises `OSError`."""
     flags = socket.AI_NUMERICHOST | socket.AI_PASSIVE
     [(family, kind, number, _, address)] = socket.getaddrinfo(
         host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP, flags=flags
@@ -91,24 +91,24 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def address_of(host: str, port: int) -> str:
-    """`10.0.0.9:51200` or `[fd00::9]:51200`; an IPv4 address in IPv6 is that IPv4 address."""
+    """Formats `10.0.0.9:51200` or `[fd00::9]:51200`. An IPv4-mapped address is shown as IPv4."""
     return joined(str(parse_address(host)), port)
 
 
 def rejection(reason: str, detail: str, status: str = "rejected") -> tuple[Headers, bytes]:
-    """The headers and the JSON of a refusal."""
+    """Returns the headers and the JSON of a refusal."""
     body = msgspec.json.encode({"status": status, "reason": reason, "detail": detail})
     return headers_of(b"application/json", body), body
 
 
 def headers_of(kind: bytes, body: bytes) -> Headers:
-    """The headers of an answer with this body."""
+    """Returns the headers of a response with this body."""
     return [(b"content-type", kind), (b"content-length", b"%d" % len(body)), *SAFE]
 
 
 @dataclass
 class Counts:
-    """What became of connections: how many are `open`, and why others were refused or closed."""
+    """Counts of connections: how many are `open`, and why others were refused or closed."""
 
     accepted: int = 0
     refused_source: int = 0
@@ -121,16 +121,16 @@ class Counts:
 
 
 class Host:
-    """Serves one ASGI application on a socket that listens.
+    """Serves one ASGI application on a listening socket.
 
-    The application finds its peer, as text for logs, in `scope["state"]["peer"]`. When a request
-    did not arrive in time, `scope["state"]["late"]` is set and `receive` returns: the application
-    has a moment to answer, then the connection is dropped.
+    `scope["state"]["peer"]` is the peer's address as text, for logs. When a request does not arrive
+    in time, `scope["state"]["late"]` is set and `receive` returns. The application then has
+    `LATE_ANSWER_TIMEOUT` seconds to answer before the connection is dropped.
 
-    `rejection` makes what a request is answered with that the application never sees.
+    `rejection` creates the response to requests that never reach the application.
 
-    A peer that has sent its last byte still gets its answers, unless `leaving` says that it has
-    left then: the end of what it sends is all that tells that it closed the connection.
+    A peer that half-closes the connection still gets its responses. With `leaving`, a half-close
+    means that the client is gone, because a full close looks the same to the server.
     """
 
     def __init__(
@@ -158,19 +158,19 @@ class Host:
         self._listener = listener
 
     def counts(self) -> dict[str, int]:
-        """What became of connections, from any thread."""
+        """Returns the counts of connections. Thread-safe."""
         return asdict(self.counted)
 
     def run(self, stop: Stop) -> None:
-        """Serves in this thread until `stop`; again, when called again. The socket stays open."""
+        """Serves in this thread until `stop` is set. Can be called again: the socket stays open."""
         asyncio.run(self._serve(stop))
 
     def admits(self, host: str) -> bool:
-        """Whether a peer with this address may connect."""
+        """Returns whether a peer with this address may connect."""
         return holds(self.sources, parse_address(host))
 
     def note(self, event: str, peer: str) -> None:
-        """Counts and logs what happened to a connection. Called in the thread of `run`."""
+        """Counts and logs an event of a connection. Called in the thread of `run`."""
         setattr(self.counted, event, getattr(self.counted, event) + 1)
         if event != "idle":
             logs.refused(event, kind=(self.name, event), listener=self.name, peer=peer)
@@ -181,7 +181,7 @@ class Host:
         stopped = asyncio.Event()
 
         def end() -> None:
-            with contextlib.suppress(RuntimeError):  # This run is over, it was another that ended.
+            with contextlib.suppress(RuntimeError):  # The loop of this run is already closed.
                 loop.call_soon_threadsafe(stopped.set)
 
         stop.then(end)
@@ -210,16 +210,16 @@ class Host:
             await _end(cast("set[_Connection]", state.connections))
 
     async def _guarded(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The application, whose faults are logged and answered without a detail."""
+        """Runs the application. Exceptions are logged, and answered without details."""
         try:
             await self._app(scope, receive, send)
         except Exception:
             logs.problem("request_failed", listener=self.name, peer=scope["state"]["peer"])
-            with contextlib.suppress(RuntimeError):  # The answer has begun: it ends unfinished.
+            with contextlib.suppress(RuntimeError):  # The response has begun and is cut off.
                 await respond(send, 500, *rejection("internal_error", "see the log", "failed"))
 
     def _fault(self, loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:  # noqa: ARG002
-        """Such as no file descriptor for a connection that came in."""
+        """Logs errors of the event loop, such as no file descriptor for a new connection."""
         error = context.get("exception")
         logs.refused(
             "listener_fault",
@@ -231,13 +231,13 @@ class Host:
 
 
 async def respond(send: Send, status: int, headers: Headers, body: bytes = b"") -> None:
-    """Sends a whole answer."""
+    """Sends a complete response."""
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})
 
 
 async def _end(connections: set[_Connection]) -> None:
-    """Ends connections: those with a request under way have a while to answer it."""
+    """Closes connections; those with a pending request after at most `STOP_TIMEOUT`."""
     for connection in list(connections):
         connection.shutdown()
     deadline = time.monotonic() + STOP_TIMEOUT
@@ -249,7 +249,7 @@ async def _end(connections: set[_Connection]) -> None:
 
 
 class _Flow(FlowControl):
-    """Reads no more while bytes wait."""
+    """Flow control that does not read while received bytes are unparsed."""
 
     def __init__(self, connection: _Connection) -> None:
         super().__init__(connection.transport)
@@ -261,7 +261,7 @@ class _Flow(FlowControl):
 
 
 class _Output:
-    """Where the answer to one request goes: its header and what follows leave in one packet."""
+    """The output of one response. Sends the header together with the first piece of the body."""
 
     def __init__(self, connection: _Connection) -> None:
         self._connection = connection
@@ -271,7 +271,7 @@ class _Output:
         self.is_closing = self._transport.is_closing
 
     def write(self, data: bytes) -> None:
-        """Keeps the header until the body comes."""
+        """Writes data, but holds the header back until the body begins."""
         if self._header is None and self._cycle.response_started:
             self._header = data
         elif self._header:
@@ -281,12 +281,12 @@ class _Output:
             self._transport.write(data)
 
     def close(self) -> None:
-        """Ends the connection behind what was written."""
+        """Closes the connection after what was written."""
         self.write(b"")
         self._transport.close()
 
     def end(self) -> None:
-        """Ends the answer."""
+        """Ends the response."""
         self.write(b"")
         self._connection.on_response_complete()
 
@@ -294,9 +294,9 @@ class _Output:
 class _Connection(HttpToolsProtocol):
     """One connection.
 
-    Three deadlines, `math.inf` when they don't apply: for the request to arrive, for the reply to
-    be taken, for the next request to begin. All are at least `step` away when they are set, and the
-    alarm goes off at least that often, so none has a timer of its own.
+    It has three deadlines, `math.inf` when they don't apply: for the request to arrive, for the
+    reply to be sent, and for the next request to begin. A deadline is at least `_step` away when it
+    is set, and the one alarm goes off at least that often, so the deadlines need no own timers.
     """
 
     def __init__(
@@ -322,12 +322,12 @@ class _Connection(HttpToolsProtocol):
         self._request_due = self._reply_due = self._idle_due = math.inf
         self._alarm: asyncio.TimerHandle | None = None
 
-    # The transport's calls.
+    # Called by the transport.
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Admits the peer, or drops it before a byte."""
+        """Admits the peer, or drops it without sending a byte."""
         host, port, *_ = transport.get_extra_info("peername") or ("", 0)
-        if not host:  # It is gone already.
+        if not host:  # The peer has already disconnected.
             transport.abort()
             return
         peer = address_of(host, port)
@@ -347,13 +347,13 @@ class _Connection(HttpToolsProtocol):
         self.host.counted.open += 1
         super().connection_made(transport)
         self.app_state = {"peer": peer}
-        transport.set_write_buffer_limits(high=0)  # One reply waits at most, and its time is taken.
+        transport.set_write_buffer_limits(high=0)  # At most one reply is buffered, with a timeout.
         self.flow = _Flow(self)
         self._request_due = self.loop.time() + self.host.request_timeout
         self._set_alarm()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forgets what was under way."""
+        """Cleans up after a closed connection."""
         if not self._admitted:
             return
         self.host.counted.open -= 1
@@ -363,13 +363,13 @@ class _Connection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Parses what came, as far as it is its turn."""
+        """Buffers and parses received bytes."""
         if not self._broken and not self.transport.is_closing():
             self.held += data
             self._parse()
 
     def eof_received(self) -> bool:  # type: ignore[override]
-        """A peer that sends no more may still want its answers."""
+        """Handles a half-close: the peer may still wait for responses."""
         if self.host.leaving:
             return False
         self._ended = True
@@ -377,31 +377,31 @@ class _Connection(HttpToolsProtocol):
         return bool(whole or self.pipeline or self.held)
 
     def pause_writing(self) -> None:
-        """The peer takes less than it is sent."""
+        """Called when the peer reads more slowly than replies are written."""
         super().pause_writing()
         self._reply_due = self.loop.time() + self.host.request_timeout
 
     def resume_writing(self) -> None:
-        """The peer has taken everything."""
+        """Called when all written bytes were sent."""
         self._reply_due = math.inf
         super().resume_writing()
 
-    # The parser's calls.
+    # Called by the parser.
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """Called at the start of a request."""
         self._in_message = self._in_header = True
         super().on_message_begin()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """A header; trailers, which come behind the body, are left out."""
+        """Called for each header. Trailers, which follow the body, are ignored."""
         if self._in_header:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        """The request can be looked at."""
+        """Called after the header of a request; starts the application."""
         if self.parser.get_http_version() not in ("1.1", "1.0"):
-            raise httptools.HttpParserError("another version of HTTP")
+            raise httptools.HttpParserError("unsupported HTTP version")
         self._in_header = False
         self._overhead = 0
         super().on_headers_complete()
@@ -410,16 +410,19 @@ class _Connection(HttpToolsProtocol):
         self.cycle.on_response = output.end
 
     def on_body(self, body: bytes) -> None:
-        """A piece of the body."""
+        """Called for each piece of the body."""
         self._overhead = 0
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """The request is whole; but one that offers another protocol may have a body still."""
+        """Called at the end of a request.
+
+        With an Upgrade header the parser stops before the body, which is then read here.
+        """
         if self.parser.should_upgrade():
             headers = dict(self.headers)
             if b"transfer-encoding" in headers:
-                raise httptools.HttpParserError("chunked, and another protocol")
+                raise httptools.HttpParserError("chunked body with Upgrade")
             self._unparsed = int(headers.get(b"content-length", 0))
         if not self._unparsed:
             self._complete()
@@ -430,10 +433,10 @@ class _Connection(HttpToolsProtocol):
         self._overhead = 0
         super().on_message_complete()
 
-    # The application's calls.
+    # Called by the application.
 
     def on_response_complete(self) -> None:
-        """An answer is sent: the next request has its turn, or the connection is idle."""
+        """Called after a response: the next request starts, or the connection becomes idle."""
         self.server_state.total_requests += 1
         if self.transport.is_closing():
             return
@@ -446,7 +449,7 @@ class _Connection(HttpToolsProtocol):
         self._settle()
 
     def _settle(self) -> None:
-        """When nothing is under way, the connection is idle, or done."""
+        """Starts the idle deadline, or closes the connection, when no request is pending."""
         if self._busy() or self._request_due != math.inf or self.transport.is_closing():
             return
         if self._ended:
@@ -455,11 +458,11 @@ class _Connection(HttpToolsProtocol):
             self._idle_due = self.loop.time() + KEEP_ALIVE
 
     def _busy(self) -> bool:
-        """Whether a request waits for its answer."""
+        """Returns whether a request waits for its response."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _parse(self) -> None:
-        """Parses slice after slice, as long as no request waits behind another."""
+        """Parses slice after slice until a pipelined request has to wait."""
         whole, at, messages = memoryview(self.held), 0, self._messages
         self._idle_due = math.inf
         if self._request_due == math.inf:
@@ -475,7 +478,7 @@ class _Connection(HttpToolsProtocol):
         self._settle()
 
     def _take(self, piece: memoryview) -> int:
-        """Parses a slice; how much of it is done with."""
+        """Parses a slice. Returns the number of bytes that were consumed."""
         if self._unparsed:
             body = bytes(piece[: self._unparsed])
             self._unparsed -= len(body)
@@ -496,7 +499,7 @@ class _Connection(HttpToolsProtocol):
         return len(piece)
 
     def _refuse(self, status: int, detail: str) -> None:
-        """Ends a connection on which no request can be found any more, after its last answer."""
+        """Closes a connection that can no longer be parsed, after the pending response."""
         self._broken = True
         self.host.note("broken_request", self.app_state["peer"])
         if self._busy() and not self.cycle.more_body:
@@ -509,7 +512,7 @@ class _Connection(HttpToolsProtocol):
             self.transport.write(b"".join([STATUS_LINE[status], *lines, b"\r\n", body]))
             self.transport.close()
 
-    # Time.
+    # Deadlines.
 
     def _set_alarm(self) -> None:
         now = self.loop.time()
@@ -517,13 +520,13 @@ class _Connection(HttpToolsProtocol):
         self._alarm = self.loop.call_at(due, self._look)
 
     def _look(self) -> None:
-        """Drops the connection when a deadline is over."""
+        """Closes the connection when a deadline has passed."""
         now = self.loop.time()
         peer = self.app_state["peer"]
         if self._reply_due <= now:
             self.host.note("slow_reader", peer)
             self.transport.abort()
-        elif self._request_due <= now and self.flow.read_paused:  # It waits for us.
+        elif self._request_due <= now and self.flow.read_paused:  # The peer waits for the server.
             self._request_due = now + self.host.request_timeout
         elif self._request_due <= now:
             self._be_late()
@@ -533,7 +536,7 @@ class _Connection(HttpToolsProtocol):
         self._set_alarm()
 
     def _be_late(self) -> None:
-        """Lets the application answer, if it waits for the body; else the connection ends."""
+        """Lets the application answer if it waits for the body; otherwise drops the connection."""
         cycle = self.cycle
         if not (self._busy() and cycle.more_body) or self.pipeline:
             self.host.note("request_timeout", self.app_state["peer"])

@@ -1,4 +1,4 @@
-"""What OpenAPI documents are made of: objects, answers, refusals."""
+"""Building blocks of OpenAPI documents: schemas, responses and refusals."""
 
 from __future__ import annotations
 
@@ -15,21 +15,24 @@ Schema: TypeAlias = dict[str, Any]
 
 DOCUMENT = "/openapi.json"
 PAGE = "/docs"
-"""Where every application has its document, and that as a page."""
+"""The paths of the OpenAPI document and of its page, in every application."""
 
 
 def integer(least: int, most: int) -> Schema:
-    """An integer of a range."""
+    """The schema of an integer from `least` to `most`."""
     return {"type": "integer", "minimum": least, "maximum": most}
 
 
 def array_of(items: Schema) -> Schema:
-    """A list."""
+    """The schema of an array."""
     return {"type": "array", "items": items}
 
 
 def object_of(properties: dict[str, Schema], *, optional: Sequence[str] = ()) -> Schema:
-    """An object that has all of these but for the optional ones, and nothing else."""
+    """The schema of an object with these properties and no others.
+
+    Properties are required, except those in `optional`.
+    """
     return {
         "type": "object",
         "required": [name for name in properties if name not in optional],
@@ -39,23 +42,23 @@ def object_of(properties: dict[str, Schema], *, optional: Sequence[str] = ()) ->
 
 
 def ref(name: str, kind: str = "schemas") -> Schema:
-    """What a component is referred to by."""
+    """A reference to a component."""
     return {"$ref": f"#/components/{kind}/{name}"}
 
 
 def json_answer(description: str, schema: Schema, example: object = None) -> dict[str, Any]:
-    """An answer in JSON."""
+    """A JSON response."""
     content = {"schema": schema} | ({} if example is None else {"example": example})
     return {"description": description, "content": {"application/json": content}}
 
 
 def html_answer() -> dict[str, Any]:
-    """An answer in HTML."""
+    """An HTML response."""
     return {"description": "HTML", "content": {"text/html": {"schema": {"type": "string"}}}}
 
 
 def parameter(name: str, schema: Schema, example: object, description: str) -> dict[str, Any]:
-    """A parameter that is needed in a query."""
+    """A required query parameter."""
     return {
         "name": name,
         "in": "query",
@@ -67,14 +70,14 @@ def parameter(name: str, schema: Schema, example: object, description: str) -> d
 
 
 def refused_by(rows: Iterable[Refusal]) -> dict[str, Any]:
-    """The answers of an operation that these refuse, each a component."""
+    """The responses of an operation for these refusals, as references to components."""
     return {str(row.status): ref(_component(row), "responses") for row in rows}
 
 
 def refusal_components(
     rows: Iterable[Refusal], said: Callable[[Refusal], dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """The components that `refused_by` refers to; `said` makes an answer of a row."""
+    """The components that `refused_by` refers to; `said` creates the response of a row."""
     return {_component(row): _with_headers(row, said(row)) for row in rows}
 
 

@@ -1,4 +1,4 @@
-"""The page of the OpenAPI document: HTML that needs no script, and no other host."""
+"""Renders an OpenAPI document as an HTML page without scripts or external resources."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ POLICY = (
     b"default-src 'none'; style-src 'sha256-" + _DIGEST + b"'; base-uri 'none'; "
     b"form-action 'none'; frame-ancestors 'none'"
 )
-"""The Content-Security-Policy of the page: its own style, and nothing else."""
+"""The Content-Security-Policy of the page: it allows only the page's own style."""
 
 
 def render(document: Mapping[str, Any], server: str) -> bytes:
-    """The page of a document; `server` is where its examples send their requests."""
+    """Renders the page of a document. The example commands use `server` as base URL."""
     info = document["info"]
     operations = [
         (path, method, operation)
@@ -97,28 +97,28 @@ def _section(
         parts.append(f"<p>{_marked(operation['description'])}</p>")
     secured = bool(operation["security"])
     if secured:
-        parts.append('<p class="dim">Needs a token.</p>')
+        parts.append('<p class="dim">Requires a token.</p>')
     parameters = operation.get("parameters", [])
     if parameters:
         rows = [
             (f"<code>{entry['name']}</code>", escape(entry["description"]), _range(document, entry))
             for entry in parameters
         ]
-        parts.append("<h3>Parameters</h3>" + _table(("name", "is", "allowed"), rows))
+        parts.append("<h3>Parameters</h3>" + _table(("name", "description", "allowed"), rows))
     for title, command in _examples(server, path, operation, secured):
         parts.append(f"<h3>{escape(title)}</h3><pre>{escape(command)}</pre>")
-    parts.append("<h3>Answers</h3>")
+    parts.append("<h3>Responses</h3>")
     rows = [
         _row(document, status, answer) for status, answer in sorted(operation["responses"].items())
     ]
-    parts.append(_table(("status", "means", "body"), rows))
+    parts.append(_table(("status", "description", "body"), rows))
     return "".join([*parts, "</section>"])
 
 
 def _examples(
     server: str, path: str, operation: Mapping[str, Any], secured: bool
 ) -> Iterable[tuple[str, str]]:
-    """Commands to try, each with a title."""
+    """Yields the title and the command line of each example."""
     token = ' -H "Authorization: Bearer $TOKEN"' if secured else ""
     if "requestBody" in operation:
         for example in operation["requestBody"]["content"]["application/json"]["examples"].values():
@@ -168,7 +168,7 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def _marked(text: str) -> str:
-    """Text in which `words` are code."""
+    """Escapes text for HTML, and marks words in backticks as code."""
     parts = escape(text).split("`")
     return "".join(
         f"<code>{part}</code>" if place % 2 else part for place, part in enumerate(parts)
@@ -176,7 +176,7 @@ def _marked(text: str) -> str:
 
 
 def _resolved(document: Mapping[str, Any], entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a reference refers to."""
+    """Resolves a reference; other entries are unchanged."""
     if "$ref" not in entry:
         return entry
     found: Any = document

@@ -1,7 +1,6 @@
-"""Refusals of HTTP applications: which status a reason has, and what that means.
+"""Refusals of HTTP applications: the status code and the meaning of each reason.
 
-An application has one table. Its handlers take the status of a reason from it, and its OpenAPI
-document is made of the same.
+Each application has one table. Its handlers and its OpenAPI document both use it.
 """
 
 from __future__ import annotations
@@ -15,21 +14,21 @@ if TYPE_CHECKING:
     from holdfast.web.host import Headers
 
 UNREAD = (408, 413)
-"""Statuses of requests of which more may come: the connection ends with the answer."""
+"""Status codes of requests whose body is not fully read; the connection is closed after them."""
 
 HEADERS = {401: ("WWW-Authenticate", "Bearer"), 503: ("Retry-After", "1")}
-"""Headers that go with a status."""
+"""Response headers that a status code requires."""
 
 
 def headers_with(status: int) -> Headers:
-    """The headers that go with a status, as an answer has them."""
+    """Returns the response headers that a status code requires."""
     found = [HEADERS[status]] if status in HEADERS else []
     return [(name.lower().encode(), value.encode()) for name, value in found]
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """One status: its reasons, each in a word, what they mean, and what is said of one, say."""
+    """A status code: its reasons as words, what they mean, and an example message."""
 
     status: int
     reasons: tuple[str, ...]
@@ -43,15 +42,15 @@ class Refusals:
     def __init__(self, *rows: Refusal) -> None:
         self.rows = rows
         self.reasons = tuple(reason for row in rows for reason in row.reasons)
-        """All of them, each once."""
+        """All reasons."""
         self._rows = {reason: row for row in rows for reason in row.reasons}
         assert len(self._rows) == len(self.reasons), "a reason has two statuses"
 
     def status(self, reason: str) -> int:
-        """The status of a reason."""
+        """Returns the status code of a reason."""
         return self._rows[reason].status
 
     def of(self, reasons: Iterable[str]) -> list[Refusal]:
-        """Those that have some of these reasons, by status."""
+        """Returns the refusals with at least one of these reasons, sorted by status code."""
         found = {row.status: row for row in map(self._rows.__getitem__, reasons)}
         return [found[status] for status in sorted(found)]

@@ -1,7 +1,7 @@
-"""Requests as HTTP applications see them: bodies, tokens, and where they come from.
+"""Requests of HTTP applications: bodies, tokens, and origins.
 
-Nothing here knows a route. What can't be taken raises `BadRequest`, whose reason the application
-turns into a status.
+This module does not know routes. An invalid request raises `BadRequest`; the application converts
+its reason to a status code.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from holdfast.web.host import Headers, Receive, Scope, Send
 
 LINGER_TIMEOUT = 2.0
-"""Seconds that a client has to end a body that is too large, so that it gets the answer."""
+"""Seconds to keep reading an oversized body, so that the client receives the response."""
 
 _JSON = re.compile(rb'application/json[ \t]*(;[ \t]*charset="?utf-?8"?[ \t]*)?', re.I)
 _JSON_WITH_PARAMETERS = re.compile(rb"application/json[ \t]*(;.*)?", re.I)
@@ -31,7 +31,7 @@ _MAX_SHOWN = 40
 
 
 class BadRequest(Exception):
-    """A request that can't be taken: why, in a word and in a sentence."""
+    """A request is invalid or refused: `reason` is a word, `detail` a sentence."""
 
     def __init__(self, reason: str, detail: str) -> None:
         self.reason = reason
@@ -40,11 +40,11 @@ class BadRequest(Exception):
 
 
 class ClientDisconnected(Exception):
-    """The client went away."""
+    """The client closed the connection."""
 
 
 class Request:
-    """What is known of a request."""
+    """An HTTP request."""
 
     __slots__ = ("arrived", "method", "more_headers", "path", "peer", "receive", "scope", "who")
 
@@ -55,30 +55,30 @@ class Request:
         self.method: str = scope["method"]
         self.peer: str = scope["state"]["peer"]
         self.who = "-"
-        """Who asks, once that is known."""
+        """The name of the token's owner; `-` until the token was checked."""
         self.arrived = False
-        """Whether all of the body has come."""
+        """Whether the body was received completely."""
         self.more_headers: Headers = []
-        """Headers of the answer, whichever it is."""
+        """Additional headers of the response."""
 
     def headers(self, wanted: bytes) -> list[bytes]:
-        """All headers of this name."""
+        """Returns all headers of this name."""
         return [value for name, value in self.scope["headers"] if name == wanted]
 
     def header(self, wanted: bytes) -> bytes | None:
-        """The last header of this name, if there is one."""
+        """Returns the last header of this name, if there is one."""
         found = self.headers(wanted)
         return found[-1] if found else None
 
     @property
     def late(self) -> bool:
-        """Whether it did not arrive in time."""
+        """Whether the request did not arrive in time."""
         return "late" in self.scope["state"]
 
     def check_json(self, *also: bytes, parameters: bool = False) -> None:
-        """Raises `BadRequest` unless the body is plain JSON, or of one of these types in name.
+        """Raises `BadRequest` unless Content-Type is JSON or in `also`, without compression.
 
-        With `parameters` the type may have any.
+        With `parameters`, the type may have any parameters.
         """
         kind = self.header(b"content-type")
         form = _JSON_WITH_PARAMETERS if parameters else _JSON
@@ -88,10 +88,10 @@ class Request:
             )
         coding = self.header(b"content-encoding")
         if coding is not None and coding.lower() != b"identity":
-            raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed is none")
+            raise BadRequest("not_json", f"Content-Encoding is {_found(coding)}, allowed: none")
 
     async def body(self, most: int) -> bytes:
-        """All of the body. Raises `BadRequest`, and `ClientDisconnected` when the client is."""
+        """Reads the body, at most `most` bytes. Raises `BadRequest` and `ClientDisconnected`."""
         told = self.header(b"content-length")
         if told is not None and int(told) > most:
             raise _too_large(most)
@@ -108,17 +108,17 @@ class Request:
             if size > most:
                 raise _too_large(most)
             if more and self.late:
-                raise BadRequest("timeout", f"{size} bytes came in time, more were announced")
+                raise BadRequest("timeout", f"the body is incomplete: {size} bytes arrived in time")
         return b"".join(pieces)
 
     async def gone(self) -> None:
-        """Returns when the client goes away; only for a request that has arrived."""
+        """Returns when the client disconnects. The body must have been read."""
         while (await self.receive())["type"] != "http.disconnect":
             pass
 
     @property
     def is_foreign(self) -> bool:
-        """Whether a browser says that a page of another site sends this."""
+        """Whether a browser sent the request from a page of another site."""
         origin, host = self.header(b"origin"), self.header(b"host") or b""
         if origin is not None and origin.partition(b"://")[2].lower() != host.lower():
             return True
@@ -126,38 +126,43 @@ class Request:
 
     @property
     def is_direct(self) -> bool:
-        """Whether its Host, if it has one, names this machine without a name server's help.
+        """Whether Host is missing, an IP address or `localhost`.
 
-        A page of the web can make its own name lead to this machine, but not change that header.
+        This prevents DNS rebinding: a web page can point its own name at this machine, but the
+        browser still sends that name as Host.
         """
         host = self.header(b"host")
         return host is None or _is_direct(host)
 
     def owner(self, tokens: Iterable[tuple[str, bytes]]) -> str:
-        """The name of its token, of those with a name and a SHA-256. Raises `BadRequest`."""
+        """Returns the name of the request's token. Raises `BadRequest` if there is none.
+
+        `tokens` are names and SHA-256 hashes.
+        """
         given = self.headers(b"authorization")
         if len(given) != 1:
-            detail = "there is more than one Authorization" if given else "no Authorization"
-            raise BadRequest("unauthorized", f"{detail}, needed is Authorization: Bearer TOKEN")
+            detail = "more than one Authorization header" if given else "no Authorization header"
+            raise BadRequest("unauthorized", f"{detail}, required: Authorization: Bearer TOKEN")
         scheme, _, secret = given[0].partition(b" ")
         if scheme.lower() != b"bearer":
             raise BadRequest("unauthorized", "Authorization is not of the form Bearer TOKEN")
         digest = hashlib.sha256(secret.strip()).digest()
         owner = None
-        for name, known in tokens:  # All of them: the time tells nothing.
+        for name, known in tokens:  # Compares all of them, so the time reveals nothing.
             if hmac.compare_digest(known, digest):
                 owner = name
         if owner is None:
-            raise BadRequest("unauthorized", "the token is not known")
+            raise BadRequest("unauthorized", "unknown token")
         return owner
 
 
 async def respond_to_its_end(
     request: Request, send: Send, status: int, headers: Headers, body: bytes
 ) -> None:
-    """Answers a request of which more may come, takes that for a while, and ends the connection.
+    """Responds to a request whose body is not fully read, and closes the connection.
 
-    A connection that is closed while the client sends is reset, and the answer lost with it.
+    First it reads more of the body, for at most `LINGER_TIMEOUT`. Closing a connection while the
+    client still sends would reset it, and the client would lose the response.
     """
     closing = [*headers, (b"connection", b"close")]
     await send({"type": "http.response.start", "status": status, "headers": closing})
@@ -173,7 +178,7 @@ async def respond_to_its_end(
 
 
 def shown(text: str) -> str:
-    """Text from outside, quoted and cut short."""
+    """Quotes untrusted text, cut to a limited length."""
     return json.dumps(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…")
 
 

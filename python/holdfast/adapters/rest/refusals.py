@@ -15,7 +15,7 @@ REFUSALS = Refusals(
         401,
         ("unauthorized",),
         "The token is missing or unknown",
-        "the token is not known",
+        "unknown token",
     ),
     Refusal(
         403,
@@ -39,7 +39,7 @@ REFUSALS = Refusals(
         408,
         ("timeout",),
         "The body did not arrive in time; the connection is closed",
-        "1024 bytes arrived in time, Content-Length is larger",
+        "the body is incomplete: 1024 bytes arrived in time",
     ),
     Refusal(
         413,

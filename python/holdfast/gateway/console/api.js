@@ -1,11 +1,11 @@
-// Requests to the gateway. A token, if one is needed, lives in this tab's session storage only.
+// Requests to the gateway. A token is kept only in the session storage of this tab.
 
 import { $, h } from "./dom.js";
 
 const KEY = "holdfast-token";
 const JSON_TYPE = { "Content-Type": "application/json" };
 
-/** What went wrong: a reason in a word, and what the gateway said. */
+/** An error: a reason as a word, and the gateway's message. */
 export class Problem extends Error {
   constructor(reason, said) {
     super(said);
@@ -16,10 +16,10 @@ export class Problem extends Error {
 export const hasToken = () => sessionStorage.getItem(KEY) !== null;
 export const forgetToken = () => sessionStorage.removeItem(KEY);
 
-/** The answer to a GET. */
+/** Sends a GET request and returns the answer. */
 export const get = async (path) => answer(await send(path));
 
-/** The answer to a POST; `body` may be JSON text already. */
+/** Sends a POST request and returns the answer; `body` is an object or JSON text. */
 export const post = async (path, body, signal) =>
   answer(await send(path, {
     method: "POST",
@@ -28,13 +28,13 @@ export const post = async (path, body, signal) =>
     signal,
   }));
 
-/** Calls `onEvent(name, data)` for the events of an answer that goes on, until it ends. */
+/** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */
 export async function stream(path, options, onEvent) {
   const headers = options.body ? JSON_TYPE : {};
   const reply = await send(path, { ...options, headers });
   if (!(reply.headers.get("Content-Type") ?? "").startsWith("text/event-stream")) {
     await answer(reply);
-    throw new Problem("internal_error", "the gateway sent no events");
+    throw new Problem("internal_error", "the gateway did not send an event stream");
   }
   const reader = reply.body.pipeThrough(new TextDecoderStream()).getReader();
   let held = "";
@@ -65,7 +65,7 @@ async function send(path, options = {}) {
       throw new Problem("gateway_gone", "the gateway does not answer");
     }
     if (reply.status !== 401) return reply;
-    await askForToken(token === null ? "" : "The gateway does not know this token.");
+    await askForToken(token === null ? "" : "Unknown token.");
   }
 }
 
@@ -74,7 +74,7 @@ async function answer(reply) {
   try {
     body = await reply.json();
   } catch {
-    throw new Problem("internal_error", `status ${reply.status}, and no JSON`);
+    throw new Problem("internal_error", `status ${reply.status}, the body is not JSON`);
   }
   if (reply.status === 200 && body.success !== false) return body;
   throw new Problem(reply.headers.get("Holdfast-Reason") ?? "exception", body.error ?? `status ${reply.status}`);
@@ -82,7 +82,7 @@ async function answer(reply) {
 
 let asking = null;
 
-/** Asks once, however many requests wait for it. */
+/** Asks for a token. Concurrent requests share one dialog. */
 function askForToken(error) {
   asking ??= new Promise((resolve, reject) => {
     const dialog = $("token-dialog");
@@ -106,7 +106,7 @@ function askForToken(error) {
   return asking;
 }
 
-/** A problem as a notice: what it means in plain words, what to try, what was said. */
+/** Creates a notice for an error: what it means, what to try, and the original message. */
 export function notice(error, heading = null) {
   const [title, tries] = explained(error);
   return h("div", { class: "notice bad" },
@@ -116,12 +116,12 @@ export function notice(error, heading = null) {
     h("span", { class: "said" }, error.message));
 }
 
-/** Fields of the page by what the gateway calls them, where that is not their name. */
+/** Maps the gateway's field names to names on this page, where they differ. */
 const FIELDS = {
   unitid: "unit", servername: "server", datatype: "type", byteorder: "order", values: "write-value", value: "write-value",
 };
 
-/** Marks the field that an error begins with; whether it is on the page. */
+/** Marks the field whose name starts the error message. Returns whether it is on the page. */
 function mark(error) {
   const name = /^\w+/.exec(error.message)?.[0].toLowerCase() ?? "";
   const known = FIELDS[name] ?? name;
@@ -131,63 +131,63 @@ function mark(error) {
   return field !== undefined;
 }
 
-/** A field is no longer the one that was wrong. */
+/** Removes the mark from a field. */
 export const unmark = (field) => field.removeAttribute("aria-invalid");
 
 const WORDS = {
-  timeout: ["No answer in time.", [
+  timeout: ["The device did not respond in time.", [
     "Is the device powered and on this network? Is the address right?",
-    "Is the unit id right? Many devices, and all serial ones behind a gateway, stay silent for others. Try 1, 0 or 255.",
-    "Does a firewall drop the packets? Does another master hold the only connection?",
+    "Is the unit id right? Many devices, and all serial devices behind a gateway, ignore other unit ids. Try 1, 0 or 255.",
+    "Does a firewall drop the packets? Does another client use the device's only connection?",
     "Is the device slow? Try a longer timeout.",
   ]],
-  no_connection: ["There is something at this address, or on the way to it, but it takes no connection.", [
-    "Is Modbus TCP switched on in the device? Is its port another than 502?",
+  no_connection: ["The connection was refused or failed.", [
+    "Is Modbus TCP enabled in the device? Does it use a port other than 502?",
     "Is the address right? This may be another machine.",
   ]],
-  connection_lost: ["The device ended the connection.", [
-    "It may allow few connections: is another master connected?",
-    "It may speak something else on this port: check port and transport.",
+  connection_lost: ["The device closed the connection.", [
+    "The device may allow few connections: is another client connected?",
+    "Another protocol may run on this port: check port and transport.",
   ]],
-  tls_failed: ["TLS was not agreed on.", [
-    "Is the certificate for another name? If that is the device, give it as the name in its certificate.",
-    "Is its issuer unknown? Whoever runs the gateway says who is trusted: with --tls-ca, or tls in its configuration.",
-    "Does the device ask for a certificate, or refuse the gateway's? That is --tls-cert and --tls-key, or tls in its configuration.",
-    "Is this the port of TLS? It is 802 as a rule.",
+  tls_failed: ["The TLS handshake failed.", [
+    "Is the certificate for another name? If it is the right device, enter that name as the name in its certificate.",
+    "Is the issuer unknown? The gateway trusts the certificates in --tls-ca, or in tls in its configuration.",
+    "Does the device require a certificate, or refuse the gateway's? Set --tls-cert and --tls-key, or tls in the configuration.",
+    "Is this the TLS port? It is usually 802.",
   ]],
-  invalid_reply: ["Something answers, but not as Modbus should.", [
-    "Is the transport right? A serial gateway may want RTU over TCP.",
+  invalid_reply: ["The response is not valid Modbus.", [
+    "Is the transport right? A serial gateway may need RTU over TCP.",
     "Is the port right?",
   ]],
-  no_such_name: ["Nobody knows this name.", ["Is it spelled right?", "Try the IP address instead."]],
-  refused_target: ["This gateway may not connect there.", [
-    "Whoever runs the gateway says which networks and ports it may use: with --allow, or allow in its configuration.",
-    "Is the port in that list too? Without ports it is 502, and 802 with TLS.",
+  no_such_name: ["The name can't be resolved.", ["Is it spelled right?", "Try the IP address instead."]],
+  refused_target: ["The gateway does not allow this target.", [
+    "Networks and ports are allowed with --allow, or with allow in the gateway's configuration.",
+    "Is the port in that list too? The default is 502, and 802 with TLS.",
   ]],
-  writes_off: ["This gateway only reads.", ["Whoever runs it can allow writing: with --writes, or access: read-write in its configuration."]],
-  unauthorized: ["This gateway needs a token.", ["`holdfast token --line` makes one for its token file, `holdfast token --gateway` one for its configuration."]],
-  busy: ["The gateway has too much to do.", ["Try again in a moment."]],
-  stopping: ["The gateway is being stopped.", ["Reload the page when it runs again."]],
-  gateway_gone: ["The gateway does not answer.", ["Is it still running?", "Reload the page when it is."]],
+  writes_off: ["Writes are disabled.", ["Enable them with --writes, or with access: read-write in the gateway's configuration."]],
+  unauthorized: ["This gateway requires a token.", ["Create one with `holdfast token --line` for the token file, or with `holdfast token --gateway` for the configuration."]],
+  busy: ["The gateway is busy.", ["Try again in a moment."]],
+  stopping: ["The gateway is stopping.", ["Reload the page when it runs again."]],
+  gateway_gone: ["The gateway does not answer.", ["Is it still running?", "Reload the page when it runs again."]],
 };
 
 const EXCEPTIONS = {
-  "0x1": ["The device does not know this function.", ["It may not have this area: try another."]],
-  "0x2": ["The device has no such address.", [
-    "Its manual may count from 1, or write 40001: this page counts from 0.",
-    "A range must not touch an address that is missing: read fewer, or find out with the map.",
+  "0x1": ["The device does not support this function.", ["It may not have this area: try another."]],
+  "0x2": ["The device does not have this address.", [
+    "The manual may count from 1, or use numbers such as 40001: this page counts from 0.",
+    "A range must not contain a missing address: read fewer addresses, or use the map.",
   ]],
-  "0x3": ["The device does not take this value or quantity.", ["Read fewer at once.", "Is the value in the range of the device?"]],
-  "0x4": ["The device failed at this.", ["It may be in a state that does not allow it: look at the device."]],
-  "0x5": ["The device works on it.", ["Try again in a while."]],
+  "0x3": ["The device does not accept this value or quantity.", ["Read fewer addresses at once.", "Is the value in the range that the device allows?"]],
+  "0x4": ["The device failed to carry out the request.", ["Its current state may not allow it: check the device."]],
+  "0x5": ["The device accepted the request and is still processing it.", ["Try again later."]],
   "0x6": ["The device is busy.", ["Try again in a moment."]],
-  "0xa": ["The gateway in front of the device has no way to it.", ["Is the unit id right?", "Is the serial line of that gateway set up?"]],
-  "0xb": ["The device behind the gateway does not answer.", ["Is the unit id right?", "Is the device powered, and the serial line wired?"]],
+  "0xa": ["The Modbus gateway has no path to the device.", ["Is the unit id right?", "Is the serial line of that gateway configured?"]],
+  "0xb": ["The device behind the Modbus gateway does not respond.", ["Is the unit id right?", "Is the device powered, and the serial line wired?"]],
 };
 
 function explained(error) {
   const code = /\(code (0x[0-9a-f]+)\)/.exec(error.message);
   if (code && EXCEPTIONS[code[1]]) return EXCEPTIONS[code[1]];
-  if (error.reason === "malformed") return ["The gateway can't take this request.", [mark(error) ? "Check the marked value." : "Check the values."]];
-  return WORDS[error.reason] ?? ["This did not work.", []];
+  if (error.reason === "malformed") return ["The request is malformed.", [mark(error) ? "Check the marked value." : "Check the values."]];
+  return WORDS[error.reason] ?? ["The request failed.", []];
 }

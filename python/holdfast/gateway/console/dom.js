@@ -1,8 +1,8 @@
-// Elements by a word: made, found, and told apart.
+// Creates, finds and updates elements.
 
 export const $ = (id) => document.getElementById(id);
 
-/** An element with properties and children; `class`, `role`, `aria-…` and `data-…` as in HTML. */
+/** Creates an element with properties and children; `class`, `role`, `aria-…`, `data-…` as in HTML. */
 export function h(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
@@ -15,13 +15,13 @@ export function h(tag, properties = {}, ...children) {
   return element;
 }
 
-/** Puts a message into a live region; it is read out even if it is the same as before. */
+/** Puts a message into a live region. Screen readers announce it even if it is unchanged. */
 export function say(region, ...content) {
   const shown = content.filter((each) => each !== null);
   region.replaceChildren(...shown.map((each) => (typeof each === "string" ? h("p", {}, each) : each)));
 }
 
-/** Does one thing at a time for a button, which keeps the focus meanwhile. */
+/** Runs one action of a button at a time. The button keeps the focus, unlike with `disabled`. */
 export async function once(button, work) {
   if (button.getAttribute("aria-disabled") === "true") return;
   button.setAttribute("aria-disabled", "true");
@@ -32,13 +32,13 @@ export async function once(button, work) {
   }
 }
 
-/** Hides a field with its label, or shows it; what is hidden is not checked. */
+/** Shows or hides a field with its label. Hidden fields are not validated. */
 export function show(field, is) {
   field.closest("label").hidden = !is;
   field.disabled = !is;
 }
 
-/** Tabs that the arrow keys move between. */
+/** Makes a list of tabs that the arrow keys move between. */
 export function tabs(list) {
   const all = [...list.querySelectorAll("[role=tab]")];
   const choose = (chosen) => {
@@ -60,9 +60,9 @@ export function tabs(list) {
   return choose;
 }
 
-/** What a custom property of the style sheet is now, for canvases. */
+/** Returns the current value of a custom property of the style sheet, for canvases. */
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-/** Calls back when light turns to dark, or dark to light. */
+/** Calls `callback` when the color scheme changes. */
 export const onTheme = (callback) =>
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", callback);

@@ -1,4 +1,4 @@
-// The console: which device, and what to do with it.
+// The console: connects to a device, and switches between its views.
 
 import { forgetToken, get, hasToken, notice, post, unmark } from "./api.js";
 import { $, h, say, tabs } from "./dom.js";
@@ -7,9 +7,9 @@ import { Values } from "./values.js";
 
 const may = { write: false };
 const fields = ["host", "port", "unit", "transport", "timeout", "server"];
-/** Problems of the probe that say nothing of other areas. */
+/** Errors of the probe after which other areas may still respond. */
 const UNPROVEN = new Set(["timeout", "connection_lost", "invalid_reply", "exception"]);
-const PROBE = "It did not answer this probe, holding register 0; other areas may";
+const PROBE = "It can't read holding register 0, but other areas may work";
 const isSecure = () => $("transport").value === "tls";
 
 /** The device that the form names. */
@@ -30,11 +30,11 @@ const map = new Map_((area, address, length) => {
   values.open(area, address, length);
 });
 
-/** The device that was connected to; what the form names meanwhile is another. */
+/** The connected device. The form may name another one meanwhile. */
 let device = null;
 let connecting = null;
 
-/** Asks the gateway what it may do. */
+/** Gets the settings of the gateway. */
 async function begin() {
   try {
     const status = await get("/api/gateway");
@@ -52,7 +52,7 @@ async function begin() {
   $("forget").hidden = !hasToken();
 }
 
-/** The device is part of the address of the page, so that it can be kept and passed on. */
+/** Stores the device in the page's URL, so that it can be bookmarked and shared. */
 function remember() {
   const given = fields.filter((id) => id !== "server" || target().serverName);
   const query = new URLSearchParams(given.map((id) => [id, $(id).value.trim()]));
@@ -66,7 +66,7 @@ function recall() {
   $("server-label").hidden = !isSecure();
 }
 
-/** What goes with the transport: a port that is not the usual one stays. */
+/** Adapts the form to the transport. Keeps a port that is not a default port. */
 function chooseTransport() {
   $("server-label").hidden = !isSecure();
   const [other, usual] = isSecure() ? ["502", "802"] : ["802", "502"];
@@ -85,8 +85,8 @@ async function connect() {
     const found = await post("/api/modbus/connect", asked, aborting.signal);
     if (connecting !== aborting) return;
     const took = Math.round(performance.now() - began);
-    if (found.exception) use(asked, `The device answers, in ${took} ms. ${PROBE}: ${found.exception}.`);
-    else use(asked, `The device answers, in ${took} ms.`);
+    if (found.exception) use(asked, `The device responded in ${took} ms. ${PROBE}: ${found.exception}.`);
+    else use(asked, `The device responded in ${took} ms.`);
   } catch (error) {
     if (connecting !== aborting) return;
     connecting = null;
@@ -94,18 +94,18 @@ async function connect() {
   }
 }
 
-/** Lets one go on with a device that did not answer. */
+/** Offers to continue with a device that did not respond. */
 const offer = (asked) =>
-  h("p", { class: "offer" }, "Only holding register 0 was asked for; other areas may answer. ",
+  h("p", { class: "offer" }, "Only holding register 0 was read; other areas may respond. ",
     h("button", {
       type: "button",
       onclick: () => {
         use(asked, `${PROBE}.`, false);
         $("tab-values").focus();
       },
-    }, "Go on all the same"));
+    }, "Continue anyway"));
 
-/** Takes a device to work on. */
+/** Selects a device for the views. */
 function use(asked, what, proven = true) {
   device = asked;
   connecting = null;
@@ -116,7 +116,7 @@ function use(asked, what, proven = true) {
   if (proven) identify();
 }
 
-/** The device is another from now on, or connected to anew: nothing is read or written meanwhile. */
+/** Disconnects: nothing is read or written until the next connect. */
 function leave() {
   connecting?.abort();
   connecting = device = null;
@@ -126,16 +126,16 @@ function leave() {
   map.leave();
 }
 
-/** The form names another device. */
+/** Handles a change of the form: it may now name another device. */
 function changed() {
   const was = device ?? connecting;
   leave();
   $("connection").querySelector(".offer")?.remove();
-  const below = $("work").hidden ? "" : " What is shown below is old.";
-  if (was) say($("connection"), `Not connected: connect to go on.${below}`);
+  const below = $("work").hidden ? "" : " The values below are stale.";
+  if (was) say($("connection"), `Not connected: connect to continue.${below}`);
 }
 
-/** What the device says of itself, if it does; many don't. */
+/** Shows the device identification. Many devices do not support it. */
 async function identify() {
   const asked = device;
   const facts = await told(asked).catch(() => []);

@@ -1,15 +1,15 @@
-// The map of a device: its four areas as pictures, and its ranges as a list.
+// The map of a device: a picture of each area, and a list of its ranges.
 
 import { notice, stream } from "./api.js";
 import { $, colour, h, onTheme, say } from "./dom.js";
 import { AREAS } from "./standard.js";
 
-const FAILURES = { timeout: "no answer", connection: "connection lost", invalid: "wrong reply" };
+const FAILURES = { timeout: "no response", connection: "connection lost", invalid: "invalid response" };
 const CELLS = 1024;
 const NARROW = 640;
 const MOST_LISTED = 200;
 
-/** The view of the map of a device; `open` shows a range in the other view. */
+/** The map view. `open` shows a range in the values view. */
 export class Map_ {
   constructor(open) {
     this.open = open;
@@ -24,7 +24,7 @@ export class Map_ {
     onTheme(() => this.pictures.forEach((each) => each.draw()));
   }
 
-  /** Takes a device to work on; the map of another goes. */
+  /** Selects a device, and removes the map of the previous one. */
   use(device) {
     this.device = device;
     this.pictures = [];
@@ -32,7 +32,7 @@ export class Map_ {
     say($("survey-state"));
   }
 
-  /** There is no device; what was found stays. */
+  /** Deselects the device. The map stays visible. */
   leave() {
     if (this.running) this.stop();
     this.device = null;
@@ -67,7 +67,7 @@ export class Map_ {
     $("survey-progress").hidden = false;
     $("survey-progress").removeAttribute("value");
     $("survey-go").textContent = "Stop";
-    say($("survey-state"), "Looking…");
+    say($("survey-state"), "Mapping…");
   }
 
   happened(name, data) {
@@ -76,7 +76,7 @@ export class Map_ {
     const counted = `${found.toLocaleString("en")} addresses, ${data.requests.toLocaleString("en")} requests`;
     if (name === "progress") {
       $("survey-progress").value = data.at / data.total;
-      $("survey-state").firstChild.textContent = `Looking… ${counted}`;
+      $("survey-state").firstChild.textContent = `Mapping… ${counted}`;
       return;
     }
     this.pictures.forEach((each) => each.list());
@@ -84,10 +84,10 @@ export class Map_ {
     else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: data.reason ?? "timeout" })), `Until then: ${counted}.`);
   }
 
-  /** That not every address was asked, and a way to do so. */
+  /** Explains that not every address was read, and offers to read them all. */
   sampled(step) {
-    return h("p", { class: "offer" }, `Asked every ${step} addresses, and where ranges like to begin; gaps may hide more. `,
-      h("button", { type: "button", onclick: () => this.startExact() }, "Ask every address (slow)"));
+    return h("p", { class: "offer" }, `Read at least every ${step} addresses; gaps may contain more. `,
+      h("button", { type: "button", onclick: () => this.startExact() }, "Read every address (slow)"));
   }
 
   startExact() {
@@ -98,7 +98,7 @@ export class Map_ {
 
   stop() {
     this.running.abort();
-    say($("survey-state"), "Stopped; what was found is shown.");
+    say($("survey-state"), "Stopped. The map is incomplete.");
     this.pictures.forEach((each) => each.list());
     this.end();
   }
@@ -110,7 +110,7 @@ export class Map_ {
   }
 }
 
-/** One area: every cell is some addresses, the darker the more of them are there. */
+/** One area. A cell stands for some addresses; it is darker the more of them are valid. */
 class Picture {
   constructor(area, first, last, open) {
     ({ title: this.title, code: this.code } = AREAS[area]);
@@ -125,7 +125,7 @@ class Picture {
     this.canvas = h("canvas", { role: "img" });
     this.ranged = h("ul", { class: "ranges" });
     this.canvas.addEventListener("pointermove", (event) => this.point(event));
-    const per = this.each === 1 ? "1 address a cell" : `${this.each} addresses a cell`;
+    const per = this.each === 1 ? "1 address per cell" : `${this.each} addresses per cell`;
     this.root = h("article", { class: "card picture" },
       h("header", {}, h("h3", {}, this.title), this.count),
       this.canvas,
@@ -143,7 +143,7 @@ class Picture {
     this.draw();
   }
 
-  /** How many addresses of each cell are in some ranges. */
+  /** Returns the number of addresses of each cell that the ranges contain. */
   filled(ranges) {
     const cells = new Float32Array(this.columns * this.rows);
     for (const [from, to] of ranges) {
@@ -157,7 +157,7 @@ class Picture {
     return cells;
   }
 
-  /** Draws it in whole pixels of the screen. */
+  /** Draws the cells aligned to screen pixels. */
   draw() {
     const room = this.root.clientWidth - 2 * parseFloat(getComputedStyle(this.root).paddingLeft);
     const size = Math.max(3, Math.floor((room * devicePixelRatio) / this.columns));
@@ -182,10 +182,10 @@ class Picture {
     const column = Math.floor(((event.clientX - box.left) / box.width) * this.columns);
     const cell = Math.floor(((event.clientY - box.top) / box.height) * this.rows) * this.columns + column;
     const from = this.first + cell * this.each;
-    this.canvas.title = `${from}${this.each > 1 ? ` to ${from + this.each - 1}` : ""}: ${this.there[cell] ?? 0} there`;
+    this.canvas.title = `${from}${this.each > 1 ? ` to ${from + this.each - 1}` : ""}: ${this.there[cell] ?? 0} valid`;
   }
 
-  /** The ranges, each to be read with a click. */
+  /** Lists the ranges; a click reads a range. */
   list() {
     const items = this.ranges.slice(0, MOST_LISTED).map(([from, to]) => {
       const onclick = () => this.open(this.code, from, to - from + 1);
@@ -197,7 +197,7 @@ class Picture {
       const count = ranges.reduce((sum, [from, to]) => sum + to - from + 1, 0);
       items.push(h("li", { class: "wrong" }, `${count} with ${FAILURES[kind] ?? `exception ${kind}`}`));
     }
-    if (items.length === 0) items.push(h("li", { class: "dim" }, this.givenUp === 1 ? "The device does not know this area." : "None found."));
+    if (items.length === 0) items.push(h("li", { class: "dim" }, this.givenUp === 1 ? "The device does not support this area." : "None found."));
     this.ranged.replaceChildren(...items);
   }
 }

@@ -1,4 +1,4 @@
-// Registers as numbers, as text, and as what people write.
+// Converts registers to numbers and text, and parses what people type.
 
 export const hex = (register) => register.toString(16).toUpperCase().padStart(4, "0");
 export const binary = (register) => register.toString(2).padStart(16, "0").replace(/(....)(?=.)/g, "$1 ");
@@ -10,7 +10,7 @@ const WIDTHS = {
   int64: 4, uint64: 4, float64: 4,
 };
 
-/** A type by its kind, and which bit or how many bytes it has; `width` is in registers. */
+/** Returns a type. `size` is the bit number, or the number of bytes; `width` is in registers. */
 export function typeOf(kind, size) {
   const ofBytes = kind === "string" || kind === "bytes";
   const width = ofBytes ? Math.ceil(size / 2) : WIDTHS[kind];
@@ -18,43 +18,43 @@ export function typeOf(kind, size) {
   return { name, kind, size, width, bytes: ofBytes ? size : 2 * width };
 }
 
-/** What is wrong with eight letters as the order of a type; "" if nothing is. */
+/** Returns the error in a byte order of eight letters; "" if it is valid for the type. */
 export function flaw(letters, type) {
   const wire = [...letters];
-  if (wire.toSorted().join("") !== "ABCDEFGH") return "An order of eight letters has A to H once each.";
-  if (type.bytes !== 8) return `Eight letters are for values of eight bytes; ${type.name} has ${type.bytes}.`;
+  if (wire.toSorted().join("") !== "ABCDEFGH") return "A byte order of eight letters contains each of A to H once.";
+  if (type.bytes !== 8) return `Eight letters are only for values of eight bytes; ${type.name} has ${type.bytes}.`;
   const from = wire.map((letter) => letter.charCodeAt(0) - 65);
-  if (from.some((byte, at) => at % 2 === 0 && byte >> 1 !== from[at + 1] >> 1)) return "A register stays whole: AB, CD, EF and GH stay together.";
-  if (from.some((byte, at) => from[byte] !== at)) return "An order that is applied twice changes nothing; this one does.";
+  if (from.some((byte, at) => at % 2 === 0 && byte >> 1 !== from[at + 1] >> 1)) return "The bytes of a register stay together: AB, CD, EF and GH.";
+  if (from.some((byte, at) => from[byte] !== at)) return "A byte order applied twice must give ABCDEFGH; this one does not.";
   return "";
 }
 
 const DIGITS = { 1: "0", 2: "1", 3: "4", 4: "3" };
 
-/** An address as Modicon wrote it: 40001 is holding register 0. */
+/** Formats an address in Modicon notation: 40001 is holding register 0. */
 export const modicon = (area, address) =>
   DIGITS[area] + String(address + 1).padStart(address > 9998 ? 5 : 4, "0");
 
-/** A register as it is written: decimal, 0x and 0b, or negative. Throws what is wrong with it. */
+/** Parses a register: decimal, 0x, 0b, or negative. Throws an error for other text. */
 export function register(text) {
   const plain = text.trim().replaceAll("_", "");
   const form = /^(-?\d{1,5}|0[xX][0-9a-fA-F]{1,4}|0[bB][01]{1,16})$/;
   const value = form.test(plain) ? Number(plain) : NaN;
   if (!(value >= -32768 && value <= 65535)) {
-    throw new Error(`“${text.trim()}” is no register: −32768 to 65535, 0x0000 to 0xFFFF or 0b…`);
+    throw new Error(`“${text.trim()}” is not a register value: −32768 to 65535, 0x0000 to 0xFFFF or 0b…`);
   }
   return value < 0 ? value + 65536 : value;
 }
 
-/** A bit as it is written. */
+/** Parses a bit. Throws an error for other text. */
 export function bit(text) {
   const word = text.trim().toLowerCase();
   if (["1", "on", "true"].includes(word)) return true;
   if (["0", "off", "false"].includes(word)) return false;
-  throw new Error(`“${text.trim()}” is no bit: 0, 1, on or off`);
+  throw new Error(`“${text.trim()}” is not a bit: 0, 1, on or off`);
 }
 
-/** A value of a type as it is shown, and as JSON. Throws what is wrong with it. */
+/** Parses a value of a type. Returns its display text and its JSON. Throws an error for other text. */
 export function literal(text, type) {
   if (type.kind === "string") return characters(text, type);
   if (type.kind === "bytes") return octets(text, type);
@@ -68,7 +68,7 @@ export function literal(text, type) {
 
 function characters(text, type) {
   if (!/^[\x00-\x7f]*$/.test(text) || text.length > type.size) {
-    throw new Error(`“${text}” is no ${type.name}: up to ${type.size} characters of ASCII`);
+    throw new Error(`“${text}” is not a valid ${type.name}: up to ${type.size} ASCII characters`);
   }
   return { shown: text, json: JSON.stringify(text) };
 }
@@ -76,19 +76,19 @@ function characters(text, type) {
 function octets(text, type) {
   const plain = text.replace(/\s/g, "").toLowerCase();
   if (!/^([0-9a-f]{2})*$/.test(plain) || plain.length !== 2 * type.size) {
-    throw new Error(`“${text.trim()}” is no ${type.name}: ${type.size} pairs of hexadecimal digits`);
+    throw new Error(`“${text.trim()}” is not a valid ${type.name}: ${type.size} pairs of hexadecimal digits`);
   }
   return { shown: plain.replace(/(..)(?=.)/g, "$1 "), json: JSON.stringify(plain) };
 }
 
-/** The least and the most of types of whole numbers. */
+/** The minimum and the maximum of integer types. */
 const EXTENTS = {
   int16: [-(2n ** 15n), 2n ** 15n - 1n], uint16: [0n, 2n ** 16n - 1n], bcd16: [0n, 9999n],
   int32: [-(2n ** 31n), 2n ** 31n - 1n], uint32: [0n, 2n ** 32n - 1n], bcd32: [0n, 99999999n],
   int64: [-(2n ** 63n), 2n ** 63n - 1n], uint64: [0n, 2n ** 64n - 1n],
 };
 
-/** A number of a type as JSON text, digit by digit as it was written. Throws what is wrong with it. */
+/** Parses a number of a type. Returns JSON text with the same digits. Throws an error for other text. */
 export function numeral(text, type) {
   const plain = text.trim().replace(/^\+/, "");
   const extent = EXTENTS[type];
@@ -97,7 +97,7 @@ export function numeral(text, type) {
     const whole = BigInt(plain);
     if (whole >= extent[0] && whole <= extent[1]) return plain;
   }
-  throw new Error(`“${text.trim()}” is no ${type}${extent ? `: ${extent[0]} to ${extent[1]}` : ""}`);
+  throw new Error(`“${text.trim()}” is not a valid ${type}${extent ? `: ${extent[0]} to ${extent[1]}` : ""}`);
 }
 
 const READERS = {
@@ -120,7 +120,7 @@ function half(bits) {
   return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
 }
 
-/** Binary coded decimals; a digit above 9 is none. */
+/** Converts binary coded decimals; "–" for a digit above 9. */
 function digits(number, count) {
   const text = number.toString(16).padStart(count, "0");
   return /^\d+$/.test(text) ? Number(text) : "–";
@@ -145,7 +145,7 @@ function rows(bytes, arrangements, fits) {
   });
 }
 
-/** The bits of a register that are on, "0 3–5", or "none". */
+/** Lists the bits of a register that are on: "0 3–5", or "none". */
 function bitsOn(register) {
   const runs = [];
   for (let at = 0; at < 16; at += 1) {
@@ -156,7 +156,7 @@ function bitsOn(register) {
   return runs.map(([from, to]) => (from === to ? from : `${from}–${to}`)).join(" ") || "none";
 }
 
-/** What registers are in every type and order: tables of a head, and of rows with texts by order. */
+/** Converts registers to every type and byte order. Returns tables: the orders, and a row for each type. */
 export function everyType(registers) {
   const bytes = registers.flatMap((each) => [each >> 8, each & 255]);
   const arrangements = Object.values(ORDERS);

@@ -1,4 +1,4 @@
-// Small plots of what is watched, one above the other, over the same time.
+// Small plots of watched values, one above the other, with a common time axis.
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 import { $, colour, h, onTheme } from "./dom.js";
@@ -13,7 +13,7 @@ const now = () => Date.now() / 1000;
 
 /** The plots of one watch. */
 export class Plots {
-  /** `number(address)` is the value of now of an address of the range. */
+  /** `number(address)` returns the current value of an address of the range. */
   constructor(range, number) {
     this.first = range.address;
     this.last = range.address + range.quantity - 1;
@@ -34,28 +34,28 @@ export class Plots {
     onTheme(() => this.restyle());
   }
 
-  /** Adds the plot of an address that was typed in, or says why not. */
+  /** Adds the plot of a typed address, or shows an error. */
   wish(text) {
     const address = Number(text);
     if (text === "" || !(address >= this.first && address <= this.last)) {
-      this.told.textContent = `${text || "Nothing"} is not watched: ${this.first} to ${this.last} are.`;
+      this.told.textContent = text ? `${text} is not watched, only ${this.first} to ${this.last}.` : `Enter an address from ${this.first} to ${this.last}.`;
     } else if (this.shown.has(address)) {
-      this.told.textContent = `${address} is plotted.`;
+      this.told.textContent = `${address} is already plotted.`;
     } else {
       this.choose(address);
     }
   }
 
-  /** Adds the plot of an address, or takes it away. */
+  /** Adds the plot of an address, or removes it. */
   choose(address) {
     this.told.textContent = "";
     if (this.shown.has(address)) this.remove(address);
     else if (this.shown.size < MOST) this.add(address);
-    else this.told.textContent = `There are ${MOST} plots, which is the most.`;
+    else this.told.textContent = `There can be at most ${MOST} plots. Remove one first.`;
     this.chosen = true;
   }
 
-  /** A value has changed: without a choice, the first ones that do are plotted. */
+  /** Handles a changed value. Until the user chooses plots, the first values that change get one. */
   changed(address) {
     if (!this.chosen && !this.shown.has(address) && this.shown.size < 4) this.add(address);
     this.shown.get(address)?.take(this.number(address));
@@ -87,7 +87,7 @@ export class Plots {
     for (const plot of this.shown.values()) plot.show();
   }
 
-  /** There is nothing more to come. */
+  /** Stops updating. */
   stop() {
     clearInterval(this.timer);
   }
@@ -127,7 +127,7 @@ class Plot {
     this.extent.textContent = `${shortened(Math.min(...few))} … ${shortened(Math.max(...few))}`;
   }
 
-  /** Makes it anew, in the colours of now. */
+  /** Creates the plot again, in the current colors. */
   show() {
     this.plot?.destroy();
     this.scale = 1;
@@ -170,13 +170,13 @@ class Plot {
 
 const shortened = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5))));
 
-/** The same for an axis, where there is little room. */
+/** Formats a number for an axis, where space is limited. */
 function short(value) {
   const text = shortened(value);
   return text.length <= 8 ? text : value.toExponential(2).replace("e+", "e");
 }
 
-/** What tiny values are to be multiplied with: the plots know no steps below 1e-16. */
+/** Returns a factor for tiny values, because uPlot has no axis steps below 1e-16. */
 function scaled(values) {
   const most = Math.max(...values.map(Math.abs));
   return most > 0 && most < 1e-6 ? 10 ** Math.min(300, -Math.floor(Math.log10(most))) : 1;
@@ -184,7 +184,7 @@ function scaled(values) {
 
 const clock = (seconds) => new Date(1000 * seconds).toTimeString().slice(0, 8);
 
-/** Room above and below, and some for a line that is flat. */
+/** Adds space above and below, also for a flat line. */
 function padded(low, high) {
   if (low === null) return [0, 1];
   const room = (high - low) * 0.1 || Math.abs(high) * 0.1 || 1;

@@ -1,4 +1,4 @@
-// What the standard fixes: the areas with their read functions, and what one request reads at most.
+// The areas of the Modbus standard: their read functions, and the limits of one read.
 
 export const AREAS = {
   coils: { title: "Coils", code: 1, most: 2000 },
@@ -7,7 +7,7 @@ export const AREAS = {
   input_registers: { title: "Input registers", code: 4, most: 125 },
 };
 
-/** The area that a function reads. */
+/** Returns the area that a function code reads. */
 export const areaOf = (code) => Object.values(AREAS).find((area) => area.code === code);
 
 export const LAST = 65535;

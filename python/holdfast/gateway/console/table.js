@@ -1,13 +1,13 @@
-// The table of registers, or the field of bits, and what changes in it.
+// The table of registers, or the grid of bits, with marks for changes.
 
 import { $, h } from "./dom.js";
 import { binary, everyType, hex, modicon } from "./numbers.js";
 
 const MARKED = 1500;
 
-/** Shows a range, and keeps what is shown up to date. */
+/** Shows the values of a range and updates them. */
 export class Table {
-  /** `actions` are `write(address)` or null, and `plot(address)`. */
+  /** `actions` has `write(address)`, or null if writes are not possible, and `plot(address)`. */
   constructor(place, range, actions) {
     this.range = range;
     this.values = [];
@@ -22,7 +22,7 @@ export class Table {
     this.stale(false);
   }
 
-  /** All values, and the texts of typed ones; what differs is marked if asked for. */
+  /** Sets all values, and the texts of typed values. With `mark`, changes are marked. */
   set(values, texts, mark = false) {
     values.forEach((value, at) => this.put(at, value, mark));
     (texts ?? []).forEach((text, index) => this.putTyped(index, text, mark));
@@ -64,14 +64,14 @@ export class Table {
     cell.fading = setTimeout(() => cell.classList.remove("changed"), MARKED);
   }
 
-  /** Whether the values are of now. */
+  /** Marks the values as stale or current. */
   stale(is) {
     this.root.classList.toggle("stale", is);
     this.age.classList.toggle("old", is);
-    this.age.textContent = is ? `Old values of ${this.where}: not of now.` : `Values of ${this.where}.`;
+    this.age.textContent = is ? `Stale values of ${this.where}.` : `Values of ${this.where}.`;
   }
 
-  /** The number that is plotted for an address: of its type where one begins there. */
+  /** Returns the number to plot for an address: the typed value if one starts there. */
   number(at) {
     const { width, ofBits, type } = this.range;
     if (ofBits) return Number(this.values[at]);
@@ -136,7 +136,7 @@ export class Table {
     return bit;
   }
 
-  /** The registers from one on in every type and order, to find out which fits. */
+  /** Shows up to four registers in every type and byte order. */
   showTypes(at) {
     const own = this.values.slice(at, at + 4);
     $("types-title").textContent = `All types from ${this.range.address + at}: ${own.map(hex).join(" ")}`;

@@ -1,4 +1,4 @@
-// Reading a range, once or again and again, and what can be done with what is there.
+// The values view: reads or watches a range, and offers plots and writes.
 
 import { notice, post, stream } from "./api.js";
 import { $, h, say, show } from "./dom.js";
@@ -9,11 +9,11 @@ import { Table } from "./table.js";
 import { Writer } from "./writing.js";
 
 const RESUME = 1000;
-const WRITTEN = { written: "Written", refused: "Not written", unknown: "Not known whether it was written" };
-/** Problems that waiting for the gateway does not solve. */
+const WRITTEN = { written: "Written", refused: "Not written", unknown: "Unknown whether it was written" };
+/** Errors after which a watch does not retry. */
 const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
 
-/** The view of values of a device; `may.write` says whether it may change. */
+/** The values view. `may.write` is whether the gateway allows writes. */
 export class Values {
   constructor(may) {
     this.may = may;
@@ -35,23 +35,23 @@ export class Values {
     this.adapt();
   }
 
-  /** Takes a device to work on; what was shown goes. */
+  /** Selects a device, and removes the values of the previous one. */
   use(device) {
     this.device = device;
     this.plots?.end();
     this.table = this.plots = null;
-    $("table").replaceChildren(h("p", { class: "card empty" }, "Choose a range, then read it once, or watch it."));
+    $("table").replaceChildren(h("p", { class: "card empty" }, "Choose a range, then read or watch it."));
     say($("outcome"));
   }
 
-  /** There is no device; what was read last stays, as old. */
+  /** Deselects the device. The last values stay visible, marked as stale. */
   leave() {
     this.stop();
     this.device = null;
     this.table?.stale(true);
   }
 
-  /** Makes the fields those of the area and the type, and says which don't go together. */
+  /** Adapts the form to area and type, and validates it. */
   adapt() {
     const area = Number($("area").value);
     const ofBits = area < 3;
@@ -60,13 +60,13 @@ export class Values {
     for (const id of ["type", "order"]) show($(id), !ofBits);
     show($("letters"), ofLetters);
     show($("size"), !ofBits && ["bit", "string", "bytes"].includes(kind));
-    $("size-name").textContent = kind === "bit" ? "Which bit" : "Bytes each";
+    $("size-name").textContent = kind === "bit" ? "Bit number" : "Bytes per value";
     [$("size").min, $("size").max] = kind === "bit" ? [0, 15] : [1, 250];
     $("quantity").max = areaOf(area).most;
     const address = Number($("address").value);
     $("modicon").textContent = Number.isInteger(address) && address >= 0 ? `= ${modicon(area, address)}` : "";
     const past = address + whole(Number($("quantity").value), this.type().width) > LAST + 1;
-    $("quantity").setCustomValidity(past ? `The last address is ${LAST}: from ${address} there are ${LAST + 1 - address}.` : "");
+    $("quantity").setCustomValidity(past ? `The last address is ${LAST}: at most ${LAST + 1 - address} from ${address}.` : "");
     $("letters").setCustomValidity(ofLetters ? flaw(this.order(), this.type()) : "");
   }
 
@@ -78,7 +78,7 @@ export class Values {
     return $("order").value === "letters" ? $("letters").value.trim().toUpperCase() : $("order").value;
   }
 
-  /** Shows a range that was chosen elsewhere: all of it, as far as one read goes. */
+  /** Reads a range of the map, as much of it as one read allows. */
   open(area, address, length) {
     $("area").value = area;
     $("address").value = address;
@@ -87,10 +87,10 @@ export class Values {
     if (length <= most && length % this.type().width > 0) $("type").value = "uint16";
     $("quantity").value = whole(Math.min(length, most), this.type().width);
     this.adapt();
-    this.read(length > most ? `The range has ${length.toLocaleString("en")}, which one read does not take.` : null);
+    this.read(length > most ? `The range has ${length.toLocaleString("en")} addresses; one read covers only a part of it.` : null);
   }
 
-  /** What the form asks for: whole values of the type. */
+  /** Returns the range of the form, with the quantity rounded to whole values of the type. */
   range() {
     const area = Number($("area").value);
     const address = Number($("address").value);
@@ -105,11 +105,11 @@ export class Values {
       width: type.width,
       order: this.order(),
       title: `${areaOf(area).title} ${address} to ${address + quantity - 1}`,
-      note: asked === quantity ? null : `Each ${type.name} takes ${type.width} registers: ${quantity} rather than ${asked}.`,
+      note: asked === quantity ? null : `Each ${type.name} has ${type.width} registers: ${quantity} instead of ${asked}.`,
     };
   }
 
-  /** The range as the gateway wants it. */
+  /** Converts a range to the fields of a request. */
   request(range) {
     const { device, area, address, quantity, ofBits, type, order } = range;
     const typed = ofBits ? {} : { datatype: type.name, byteOrder: order };
@@ -157,23 +157,23 @@ export class Values {
       return;
     }
     if (this.watching) {
-      say($("outcome"), `${told}. Watching goes on.`);
+      say($("outcome"), `${told}. The watch continues.`);
       return;
     }
     try {
       const found = await post("/api/modbus/read", this.request(range));
       if (this.table?.range !== range || this.device !== range.device) return;
       this.table.set(found.values, found.typedText, true);
-      const changed = `${told}, and read back: what has changed is marked.`;
-      say($("outcome"), outcome === "written" ? changed : `${told}. Read back: this is what is there.`);
+      const changed = `${told} and read back. Changes are marked.`;
+      say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
       if (this.table?.range !== range) return;
       this.table.stale(true);
-      say($("outcome"), notice(error, `${told}. It could not be read back.`));
+      say($("outcome"), notice(error, `${told}. Reading back failed.`));
     }
   }
 
-  /** The plot of an address of the table, whose range is watched for that. */
+  /** Adds or removes the plot of an address. Starts a watch if necessary. */
   plot(address) {
     if (!this.watching) {
       if (!$("interval").reportValidity()) return;
@@ -183,7 +183,7 @@ export class Values {
     this.plots?.choose(address);
   }
 
-  /** Polls a range until it is stopped; begins again when the gateway was gone. */
+  /** Watches a range until it is stopped. Retries when the stream ends. */
   async watch(range) {
     this.stop();
     const stopping = new AbortController();
@@ -220,14 +220,14 @@ export class Values {
     }
   }
 
-  /** There is nothing to watch for now; says it once. */
+  /** Handles an interrupted watch. Shows each reason once. */
   interrupted(error, told) {
     const reason = error?.reason ?? "ended";
     this.table?.stale(true);
     const gone = ["ended", "gateway_gone"];
     if (reason === told || (gone.includes(reason) && gone.includes(told))) return told;
-    const goes = "It goes on by itself when that is over; Stop ends it.";
-    if (gone.includes(reason)) say($("outcome"), "The gateway has ended the watch, or is gone. It goes on by itself when the gateway is back; Stop ends it.");
+    const goes = "The watch resumes automatically. Press Stop to end it.";
+    if (gone.includes(reason)) say($("outcome"), "The gateway ended the watch or does not answer. The watch resumes automatically when the gateway is back. Press Stop to end it.");
     else say($("outcome"), notice(error), goes);
     return reason;
   }
@@ -236,7 +236,7 @@ export class Values {
     if (name === "problem") {
       this.table?.stale(true);
       const problem = Object.assign(new Error(data.error), { reason: data.reason });
-      say($("outcome"), notice(problem), "Trying again and again…");
+      say($("outcome"), notice(problem), "Retrying…");
     } else if (name === "values") {
       this.begin(range, data);
     } else {
@@ -259,7 +259,7 @@ export class Values {
     say($("outcome"), `Watching ${range.title.toLowerCase()}, every ${this.interval} ms.`, range.note);
   }
 
-  /** Ends reading and watching; what was seen last stays. */
+  /** Stops reading and watching. The last values stay visible. */
   stop() {
     this.reading?.abort();
     this.reading = null;
@@ -277,5 +277,5 @@ export class Values {
   }
 }
 
-/** As many registers as hold whole values, but one at least. */
+/** Rounds a quantity down to whole values, at least one. */
 const whole = (quantity, width) => Math.max(width, Math.floor(quantity / width) * width);

@@ -1,29 +1,29 @@
-// Writing: a new value, then what is there and what will be, side by side, then it is written.
+// The write dialog: asks for a value, shows it beside the current one, then writes it.
 
 import { notice, post, Problem } from "./api.js";
 import { $, h, once } from "./dom.js";
 import { binary, bit, hex, literal, modicon, register } from "./numbers.js";
 import { areaOf } from "./standard.js";
 
-const BITS_HELP = "0, 1, on or off. Several, with commas between them, go to the coils that follow.";
+const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with commas.";
 const HELP = {
-  register: () => "Decimal, 0x… or 0b…. Several, with commas between them, go to the registers that follow.",
-  string: ({ size }) => `Up to ${size} characters of ASCII. What is shorter is filled with zeros.`,
-  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. Several, with commas between them, go to the registers that follow.`,
-  bit: () => "0, 1, on or off. It needs function 22; a device without it takes the whole register as it is.",
+  register: () => "Decimal, 0x… or 0b…. Separate values for consecutive registers with commas.",
+  string: ({ size }) => `Up to ${size} ASCII characters. Shorter text is padded with zeros.`,
+  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. Separate values for consecutive registers with commas.`,
+  bit: () => "0, 1, on or off. This uses function 22. If the device does not support it, write the whole register.",
 };
-const TYPED_HELP = () => "Several, with commas between them, go to the registers that follow.";
+const TYPED_HELP = () => "Separate values for consecutive registers with commas.";
 const MOST_REVIEWED = 16;
 
-/** Reasons that come before anything is sent to the device. */
+/** Reasons of errors that occur before anything is sent to the device. */
 const UNSENT = new Set(["no_connection", "no_such_name", "refused_target", "writes_off", "malformed", "busy", "unauthorized",
   "foreign_page", "too_large", "not_json"]);
-/** Exceptions that leave open what has become of a request: it is worked on, or was passed on. */
+/** Exceptions after which a write may still be carried out: Acknowledge, and a gateway's timeout. */
 const OPEN = /\(code 0x[5b]\)/;
-/** What the gateway says of a request that did not leave it. */
+/** The gateway's message for a timeout of a request that it has not sent. */
 const KEPT = /was not sent/;
 
-/** Asks for a value and writes it. */
+/** The write dialog. */
 export class Writer {
   constructor() {
     this.asked = null;
@@ -40,7 +40,7 @@ export class Writer {
       this.step(this.asked);
     });
     form.addEventListener("keydown", (event) => {
-      // A key that is held down confirms nothing.
+      // A held Enter key must not confirm the next step.
       if (event.key === "Enter" && event.repeat) event.preventDefault();
     });
   }
@@ -56,7 +56,7 @@ export class Writer {
     const what = range.ofBits ? "coil" : "holding register";
     $("write-title").textContent = `Write ${what} ${address}`;
     $("write-where").textContent = `${modicon(range.area, address)} of unit ${unitId} at ${host}:${port}`;
-    const forms = range.ofBits ? [["bit", "bit"]] : [["register", "register as it is"], ["typed", range.type.name]];
+    const forms = range.ofBits ? [["bit", "bit"]] : [["register", "plain register"], ["typed", range.type.name]];
     $("write-as").replaceChildren(...forms.map(([value, text]) => h("option", { value }, text)));
     $("write-as-label").hidden = range.ofBits;
     const plain = ["int16", "uint16"].includes(range.type.kind);
@@ -83,7 +83,7 @@ export class Writer {
     $("write-value").required = !(typed && kind === "string");
   }
 
-  /** Back to the question. */
+  /** Returns to the first step. */
   back() {
     this.asked.change = null;
     $("write-ask").hidden = false;
@@ -92,7 +92,7 @@ export class Writer {
     $("write-cancel").textContent = "Cancel";
   }
 
-  /** Whether the dialog is still about this. */
+  /** Returns whether the dialog is open for this write. */
   isAbout(asked) {
     return this.asked === asked && this.dialog.open;
   }
@@ -115,7 +115,7 @@ export class Writer {
     });
   }
 
-  /** Reads what is there now, and shows it beside what was asked for. */
+  /** Reads the current values, and shows them beside the new ones. */
   async review(asked) {
     const change = wanted(asked.range, $("write-as").value, $("write-value").value);
     change.before = await this.read(asked, change);
@@ -132,7 +132,7 @@ export class Writer {
     $("write-go").focus();
   }
 
-  /** Writes what was confirmed. Does not fail: what has become of it is the outcome. */
+  /** Writes the confirmed values. Never throws: `asked.outcome` has the outcome. */
   async write(asked) {
     const doubt = asked.outcome === "unknown" ? "unknown" : "refused";
     asked.outcome = "unknown";
@@ -145,7 +145,7 @@ export class Writer {
         ? !OPEN.test(error.message)
         : UNSENT.has(error.reason) || KEPT.test(error.message);
       if (refused) asked.outcome = doubt;
-      const told = refused ? "Not written." : "Not known whether it was written.";
+      const told = refused ? "Not written." : "Unknown whether it was written.";
       const back = await this.read(asked, asked.change).catch(() => null);
       if (!this.isAbout(asked)) return;
       $("write-error").replaceChildren(notice(error, told), h("p", {}, compared(asked.change, back)));
@@ -153,16 +153,16 @@ export class Writer {
     }
   }
 
-  /** What is there of what a change is about. */
+  /** Reads the addresses of a change. */
   async read({ range, address }, { count, typed }) {
     const { most } = areaOf(range.area);
-    if (count > most) throw new Error(`${count} are too many: ${most} at most`);
+    if (count > most) throw new Error(`too many values: ${count}, at most ${most}`);
     const found = await post("/api/modbus/read", { ...range.device, functionCode: range.area, address, quantity: count, ...typed });
     return found.typedText ?? found.values;
   }
 }
 
-/** What was typed in, as values that are shown and as JSON. Throws what is wrong with it. */
+/** Parses the typed values. Returns their display text and JSON. Throws an error if they are invalid. */
 function wanted(range, form, text) {
   const { type, order } = range;
   if (form !== "typed") {
@@ -170,7 +170,7 @@ function wanted(range, form, text) {
     return { form, shown, json: shown, step: 1, count: shown.length, typed: {} };
   }
   const parts = type.kind === "string" ? [text] : text.split(",");
-  if (type.kind === "bit" && parts.length > 1) throw new Error("One bit at a time");
+  if (type.kind === "bit" && parts.length > 1) throw new Error("Write one bit at a time");
   const values = parts.map((part) => literal(part, type));
   return {
     form,
@@ -182,7 +182,7 @@ function wanted(range, form, text) {
   };
 }
 
-/** Where a change is sent, and as what. */
+/** Returns the path and the body of the request for a change. */
 function request({ range, address, change }) {
   const about = { ...range.device, address };
   const { form, json, typed } = change;
@@ -201,13 +201,13 @@ function request({ range, address, change }) {
     : [`/api/modbus/write/${many}`, { ...about, values: json }];
 }
 
-/** What reading back tells after a write that failed. */
+/** Describes the values that were read back after a failed write. */
 function compared({ shown, before }, back) {
-  if (back === null) return "It could not be read back: read it before you go on.";
+  if (back === null) return "Reading back failed: read the values before you continue.";
   const same = (others) => back.every((value, at) => value === others[at]);
-  if (same(before)) return "Read back: it is as it was before.";
-  if (same(shown)) return "Read back: it is what was to be written.";
-  return `Read back: it is neither as before nor what was to be written, but ${back.slice(0, MOST_REVIEWED).map(inWords).join(", ")}.`;
+  if (same(before)) return "Read back: unchanged.";
+  if (same(shown)) return "Read back: the new values are there.";
+  return `Read back: neither the old nor the new values, but ${back.slice(0, MOST_REVIEWED).map(inWords).join(", ")}.`;
 }
 
 function inWords(value) {
@@ -215,7 +215,7 @@ function inWords(value) {
   return typeof value === "number" ? `${value}  0x${hex(value)}` : value;
 }
 
-/** One register in every form; the bits that change are marked. */
+/** Formats one register in every form. Changed bits are marked. */
 function forms(before, after) {
   const [was, will] = [binary(before), binary(after)];
   const marked = [...will].map((bit, at) => (bit === was[at] ? bit : h("mark", {}, bit)));
