@@ -390,7 +390,7 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
             for _ in range(3):
                 scanner.do(scanner.scanner._heart.beat(scanner.scanner._broker.client))
         [told] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
-        reason = "the server has no JetStream, or none for this account"
+        reason = "JetStream is not enabled on the server or for this account"
         assert told.__dict__["fields"]["reason"] == reason
         scanner.stop()
     finally:
@@ -409,7 +409,7 @@ def test_a_bucket_in_which_heartbeats_stay_for_ever_is_told_of_once(
     scanner.do(heart.beat(broker.client))
     [told] = [each for each in caplog.records if each.getMessage() == "heartbeat_has_no_end"]
     assert told.__dict__["fields"]["bucket"] == "service_heartbeats"
-    assert "remove it" in told.__dict__["fields"]["todo"]
+    assert "delete the bucket" in told.__dict__["fields"]["todo"]
 
 
 async def _bucket_without_end(caller: Caller) -> None:
@@ -530,7 +530,7 @@ def test_a_message_that_is_none_is_told_of_now_and_then(
     [record, *_] = [each for each in caplog.records if each.getMessage() == "message_malformed"]
     assert record.__dict__["fields"] == {
         "subject": "modbus.command.\\xff",
-        "reason": "no UTF-8 in the subject, the reply subject or a header",
+        "reason": "invalid UTF-8 in the subject, the reply subject or a header",
     }
 
 

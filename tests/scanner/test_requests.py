@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"deviceId": None}, "Expected `str`, got `null` - at `$.deviceId`"),
     ({"deviceId": ""}, "Expected `str` of length >= 1 - at `$.deviceId`"),
-    ({"deviceId": "a b"}, "deviceId is 'a b', allowed is"),
-    ({"deviceId": "a.*"}, "deviceId is 'a.*', allowed is"),
-    ({"deviceId": "a..b"}, "deviceId is 'a..b', allowed is"),
+    ({"deviceId": "a b"}, "deviceId is 'a b', which can't be a part of a subject"),
+    ({"deviceId": "a.*"}, "deviceId is 'a.*', which can't be a part of a subject"),
+    ({"deviceId": "a..b"}, "deviceId is 'a..b', which can't be a part of a subject"),
     ({"deviceId": "a\r\nPUB x 0"}, "deviceId is"),
     ({"subscriberId": 7}, "Expected `str`, got `int` - at `$.subscriberId`"),
-    ({"host": None}, "host is missing; a url in its place would do"),
+    ({"host": None}, "host is missing: give host or url"),
     ({"host": 5}, "Expected `str | null`, got `int` - at `$.host`"),
     ({"port": 0}, "Expected `int` >= 1 - at `$.port`"),
     ({"port": "502"}, "Expected `int | null`, got `str` - at `$.port`"),
-    ({"url": "tcp://127.0.0.1"}, "host stands beside url, allowed is one of both"),
+    ({"url": "tcp://127.0.0.1"}, "both url and host are given, allowed is only one"),
     ({"host": None, "port": None, "url": "http://127.0.0.1"}, "url: 'http://127.0.0.1' is no URL"),
     ({"host": None, "port": None, "url": "tls://127.0.0.1?ca=/etc/passwd"}, "url: ca is given, al"),
     ({"host": None, "port": None, "url": "tls://127.0.0.1?cert=a&key=b"}, "url: cert is given, al"),
@@ -51,14 +51,14 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"scanRate": 100.5}, "Expected `int | null`, got `float` - at `$.scanRate`"),
     ({"timeout": 5}, "timeout is 5, allowed are 10 to 30000 ms"),
     ({"publish": "always"}, "at `$.publish`, allowed are scan, change"),
-    ({"deadband": 1}, 'deadband goes with "publish": "change"'),
+    ({"deadband": 1}, 'deadband requires "publish": "change"'),
     ({"deadband": -1, "publish": "change"}, "Expected `float` >= 0.0 - at `$.deadband`"),
     ({"plan": {"max_registers": 126}}, "Expected `int` <= 125 - at `$.plan.max_registers`"),
     ({"plan": {"maxGap": 1}}, "Object contains unknown field `maxGap` - at `$.plan`"),
     ({"plan": {"readable": [[5, 4]]}}, "plan.readable[0] is [5, 4], allowed are first and last"),
     ({"plan": {"readable": [["coil", 4]]}}, "plan.readable[0] is ['coil', 4], allowed are"),
     ({"plan": {"readable": [[1, 2, 3]]}}, "plan.readable[0] is [1, 2, 3], allowed are"),
-    ({"plan": {"forbidden": [[0, 9]]}}, "tag 'a' from address 5 on: plan.forbidden has 0 to 9"),
+    ({"plan": {"forbidden": [[0, 9]]}}, "tag 'a' from address 5: plan.forbidden contains 0 to 9"),
     ({"scanrate": 100}, "Object contains unknown field `scanrate`"),
     ({"tags": None}, "Expected `array`, got `null` - at `$.tags`"),
     (
@@ -69,11 +69,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"tags": [tag("a", 0, "string:2", encoding="x")]}, "tags[0]: encoding 'x' is unknown"),
     (
         {"tags": [tag("a", 0, "uint16[124]", writable=True)]},
-        "tags[0]: uint16[124] takes 124 registers, one request writes at most 123",
+        "tags[0]: uint16[124] has 124 registers, one request writes at most 123",
     ),
     (
         {"tags": [tag("a", 0, "boolean[1969]", functionCode="coil", writable=True)]},
-        "tags[0]: boolean[1969] takes 1969 coils, one request writes at most 1968",
+        "tags[0]: boolean[1969] has 1969 coils, one request writes at most 1968",
     ),
     (
         {"tags": [tag("a", 0, "bit:3[2]", writable=True)]},
@@ -81,11 +81,14 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ),
     ({"tags": [{"id": "a"}]}, "Object missing required field `address` - at `$.tags[0]`"),
     ({"tags": [tag("", 0)]}, "Expected `str` of length >= 1 - at `$.tags[0].id`"),
-    ({"tags": [tag("a", 0), tag("a", 1)]}, "tags[1]: the id 'a' is there twice"),
+    ({"tags": [tag("a", 0), tag("a", 1)]}, "tags[1]: duplicate id 'a'"),
     ({"tags": [tag("a", -1)]}, "Expected `int` >= 0 - at `$.tags[0].address`"),
-    ({"tags": [tag("a", 65535, "int32")]}, "tags[0]: int32 from address 65535 on, the last is"),
+    (
+        {"tags": [tag("a", 65535, "int32")]},
+        "tags[0]: int32 from address 65535: the last address is",
+    ),
     ({"tags": [tag("a", 0, "int8")]}, "tags[0]: type 'int8' is unknown, allowed are"),
-    ({"tags": [tag("a", 0, "string:252")]}, "tag 'a': string:252 takes 126 registers, one request"),
+    ({"tags": [tag("a", 0, "string:252")]}, "tag 'a': string:252 has 126 registers, one request"),
     ({"tags": [tag("a", 0, functionCode="coils")]}, "allowed are coil, discrete, holding, input"),
     (
         {"tags": [tag("a", 0, functionCode="coil")]},
@@ -93,13 +96,13 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"tags": [tag("a", 0, functionCode="input", writable=True)]},
-        "what functionCode input reads can't be written",
+        "functionCode input is not writable",
     ),
     ({"tags": [tag("a", 0, byteOrder="CDABGHEF")]}, "order CDABGHEF is for 8 bytes"),
     ({"tags": [tag("a", 0, unit="V")]}, "Object contains unknown field `unit` - at `$.tags[0]`"),
     ({"tags": [tag("a", 0, null=[70000])]}, "tags[0].null: 70000 is outside 0 to 65535 of uint16"),
     ({"tags": [tag("a", 0, null=["nan"])]}, "tags[0].null: 'nan'"),
-    ({"tags": [tag("a", 0, "bytes:2", null=["AA=="])]}, "tags[0].null: not for bytes:2"),
+    ({"tags": [tag("a", 0, "bytes:2", null=["AA=="])]}, "tags[0].null: not supported for bytes:2"),
 ]
 
 
@@ -144,14 +147,14 @@ def _browsed(caller: Caller) -> Any:
         ({"unitId": 2}, "plc1 is known as"),
         ({"transport": "udp"}, "plc1 is known as"),
         ({"host": "localhost"}, "plc1 is known as"),
-        ({"timeout": 2000}, "timeout of plc1 is another one already"),
-        ({"release": True}, "release of plc1 is another one already"),
-        ({"plan": {"max_gap": 0}}, "plan of plc1 is another one already"),
-        ({"tags": [tag("b", 0), tag("a", 6)]}, "tag 'a' of plc1 has another definition already"),
-        ({"tags": [tag("b", 0), tag("a", 5, "int16")]}, "tag 'a' of plc1 has another"),
-        ({"tags": [tag("a", 5, functionCode="input")]}, "tag 'a' of plc1 has another"),
-        ({"tags": [tag("a", 5, null=[0])]}, "tag 'a' of plc1 has another"),
-        ({"byteOrder": "DCBA"}, "tag 'a' of plc1 has another"),
+        ({"timeout": 2000}, "timeout of plc1 is already different"),
+        ({"release": True}, "release of plc1 is already different"),
+        ({"plan": {"max_gap": 0}}, "plan of plc1 is already different"),
+        ({"tags": [tag("b", 0), tag("a", 6)]}, "tag 'a' of plc1 already has another definition"),
+        ({"tags": [tag("b", 0), tag("a", 5, "int16")]}, "tag 'a' of plc1 already has another"),
+        ({"tags": [tag("a", 5, functionCode="input")]}, "tag 'a' of plc1 already has another"),
+        ({"tags": [tag("a", 5, null=[0])]}, "tag 'a' of plc1 already has another"),
+        ({"byteOrder": "DCBA"}, "tag 'a' of plc1 already has another"),
     ],
 )
 @pytest.mark.parametrize("who", ["hmi", "historian"])
@@ -183,10 +186,10 @@ def test_limits_are_kept_and_told(
     assert ask("d1", "a", "1", "2")["success"]
     assert ask("d1", "b", "3")["success"]
     assert ask("d1", "b", "4")["error"] == "d1 would have 4 tags, allowed are 3"
-    assert ask("d1", "c", "3")["error"] == "d1 has 2 subscribers, no more are allowed"
+    assert ask("d1", "c", "3")["error"] == "d1 already has 2 subscribers, which is the limit"
     assert ask("d2", "a", "1", "2", "3")["error"] == "there would be 6 tags, allowed are 5"
     assert ask("d2", "a", "1", "2")["success"]
-    assert ask("d3", "a", "1")["error"] == "there are 2 devices, more are not allowed"
+    assert ask("d3", "a", "1")["error"] == "there are already 2 devices, which is the limit"
     assert "allowed are 2000" in ask("d2", "a", "x" * 2000)["error"]
 
     left = leaving("1", "2", deviceId="d2", subscriberId="a")
@@ -243,10 +246,10 @@ def test_devices_on_one_serial_line_have_the_same_settings(
 
     assert ask("one", "rtu:///dev/ttyNONE0?baud=9600")["success"]
     for url, error in (
-        ("rtu:///dev/ttyNONE0", "baud of /dev/ttyNONE0 is 9600 for one already, not 19200; dev"),
-        ("rtu:///dev/ttyNONE0?baud=9600&parity=none", "parity of /dev/ttyNONE0 is even for one"),
-        ("ascii:///dev/ttyNONE0?baud=9600", "mode of /dev/ttyNONE0 is rtu for one already"),
-        ("rtu:///dev/ttyNONE0?baud=9600&silence=0.1", "is the default for one already, not 0.1"),
+        ("rtu:///dev/ttyNONE0", "baud of /dev/ttyNONE0 is already 9600 for one, not 19200; dev"),
+        ("rtu:///dev/ttyNONE0?baud=9600&parity=none", "parity of /dev/ttyNONE0 is already even for one"),
+        ("ascii:///dev/ttyNONE0?baud=9600", "mode of /dev/ttyNONE0 is already rtu for one"),
+        ("rtu:///dev/ttyNONE0?baud=9600&silence=0.1", "is already the default for one, not 0.1"),
     ):
         assert error in ask("two", url)["error"]
     assert "baud 9600" in ask("one", "rtu:///dev/ttyNONE0")["error"]
@@ -264,7 +267,8 @@ def test_a_serial_device_is_refused_that_is_not_named(scanner: Running, caller: 
     }
     answer = caller.request("modbus.subscribe", request)
     assert answer["error"] == (
-        "/dev/ttyUSB7 is not allowed; name it with --allow, or in nats.devices of the configuration"
+        "/dev/ttyUSB7 is not allowed; allow it with --allow, or in nats.devices of the "
+        "configuration"
     )
 
 

@@ -528,7 +528,7 @@ def test_a_device_that_does_not_fit_into_one_answer_is_browsed_in_pages(
     last = caller.request("modbus.browse", {"deviceId": "plc1", "tagOffset": 3000})
     assert last["devices"][0]["tags"] == []
     lost = caller.request("modbus.browse", {"tagOffset": 1})
-    assert lost == {"success": False, "error": "tagOffset goes with deviceId"}
+    assert lost == {"success": False, "error": "tagOffset requires deviceId"}
 
 
 def test_between_two_large_requests_others_have_their_turn(

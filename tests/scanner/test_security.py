@@ -256,7 +256,7 @@ def test_credentials_that_are_refused_are_told_and_read_anew(
     told(caplog, "nats_connect_failed", "Authorization Violation")
     assert not scanner.serves
     file.write_text("")
-    told(caplog, "nats_connect_failed", "there is no block NATS USER JWT")
+    told(caplog, "nats_connect_failed", "block NATS USER JWT is missing")
     User(plant).write(file)
     wire.until(lambda: scanner.serves, "it is connected")
 
@@ -399,16 +399,16 @@ def damaged(seed: str) -> str:
 @pytest.mark.parametrize(
     ("jwt", "seed", "error"),
     [
-        ("{jwt}", "", "there is no block USER NKEY SEED, as credentials of NATS have it"),
-        ("", "{seed}", "there is no block NATS USER JWT, as credentials of NATS have it"),
-        ("{jwt}", "{account}", "the seed is that of an account, allowed: that of a user"),
-        ("{jwt}", "{damaged}", "the seed is damaged or none"),
-        ("{jwt}", "{user}", "the seed is damaged or none"),
-        ("{jwt}", "{other}", "the seed does not belong to the JWT"),
-        ("no.jwt", "{seed}", "the JWT is damaged or none"),
-        ("e30.W10.e30", "{seed}", "the JWT is damaged or none"),
-        ("e30.e30.e30", "{seed}", "the JWT is damaged or none"),
-        ("\0", "\0", "there is no block NATS USER JWT, as credentials of NATS have it"),
+        ("{jwt}", "", "block USER NKEY SEED is missing; a NATS credentials file has one"),
+        ("", "{seed}", "block NATS USER JWT is missing; a NATS credentials file has one"),
+        ("{jwt}", "{account}", "the seed belongs to an account, allowed: the seed of a user"),
+        ("{jwt}", "{damaged}", "the seed is malformed"),
+        ("{jwt}", "{user}", "the seed is malformed"),
+        ("{jwt}", "{other}", "the seed and the JWT are of different users"),
+        ("no.jwt", "{seed}", "the JWT is malformed"),
+        ("e30.W10.e30", "{seed}", "the JWT is malformed"),
+        ("e30.e30.e30", "{seed}", "the JWT is malformed"),
+        ("\0", "\0", "block NATS USER JWT is missing; a NATS credentials file has one"),
     ],
 )
 def test_credentials_that_are_none_are_told(file: Path, jwt: str, seed: str, error: str) -> None:

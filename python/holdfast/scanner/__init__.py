@@ -1,11 +1,11 @@
-"""The scanner: polls Modbus devices for whoever subscribes over NATS, and publishes what they say.
+"""The scanner: polls Modbus devices for subscribers on NATS, and publishes the values.
 
-It has no configuration of devices: a device is connected to when somebody wants tags of it, and let
-go with the last who does. Nothing is kept over a restart.
+It has no configuration of devices. It connects to a device at the first subscription to its tags,
+and disconnects after the last one ends. It keeps no state over a restart.
 
-The rooms, from the outside in: `service` wires all; `broker`, `receiving`, `outbox` and `wire` talk
-to NATS, `polling` and `commands` to devices; `registry` knows who wants what; `groups`, `decoding`
-and `publishing` make messages of what was read. The last four do no I/O.
+The modules: `service` connects the parts. `broker`, `receiving`, `outbox` and `wire` communicate
+with NATS, `polling` and `commands` with devices. `registry` holds the subscriptions. `groups`,
+`decoding` and `publishing` convert values to messages. `registry` and these three do no I/O.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The scanner as a part of an appliance: in a thread, until the appliance stops it."""
+"""Runs the scanner in an appliance, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class ScannerAdapter:
-    """One scanner, under a supervisor.
+    """A scanner with the interface of an adapter.
 
-    It ends by itself when a message asks for that. `settings.servers` hold no secrets in their
-    URLs: `status` shows them.
+    It returns when a shutdown message arrives. The URLs in `settings.servers` must not contain
+    secrets, because `status` shows them.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -25,21 +25,24 @@ class ScannerAdapter:
         self._scanner = Scanner(settings)
 
     def run(self, stop: Stop) -> None:
-        """Serves until `stop`, or until it is asked to end. Raises `OSError` for files."""
+        """Serves until `stop` is set, or until a shutdown message.
+
+        Raises `OSError` for a file of the settings that can't be used.
+        """
         asyncio.run(self._serve(stop))
 
     async def _serve(self, stop: Stop) -> None:
         loop = asyncio.get_running_loop()
 
         def end() -> None:
-            with contextlib.suppress(RuntimeError):  # It has ended by itself.
+            with contextlib.suppress(RuntimeError):  # The loop is already closed.
                 loop.call_soon_threadsafe(self._scanner.end)
 
         stop.then(end)
         await self._scanner.run()
 
     def status(self) -> dict[str, object]:
-        """Whether it is connected, how many devices it polls, and what became of messages."""
+        """Returns the state of the connection, the number of devices, and counts of messages."""
         scanner = self._scanner
         return {
             "connected": scanner.serves,

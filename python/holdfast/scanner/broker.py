@@ -1,7 +1,7 @@
-"""The connection to NATS: made, made again for ever, and told of in the log.
+"""The connection to NATS: connects, reconnects forever, and logs both.
 
-nats-py reconnects by itself and repeats the subscriptions. It gives a connection up for good when
-the server sends an error that it does not know better; then a new client is made here.
+nats-py reconnects and repeats the subscriptions by itself. But after some errors of the server it
+closes the client permanently. Then this module creates a new client.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
 
 FIRST_PAUSE = 0.25
 MAX_PAUSE = 2.0
-"""Seconds between attempts to connect: doubled with each failure, up to the longest."""
+"""Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
 
 SILENCE = 600.0
-"""Seconds for which a failure to connect is not logged again when its reason is the same."""
+"""Seconds before a failure to connect with the same reason is logged again."""
 
 PING = 10
-"""Seconds between questions whether the server is still there; two may stay without an answer."""
+"""Seconds between pings to the server. nats-py reconnects when two have no answer."""
 
 PENDING = 64 * 1024 * 1024
-"""Bytes that nats-py may hold; the outbox sees to it that there are never so many."""
+"""The limit of nats-py's send buffer in bytes. The outbox always stays below it."""
 
 CHECK_INTERVAL = 1.0
-"""Seconds between looks whether nats-py has given a connection up without telling."""
+"""Seconds between checks whether nats-py closed the client without a callback."""
 
 CLOSING = 1.5
-"""Seconds that the last messages have to reach the server."""
+"""Seconds to send the last messages when a client is closed."""
 
 
 @dataclass(frozen=True)
 class Servers:
-    """Where NATS is, and who we are there. Files are read at each new client."""
+    """The NATS servers and the credentials. Files are read again for each new client."""
 
     urls: tuple[str, ...] = ("nats://127.0.0.1:4222",)
     user: str | None = None
@@ -59,15 +59,15 @@ class Servers:
     credentials: Path | None = None
     """A file with a JWT and a seed, see `Credentials`."""
     tls: Tls = NO_FILES
-    """Whom we trust there, and what we show."""
+    """The TLS files for the connection."""
 
     @property
     def secure(self) -> bool:
-        """Whether nothing may be sent without TLS."""
+        """Whether the connection requires TLS."""
         return self.tls != NO_FILES or any(url.startswith("tls://") for url in self.urls)
 
     def options(self) -> dict[str, Any]:
-        """As `Client.connect` has them. Raises `OSError` for a file that can't be used."""
+        """Returns options for `Client.connect`. Raises `OSError` for an unusable file."""
         options: dict[str, Any] = {"servers": list(self.urls)}
         if self.user is not None:
             options["user"] = self.user
@@ -87,11 +87,11 @@ def _secret(file: Path) -> str:
     try:
         return file.read_text().removesuffix("\n").removesuffix("\r")
     except UnicodeDecodeError:
-        raise OSError(f"{file} is no text") from None
+        raise OSError(f"{file} is not UTF-8 text") from None
 
 
 class Broker:
-    """Stays connected. `handlers` get the messages of their subjects."""
+    """Keeps a connection to NATS. Calls `handlers` for messages of their subjects."""
 
     def __init__(
         self,
@@ -111,11 +111,14 @@ class Broker:
 
     @property
     def serves(self) -> bool:
-        """Whether messages reach the handlers just now."""
+        """Whether messages currently reach the handlers."""
         return self.client is not None and self._subscribed
 
     async def run(self) -> None:
-        """Connects, and connects again, until it is cancelled. Raises `OSError` for files."""
+        """Connects and reconnects until it is cancelled.
+
+        Raises `OSError` for an unusable file before the first connection.
+        """
         while True:
             client = TlsClient() if self._servers.secure else SafeClient()
             ended = asyncio.Event()
@@ -132,7 +135,7 @@ class Broker:
             await asyncio.sleep(FIRST_PAUSE)
 
     async def _connect(self, client: Client, ended: asyncio.Event) -> None:
-        """Connects, and listens to all subjects, until nats-py gives up; then `ended` is set."""
+        """Connects and subscribes; returns when nats-py gives up, which sets `ended`."""
 
         async def lost() -> None:
             if self.client is client:
@@ -173,7 +176,7 @@ class Broker:
         self._lost("the connection was lost")
 
     async def _listen(self, client: Client, ended: asyncio.Event) -> None:
-        """Subscribes to all subjects; `ended` is set if that fails."""
+        """Subscribes to all subjects. Sets `ended` on failure."""
         try:
             for subject, handler in self._handlers.items():
                 await client.subscribe(subject, cb=handler)
@@ -205,7 +208,7 @@ class Broker:
         logs.write(level, "nats_disconnected", reason=reason)
 
     def _note(self, client: Client, error: Exception) -> None:
-        """Notes an error; while there is no connection it is that of an attempt to make one."""
+        """Logs an error. Without a connection, the error is a failed attempt to connect."""
         reason = str(error) or type(error).__name__
         if self.client is not None:
             logs.refused("nats_error", kind="nats", reason=reason)
@@ -221,7 +224,7 @@ class Broker:
 
 
 async def _given_up(client: Client, ended: asyncio.Event) -> None:
-    """Returns when nats-py has given a client up, which it does not say when that fails."""
+    """Returns when nats-py has closed a client. It does not always call the callback."""
     while not (ended.is_set() or client.is_closed):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CHECK_INTERVAL):
@@ -230,7 +233,7 @@ async def _given_up(client: Client, ended: asyncio.Event) -> None:
 
 
 async def _closed(client: Client) -> None:
-    """Closes a client, whatever the server does."""
+    """Closes a client, with a timeout. Ignores errors."""
     with contextlib.suppress(Exception):
         async with asyncio.timeout(CLOSING):
             await client.close()

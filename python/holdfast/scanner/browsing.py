@@ -1,4 +1,4 @@
-"""What `browse` tells: devices, tags, subscribers, blocks, and what goes wrong."""
+"""The answer to `browse`: devices, tags, subscribers, blocks and errors."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 _encode = msgspec.json.Encoder().encode
 
 ENVELOPE = 300
-"""Bytes of an answer that are no device."""
+"""Bytes of an answer without devices."""
 
 SMALLEST_TAG = 100
-"""Bytes that a tag takes at least, by which it is known that some tags can't fit."""
+"""The fewest bytes of a tag in an answer. It limits how many tags can fit."""
 
 SMALLEST_ID = 4
-"""Bytes that each subscriber takes at least for each of its tags."""
+"""The fewest bytes of a tag id in the list of a subscriber."""
 
 
 def browsed(
@@ -45,9 +45,10 @@ def browsed(
     service: ServiceReport,
     most: int,
 ) -> BrowseAnswer:
-    """The answer, in at most so many bytes. `devices` come with why their tags have no value.
+    """Returns the answer, with at most `most` bytes.
 
-    Raises `Refused` for an offset into nothing.
+    `devices` holds each device with the errors of tags that could not be decoded. Raises `Refused`
+    for `tagOffset` without `deviceId`.
     """
     answer = BrowseAnswer(True, len(devices), service, [])
     room = most - ENVELOPE
@@ -59,7 +60,7 @@ def browsed(
             answer.devices.append(page)
         return answer
     if request.tag_offset is not None:
-        raise Refused("tagOffset goes with deviceId")
+        raise Refused("tagOffset requires deviceId")
     for at, id in enumerate(sorted(devices)[request.offset or 0 :], request.offset or 0):
         device, undecoded = devices[id]
         whole = _Report(device, undecoded, counters.get(device.polled_as, {})).whole(most)
@@ -73,7 +74,7 @@ def browsed(
 
 
 class _Report:
-    """What there is to tell of one device."""
+    """Creates the reports of one device."""
 
     def __init__(
         self, device: ScannedDevice, undecoded: Mapping[str, str], counters: Mapping[str, Any]
@@ -86,7 +87,7 @@ class _Report:
         self._least = SMALLEST_TAG + SMALLEST_ID * len(device.subscribers)
 
     def whole(self, most: int) -> DeviceReport:
-        """All of it; without tags, blocks and subscribers if an answer could not have it."""
+        """Returns the whole report; without tags, blocks and subscribers if it is too large."""
         if len(self._tags) * SMALLEST_TAG <= most:
             report = self._with(self._tags)
             if len(_encode(report)) < most - ENVELOPE:
@@ -94,7 +95,7 @@ class _Report:
         return self._head()
 
     def page(self, offset: int, room: int) -> tuple[DeviceReport, int | None]:
-        """As many tags as fit, and the offset of the next one if there is one."""
+        """Returns a report with as many tags as fit, and the offset of the next tag, if any."""
         left = self._tags[offset:]
         count = min(len(left), max(room // self._least, 1))
         while True:
@@ -138,7 +139,7 @@ class _Report:
         )
 
     def _with(self, tags: Sequence[Tag]) -> DeviceReport:
-        """With some of the tags, their blocks, and who wants them."""
+        """Returns a report with these tags, their blocks and their subscribers."""
         ids = {tag.id for tag in tags}
         return msgspec.structs.replace(
             self._head(),
@@ -157,7 +158,7 @@ class _Report:
         )
 
     def _blocks(self, ids: Set[str]) -> Iterator[BlockReport]:
-        """The blocks that have some of these tags."""
+        """Yields the blocks that contain some of these tags."""
         asked = self._device.health.blocks
         if self._device.health.state != "online":
             planned = self._device.source.plan.blocks(self._tags)

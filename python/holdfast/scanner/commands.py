@@ -1,4 +1,4 @@
-"""Commands: a value as text, into a coil or holding registers of a device."""
+"""Commands: write a value, given as text, to coils or holding registers of a device."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NUMBER = re.compile(r"-?[0-9]{1,400}(\.[0-9]{1,400})?([eE][+-]?[0-9]{1,3})?")
 
 
 def value(text: str, tag: Tag) -> Any:
-    """The value that a text is for a tag. Raises `Refused`."""
+    """Parses a text to a value of a tag's type. Raises `Refused`."""
     type = parsed(tag.type)
     if type.count is not None:
         return _array(text, tag)
@@ -49,7 +49,7 @@ def value(text: str, tag: Tag) -> Any:
 
 
 def _checked(made: Any, tag: Tag) -> Any:
-    """A value that the type of the tag can hold."""
+    """Returns the value if it fits the type of the tag. Raises `Refused`."""
     try:
         encode(made, tag.type, tag.order, encoding=tag.encoding)
     except ConversionError as error:
@@ -60,13 +60,15 @@ def _checked(made: Any, tag: Tag) -> Any:
 def _boolean(text: str, tag: Tag) -> bool:
     found = BOOLEANS.get(text.strip().lower())
     if found is None:
-        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed are true, false, 1 and 0")
+        raise Refused(
+            f"{_shown(text)} is not a valid {tag.asked_type}, allowed are true, false, 1 and 0"
+        )
     return found
 
 
 def _number(text: str, tag: Tag, is_float: bool) -> int | float:
     if _NUMBER.fullmatch(text) is None:
-        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed is a number as JSON has it")
+        raise Refused(f"{_shown(text)} is not a valid {tag.asked_type}, allowed is a JSON number")
     if is_float:
         number = float(text)
         if math.isinf(number):
@@ -74,7 +76,7 @@ def _number(text: str, tag: Tag, is_float: bool) -> int | float:
         return number
     exact = Decimal(text)
     if exact.adjusted() > 20 or exact != exact.to_integral_value():
-        raise Refused(f"{_shown(text)} is no {tag.asked_type}")
+        raise Refused(f"{_shown(text)} is not a valid {tag.asked_type}")
     return int(exact)
 
 
@@ -82,7 +84,9 @@ def _bytes(text: str, tag: Tag) -> bytes:
     try:
         return base64.b64decode(text.strip(), validate=True)
     except (binascii.Error, ValueError):
-        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed is base64") from None
+        raise Refused(
+            f"{_shown(text)} is not a valid {tag.asked_type}, allowed is base64"
+        ) from None
 
 
 def _array(text: str, tag: Tag) -> list[Any]:
@@ -91,7 +95,7 @@ def _array(text: str, tag: Tag) -> list[Any]:
     except (msgspec.DecodeError, RecursionError):
         items = None
     if not isinstance(items, list):
-        raise Refused(f"{_shown(text)} is no {tag.asked_type}, allowed is a JSON array")
+        raise Refused(f"{_shown(text)} is not a valid {tag.asked_type}, allowed is a JSON array")
     base = parsed(tag.type).base
     if base == "bytes":
         items = [_bytes(item, tag) if isinstance(item, str) else item for item in items]
@@ -104,7 +108,7 @@ def _shown(text: str) -> str:
 
 
 async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) -> None:
-    """Writes a value that is given as text; returns when the device has confirmed it.
+    """Writes a value, given as text. Returns when the device has confirmed it.
 
     Raises `Refused`.
     """

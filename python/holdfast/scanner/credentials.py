@@ -1,7 +1,7 @@
-"""Who we are at NATS by a JWT and a seed, as `nsc` writes them into one file.
+"""NATS credentials: a file with a JWT and a seed, as `nsc` creates it.
 
-The server sends a text that is signed with the seed. The seed itself is never sent, logged or told
-in an error.
+The client signs a nonce from the server with the seed. The seed itself is never sent or logged, and
+never appears in an error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SEED = 18 << 3
-"""The first five bits of a seed, by which its text begins with S."""
+"""The first five bits of a seed. They make its text begin with S."""
 
 USER = 20 << 3
 KINDS = {
@@ -28,14 +28,14 @@ KINDS = {
     13 << 3: "a server",
     2 << 3: "a cluster",
 }
-"""Whose a key is, by the byte that says so: texts begin with O, A, U, N and C."""
+"""The owner of a key by its prefix byte. The texts begin with O, A, U, N and C."""
 
 SEED_LENGTH = 36
-"""Two bytes that say what it is, 32 of the seed, two of the checksum."""
+"""Two prefix bytes, 32 bytes of the seed, two bytes of the checksum."""
 
 
 class Credentials:
-    """A file with the JWT and the seed of a user; it is read anew for each connection."""
+    """A file with the JWT and the seed of a user. It is read again for each connection."""
 
     def __init__(self, file: Path) -> None:
         """Raises `OSError` if the file can't be used."""
@@ -43,12 +43,12 @@ class Credentials:
         self._read()
 
     def sign(self, nonce: str) -> bytes:
-        """The signature as base64. Raises `OSError` if the file can't be used."""
+        """Returns the base64 signature of a nonce. Raises `OSError` if the file can't be used."""
         key = self._read()
         return base64.b64encode(key.sign(nonce.encode()).signature)
 
     def jwt(self) -> bytes:
-        """The JWT that was in the file when it was last read."""
+        """Returns the JWT that was last read from the file."""
         return self._jwt
 
     def _read(self) -> SigningKey:
@@ -57,7 +57,7 @@ class Credentials:
             jwt = _block(text, "NATS USER JWT")
             key = _key(_block(text, "USER NKEY SEED"))
             if _subject(jwt) != _public(key):
-                raise ValueError("the seed does not belong to the JWT")
+                raise ValueError("the seed and the JWT are of different users")
         except ValueError as error:
             raise OSError(f"{self._file}: {error}") from None
         self._jwt = jwt
@@ -65,31 +65,31 @@ class Credentials:
 
 
 def _block(text: bytes, name: str) -> bytes:
-    """What is between the lines BEGIN and END of a name. Raises `ValueError`."""
+    """Returns the text between the lines BEGIN and END of a name. Raises `ValueError`."""
     found = re.search(rf"-{{3,}}BEGIN {name}-+\s+([!-~]+)\s+-{{3,}}END {name}-".encode(), text)
     if found is None:
-        raise ValueError(f"there is no block {name}, as credentials of NATS have it")
+        raise ValueError(f"block {name} is missing; a NATS credentials file has one")
     return found[1]
 
 
 def _key(seed: bytes) -> SigningKey:
-    """The key of a user. Raises `ValueError`."""
+    """Returns the signing key of a user's seed. Raises `ValueError`."""
     try:
         found = base64.b32decode(seed + b"=" * (-len(seed) % 8))
     except binascii.Error:
         found = b""
     sound = len(found) == SEED_LENGTH and found[0] & 0xF8 == SEED
     if not sound or found[-2:] != _checksum(found[:-2]):
-        raise ValueError("the seed is damaged or none")
+        raise ValueError("the seed is malformed")
     kind = (found[0] & 7) << 5 | found[1] >> 3
     if kind != USER:
         owner = KINDS.get(kind, "something else")
-        raise ValueError(f"the seed is that of {owner}, allowed: that of {KINDS[USER]}")
+        raise ValueError(f"the seed belongs to {owner}, allowed: the seed of {KINDS[USER]}")
     return SigningKey(found[2:-2])
 
 
 def _public(key: SigningKey) -> str:
-    """The name of a user, which is made of the public part of the key."""
+    """Returns the public key of a user in the encoding of NATS."""
     named = bytes([USER]) + bytes(key.verify_key)
     return base64.b32encode(named + _checksum(named)).rstrip(b"=").decode()
 
@@ -99,9 +99,9 @@ def _checksum(data: bytes) -> bytes:
 
 
 def _subject(jwt: bytes) -> object:
-    """Whom a JWT is about. Raises `ValueError`."""
+    """Returns the subject of a JWT. Raises `ValueError`."""
     try:
         _, claims, _ = jwt.split(b".")
         return json.loads(base64.urlsafe_b64decode(claims + b"=" * (-len(claims) % 4)))["sub"]
     except (ValueError, KeyError, TypeError):
-        raise ValueError("the JWT is damaged or none") from None
+        raise ValueError("the JWT is malformed") from None

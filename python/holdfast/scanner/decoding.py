@@ -1,4 +1,4 @@
-"""From the bytes of blocks to values: compiled once for the blocks that a device answers. Pure."""
+"""Decodes the bytes of blocks to values. Decoders are compiled once per block. Does no I/O."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 Decoder: TypeAlias = Callable[[bytes], Sequence[Any]]
 
 LAYOUTS = 1024
-"""Layouts that are remembered."""
+"""The size of the cache of layouts."""
 
 _BITS = [tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256)]
 
 
 class Undecoded:
-    """In place of a value that its registers can't be."""
+    """Stands for a value whose registers can't be decoded."""
 
     def __init__(self, error: str) -> None:
         self.error = error
 
 
 def decoder(tags: Sequence[Tag], address: int, count: int) -> Decoder:
-    """What makes the values of tags of one area from the bytes of a block that has them all."""
+    """Returns a decoder for tags of one area, which must all be inside the block."""
     if tags[0].of_bits:
         return _bits(tags, address)
     layout = _layout(
@@ -47,15 +47,13 @@ def decoder(tags: Sequence[Tag], address: int, count: int) -> Decoder:
 
 @lru_cache(LAYOUTS)
 def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
-    """How the registers of a block become values. Devices of one kind have the same layouts, and so
-    have the blocks of one tag each.
-    """
+    """Returns the layout of a block. Cached, because devices of one kind share their layouts."""
     named = [Field(f"{at}", *field) for at, field in enumerate(fields)]
     return Layout(named, size=count)
 
 
 def _alone(tag: Tag, data: bytes, address: int) -> Any:
-    """The value of one tag, whatever becomes of the others."""
+    """Decodes one tag, independently of the others."""
     start = 2 * (tag.address - address)
     try:
         return decode(

@@ -1,7 +1,7 @@
-"""Whom the scanner trusts among devices, and what it shows them.
+"""The TLS files for connections to devices.
 
-That is for whoever runs the scanner to say, never for its callers: they name devices, and at most
-the name that a device's certificate has.
+They are settings of the scanner. A request can't choose files, only the name in a device's
+certificate.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ def check(tls: Tls) -> None:
 
 
 def endpoint_of(address: Target, tls: Tls) -> Endpoint:
-    """Where a device is connected to. The files are read when a device is first subscribed to, or
-    has moved. Raises `Refused`.
+    """Returns the endpoint of a device. Reads the TLS files. Raises `Refused`.
+
+    Called at the first subscription to a device, and when its address has changed.
     """
     if isinstance(address, NetworkTarget) and address.transport == "tls":
         address = replace(address, tls=replace(tls, name=address.tls.name))

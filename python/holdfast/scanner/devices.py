@@ -1,4 +1,4 @@
-"""What is known of a device: who wants what of it, and how it does. Nothing here does I/O."""
+"""The state of a device: its subscribers, its tags and its health. Does no I/O."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 MAX_GAP = 10
 
 LOOK_UP = 10.0
-"""Seconds after which the name of a device that does not answer is looked up again."""
+"""Seconds between lookups of the name of a device that does not respond."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The rules that blocks are drawn by."""
+    """The rules for combining tags into requests."""
 
     max_gap: int = MAX_GAP
     max_registers: int = READ_REGISTERS
     max_bits: int = READ_BITS
     readable: tuple[tuple[Area, int, int], ...] = ()
-    """Areas with start and end, the end not included."""
+    """Area, start and end of ranges; the end is exclusive."""
     forbidden: tuple[tuple[Area, int, int], ...] = ()
 
     @staticmethod
     def of(request: PlanRequest | None) -> Plan:
-        """The rules that a request names. Raises `Refused`."""
+        """Creates the plan of a request. Raises `Refused`."""
         if request is None:
             return Plan()
         return Plan(
@@ -51,7 +51,7 @@ class Plan:
         )
 
     def blocks(self, tags: Sequence[Tag]) -> list[tuple[Area, int, int, list[int], int]]:
-        """The requests that read tags, as `plan_blocks` has them. Raises `ValueError`."""
+        """Returns the blocks that read the tags, see `plan_blocks`. Raises `ValueError`."""
         return plan_blocks(
             [(tag.area, tag.address, tag.count) for tag in tags],
             max_gap=self.max_gap,
@@ -62,17 +62,17 @@ class Plan:
         )
 
     def check(self, tags: Sequence[Tag]) -> None:
-        """Raises `Refused` for a tag that no request may read."""
+        """Raises `Refused` for a tag that the plan does not allow to read."""
         for tag in tags:
             most = self.max_bits if tag.of_bits else self.max_registers
             if tag.count > most:
                 kind = "bits" if tag.of_bits else "registers"
-                found = f"takes {tag.count} {kind}, one request reads at most {most}"
+                found = f"has {tag.count} {kind}, one request reads at most {most}"
                 raise Refused(f"tag {tag.id!r}: {tag.type} {found}")
             for area, start, end in self.forbidden:
                 if tag.area == area and start < tag.end and tag.address < end:
-                    found = f"plan.forbidden has {start} to {end - 1} of {area}"
-                    raise Refused(f"tag {tag.id!r} from address {tag.address} on: {found}")
+                    found = f"plan.forbidden contains {start} to {end - 1} of {area}"
+                    raise Refused(f"tag {tag.id!r} from address {tag.address}: {found}")
 
 
 def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, int]]:
@@ -80,7 +80,7 @@ def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, in
         *area, start, end = given
         addresses = isinstance(start, int) and isinstance(end, int) and start <= end
         if not addresses or any(word not in AREA_OF_CODE for word in area):
-            allowed = "allowed are first and last address, an area may stand before them"
+            allowed = "allowed are first and last address, with an optional area before them"
             raise Refused(f"{where}[{index}] is {given}, {allowed}")
         assert isinstance(start, int)
         assert isinstance(end, int)
@@ -91,10 +91,10 @@ def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, in
 
 @dataclass(frozen=True)
 class Source:
-    """Where a device is and how it is talked to; the same for all of its subscribers."""
+    """The address and the settings of a device, common to all of its subscribers."""
 
     target: Target
-    """As it was asked for."""
+    """The target in the request; its host may be a name."""
     unit: int
     timeout: int
     """Milliseconds."""
@@ -104,7 +104,7 @@ class Source:
 
 @dataclass
 class Subscriber:
-    """Somebody who wants tags of a device, and how often."""
+    """A subscriber of a device: its tags, and how they are published."""
 
     rate: int
     """Milliseconds."""
@@ -115,37 +115,37 @@ class Subscriber:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a subscriber says of a tag beside what it is."""
+    """The properties of a tag that each subscriber sets for itself."""
 
     writable: bool
     description: str | None
 
 
 class ScannedDevice:
-    """A device that somebody wants tags of."""
+    """A device with at least one subscriber."""
 
     def __init__(self, id: str, source: Source, address: Target, health: Health) -> None:
         self.id = id
         self.source = source
         self.address = address
-        """The target that is connected to: an address where `source` may have a name."""
+        """The target with the resolved address."""
         self.endpoint: Endpoint | None = None
-        """The same as the poller has it."""
+        """The native form of `address`, for the poller."""
         self.subscribers: dict[str, Subscriber] = {}
         self.tags: dict[str, Tag] = {}
-        """What the subscribers want, all together, by id."""
+        """The tags of all subscribers, by id."""
         self.health = health
         self.polled_as = ""
-        """The name that the poller knows it by, which is new with every change."""
+        """The device's name in the poller. Each change gives it a new one."""
         self._looked_up = time.monotonic()
 
     @property
     def rate(self) -> int:
-        """Milliseconds from scan to scan: those of the fastest subscriber."""
+        """The scan interval in milliseconds: the shortest of all subscribers."""
         return min(subscriber.rate for subscriber in self.subscribers.values())
 
     def may_have_moved(self) -> bool:
-        """Whether it is time to look up its name again, which is noted then."""
+        """Returns whether its name must be looked up again, at most every `LOOK_UP` seconds."""
         now = time.monotonic()
         if self.address == self.source.target or self.health.state != "offline":
             return False
@@ -155,18 +155,18 @@ class ScannedDevice:
         return True
 
     def is_extended_by(self, subscriber: str, ids: Collection[str]) -> bool:
-        """Whether a subscriber that is known asks for tags beside those that there are."""
+        """Returns whether a known subscriber requests only tags that are new."""
         return subscriber in self.subscribers and self.tags.keys().isdisjoint(ids)
 
     def writable(self, id: str) -> bool:
-        """Whether one of the subscribers of a tag says so."""
+        """Returns whether one of the tag's subscribers declared it writable."""
         return any(
             id in subscriber.tags and subscriber.tags[id].writable
             for subscriber in self.subscribers.values()
         )
 
     def forget(self, ids: Collection[str]) -> list[str]:
-        """Drops those of some tags that nobody wants any more; which they were."""
+        """Removes the given tags that have no subscriber left. Returns the removed ids."""
         wanted = {id for subscriber in self.subscribers.values() for id in subscriber.tags}
         unwanted = [id for id in ids if id in self.tags and id not in wanted]
         for id in unwanted:

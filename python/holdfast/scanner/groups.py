@@ -1,8 +1,8 @@
-"""Which tags are published how often: what all subscribers of a device want, put together. Pure.
+"""Combines the subscriptions of a device into groups of tags with one publishing rate. Does no I/O.
 
-All subscribers of a device listen to one subject, so a tag is published as often as the fastest of
-those who want it asks. Where one wants every value and another wants changes sooner than that, it
-is published for both.
+All subscribers of a device share one subject, so a tag is published at the rate of its fastest
+subscriber. A tag is in two groups if one subscriber requests every value, and another requests
+changes at a faster rate.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Group:
-    """Tags that are published alike."""
+    """Tags with the same rate and mode of publishing."""
 
     rate: int
     """Milliseconds."""
     change: bool
-    """Only those that changed by more than their deadbands."""
+    """Whether only changes greater than the deadbands are published."""
     tags: tuple[Tag, ...]
     deadbands: tuple[float, ...]
 
 
 def grouped(device: ScannedDevice) -> list[Group]:
-    """The groups of a device: those that are always published first, then by rate."""
+    """Returns the groups of a device: first those that publish every value, then by rate."""
     demands: dict[tuple[bool, int, float], set[str]] = {}
     for subscriber in device.subscribers.values():
         demand = (subscriber.publish == "change", subscriber.rate, subscriber.deadband)
@@ -49,11 +49,11 @@ def grouped(device: ScannedDevice) -> list[Group]:
 def _needed(
     demands: Mapping[tuple[bool, int, float], set[str]],
 ) -> Iterator[tuple[tuple[bool, int, float], list[str]]]:
-    """The demands with those of their tags for which no other demand includes them."""
+    """Yields each demand with those of its tags that no other demand already covers."""
     scanned: dict[str, int] = {}
-    """The rate at which a tag is always published."""
+    """The rate at which every value of a tag is published."""
     narrowest: dict[str, float] = {}
-    """The least deadband that was asked for, at this rate or sooner."""
+    """The smallest deadband of a tag so far, at this rate or faster."""
     for (change, rate, deadband), ids in sorted(demands.items()):
         if change:
             needed = [

@@ -1,4 +1,4 @@
-"""How a device does, as its polls tell."""
+"""The health of a device, derived from its polls."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ Found = TypeVar("Found", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""
 
 UNREACHED = (PATH_UNAVAILABLE, TARGET_SILENT)
-"""What a gateway answers that does not reach the device."""
+"""Exceptions of a gateway that does not reach the device."""
 
 FORGIVEN = 1
-"""Scans in a row that a device may leave unanswered before it is offline."""
+"""Consecutive scans without a response before a device is offline."""
 
 UNWRITTEN = (
     ILLEGAL_FUNCTION,
@@ -40,36 +40,36 @@ UNWRITTEN = (
     PATH_UNAVAILABLE,
     NO_CONNECTION,
 )
-"""Faults of a write that never came to be carried out."""
+"""Faults of a write that the device certainly has not carried out."""
 
 
 def is_unwritten(fault: int) -> bool:
-    """Whether a write that failed has certainly changed nothing."""
+    """Returns whether a failed write has certainly changed nothing."""
     return fault in UNWRITTEN
 
 
 @dataclass
 class Health:
-    """State, failures since the last answer, and why."""
+    """The state of a device, its failures and its last errors."""
 
     state: State = "connecting"
     since: float = field(default_factory=time.time)
-    """Seconds since 1970, as the other times: when the state began."""
+    """When the state began. All times are seconds since 1970."""
     failures: int = 0
     error: str | None = None
     last_answer: float | None = None
     last_error: str | None = None
-    """What went wrong last, though it may be well again."""
+    """The last error, also after a recovery."""
     last_error_at: float | None = None
     scans: int = 0
     blocks: list[PolledBlock] = field(default_factory=list)
-    """Each as the last scan left it that came to it."""
+    """Each block with the result of the last scan that read it."""
 
     def judge(self, blocks: list[PolledBlock]) -> bool:
-        """Takes note of a poll; whether that is worth telling.
+        """Updates the health from a poll. Returns whether it must be published.
 
-        It is when the state changes, and when a device that answers refuses something new. One
-        reply that is missing does not make a device offline that was online.
+        It must when the state changes, and when an online device returns another exception. A
+        single missing response does not make an online device offline.
         """
         if not blocks:
             return False
@@ -96,7 +96,7 @@ class Health:
 
 
 def beside(blocks: Iterable[Found], others: Iterable[PolledBlock]) -> list[Found]:
-    """The blocks that share nothing with others, which don't overlap each other."""
+    """Returns the blocks that overlap none of `others`, which must not overlap each other."""
     places = sorted(block[:3] for block in others)
 
     def is_beside(block: Found) -> bool:

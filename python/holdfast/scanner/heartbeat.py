@@ -1,4 +1,4 @@
-"""A sign of life in a JetStream bucket, which others look at to know what runs."""
+"""A heartbeat in a JetStream bucket, which shows other services that the scanner runs."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 BUCKET = "service_heartbeats"
 EVERY = 10.0
-"""Seconds from one sign to the next."""
+"""Seconds between heartbeats."""
 
 KEPT = 60.0
-"""Seconds after which a sign that is not renewed is gone."""
+"""Seconds after which a heartbeat expires if it is not renewed."""
 
 JETSTREAM_TIMEOUT = 2.0
-"""Seconds that JetStream has to answer."""
+"""Seconds to wait for an answer of JetStream."""
 
 
 class Heart:
-    """Beats in one key, as long as somebody runs it."""
+    """Writes heartbeats to one key of the bucket."""
 
     def __init__(self, key: str) -> None:
         self._key = key
@@ -41,7 +41,7 @@ class Heart:
         self._checked = False
 
     async def beat(self, client: Client | None) -> None:
-        """Renews the sign. Where there is no JetStream, says so once."""
+        """Renews the heartbeat. Logs only the first of consecutive failures."""
         if client is None:
             return
         sign = Heartbeat(
@@ -56,21 +56,21 @@ class Heart:
             if not self._works:
                 await self._check(bucket)
             await bucket.put(self._key, msgspec.json.encode(sign))
-        except Exception as error:  # A heartbeat is a courtesy, whatever keeps it from being given.
+        except Exception as error:  # Heartbeats are optional, so no error may stop the scanner.
             self._told(False, _reason(error))
         else:
             self._told(True, "")
 
     async def _check(self, bucket: KeyValue) -> None:
-        """Says it once if signs would stay for ever."""
+        """Logs once if heartbeats in the bucket never expire."""
         if self._checked or (await bucket.status()).ttl:
             return
         self._checked = True
-        todo = f"remove it, so that it is made anew, or give its stream max_age {KEPT:g} s"
+        todo = f"delete the bucket, so that it is created again, or set max_age {KEPT:g} s"
         logs.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
 
     async def stop(self, client: Client | None) -> None:
-        """Takes the sign away."""
+        """Deletes the heartbeat."""
         if client is None or not self._works:
             return
         with contextlib.suppress(Exception):
@@ -91,14 +91,14 @@ def _reason(error: Exception) -> str:
     if isinstance(error, APIError) and error.description:
         return error.description
     if isinstance(error, ServiceUnavailableError | NoRespondersError):
-        return "the server has no JetStream, or none for this account"
+        return "JetStream is not enabled on the server or for this account"
     if isinstance(error, TimeoutError):
         return f"JetStream did not answer within {JETSTREAM_TIMEOUT:g} s"
     return str(error) or type(error).__name__
 
 
 async def _bucket(client: Client) -> KeyValue:
-    """The bucket; it is made if it is not there."""
+    """Returns the bucket; creates it if it does not exist."""
     jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
     try:
         return await jetstream.key_value(BUCKET)

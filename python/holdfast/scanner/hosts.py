@@ -1,4 +1,4 @@
-"""Which devices callers may have the scanner talk to, and where those are."""
+"""The devices that the scanner may connect to, and their addresses."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ PRIVATE = tuple(
         "fc00::/7",
     )
 )
-"""What is allowed where nothing is said."""
+"""The default allow list."""
 
-WHERE = "name it with --allow, or in nats.devices of the configuration"
+WHERE = "allow it with --allow, or in nats.devices of the configuration"
 
 
 class Allowed:
-    """The devices that may be talked to; without any entry those of `PRIVATE`."""
+    """The allowed devices; without entries, `PRIVATE`."""
 
     def __init__(self, entries: Iterable[AllowEntry] = ()) -> None:
         self._list = AllowList(tuple(entries) or PRIVATE)
         self._resolve = Resolver()
 
     async def address(self, target: Target, *, after: Target | None = None) -> Target:
-        """The target with the address that its host has, allowed. Raises `Refused`.
+        """Returns the target with an allowed address of its host. Raises `Refused`.
 
-        With TLS it keeps the name that the certificate must have. Of several addresses it is the
-        first, or the one that follows on `after`.
+        With TLS, it keeps the expected name in the certificate. Of several addresses it uses the
+        first, or the one that follows `after`.
         """
         if isinstance(target, SerialTarget):
             if not self._list.allows_device(target.device):

@@ -1,4 +1,4 @@
-"""What callers can ask for at most. Without limits any of them could use up all memory."""
+"""The limits for requests. Without limits, any caller could exhaust memory."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ class ScannerLimits:
 
     devices: int = MAX_DEVICES
     tags: int = MAX_TAGS
-    """Of all devices."""
+    """Tags of all devices together."""
     device_tags: int = 10_000
-    """Of one device."""
+    """Tags of one device."""
     subscribers: int = 100
-    """Of one device."""
+    """Subscribers of one device."""
     shortest_scan: int = 50
     longest_scan: int = 86_400_000
     shortest_timeout: int = 10
     longest_timeout: int = 30_000
     request: int = 4 * 1024 * 1024
-    """Bytes of a request."""
+    """Size of a request in bytes."""
     command: int = 4096
-    """Bytes of the value of a command."""
+    """Size of the value of a command in bytes."""
     pending: int = 10_000
-    """Requests that are carried out at once."""
+    """Pending requests."""
 
     @property
     def connections(self) -> int:

@@ -1,8 +1,8 @@
-"""Every message of the service: what callers send, and what they get.
+"""The messages of the service: requests, answers and published messages.
 
-Requests are checked strictly: a key that is not known, a value of another type or out of its range
-refuses the whole request. `null` in place of a value that may be left out is the same as leaving it
-out. What needs more than the message to be judged is judged elsewhere.
+Requests are checked strictly: an unknown key, a wrong type or a value out of range refuses the
+whole request. `null` for an optional value is the same as omitting it. Checks that need the state
+of the scanner are in other modules.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Ranges = Annotated[list[Range], Meta(max_length=32)]
 Marker = bool | int | float | str
 
 EXACT = 2.0**53
-"""Below this, floats hold every integer."""
+"""Floats below this represent every integer exactly."""
 
 CHOICES = {
     "functionCode": get_args(FunctionCode),
@@ -39,15 +39,15 @@ CHOICES = {
 
 
 class _Message(msgspec.Struct, rename="camel"):
-    """Keys are written in camel case."""
+    """A message with keys in camel case."""
 
 
 class _Request(_Message, forbid_unknown_fields=True):
-    """A message from outside."""
+    """A request of a caller."""
 
 
 class TagRequest(_Request):
-    """A value of a device: where it is, and how it is read."""
+    """A tag: the address and the type of a value of a device."""
 
     id: Id
     address: Address
@@ -56,89 +56,89 @@ class TagRequest(_Request):
     datatype: str
     """`boolean`, `int16`, `float32`, `string:10` and every other type of `holdfast.values`."""
     byte_order: str | None = None
-    """That of the device, if left out."""
+    """Default: the byte order of the device."""
     encoding: Annotated[str, Meta(max_length=64)] | None = None
-    """Of a `string:N`; ASCII if left out."""
+    """The encoding of `string:N`. Default: ASCII."""
     writable: bool | None = None
     description: str | None = None
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
-    """Values that mean "not available", and are published as `null`."""
+    """Values that mean "not available"; they are published as `null`."""
 
 
 class PlanRequest(_Request, rename=None):
-    """How the tags of a device are put together into requests."""
+    """How the tags of a device are combined into Modbus requests."""
 
     max_gap: Annotated[int, Meta(ge=0, le=LAST_ADDRESS)] | None = None
-    """Holes of up to so many items are read; 10 if left out."""
+    """The largest gap between tags that one request reads too. Default: 10."""
     max_registers: Annotated[int, Meta(ge=1, le=READ_REGISTERS)] | None = None
     max_bits: Annotated[int, Meta(ge=1, le=READ_BITS)] | None = None
     readable: Ranges | None = None
-    """First and last addresses of all areas, or of the one that is named before them: holes are
-    read only inside these."""
+    """Ranges of readable addresses: `[area, first, last]`, or `[first, last]` for all areas. Gaps
+    are read only inside these ranges."""
     forbidden: Ranges | None = None
-    """Addresses that are never read, given in the same way."""
+    """Ranges of addresses that are never read, in the same form."""
 
 
 class SubscribeRequest(_Request):
-    """Somebody wants tags of a device."""
+    """Subscribes to tags of a device."""
 
     device_id: Annotated[str, Meta(min_length=1, max_length=128)]
     subscriber_id: Id
     tags: list[TagRequest]
     host: Annotated[str, Meta(min_length=1, max_length=253)] | None = None
     port: Annotated[int, Meta(ge=1, le=LAST_PORT)] | None = None
-    """502 if left out, 802 with `tls`."""
+    """Default: 502, with `tls` 802."""
     transport: Transport | None = None
-    """`tcp` if left out."""
+    """Default: `tcp`."""
     url: Annotated[str, Meta(max_length=512)] | None = None
-    """In place of host, port and transport."""
+    """Replaces host, port and transport."""
     unit_id: Annotated[int, Meta(ge=0, le=MAX_UNIT)] | None = None
-    """1 if left out."""
+    """Default: 1."""
     byte_order: str | None = None
-    """`ABCD` if left out."""
+    """Default: `ABCD`."""
     scan_rate: int | None = None
-    """Milliseconds, 1000 if left out."""
+    """The scan interval in milliseconds. Default: 1000."""
     timeout: int | None = None
-    """Milliseconds for a request and its reply, 1000 if left out."""
+    """The timeout of a Modbus request in milliseconds. Default: 1000."""
     publish: Publish | None = None
-    """`scan` if left out."""
+    """Default: `scan`."""
     deadband: Annotated[float, Meta(ge=0)] | None = None
-    """With `change`: numbers must differ by more than this; 0 if left out."""
+    """With `change`: the change of a number must be greater than this. Default: 0."""
     plan: PlanRequest | None = None
     release: bool | None = None
     """Whether the connection is closed after each scan."""
 
 
 class UnsubscribeRequest(_Request):
-    """Somebody does not want tags any more."""
+    """Ends a subscription, or removes tags from it."""
 
     device_id: str
     subscriber_id: str
     tag_ids: list[str] | None = None
-    """All that the subscriber has, if left out."""
+    """Default: all tags of the subscriber."""
 
 
 class BrowseRequest(_Request):
-    """What is to be told; an empty message asks for everything."""
+    """Requests a report of devices. An empty message requests all devices."""
 
     device_id: str | None = None
     offset: Annotated[int, Meta(ge=0)] | None = None
-    """How many devices are left out."""
+    """The number of devices to skip."""
     tag_offset: Annotated[int, Meta(ge=0)] | None = None
-    """How many tags of `deviceId` are left out."""
+    """The number of tags of `deviceId` to skip."""
 
 
 class Answer(_Message, omit_defaults=True):
-    """What became of a request."""
+    """The answer to a request."""
 
     success: bool
     count: int | None = None
-    """The tags of a subscribe request."""
+    """The number of tags in a subscribe request."""
     error: str | None = None
 
 
 class Data(_Message):
-    """One value of one tag. Values that JSON does not have, such as NaN, are `null`."""
+    """A value of a tag. Values that JSON can't represent, such as NaN, are `null`."""
 
     module_id: str
     device_id: str
@@ -146,22 +146,22 @@ class Data(_Message):
     value: bool | int | float | str | list[Any] | None
     datatype: DataType
     timestamp: int
-    """Milliseconds since 1970, when the device had answered."""
+    """Time of the device's response, in milliseconds since 1970."""
 
 
 class Status(_Message, omit_defaults=True):
-    """How a device does, when that changes."""
+    """A change of the state of a device."""
 
     device_id: str
     state: State
     failures: int
-    """Scans without an answer since the last one that had one."""
+    """The number of consecutive scans without a response."""
     timestamp: int
     error: str | None = None
 
 
 class Heartbeat(_Message):
-    """That the service runs."""
+    """A heartbeat of the service."""
 
     service_type: str
     module_id: str
@@ -171,19 +171,19 @@ class Heartbeat(_Message):
 
 
 class BlockReport(_Message, omit_defaults=True):
-    """One request of a scan."""
+    """One Modbus request of a scan."""
 
     area: Area
     address: int
     count: int
     tags: int
     holes: int
-    """Items that no tag wants."""
+    """The number of items that belong to no tag."""
     error: str | None = None
 
 
 class TagReport(_Message, omit_defaults=True):
-    """A tag that is scanned."""
+    """A tag with at least one subscriber."""
 
     id: str
     address: int
@@ -194,11 +194,11 @@ class TagReport(_Message, omit_defaults=True):
     encoding: str | None = None
     description: str | None = None
     error: str | None = None
-    """Why there is no value."""
+    """Why the tag has no value."""
 
 
 class SubscriberReport(_Message, omit_defaults=True):
-    """Somebody who wants tags of a device."""
+    """A subscriber of a device."""
 
     id: str
     scan_rate: int
@@ -208,7 +208,7 @@ class SubscriberReport(_Message, omit_defaults=True):
 
 
 class PlanReport(_Message, rename=None, omit_defaults=True):
-    """The rules that blocks are drawn by."""
+    """The rules for combining tags into Modbus requests."""
 
     max_gap: int
     max_registers: int
@@ -218,75 +218,75 @@ class PlanReport(_Message, rename=None, omit_defaults=True):
 
 
 class DeviceReport(_Message, omit_defaults=True):
-    """A device, all that is wanted of it, and how it does."""
+    """A device with its health, its tags and its subscribers."""
 
     device_id: str
     url: str
     address: str
-    """What it is connected to: the name in the URL was looked up once."""
+    """The URL with the resolved address."""
     unit_id: int
     state: State
     failures: int
     scan_rate: int
-    """Milliseconds: that of the fastest subscriber."""
+    """The scan interval of the fastest subscriber, in milliseconds."""
     timeout: int
     release: bool
     scans: int
     missed: int
-    """Scans that could not begin in time."""
+    """Scans skipped because they were late."""
     round_trip: float
-    """Milliseconds of the last answer."""
+    """The round trip of the last response, in milliseconds."""
     tag_count: int
     plan: PlanReport
     blocks: list[BlockReport] | None = None
-    """The requests of the last scan that came to them; where there was none yet, the first ones."""
+    """The Modbus requests of the last scan; before the first scan, the planned requests."""
     tags: list[TagReport] | None = None
-    """`blocks`, `tags` and `subscribers` are missing where the answer would be too long; whoever
-    asks for the device by its id gets them."""
+    """`blocks`, `tags` and `subscribers` are omitted if the answer would be too long. Request them
+    with `deviceId`."""
     subscribers: list[SubscriberReport] | None = None
     error: str | None = None
     state_since: int | None = None
-    """Milliseconds since 1970, as the following times."""
+    """In milliseconds since 1970, as the following times."""
     last_answer: int | None = None
     last_error: str | None = None
-    """What went wrong last, though it may be well again."""
+    """The last error, also after a recovery."""
     last_error_at: int | None = None
 
 
 class ServiceReport(_Message):
-    """What became of all messages since the start."""
+    """The counts of messages since the start."""
 
     started_at: int
     published: int
-    """Messages that were handed to NATS."""
+    """Messages sent to NATS."""
     replaced: int
-    """Messages whose place a newer one took, while NATS did not take them."""
+    """Messages that a newer value of the same tag replaced while NATS was slow or disconnected."""
     dropped: int
-    """Messages that were lost because too many waited for NATS."""
+    """Messages lost because too many waited for NATS."""
     lost_scans: int
-    """Scans that were lost because this process did not keep up."""
+    """Scans lost because this process did not keep up."""
 
 
 class BrowseAnswer(_Message, omit_defaults=True):
-    """Devices by id."""
+    """A report of devices, sorted by id."""
 
     success: bool
     count: int
-    """Of all devices."""
+    """The number of all devices."""
     service: ServiceReport
     devices: list[DeviceReport]
     next: int | None = None
-    """The offset to ask for, where not all devices fit into one answer."""
+    """The `offset` of the next request, if not all devices fit into this answer."""
     next_tag: int | None = None
-    """The tag offset to ask for, where a device does not fit into one answer: it has some of its
-    tags then, their blocks, and which of them each subscriber wants."""
+    """The `tagOffset` of the next request, if the device does not fit into this answer. The answer
+    then has some of its tags, with their blocks and subscribers."""
 
 
 Asked = TypeVar("Asked", bound=_Request)
 
 
 def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
-    """The request that a message is. Raises `Refused`."""
+    """Parses a request of at most `most` bytes. Raises `Refused`."""
     if len(data) > most:
         raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
     try:
@@ -303,7 +303,7 @@ def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
 
 
 def _with_integers(value: Any) -> Any:
-    """JSON in which numbers without a fraction are integers, as callers in JavaScript have it."""
+    """Converts whole floats to integers. JavaScript callers do not distinguish them."""
     if type(value) is dict:
         return {key: _with_integers(item) for key, item in value.items()}
     if type(value) is list:
@@ -314,7 +314,7 @@ def _with_integers(value: Any) -> Any:
 
 
 def _explained(text: str) -> str:
-    """An error of msgspec; where only some words are right, with these."""
+    """Returns an error message of msgspec; for an enumeration, with the allowed words."""
     if "enum" in text:
         for key, words in CHOICES.items():
             if f".{key}`" in text:

@@ -1,9 +1,8 @@
-"""What waits to be published. While NATS does not take it, the newest value of each tag is kept.
+"""Queues messages for NATS. While NATS is slow or disconnected, it keeps only the newest of a tag.
 
-Messages flow through in order as long as the server takes them. When there is no connection, or it
-is slow, each message takes the place of the older one of the same tag; the number of those that
-wait is bounded too. So a scanner neither stops nor grows, and when the server is back it gets what
-is true now.
+As long as the server accepts messages, they are sent in order. Otherwise each message replaces the
+older one of the same tag, and the number of kept messages is limited. So the scanner neither blocks
+nor grows, and after a reconnect the server gets the current values.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
 BACKLOG = 2 * 1024 * 1024
-"""Bytes that may be on their way; beyond them the connection is slow."""
+"""Unsent bytes above which the connection counts as slow."""
 
 PIECE = 512 * 1024
-"""Bytes of what was kept that are sent at once; the rest may still be replaced."""
+"""Bytes of kept messages that are sent at once. The others can still be replaced."""
 
 KEPT = 200_000
-"""Messages that are kept while there is no connection."""
+"""Limit of kept messages."""
 
 CHECK_INTERVAL = 0.005
-"""Seconds between looks whether a slow connection takes more."""
+"""Seconds between checks whether a slow connection accepts more."""
 
 
 class Outbox:
-    """Messages on their way to NATS."""
+    """The queue of messages for NATS."""
 
     def __init__(self, most: int = KEPT) -> None:
         self._client: Client | None = None
@@ -46,19 +45,19 @@ class Outbox:
         self._most = most
         self._news = asyncio.Event()
         self.sent = 0
-        """Messages that were handed to the connection."""
+        """Messages sent to the connection."""
         self.replaced = 0
-        """Messages whose place a newer one of the same tag took."""
+        """Messages that a newer one of the same tag replaced."""
         self.dropped = 0
-        """Messages that were lost because too many were kept."""
+        """Messages lost because too many were kept."""
 
     def connected(self, client: Client | None) -> None:
-        """What is put in goes to this client from now on; to nobody if it is `None`."""
+        """Sets the client for further messages; `None` while there is no connection."""
         self._client = client
         self._news.set()
 
     def put(self, messages: Iterable[tuple[object, bytes]]) -> None:
-        """Messages, each with what it tells of, such as device and tag."""
+        """Adds messages. Each has a key, such as device and tag; a newer message replaces it."""
         if self._kept or self._size > BACKLOG or not self._takes():
             for key, text in messages:
                 self._keep(key, text)
@@ -69,7 +68,7 @@ class Outbox:
         self._news.set()
 
     async def answer(self, subject: str, text: bytes) -> None:
-        """A message that somebody waits for: it goes before those that wait here."""
+        """Sends a message that a caller waits for, before all queued messages."""
         client = self._client
         if client is not None and client.is_connected:
             await wire.send(client, text, 1)
@@ -77,7 +76,7 @@ class Outbox:
             self.put([(subject, text)])
 
     async def run(self) -> None:
-        """Sends what is put in, for ever."""
+        """Sends queued messages, until it is cancelled."""
         while True:
             await self._news.wait()
             self._news.clear()
@@ -88,7 +87,7 @@ class Outbox:
                 await self._send(self._client)
 
     async def flush(self) -> None:
-        """Waits until the server has what was put in, or is gone."""
+        """Waits until the server has received all messages, or is disconnected."""
         while (self._flowing or self._kept) and self._client is not None:
             await asyncio.sleep(CHECK_INTERVAL)
         if self._client is not None:
@@ -104,7 +103,7 @@ class Outbox:
         await wire.send(client, b"".join(texts), len(texts))
 
     def _oldest(self) -> list[bytes]:
-        """Takes some of what was kept, in its order."""
+        """Removes and returns the oldest kept messages, about `PIECE` bytes."""
         texts, size = [], 0
         while self._kept and size < PIECE:
             _, text = self._kept.popitem(last=False)
@@ -113,12 +112,12 @@ class Outbox:
         return texts
 
     def _takes(self) -> bool:
-        """Whether the connection takes more just now."""
+        """Returns whether the connection currently accepts more."""
         client = self._client
         return client is not None and client.is_connected and wire.backlog(client) < BACKLOG
 
     def _keep(self, key: object, text: bytes) -> None:
-        # What takes the place of another has its turn too, lest it wait for ever.
+        # A replacement keeps the position of the older message, so it can't wait forever.
         if key in self._kept:
             self.replaced += 1
         elif len(self._kept) >= self._most:

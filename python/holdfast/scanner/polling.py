@@ -1,7 +1,7 @@
-"""The native poller, and the thread that takes what it read and wrote.
+"""The native poller, and the thread that passes its results to the event loop.
 
-The thread hands over all polls that wait at once, and takes no more before they are dealt with:
-what the event loop can't keep up with stays in the poller, which drops the oldest.
+The thread passes all waiting results at once, and fetches no more until they are handled. If the
+event loop can't keep up, results stay in the poller, which drops the oldest.
 """
 
 from __future__ import annotations
@@ -19,37 +19,38 @@ if TYPE_CHECKING:
     from holdfast.scanner.devices import ScannedDevice
 
 Poll: TypeAlias = tuple[str, float, list[PolledBlock]]
-"""What the device is polled as, when the schedule wanted the poll, in seconds, and its blocks."""
+"""The device's name in the poller, the scheduled time in seconds, and the blocks."""
 
 RESULTS_TIMEOUT = 60.0
-"""Seconds that the thread waits for polls at once; it ends with the poller."""
+"""Seconds of one wait for results. Stopping the poller ends the wait."""
 
 GATHERED = 0.005
-"""Seconds from one hand-over to the next, at least: so that a batch is worth its price."""
+"""The shortest time in seconds between two batches, so that batches have a useful size."""
 
 FIRST_WITHIN = 1.0
-"""Seconds in which the first polls of new devices are spread."""
+"""Seconds over which the first polls of new devices are spread."""
 
 RENEWED = 0.1
-"""Seconds from one change of what a device is polled for to the next, at least: a poll begins with
-each, and a caller may ask for a thousand tags one by one."""
+"""The shortest time in seconds between two changes of a device in the poller. Each change starts a
+poll, and a caller may subscribe to a thousand tags one by one."""
 
 
 class Polling:
-    """Devices that are polled. `take` gets each poll, in the event loop: the device, when the
-    schedule wanted it, in seconds, and the blocks.
+    """Polls devices. Calls `take` in the event loop for each poll.
+
+    Its arguments are the device, the scheduled time in seconds, and the blocks.
     """
 
     def __init__(self, take: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
         self._take = take
         self._devices: dict[str, ScannedDevice] = {}
-        """By what they are polled as."""
+        """The devices by their name in the poller."""
         self._renewed: dict[ScannedDevice, float] = {}
         self._waiting: dict[ScannedDevice, asyncio.TimerHandle] = {}
         self._urgent: set[ScannedDevice] = set()
-        """Those of which somebody waits for values that nobody has yet."""
+        """Devices that must be polled immediately, because a new subscriber waits for values."""
         self._writes: dict[int, asyncio.Future[int]] = {}
-        """By the number that the poller gave them: what will have the fault."""
+        """Futures of the faults of pending writes, by the number from the poller."""
         self._loop = asyncio.get_running_loop()
         self._poller = _core.Poller([])
         self._names = map(str, itertools.count())
@@ -59,8 +60,9 @@ class Polling:
         self._thread.start()
 
     def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
-        """Polls a device as it is now wanted: at once, or soon if that has just changed; without
-        `at_once` when it is its turn.
+        """Updates a device in the poller, at most every `RENEWED` seconds.
+
+        With `at_once`, it is then polled immediately, otherwise at its next scheduled time.
         """
         if at_once:
             self._urgent.add(device)
@@ -73,8 +75,9 @@ class Polling:
             self._renew(device)
 
     def _renew(self, device: ScannedDevice) -> None:
-        """The name is another one with every change: what was still read for the old one is not
-        taken for the new one's.
+        """Replaces a device in the poller.
+
+        Each change gives the device a new name, so that results of the old tags are discarded.
         """
         self._waiting.pop(device, None)
         at_once = device in self._urgent
@@ -90,7 +93,7 @@ class Polling:
         self._renewed[device] = self._loop.time()
 
     def drop(self, device: ScannedDevice) -> None:
-        """Polls a device no more; its connection is closed."""
+        """Stops polling a device and closes its connection."""
         waiting = self._waiting.pop(device, None)
         if waiting is not None:
             waiting.cancel()
@@ -100,7 +103,7 @@ class Polling:
         del self._renewed[device]
 
     async def write(self, device: ScannedDevice, request: _core.Request) -> int:
-        """Sends a write to a device between two reads; the fault, 0 when it was confirmed."""
+        """Sends a write between two reads. Returns the fault, or 0 when the device confirmed it."""
         number = self._poller.write(device.polled_as, request)
         done: asyncio.Future[int] = self._loop.create_future()
         self._writes[number] = done
@@ -110,16 +113,16 @@ class Polling:
             del self._writes[number]
 
     def counters(self) -> dict[str, dict[str, Any]]:
-        """How the poller sees its devices, by what they are polled as."""
+        """Returns the poller's counters of each device, by its name in the poller."""
         return self._poller.counters()
 
     @property
     def dropped(self) -> int:
-        """Polls that were lost because the event loop did not keep up."""
+        """Polls lost because the event loop did not keep up."""
         return self._poller.dropped
 
     async def stop(self) -> None:
-        """Polls nothing any more."""
+        """Stops polling and closes all connections."""
         self._stopping.set()
         self._taken.release()
         for waiting in self._waiting.values():

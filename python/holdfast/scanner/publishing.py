@@ -1,8 +1,8 @@
-"""From the polls of a device to its messages: what is due, as text for NATS.
+"""Converts the polls of a device to messages that are due, as text for NATS. Does no I/O.
 
-The blocks of a device are nearly always the same. For those, `_Part` holds all that does not depend
-on the values: where they are, and the text around them. A value then costs its own JSON and one
-formatting of bytes. Nothing here does I/O.
+The blocks of a device nearly always have the same shape. For each shape, `_Part` caches everything
+that does not depend on the values: their places, and the text around them. A value then costs only
+its own JSON and one formatting of bytes.
 """
 
 from __future__ import annotations
@@ -32,47 +32,45 @@ Message: TypeAlias = tuple[str, bytes]
 """The id of a tag, and the text that publishes its value."""
 
 SHAPES = 64
-"""Sets of blocks that are remembered; a device that refuses some has more than one."""
+"""Limit of cached shapes. A device that refuses some blocks has more than one shape."""
 
 SLACK = 0.0005
-"""Seconds that two times of a schedule may be off: they were reckoned in nanoseconds."""
+"""Tolerance in seconds when scheduled times are compared, because they are rounded."""
 
 _UNKNOWN = object()
 _encode = msgspec.json.Encoder().encode
 
 
 class Publisher:
-    """The messages of one device."""
+    """Creates the messages of one device."""
 
     def __init__(self, prefix: str, device: str) -> None:
         self._prefix = prefix
         self._device = device
         self._wanted: Callable[[], Sequence[Group]] | None = None
-        """The groups that are published from the next poll on, if others than before."""
+        """Returns the groups from the next poll on; `None` if they have not changed."""
         self._newcomers: set[str] = set()
         self._anew = False
         self._groups: list[_Due] = []
         self._shapes: dict[Shape, list[tuple[_Due, list[_Placed]]]] = {}
         self._fresh: set[str] = set()
-        """Tags whose next value is published whenever it comes."""
+        """Tags whose next value is published even if it is not due."""
         self._last: dict[str, Any] = {}
-        """The values that were published last, of tags whose changes somebody wants."""
+        """The last published values of tags in groups that publish changes."""
         self.undecoded: dict[str, str] = {}
-        """Why tags have no value though their registers were read."""
+        """The errors of tags whose registers were read but can't be decoded."""
 
     def want(self, groups: Callable[[], Sequence[Group]], newcomers: Iterable[str] = ()) -> None:
-        """Publishes other groups, from the next poll on: as `regroup`, but many changes that come
-        before it are one.
-        """
+        """Changes the groups from the next poll on. Combines all changes before that poll."""
         self._wanted = groups
         self._newcomers.update(newcomers)
 
     def renew(self) -> None:
-        """Publishes the next values of all tags, changed or not, due or not."""
+        """Publishes the next values of all tags, even if they are unchanged or not due."""
         self._anew = True
 
     def regroup(self, groups: Sequence[Group], newcomers: Collection[str]) -> None:
-        """Publishes these groups from now on; of newcomers the next value, changed or not."""
+        """Changes the groups now. The next value of newcomers is published even if unchanged."""
         before = {(due.group.change, due.group.rate): due for due in self._groups if not due.once}
         tags = {tag.id: tag for group in groups for tag in group.tags}
         known = {tag.id for due in before.values() for tag in due.group.tags} - self._fresh
@@ -91,7 +89,7 @@ class Publisher:
         self.undecoded = {id: why for id, why in self.undecoded.items() if id in tags}
 
     def _settle(self) -> None:
-        """Does what was asked for since the last poll."""
+        """Applies the changes that were requested since the last poll."""
         groups = None if self._wanted is None else self._wanted()
         if groups is None and self._anew:
             groups = [due.group for due in self._groups if not due.once]
@@ -104,7 +102,7 @@ class Publisher:
         self._wanted, self._newcomers, self._anew = None, set(), False
 
     def messages(self, due: float, blocks: Sequence[PolledBlock]) -> list[Message]:
-        """What is to be published after a poll that the schedule wanted at this time in seconds."""
+        """Returns the messages after a poll. `due` is its scheduled time in seconds."""
         self._settle()
         shape = tuple(block[:3] for block in blocks if block[3] is not None)
         parts = self._shapes.get(shape)
@@ -131,7 +129,7 @@ class Publisher:
         return made
 
     def _await_firsts(self, ids: Set[str]) -> None:
-        """Publishes the next values of these tags though their groups are not due."""
+        """Publishes the next values of these tags even if their groups are not due."""
         groups = [due for due in self._groups if not due.once]
         tags = {tag.id: tag for due in groups for tag in due.group.tags if tag.id in ids}
         if tags:
@@ -141,7 +139,7 @@ class Publisher:
         self._shapes.clear()
 
     def _made(self, part: _Part, data: bytes, timestamp: bytes) -> Iterable[Message]:
-        """The messages of the tags of one group in one block."""
+        """Returns the messages of the tags of one group in one block."""
         values = part.decoder(data)
         if part.special:
             values = [_clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
@@ -159,8 +157,9 @@ class Publisher:
         )
 
     def _picked(self, part: _Part, values: Sequence[Any]) -> list[bool]:
-        """Which values are to be published: of a change group the changed. Those that can't be
-        decoded are noted; they are as no value.
+        """Returns which values to publish; in a group that publishes changes, the changed ones.
+
+        Records errors of decoding. An undecoded value counts as no value.
         """
         picked = []
         for id, value, deadband in zip(part.ids, values, part.deadbands, strict=True):
@@ -177,7 +176,7 @@ class Publisher:
         return picked
 
     def _compiled(self, shape: Shape) -> list[tuple[_Due, list[_Placed]]]:
-        """The parts of all groups for the blocks that came; each tag is taken from the first."""
+        """Compiles the parts of all groups for a shape. Each tag is read from its first block."""
         if len(self._shapes) >= SHAPES:
             self._shapes.clear()
         parts = [(due, list(self._parts(due, shape))) for due in self._groups]
@@ -225,7 +224,7 @@ _INFALLIBLE = {
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (16, 32, 64)),
     *(f"float{bits}" for bits in (16, 32, 64)),
 }
-"""Types that any registers are a value of, and whose values are one JSON number or word."""
+"""Types that decode any registers, to a single JSON number or word."""
 
 
 class _Part(NamedTuple):
@@ -235,25 +234,25 @@ class _Part(NamedTuple):
     tags: Sequence[Tag]
     ids: Sequence[str]
     templates: Sequence[bytes]
-    """With places for the length, the value and the time."""
+    """The messages, with placeholders for length, value and time."""
     lengths: Sequence[int]
-    """Of the payloads without values and times."""
+    """The lengths of the payloads without values and times."""
     deadbands: Sequence[float]
     plain: bool
-    """Whether the JSON of all values can be made at once, and cut at the commas."""
+    """Whether all values can be encoded as one JSON array and split at the commas."""
     special: bool
-    """Whether some values mean something else."""
+    """Whether some values must be converted, such as NaN or a marker to `null`."""
     change: bool
     picky: bool
-    """Whether some values may be left out, or have to be remembered."""
+    """Whether some values may be omitted, or must be remembered."""
 
 
 _Placed: TypeAlias = tuple[int, _Part]
-"""A part, and which of the blocks has it."""
+"""The index of a block, and the part in it."""
 
 
 class _Due:
-    """A group, and when it is published next."""
+    """A group, and the time of its last publication."""
 
     def __init__(self, group: Group, before: _Due | None, *, once: bool = False) -> None:
         self.group = group
@@ -264,22 +263,22 @@ class _Due:
             tag.id: deadband for tag, deadband in zip(group.tags, group.deadbands, strict=True)
         }
         self.parts: dict[Place, _Part] = {}
-        """What was compiled for blocks; every shape has parts of the same."""
+        """The compiled parts of blocks, shared by all shapes."""
 
     def hurried(self, fresh: Collection[str]) -> Iterable[str]:
-        """Makes it due if all of its tags are fresh; its tags if it is due whatever comes."""
+        """Makes the group due if all of its tags are fresh. Returns its tags if it is due then."""
         if all(id in fresh for id in self.deadbands):
             self._last = -math.inf
         return self.deadbands if self._last == -math.inf else ()
 
     def keep(self, place: Place, part: _Part) -> None:
-        """Remembers a part; not one from each of ever other blocks."""
+        """Caches a part. The cache is limited, because blocks may differ at every poll."""
         if len(self.parts) >= SHAPES + 2 * len(self.group.tags):
             self.parts.clear()
         self.parts[place] = part
 
     def now(self, due: float) -> bool:
-        """Whether it is published with the values of this scan, which is noted then."""
+        """Returns whether the group is due at this scan, and records the publication if so."""
         if due < self._last + self.group.rate / 1000 - SLACK:
             return False
         self._last = due
@@ -287,7 +286,7 @@ class _Due:
 
 
 def _template(prefix: str, device: str, tag: Tag) -> tuple[bytes, int]:
-    """The text that publishes a value, with places for what changes; the length of the rest."""
+    """Returns the text of a message, with placeholders, and the fixed part of its length."""
     head = {"moduleId": prefix, "deviceId": device, "variableId": tag.id}
     before = _encode(head)[:-1] + b',"value":'
     after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
@@ -297,7 +296,7 @@ def _template(prefix: str, device: str, tag: Tag) -> tuple[bytes, int]:
 
 
 def _clean(value: Any, tag: Tag) -> Any:
-    """A value, or `None` if it means that there is none."""
+    """Returns the value; `None` for NaN and for markers of the tag."""
     if type(value) is list:
         return [_clean(item, tag) for item in value]
     if type(value) is float and value != value:
@@ -308,11 +307,11 @@ def _clean(value: Any, tag: Tag) -> Any:
 
 
 def _differs(value: Any, last: Any, deadband: float) -> bool:
-    """Whether a value is another one, a number by more than the deadband."""
+    """Returns whether a value differs; a number, by more than the deadband."""
     if type(value) is list and type(last) is list:
         pairs = zip(value, last, strict=True)
         return any(_differs(one, other, deadband) for one, other in pairs)
     if type(value) in (int, float) and type(last) in (int, float):
-        # The difference of two equal infinities is NaN, which is no more than anything.
+        # The difference of two equal infinities is NaN, which is not greater than the deadband.
         return bool(abs(value - last) > deadband)
     return bool(value is not last and value != last)

@@ -1,8 +1,7 @@
-"""A client of NATS that nothing which anyone may send puts out of order.
+"""A NATS client that survives malformed messages.
 
-The server passes on subjects that are no UTF-8 or have vertical tabs, and headers that are none.
-nats-py takes no more messages after any of them, or not for a while. Here they are left out, and
-what follows is taken.
+The server forwards subjects with invalid UTF-8 or vertical tabs, and malformed headers. nats-py
+stops receiving after any of them, permanently or for some time. This client skips such messages.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from holdfast import logs
 
 END = b"\r\n"
 MAX_LINE = 1024 * 1024
-"""Bytes of a line of the protocol; the longest are those that tell of the server."""
+"""The longest line of the protocol in bytes. INFO lines are the longest."""
 
 
 class SafeClient(Client):
-    """Leaves out messages that it can't take, and says so in the log now and then."""
+    """Skips malformed messages, and logs them with a limited rate."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,13 +32,13 @@ class SafeClient(Client):
     ) -> None:
         try:
             await super()._process_msg(sid, subject, reply, data, headers)
-        except Exception as error:  # Whoever sends such a message must not cost the others theirs.
+        except Exception as error:  # One malformed message must not stop the others.
             shown = subject.decode(errors="backslashreplace")
             logs.refused("message_malformed", kind="nats", subject=shown, reason=_reason(error))
 
 
 class TlsClient(SafeClient):
-    """Says nothing to a server that does not use TLS; the client by itself would go on without."""
+    """Refuses a server without TLS. nats-py would continue without encryption."""
 
     async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
         if initial_connection and not info.get("tls_required"):
@@ -57,24 +56,24 @@ def _decoded(info: bytes) -> dict[str, Any]:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, UnicodeDecodeError):
-        return "no UTF-8 in the subject, the reply subject or a header"
-    return f"headers that are none ({type(error).__name__})"
+        return "invalid UTF-8 in the subject, the reply subject or a header"
+    return f"malformed headers ({type(error).__name__})"
 
 
 class _Parser(Parser):
-    """Takes apart what the server sends where the server does: lines at blanks and tabs only."""
+    """Splits lines only at spaces and tabs, as the server does."""
 
     nc: Client
 
     async def parse(self, data: bytes = b"") -> None:
-        """Deals with all that is whole. Raises `ProtocolError` for what is no line of NATS."""
+        """Handles all complete lines and messages. Raises `ProtocolError` for malformed lines."""
         self.buf.extend(data)
         while self.buf:
             if self.state == AWAITING_CONTROL_LINE:
                 end = self.buf.find(END)
                 if end < 0:
                     if len(self.buf) > MAX_LINE:
-                        raise ProtocolError("nats: a line without an end")
+                        raise ProtocolError(f"nats: a line is longer than {MAX_LINE} bytes")
                     return
                 line = bytes(self.buf[:end])
                 del self.buf[: end + len(END)]
@@ -90,7 +89,7 @@ class _Parser(Parser):
                 await self.nc._process_msg(of["sid"], of["subject"], of["reply"], payload, head)
 
     async def _take(self, line: bytes) -> None:
-        """Deals with one line."""
+        """Handles one line."""
         word, _, rest = line.replace(b"\t", b" ").partition(b" ")
         if word in (b"MSG", b"HMSG"):
             self._begin(rest, with_header=word == b"HMSG")
@@ -106,7 +105,7 @@ class _Parser(Parser):
             raise ProtocolError("nats: unknown protocol")
 
     def _begin(self, rest: bytes, *, with_header: bool) -> None:
-        """Takes note of a message whose bytes follow."""
+        """Parses the line before the bytes of a message."""
         parts = [part for part in rest.split(b" ") if part]
         try:
             subject, sid, *reply = parts[: len(parts) - 1 - with_header]

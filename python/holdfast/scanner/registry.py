@@ -1,8 +1,7 @@
-"""All devices that somebody wants tags of. A request changes all that it asks for, or nothing.
+"""The registry of all subscriptions. A request is carried out completely or not at all.
 
-Everything is judged before anything is changed, and both happen in one go. What a request says by
-itself is checked by `understood`, which needs no registry; what it says beside what others have
-said is checked by the registry.
+All checks run before the first change, without an await in between. `understood` checks a request
+by itself. The registry checks it against the existing subscriptions.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ SCAN_RATE = 1000
 TIMEOUT = 1000
 
 SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence", "echo")
-"""What all devices on one serial line have alike."""
+"""The settings that all devices on one serial line must share."""
 
 
 @dataclass(frozen=True)
 class Subscription:
-    """A subscribe request that is right as far as it goes."""
+    """A subscribe request that is valid by itself."""
 
     device: str
     subscriber: str
     source: Source
     said: frozenset[str]
-    """What of the source the request says; the rest is as the device is known, or a default."""
+    """The settings that the request contains. Others are those of the known device, or defaults."""
     tags: Mapping[str, Tag]
     wanted: Mapping[str, Wanted]
     rate: int
@@ -52,10 +51,10 @@ class Subscription:
 
 
 def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription:
-    """What a request asks for. Raises `Refused`."""
+    """Checks a request by itself. Raises `Refused`."""
     _check_id(request.device_id)
     if request.deadband and request.publish != "change":
-        raise Refused('deadband goes with "publish": "change"')
+        raise Refused('deadband requires "publish": "change"')
     source = Source(
         _target(request),
         1 if request.unit_id is None else request.unit_id,
@@ -73,7 +72,7 @@ def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription
         where = f"tags[{index}]"
         made = tag(entry, request.byte_order or "ABCD", where)
         if made.id in tags:
-            raise Refused(f"{where}: the id {made.id!r} is there twice")
+            raise Refused(f"{where}: duplicate id {made.id!r}")
         tags[made.id] = made
     source.plan.check(list(tags.values()))
     said = {key for key in ("timeout", "release", "plan") if getattr(request, key) is not None}
@@ -93,12 +92,12 @@ def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription
 
 
 def _check_id(id: str) -> None:
-    """A device id is a part of subjects."""
+    """Checks a device id, which becomes a part of subjects. Raises `Refused`."""
     flaw = not id.isprintable() or " " in id or "*" in id or ">" in id
     if flaw or "" in id.split("."):
         raise Refused(
-            f"deviceId is {id!r}, allowed is what a subject can end in: no blanks, * or >, and no "
-            "dots at its ends or beside each other"
+            f"deviceId is {id!r}, which can't be a part of a subject: it must have no spaces, * or "
+            ">, and no dots at its ends or beside each other"
         )
 
 
@@ -106,17 +105,20 @@ def _target(request: SubscribeRequest) -> Target:
     beside = [key for key in ("host", "port", "transport") if getattr(request, key) is not None]
     if request.url is not None:
         if beside:
-            raise Refused(f"{beside[0]} stands beside url, allowed is one of both")
+            raise Refused(f"both url and {beside[0]} are given, allowed is only one")
         try:
             parts = urlsplit(request.url)
             for key in dict(parse_qsl(parts.query, keep_blank_values=True)):
                 if parts.scheme == "tls" and key != "name":
-                    raise Refused(f"url: {key} is given, allowed is name; files are the scanner's")
+                    raise Refused(
+                        f"url: {key} is given, allowed is only name; TLS files are settings of the "
+                        "scanner"
+                    )
             return targets.parse(request.url)
         except ValueError as error:
             raise Refused(f"url: {error}") from None
     if request.host is None:
-        raise Refused("host is missing; a url in its place would do")
+        raise Refused("host is missing: give host or url")
     transport = request.transport or "tcp"
     port = usual_port(transport) if request.port is None else request.port
     is_address = address_in(request.host) is not None
@@ -133,20 +135,19 @@ def _within(key: str, value: int | None, default: int, least: int, most: int) ->
 
 
 class Registry:
-    """Devices by id, and who wants what of them."""
+    """The devices by id, with their subscribers."""
 
     def __init__(self, limits: ScannerLimits) -> None:
         self.devices: dict[str, ScannedDevice] = {}
         self._limits = limits
         self._tags = 0
         self._holders: dict[str, set[str]] = {}
-        """The devices that have a tag of an id."""
+        """The ids of the devices that have a tag id."""
 
     def subscribe(self, asked: Subscription, address: Target) -> tuple[ScannedDevice | None, bool]:
-        """Adds a subscription; the device, and whether what it is to be polled for changed.
+        """Adds a subscription. Returns the device, and whether its polling must change.
 
-        Who wants no tags is no subscriber; there is no device if nobody wants tags of it. Raises
-        `Refused`.
+        A request without tags adds no subscriber, and no device. Raises `Refused`.
         """
         device = self.devices.get(asked.device)
         new = [id for id in asked.tags if device is None or id not in device.tags]
@@ -176,9 +177,9 @@ class Registry:
         return device, bool(new) or device.rate != before
 
     def unsubscribe(self, request: UnsubscribeRequest) -> tuple[ScannedDevice | None, bool]:
-        """Takes tags from a subscriber; the device, and whether what it is polled for changed.
+        """Removes tags of a subscriber. Returns the device, and whether its polling must change.
 
-        The device is gone with its last subscriber. What is not known is not wanted: all is well.
+        Removes the device with its last subscriber. Unknown ids are ignored.
         """
         device = self.devices.get(request.device_id)
         subscriber = None if device is None else device.subscribers.get(request.subscriber_id)
@@ -202,7 +203,7 @@ class Registry:
         return device, bool(unwanted) or device.rate != before
 
     def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
-        """The tag that a command names: by its id, or by device and id. Raises `Refused`."""
+        """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
         found = {(device, name) for device in self._holders.get(name, ())}
         parts = name.split(".")
         for at in range(1, len(parts)):
@@ -210,7 +211,7 @@ class Registry:
             if device in self._holders.get(id, ()):
                 found.add((device, id))
         if not found:
-            raise Refused(f"there is no tag {name!r}")
+            raise Refused(f"no tag {name!r}")
         if len(found) > 1:
             known = ", ".join(f"{device}.{id}" for device, id in sorted(found))
             raise Refused(f"{name!r} is ambiguous: {known}")
@@ -218,7 +219,7 @@ class Registry:
         return self.devices[of], self.devices[of].tags[id]
 
     def _check_line(self, asked: Subscription) -> None:
-        """That a new device says of its serial line what the others on it say."""
+        """Checks that a new device has the same settings of its serial line as the others on it."""
         target = asked.source.target
         if not isinstance(target, SerialTarget):
             return
@@ -230,18 +231,18 @@ class Registry:
                 known, said = getattr(other, key), getattr(target, key)
                 if known != said:
                     raise Refused(
-                        f"{key} of {target.device} is {_shown(known)} for {device.id} already, "
-                        f"not {_shown(said)}; devices on one serial line have the same settings"
+                        f"{key} of {target.device} is already {_shown(known)} for {device.id}, "
+                        f"not {_shown(said)}; devices on one serial line must share its settings"
                     )
 
     def _check_limits(self, device: ScannedDevice | None, asked: Subscription, new: int) -> None:
         limits = self._limits
         if device is None and len(self.devices) >= limits.devices:
-            raise Refused(f"there are {limits.devices} devices, more are not allowed")
+            raise Refused(f"there are already {limits.devices} devices, which is the limit")
         subscribers = {} if device is None else device.subscribers
         if asked.subscriber not in subscribers and len(subscribers) >= limits.subscribers:
             raise Refused(
-                f"{asked.device} has {limits.subscribers} subscribers, no more are allowed"
+                f"{asked.device} already has {limits.subscribers} subscribers, which is the limit"
             )
         tags = new + (0 if device is None else len(device.tags))
         if tags > limits.device_tags:
@@ -253,33 +254,33 @@ class Registry:
 
 
 def _check_known(device: ScannedDevice, asked: Subscription) -> None:
-    """That a request does not say otherwise of a device than those before it."""
+    """Checks that a request agrees with earlier requests for the device. Raises `Refused`."""
     check_address(device, asked)
     for key in ("timeout", "release", "plan"):
         known, said = getattr(device.source, key), getattr(asked.source, key)
         if key in asked.said and said != known:
             raise Refused(
-                f"{key} of {device.id} is another one already; unsubscribe all of it first"
+                f"{key} of {device.id} is already different; end all of its subscriptions first"
             )
     for id, wanted in asked.tags.items():
         if id in device.tags and device.tags[id] != wanted:
             raise Refused(
-                f"tag {id!r} of {device.id} has another definition already; unsubscribe it first"
+                f"tag {id!r} of {device.id} already has another definition; unsubscribe it first"
             )
 
 
 def check_address(device: ScannedDevice, asked: Subscription) -> None:
-    """That a device is where a request says it is. Raises `Refused`."""
+    """Checks that a request names the known address of a device. Raises `Refused`."""
     known, said = device.source, asked.source
     if (known.target, known.unit) != (said.target, said.unit):
         raise Refused(
-            f"{device.id} is known as {_told(known)}, not as {_told(said)}; unsubscribe all of it "
-            "first"
+            f"{device.id} is known as {_told(known)}, not as {_told(said)}; end all of its "
+            "subscriptions first"
         )
 
 
 def _told(source: Source) -> str:
-    """Where a device is, with all that makes it another one."""
+    """Formats the address of a device with everything that identifies it."""
     target = source.target
     more = ""
     if isinstance(target, SerialTarget):

@@ -1,4 +1,4 @@
-"""The JSON Schema of every message, made from the types that messages are checked by."""
+"""The JSON Schema of every message, generated from the message types."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MESSAGES = (
 
 
 def json_schema() -> dict[str, Any]:
-    """One document with a definition for each message, by name."""
+    """Returns a schema with a definition for each message, by name."""
     _, components = msgspec.json.schema_components(MESSAGES, ref_template="#/$defs/{name}")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -1,7 +1,6 @@
-"""The service: requests in, values out, from start to end.
+"""The scanner service: connects all parts, and handles requests.
 
-It wires the parts together. What it knows of devices is in the registry; whatever changes there, is
-at once polled and published in that way.
+The registry holds the subscriptions. Every change of it is passed to the poller and the publishers.
 """
 
 from __future__ import annotations
@@ -54,18 +53,18 @@ if TYPE_CHECKING:
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer]]"
 
 LARGE = 16 * 1024
-"""Bytes of a request from which on it takes milliseconds to understand it."""
+"""Size in bytes of a request that takes milliseconds to parse."""
 
 SOON = 1000
-"""Milliseconds to the next scan for which nobody needs one before it."""
+"""Scan interval in milliseconds up to which a new subscriber waits for the next regular scan."""
 
 ENDING = 2.0
-"""Seconds that each step of a stop may take."""
+"""Timeout in seconds of each step of a stop."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a scanner is told when it starts."""
+    """The settings of a scanner."""
 
     servers: Servers = field(default_factory=Servers)
     prefix: str = "modbus"
@@ -74,7 +73,7 @@ class Settings:
     """Networks and serial devices, see `Allowed`."""
     limits: ScannerLimits = field(default_factory=ScannerLimits)
     device_tls: Tls = NO_FILES
-    """Whom it trusts among devices, and what it shows them."""
+    """The TLS files for connections to devices."""
 
 
 class Scanner:
@@ -86,7 +85,7 @@ class Scanner:
         self._ended = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
         self._one_by_one = asyncio.Lock()
-        """Held while a request is understood."""
+        """Held while a request is parsed and checked."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._registry = Registry(settings.limits)
         self._publishers: dict[str, Publisher] = {}
@@ -94,10 +93,13 @@ class Scanner:
         self.outbox = Outbox()
         self._broker = Broker(settings.servers, self._handlers(), self._connected)
         self._due = asyncio.Event()
-        """Set when a heartbeat is due before its time."""
+        """Set when the next heartbeat is due immediately."""
 
     async def run(self) -> None:
-        """Serves until `end` is called or asked for. Raises `OSError` for files of the settings."""
+        """Serves until `end` is called, or until a shutdown message.
+
+        Raises `OSError` for a file of the settings that can't be used.
+        """
         device_tls.check(self._settings.device_tls)
         self._polling = Polling(self._take)
         running: list[asyncio.Task[object]] = [
@@ -113,12 +115,12 @@ class Scanner:
 
     @property
     def serves(self) -> bool:
-        """Whether requests reach it just now."""
+        """Whether requests currently reach the service."""
         return self._broker.serves
 
     @property
     def devices(self) -> int:
-        """How many devices it polls."""
+        """The number of polled devices."""
         return 0 if self._ended.is_set() else len(self._registry.devices)
 
     def end(self) -> None:
@@ -126,7 +128,11 @@ class Scanner:
         self._ended.set()
 
     def _connected(self, client: Client | None) -> None:
-        """What NATS took before it went away may be lost, so all that is true is told again."""
+        """Handles a new or lost connection.
+
+        Messages that were sent before a disconnect may be lost, so a new connection publishes all
+        values and states again.
+        """
         self.outbox.connected(client)
         self._due.set()
         if client is not None:
@@ -150,21 +156,21 @@ class Scanner:
         }
 
     def _answering(self, kind: str, handle: Handle) -> Callable[[Msg], Awaitable[None]]:
-        """What carries out messages of a kind beside each other, and answers those who ask."""
+        """Returns a handler that carries out messages concurrently and answers them."""
 
         async def carry_out(message: Msg) -> None:
             answer: Answer | BrowseAnswer
             most = self._settings.limits.pending
             try:
                 if len(self._tasks) > most:
-                    raise Refused(f"{most} requests are being carried out, no more are taken")
+                    raise Refused(f"too many requests: {most} are pending, which is the limit")
                 answer = await handle(message)
             except Refused as refused:
                 logs.refused(
                     "request_refused", kind=kind, subject=message.subject, reason=str(refused)
                 )
                 answer = Answer(success=False, error=str(refused))
-            except Exception as error:  # Nothing that a caller sends may end the service.
+            except Exception as error:  # An error in one request must not stop the service.
                 logs.problem("request_failed", subject=message.subject)
                 answer = Answer(success=False, error=f"internal error: {type(error).__name__}")
             if message.reply:
@@ -214,7 +220,7 @@ class Scanner:
         publisher.want(lambda: grouped(device), asked.tags)
 
     async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
-        """Where a device is: where it is known to be, or what its name says."""
+        """Returns the address of a device: the known one, or the result of a lookup."""
         device = self._registry.devices.get(asked.device)
         if device is None:
             address = await self._allowed.address(asked.source.target)
@@ -245,19 +251,19 @@ class Scanner:
 
     @contextlib.asynccontextmanager
     async def _in_order(self, message: Msg, *, is_large: bool = False) -> AsyncIterator[None]:
-        """One request after the other; polls have their turn before one that takes milliseconds."""
+        """Serializes requests. Lets polls run before a request that takes milliseconds."""
         async with self._one_by_one:
             if is_large or len(message.data) > LARGE:
                 await asyncio.sleep(0)
             yield
 
     def _drop(self, device: ScannedDevice) -> None:
-        """Forgets a device that nobody wants."""
+        """Removes a device without subscribers."""
         del self._publishers[device.id]
         self._polling.drop(device)
 
     def _turn(self, device: str) -> asyncio.Lock:
-        """Requests for one device are carried out one after the other."""
+        """Returns the lock that serializes requests for one device."""
         return self._turns.setdefault(device, asyncio.Lock())
 
     async def _command(self, message: Msg) -> Answer:
@@ -268,7 +274,7 @@ class Scanner:
         try:
             text = message.data.decode()
         except UnicodeDecodeError:
-            raise Refused("the value is no text") from None
+            raise Refused("the value is not UTF-8 text") from None
         async with self._in_order(message):
             device, tag = self._registry.commanded(name)
         await commands.write(self._polling, device, tag, text)
@@ -298,10 +304,10 @@ class Scanner:
         return browsed(request, devices, self._polling.counters(), service, most)
 
     def _take(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
-        """Publishes what was read."""
+        """Publishes the results of a poll."""
         try:
             self._publish(device, due, blocks)
-        except Exception:  # What is wrong with one device must not cost the others.
+        except Exception:  # An error with one device must not affect the others.
             logs.problem("scan_failed", device=device.id)
 
     def _publish(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
@@ -314,7 +320,7 @@ class Scanner:
         self.outbox.put([((id, tag), text) for tag, text in messages])
 
     async def _look_up(self, device: ScannedDevice) -> None:
-        """Looks where a device is that does not answer: its name may mean another address now."""
+        """Looks up the name of a device that does not respond; its address may have changed."""
         async with self._turn(device.id):
             if self._registry.devices.get(device.id) is not device:
                 return
@@ -330,7 +336,7 @@ class Scanner:
                 logs.write(logging.INFO, "moved", device=device.id, address=str(address))
 
     def _tell(self, device: ScannedDevice) -> None:
-        """Publishes and logs how a device does."""
+        """Publishes and logs the state of a device."""
         self._publish_state(device)
         health = device.health
         level = logging.WARNING if health.error else logging.INFO
@@ -358,7 +364,7 @@ class Scanner:
                     await self._due.wait()
 
     async def _stop(self, running: Sequence[asyncio.Task[object]]) -> None:
-        """Ends all parts; none of them may keep the others waiting."""
+        """Stops all parts, each with a timeout."""
         await _within(self._polling.stop())
         for request in list(self._tasks):
             request.cancel()
@@ -368,7 +374,7 @@ class Scanner:
         await _within(asyncio.wait(running))
 
     async def _farewell(self) -> None:
-        """Takes the heartbeat away, and sees that what was published is sent."""
+        """Deletes the heartbeat, and waits until all messages are sent."""
         await self._heart.stop(self._broker.client)
         await self.outbox.flush()
 

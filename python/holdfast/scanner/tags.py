@@ -1,4 +1,4 @@
-"""What a tag is: a place in a device, and how its bits or registers become a value. Pure."""
+"""Tags: a place in a device, and the type of its value. Does no I/O."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 AREA_OF_CODE: dict[FunctionCode, Area] = dict(zip(get_args(FunctionCode), AREAS, strict=True))
 CODE_OF_AREA = {area: code for code, area in AREA_OF_CODE.items()}
-"""What messages call the areas."""
+"""The names of the areas in messages."""
 
 FLOATS = ("float16", "float32", "float64")
 KINDS: dict[str, DataType] = {
@@ -36,7 +36,7 @@ KINDS: dict[str, DataType] = {
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """A tag of a device. Two are the same if all of this is."""
+    """A tag of a device. Two tags are the same if all fields are equal."""
 
     id: str
     area: Area
@@ -44,40 +44,40 @@ class Tag:
     type: str
     order: str
     null: frozenset[Marker]
-    """As the device would send them."""
+    """Markers, as decoded from the registers of the device."""
     encoding: str | None = None
-    """Of a text; `None` for ASCII."""
+    """The encoding of text; `None` for ASCII."""
 
     @property
     def count(self) -> int:
-        """Its bits or registers."""
+        """The number of bits or registers."""
         return parsed(self.type).registers
 
     @property
     def end(self) -> int:
-        """The address behind it."""
+        """The address after the last one."""
         return self.address + self.count
 
     @property
     def asked_type(self) -> str:
-        """Its type as requests name it."""
+        """The type as requests name it."""
         bools = parsed(self.type).base == "bool"
         return "boolean" + self.type.removeprefix("bool") if bools else self.type
 
     @property
     def datatype(self) -> DataType:
-        """What its messages say that it is."""
+        """The `datatype` in messages."""
         type = parsed(self.type)
         return "array" if type.count is not None else KINDS.get(type.base, "number")
 
     @property
     def of_bits(self) -> bool:
-        """Whether it is in an area of bits."""
+        """Whether the tag is in an area of bits."""
         return self.area in BIT_AREAS
 
 
 class Places:
-    """Tags by where they are, to find those of a block without a look at all others."""
+    """An index of tags by address, to find the tags of a block quickly."""
 
     def __init__(self, tags: Iterable[Tag]) -> None:
         self._tags: dict[Area, list[Tag]] = {}
@@ -86,14 +86,14 @@ class Places:
         self._starts = {area: [tag.address for tag in tags] for area, tags in self._tags.items()}
 
     def inside(self, area: Area, address: int, count: int) -> list[Tag]:
-        """The tags that a block has whole, by address."""
+        """Returns the tags that are entirely inside a block, sorted by address."""
         starts, end = self._starts.get(area, []), address + count
         first, last = bisect_left(starts, address), bisect_left(starts, end)
         return [tag for tag in self._tags.get(area, [])[first:last] if tag.end <= end]
 
 
 def tag(request: TagRequest, order: str, where: str) -> Tag:
-    """The tag of a request in which `order` is that of the device. Raises `Refused`."""
+    """Creates the tag of a request; `order` is the default byte order. Raises `Refused`."""
     area = AREA_OF_CODE[request.function_code]
     asked = name = request.datatype
     if name == "boolean" or name.startswith("boolean["):
@@ -111,12 +111,12 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
     except ConversionError as error:
         raise Refused(f"{where}: {error}") from None
     if request.writable and area not in WRITE_LIMITS:
-        raise Refused(f"{where}: what functionCode {request.function_code} reads can't be written")
+        raise Refused(f"{where}: functionCode {request.function_code} is not writable")
     if request.writable:
         _check_writable(asked, type, area, where)
     if request.address + type.registers > ADDRESSES:
         raise Refused(
-            f"{where}: {name} from address {request.address} on, the last is {LAST_ADDRESS}"
+            f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
         )
     null = frozenset(
         _marker(marker, type, request.encoding, where) for marker in request.null or ()
@@ -125,21 +125,21 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
 
 
 def _check_writable(name: str, type: Type, area: Area, where: str) -> None:
-    """That one request can write a tag. Raises `Refused`."""
+    """Checks that one Modbus request can write a tag. Raises `Refused`."""
     if type.base == "bit" and type.count is not None:
         raise Refused(f"{where}: {name} can't be written, only one bit can")
     most = WRITE_LIMITS[area]
     if type.registers > most:
         kind = "coils" if area in BIT_AREAS else "registers"
         raise Refused(
-            f"{where}: {name} takes {type.registers} {kind}, one request writes at most {most}"
+            f"{where}: {name} has {type.registers} {kind}, one request writes at most {most}"
         )
 
 
 def _marker(marker: Marker, type: Type, encoding: str | None, where: str) -> Marker:
-    """A marker as the device would send it: of a float the nearest that the type has."""
+    """Converts a marker to the value that the tag's registers can hold."""
     if type.base == "bytes":
-        raise Refused(f"{where}.null: not for {type.name}")
+        raise Refused(f"{where}.null: not supported for {type.name}")
     if marker == "nan" and type.base in FLOATS:
         return math.nan
     try:
