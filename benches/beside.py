@@ -1,19 +1,19 @@
-"""Measures what one polite Modbus client sees while the adapters of the appliance work hard.
+"""Measures the latency of one polite Modbus client while the appliance's adapters are under load.
 
-The client reads 10 registers and has one request in flight: at a fixed rate, and then in a closed
-loop. It is alone, or beside
+The client reads 10 registers with one request in flight: first at a fixed rate, then in a closed
+loop. It runs alone, or together with
 
-rest   2 clients that post bodies of 8 MiB without a pause, each of which fills the memory that the
-       polite client reads many times over;
+rest   2 clients that post bodies of 8 MiB in a loop; each body writes the memory that the polite
+       client reads many times;
 mqtt   a publisher that floods the broker with commands of 100 registers, QoS 0;
-both   all of these;
-burn   an unrelated process that uses the appliance's core without a pause, nice 0, nice 10, and
-       SCHED_IDLE: a yardstick of what the system's scheduler itself costs.
+both   rest and mqtt;
+burn   an unrelated process that keeps the appliance's core busy, at nice 0, nice 10 and SCHED_IDLE:
+       the reference for the cost of the system's scheduler.
 
-The appliance, with all its threads, has one core, which what burns shares with it. The polite
-client has the other one. The loads and the broker are there too, but under SCHED_IDLE, so that it
-is not them that the polite client waits for. The turns go round; what is compared is the ratio to
-the same round's client alone; what is told is the median of all rounds.
+The appliance with all its threads has one core, and the burning process shares that core. The
+polite client has the other core. The loads and the broker run there too, but under SCHED_IDLE, so
+that the polite client never waits for them. The order of the variants rotates. Ratios compare a
+variant with `alone` in the same round; figures are the medians of all rounds.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ RATES = {"2,000 requests a second": 2000, "a closed loop": 0}
 BURNERS = {"burn nice 0": 0, "burn nice 10": 10, "burn idle": None}
 VARIANTS = ["alone", "rest", "mqtt", "both", *BURNERS]
 QUIET = 0.3
-"""Seconds without processor time after which a server is held to be idle."""
+"""Seconds without processor time after which a server counts as idle."""
 
 
 def configuration(broker: int) -> str:
@@ -83,7 +83,7 @@ def command(count: int) -> str:
 
 
 class Bench:
-    """The appliance, its broker, and all that loads them."""
+    """The appliance, its broker, and the loads."""
 
     def __init__(self, options: argparse.Namespace, stack: ExitStack) -> None:
         self.options = options
@@ -101,34 +101,34 @@ class Bench:
 
     @contextlib.contextmanager
     def _broker(self, folder: Path) -> Iterator[int]:
-        """Mosquitto, on a port of its own."""
+        """Runs Mosquitto on a free port."""
         program = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
         if program is None:
-            sys.exit("mosquitto is needed")
+            sys.exit("mosquitto is not installed")
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", 0))
             port = int(taken.getsockname()[1])
         file = folder / "mosquitto.conf"
         file.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\nuser root\n")
         with common.running([program, "-c", str(file)], self.options.other, idle=True):
-            _wait("mosquitto does not start", lambda: _listens(port))
+            _wait("mosquitto did not start", lambda: _listens(port))
             yield port
 
     def _check(self) -> None:
-        """One request over REST, one message over MQTT; Modbus shows what was written."""
+        """Writes over REST and MQTT, and checks over Modbus that the values arrived."""
         _wait("no connection to the broker", lambda: self.ask("diagnostics/mqtt")["connected"])
         post = [*self._post(1), "--warmup", "0", "--seconds", "0.1"]
         subprocess.run(post, check=True, stdout=subprocess.DEVNULL)
         if common.ask(self.modbus, QUANTITY)[9:] != VALUE.to_bytes(2, "big") * QUANTITY:
             raise RuntimeError("the memory does not hold what was sent")
         with self._flood():
-            _wait("no message arrives", lambda: self.ask("diagnostics/mqtt")["received"] > 0)
+            _wait("no MQTT message arrived", lambda: self.ask("diagnostics/mqtt")["received"] > 0)
         if self._counts()["mqtt"]["refused"]:
-            raise RuntimeError("messages are refused")
+            raise RuntimeError("the appliance refused MQTT messages")
         self.settle()
 
     def ask(self, what: str) -> Any:
-        """One of the appliance's diagnostics."""
+        """Gets a resource of the appliance's REST interface."""
         request = urllib.request.Request(f"http://{self.rest}/api/v1/{what}")
         request.add_header("Authorization", f"Bearer {TOKEN}")
         with urllib.request.urlopen(request, timeout=common.TIMEOUT) as answer:
@@ -138,8 +138,8 @@ class Bench:
         return self.ask("diagnostics/stats")["adapters"]
 
     def settle(self) -> None:
-        """Waits until the server has done all that it was sent."""
-        _wait("the server does not come to rest", self._is_idle)
+        """Waits until the server has finished all work."""
+        _wait("the server did not become idle", self._is_idle)
 
     def _is_idle(self) -> bool:
         before = self.server.cpu()
@@ -167,7 +167,7 @@ class Bench:
 
     @contextlib.contextmanager
     def loaded(self, variant: str) -> Iterator[None]:
-        """The loads of a variant run."""
+        """Runs the loads of a variant."""
         other = self.options.other
         with ExitStack() as stack:
             if variant in ("rest", "both"):
@@ -185,7 +185,7 @@ class Bench:
             yield
 
     def turn(self, variant: str) -> dict[str, Result]:
-        """What the polite client sees, by the way that it asks."""
+        """Measures the polite client at each rate."""
         results = {}
         before, start = self._counts(), time.monotonic()
         with self.loaded(variant):
@@ -211,7 +211,7 @@ class Bench:
         return results
 
     def _waited(self) -> int:
-        """Nanoseconds that the thread that serves Modbus was ready and did not run."""
+        """Returns the nanoseconds that the Modbus thread was ready but did not run."""
         for task in Path(f"/proc/{self.server.process.pid}/task").iterdir():
             if (task / "comm").read_text().startswith("holdfast-io"):
                 return int((task / "schedstat").read_text().split()[1])
@@ -219,7 +219,7 @@ class Bench:
 
 
 def main() -> None:
-    """Prints a table for each way to ask, and writes all results where `--json` says."""
+    """Prints a table for each rate, and writes all results to the file of `--json`."""
     options = common.parsed(common.parser(__doc__, seconds=4, rounds=7))
     rounds: dict[str, list[dict[str, Result]]] = {name: [] for name in RATES}
     with ExitStack() as stack:
@@ -235,7 +235,7 @@ def main() -> None:
 
 
 def show(name: str, rounds: list[dict[str, Result]]) -> None:
-    """One table. `queued` is how long the thread that serves was ready and waited for its core."""
+    """Prints one table. `queued` is the time that the Modbus thread waited for its core."""
     print(f"\nOne client, {name}; latencies in us:")
     print(
         "                  p50      p99    p99.9      max   queued  bodies/s  messages/s"
@@ -252,7 +252,7 @@ def show(name: str, rounds: list[dict[str, Result]]) -> None:
 
 
 def _wait(problem: str, done: Callable[[], bool]) -> None:
-    """Waits until it is done."""
+    """Waits until `done` returns true. Raises `RuntimeError` after a timeout."""
     end = time.monotonic() + common.TIMEOUT
     while not done():
         if time.monotonic() > end:

@@ -1,8 +1,8 @@
-"""Measures the clients against pymodbus's, libmodbus's and asyncio itself, in turn, on one machine.
+"""Compares the clients with those of pymodbus and libmodbus, and with plain asyncio.
 
-Our server has one core, the client that is measured the other. The turns go round, so that a
-machine whose speed drifts treats all alike. What is compared is the ratio within one round; what is
-told is the median of all rounds. Every reply is looked at: register N holds N.
+The Holdfast server has one core, the measured client the other. The order of the clients rotates,
+so that changes of the machine's speed affect all alike. Ratios compare results of the same round;
+figures are the medians of all rounds. Every reply is checked: register N holds N.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from common import Result, TurnFailed
 import holdfast
 
 SHAPES = [(1, 1), (1, 16), (16, 1), (64, 1)]
-"""Connections, and calls at once on each."""
+"""The number of connections, and of concurrent calls on each."""
 QUANTITY = 10
 REGISTERS = list(range(QUANTITY))
 REQUEST = common.REQUEST[:-1] + bytes([QUANTITY])
 PATIENT: dict[str, Any] = {"timeout": 10}
 
 Read: TypeAlias = Callable[[], Awaitable[None]]
-"""One read of an asyncio client, whose reply is looked at."""
+"""One read of an asyncio client, with a check of the reply."""
 Calls: TypeAlias = tuple[list[Read], Callable[[], Any]]
-"""The reads of each connection, and what ends them."""
+"""The read of each connection, and a function that closes all connections."""
 
 
 def main() -> None:
-    """Prints a table for each shape, and writes all results where `--json` says."""
+    """Prints a table for each shape, and writes all results to the file of `--json`."""
     if sys.argv[1:2] == ["turn"]:
         print(json.dumps(turn(*sys.argv[2:])))
         return
@@ -54,9 +54,9 @@ def main() -> None:
                 name: common.python("client.py", "turn", name, server.address) for name in BLOCKING
             }
             blocking["libmodbus"] = [libmodbus, host, port, str(QUANTITY)]
-            results.append(measure("one after the other, blocking", blocking, options))
+            results.append(measure("blocking, one call at a time", blocking, options))
             for connections, at_once in SHAPES:
-                title = f"{connections} connections, {at_once} calls at once on each, asyncio"
+                title = f"{connections} connections, {at_once} concurrent calls on each, asyncio"
                 shape = (server.address, connections, at_once)
                 commands = {
                     name: common.python("client.py", "turn", name, *shape) for name in ASYNCIO
@@ -69,12 +69,12 @@ def main() -> None:
 
 
 def compiled(folder: Path) -> str:
-    """The client of libmodbus."""
+    """Compiles the libmodbus client and returns its path."""
     asked = ["pkg-config", "--cflags", "--libs", "libmodbus"]
     try:
         flags = subprocess.check_output(asked, text=True)
     except (OSError, subprocess.CalledProcessError):
-        sys.exit("libmodbus is missing, with its headers (libmodbus-dev)")
+        sys.exit("libmodbus with its headers is not installed (package libmodbus-dev)")
     source = Path(__file__).with_name("libmodbus_client.c")
     program = str(folder / "client")
     subprocess.run(["cc", "-O2", "-o", program, source, *shlex.split(flags)], check=True)
@@ -82,7 +82,7 @@ def compiled(folder: Path) -> str:
 
 
 def measure(title: str, commands: dict[str, list[str]], options: Any) -> dict[str, Any]:
-    """Every client once a round; the table is printed."""
+    """Measures every client once per round, and prints the table."""
     rounds: list[dict[str, Result]] = []
     failures: dict[str, str] = {}
     for index in range(options.rounds):
@@ -102,7 +102,7 @@ def show(
     title: str, names: list[str], rounds: list[dict[str, Result]], failures: dict[str, str]
 ) -> None:
     print(f"\n{title}:")
-    print(f"  client           reads/s  cpu us/read  {names[0]} against it (min to max)")
+    print(f"  client           reads/s  cpu us/read  {names[0]} / client (min to max)")
     for name in names:
         if name in failures:
             print(f"  {name:14}  failed: {failures[name]}")
@@ -117,7 +117,7 @@ def show(
 
 
 def turn(name: str, address: str, *numbers: str) -> Result:
-    """Reads for some seconds."""
+    """Reads for some seconds. Returns the rate and the processor time per read."""
     host, port = address.rsplit(":", 1)
     *shape, seconds = numbers
     if name in BLOCKING:
@@ -129,7 +129,7 @@ def turn(name: str, address: str, *numbers: str) -> Result:
 
 def checked(registers: Sequence[int]) -> None:
     if registers != REGISTERS:
-        raise RuntimeError(f"a wrong reply: {registers}")
+        raise RuntimeError(f"wrong reply: {registers}")
 
 
 def blocking_turn(read: Callable[[], Sequence[int]], seconds: float) -> Result:
@@ -207,7 +207,7 @@ async def pymodbus_calls(host: str, port: int, connections: int) -> Calls:
 
 
 class Bare(asyncio.Protocol):
-    """What asyncio can do at most: a request and a future, and no look at the reply."""
+    """The upper limit of asyncio: a request and a future, without a check of the reply."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)

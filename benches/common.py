@@ -1,4 +1,4 @@
-"""What the benchmarks share: processes that are pinned, turns that go round, and ratios."""
+"""Shared by the benchmarks: pinned processes, rotating turns, medians and ratios."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import IO, TypeAlias
 
 ROOT = Path(__file__).parent.parent
 TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "release"
-# Seconds: how long a server may take to start, and a load to end after its time.
+# Seconds to wait for a server to start, and for a load to end.
 TIMEOUT = 30
 REQUEST = bytes.fromhex("123400000006010300000000")
 
@@ -30,21 +30,21 @@ Round: TypeAlias = Mapping[str, Result]
 
 
 class TurnFailed(Exception):
-    """A server dropped or changed a reply, or was silent."""
+    """A server dropped or changed a reply, or did not reply."""
 
 
 def bench(*command: object) -> list[str]:
-    """One of the loads and loops in `src`."""
+    """The command line of a load or a loop in `src`."""
     return [str(TARGET / "holdfast-benches"), *map(str, command)]
 
 
 def python(script: str, *arguments: object) -> list[str]:
-    """One of the servers beside this file."""
+    """The command line of a script in this folder."""
     return [sys.executable, str(Path(__file__).parent / script), *map(str, arguments)]
 
 
 def pinned(core: int, *, idle: bool = False) -> Callable[[], None]:
-    """What makes a new process stay on a core; if `idle`, it runs when nobody else wants to."""
+    """Returns a function that pins a new process to a core; with `idle`, under SCHED_IDLE."""
 
     def prepare() -> None:
         os.sched_setaffinity(0, {core})
@@ -77,7 +77,7 @@ class Server:
         self.address = next(iter(self.addresses.values()))
 
     def _listening(self) -> tuple[str, str]:
-        """The name and the address of `listening NAME ADDRESS`; the name may be left out."""
+        """Reads a line `listening NAME ADDRESS`; the name is optional."""
         assert self.process.stdout is not None
         words = self.process.stdout.readline().split()
         if words[:1] != ["listening"]:
@@ -88,18 +88,18 @@ class Server:
         return " ".join(words[1:-1]), words[-1]
 
     def cpu(self) -> float:
-        """Seconds of processor time so far."""
+        """Returns the processor time so far, in seconds."""
         return time.clock_gettime(~self.process.pid << 3 | 2)  # As clock_getcpuclockid(3) does.
 
     def stop(self) -> None:
-        """Ends the process, whatever it does."""
+        """Kills the process."""
         self.process.kill()
         self.process.communicate()
 
 
 @contextlib.contextmanager
 def started(name: str, command: Sequence[str], core: int, listeners: int = 1) -> Iterator[Server]:
-    """A server."""
+    """Runs a server."""
     with tempfile.TemporaryFile("w+") as log:
         server = Server(name, command, core, listeners, log)
         try:
@@ -110,7 +110,7 @@ def started(name: str, command: Sequence[str], core: int, listeners: int = 1) ->
 
 @contextlib.contextmanager
 def appliance(configuration: str, core: int, listeners: int) -> Iterator[Server]:
-    """Holdfast with a configuration, which is YAML."""
+    """Runs an appliance with a configuration in YAML."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "holdfast.yaml"
         file.write_text(configuration)
@@ -123,7 +123,7 @@ def appliance(configuration: str, core: int, listeners: int) -> Iterator[Server]
 def running(
     command: Sequence[str], core: int, *, idle: bool = False
 ) -> Iterator[subprocess.Popen[str]]:
-    """A process that is killed in the end, if it did not end before."""
+    """Runs a process, and kills it at the end of the context."""
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -139,12 +139,12 @@ def running(
 
 
 def outcome(command: Sequence[str], seconds: float, core: int) -> Result:
-    """What a process prints that runs for some seconds."""
+    """Runs a process for `seconds`, and returns the result that it prints."""
     with running(command, core) as process:
         try:
             out, error = process.communicate(timeout=seconds + TIMEOUT)
         except subprocess.TimeoutExpired:
-            raise TurnFailed("it did not end") from None
+            raise TurnFailed("the process did not end in time") from None
     if process.returncode != 0:
         raise TurnFailed(error.strip())
     result: Result = json.loads(out)
@@ -152,18 +152,18 @@ def outcome(command: Sequence[str], seconds: float, core: int) -> Result:
 
 
 def load(command: Sequence[str], seconds: float, core: int, server: Server) -> Result:
-    """One turn: what the load says, and the server's processor time for each request."""
+    """Runs a load. Returns its result with the server's processor time per request."""
     before = server.cpu()
     result = outcome([*command, "--seconds", str(seconds)], seconds, core)
     if not result["requests"]:
         raise TurnFailed("nothing was answered in time")
-    # Not only what counts: the server works for the warm-up and the last replies too.
+    # `answered` includes the warm-up and late replies, which also cost processor time.
     result["server_us"] = (server.cpu() - before) / result["answered"] * 1e6
     return result
 
 
 def ask(address: str, quantity: int) -> bytes:
-    """The reply to one read of holding registers, from address 0 of unit 1."""
+    """Reads holding registers of unit 1 from address 0. Returns the raw reply."""
     host, _, port = address.rpartition(":")
     with socket.create_connection((host, int(port)), timeout=5) as connection:
         connection.sendall(REQUEST[:-2] + quantity.to_bytes(2, "big"))
@@ -177,18 +177,18 @@ def ask(address: str, quantity: int) -> bytes:
 
 
 def turns(names: Sequence[str], index: int) -> list[str]:
-    """All names, in the order of this round: each begins with another one."""
+    """Returns all names in the order of this round. Each round starts with another name."""
     first = index % len(names)
     return [*names[first:], *names[:first]]
 
 
 def medians(rounds: Sequence[Round], name: str, *keys: str) -> list[float]:
-    """The median of each figure."""
+    """Returns the median of each figure."""
     return [median(one[name][key] for one in rounds if name in one) for key in keys]
 
 
 def ratio(rounds: Sequence[Round], first: str, second: str, key: str = "rate") -> str:
-    """The ratio within a round: the median, the least and the most."""
+    """Formats the ratio of two results within a round: median, minimum and maximum."""
     both = [one for one in rounds if first in one and second in one]
     if not both:
         return "-"
@@ -197,30 +197,30 @@ def ratio(rounds: Sequence[Round], first: str, second: str, key: str = "rate") -
 
 
 def parser(description: str | None, seconds: float, rounds: int) -> argparse.ArgumentParser:
-    """The options that all benchmarks have."""
+    """Returns a parser with the options of all benchmarks."""
     options = argparse.ArgumentParser(description=description)
     options.set_defaults(seconds_otherwise=seconds, rounds_otherwise=rounds)
-    options.add_argument("--seconds", type=float, help=f"of each turn; {seconds:g} if not said")
-    options.add_argument("--rounds", type=int, help=f"{rounds} if not said")
-    options.add_argument("--quick", action="store_true", help="2 rounds of 0.3 s: does it work?")
-    options.add_argument("--json", type=Path, help="where to write all results")
+    options.add_argument("--seconds", type=float, help=f"per turn; default {seconds:g}")
+    options.add_argument("--rounds", type=int, help=f"default {rounds}")
+    options.add_argument("--quick", action="store_true", help="2 rounds of 0.3 s, as a smoke test")
+    options.add_argument("--json", type=Path, help="file for all results")
     return options
 
 
 def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """The options, checked; the cores, of which `core` is the server's and `other` the load's."""
+    """Parses and checks the options. Adds `core` for the server and `other` for the load."""
     options = parser.parse_args()
     options.seconds = options.seconds or (0.3 if options.quick else options.seconds_otherwise)
     options.rounds = options.rounds or (2 if options.quick else options.rounds_otherwise)
     if options.seconds <= 0 or options.rounds < 1:
-        parser.error("more than 0 seconds, 1 round or more")
-    # The processes that were started end with this one, also then.
+        parser.error("--seconds must be greater than 0, --rounds at least 1")
+    # SIGTERM raises SystemExit, so that started processes are ended.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated"))
     cores = sorted(os.sched_getaffinity(0))
     options.core, options.other = cores[0], cores[-1]
     print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()};")
     print(f"{options.rounds} rounds of {options.seconds:g} s.")
     if len(cores) < 2:
-        print("Only one core: server and load share it, so ratios say little.")
+        print("Only one core: server and load share it, so ratios are not meaningful.")
     sys.stdout.flush()
     return options

@@ -1,9 +1,9 @@
-"""Measures reads through the HTTP gateway: ten registers, with kept connections and with new ones.
+"""Measures reads of ten registers through the HTTP gateway, with kept and with new connections.
 
-The gateway has one core; the load has the other, and the one device that is read, a Holdfast server
-of its own, is there too. Each client waits for its reply before it asks again. With kept
-connections the load is in Rust; with one connection a request it is in Python, and how busy it was
-tells whether it is the load that is measured. All replies are looked at.
+The gateway has one core. The load and the device, a Holdfast server, share the other. Each client
+has one request in flight. The load with kept connections is written in Rust. The load with one
+connection per request is written in Python; if it is busy all the time, the figures show its limit
+instead of the gateway's. All replies are checked.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from common import Result
 CLIENTS = 32
 QUANTITY = 10
 PATH = "/api/modbus/read"
-KINDS = {"kept": "kept connections", "once": "one connection a request"}
+KINDS = {"kept": "kept connections", "once": "one connection per request"}
 
 
 def main() -> None:
-    """Prints a table, and writes all results where `--json` says."""
+    """Prints a table, and writes all results to the file of `--json`."""
     options = common.parsed(common.parser(__doc__, seconds=2, rounds=7))
     rounds: list[dict[str, Result]] = []
     with (
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def show(rounds: list[dict[str, Result]]) -> None:
-    """The table."""
+    """Prints the table."""
     print(f"\nReads of {QUANTITY} registers of one device, {CLIENTS} clients:")
     print("                              reads/s  p50 ms  p99 ms  gateway us/read  load busy")
     for name, title in KINDS.items():
@@ -66,7 +66,7 @@ def show(rounds: list[dict[str, Result]]) -> None:
             f"  {title:25}  {rate:8,.0f}  {p50 / 1e3:6.1f}  {p99 / 1e3:6.1f}  {cpu:15,.0f}"
             f"  {busy:9.0%}"
         )
-    print(f"  kept against new connections: {common.ratio(rounds, 'kept', 'once')}")
+    print(f"  ratio of kept to new connections: {common.ratio(rounds, 'kept', 'once')}")
 
 
 if __name__ == "__main__":

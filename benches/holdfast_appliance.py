@@ -1,4 +1,4 @@
-"""The appliance that is measured: what the configuration says that is given."""
+"""Runs the appliance under test, with the configuration file in the first argument."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gateway that is measured: it may connect to the device that is given, and nowhere else."""
+"""Runs the gateway under test. It may connect only to the device in the first argument."""
 
 from __future__ import annotations
 

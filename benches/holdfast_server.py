@@ -1,4 +1,4 @@
-"""The Holdfast server that is measured: 1,000 holding registers, unit 1."""
+"""Runs the Holdfast server under test: 1,000 holding registers, unit 1."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The limit of ingest over REST: parses the same JSON again and again, and packs its values.
+"""The upper limit of ingest over REST: parses the same JSON in a loop, and packs its values.
 
-Nothing is received, checked or written. Prints how many bodies it did, and in how many seconds.
+Nothing is received, checked or written. Prints the number of bodies and the rate as JSON.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Measures the native poller: flat out against a bare closed-loop client, and 1,000 devices at 1 s.
+"""Measures the native poller at full speed, and with 1,000 devices at an interval of 1 s.
 
-The devices are one server on core 0; the poller, or the client, has core 1. Flat out, each of 64
-devices has one read in flight, as has each of the client's 64 connections.
+One server on the first core stands for all devices; the poller has the last core. At full speed,
+64 devices with one read in flight each are compared with a bare client with 64 connections and one
+request in flight on each.
 """
 
 from __future__ import annotations
@@ -47,13 +48,13 @@ def main() -> None:
 
 def show_flat_out(rounds: list[common.Round]) -> None:
     poller, bare = (common.medians(rounds, name, "rate")[0] for name in ("poller", "bare"))
-    print(f"\nFlat out, {CONNECTIONS} connections, one read of 10 registers in flight on each:")
+    print(f"\nFull speed, {CONNECTIONS} connections, one read of 10 registers in flight on each:")
     print(f"  poller  {poller:9,.0f} blocks/s    bare client  {bare:9,.0f} requests/s")
-    print(f"  poller against bare: {common.ratio(rounds, 'poller', 'bare')}")
+    print(f"  ratio of poller to bare client: {common.ratio(rounds, 'poller', 'bare')}")
 
 
 def show_schedule(devices: int, result: common.Result) -> None:
-    print(f"\n{devices} devices of 10 blocks, each every second:")
+    print(f"\n{devices} devices of 10 blocks, polled every second:")
     print(
         f"  {result['rate']:,.0f} blocks/s, {result['cpu']:.0%} of a core, "
         f"{result['missed']:.0f} scans missed, {result['timeouts']:.0f} timeouts, "

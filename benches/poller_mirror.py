@@ -1,7 +1,7 @@
-"""The poller that is measured: devices of ten blocks each, mirrored into one memory.
+"""Runs the poller under test: devices of ten blocks each, mirrored into one memory.
 
-Every device has an address of its own, and so a connection. What is printed at the end covers the
-time after all have connected.
+Every device has its own address, and so its own connection. The printed figures cover the time
+after all devices have connected.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The device that the poller reads: 1,000 holding registers, unit 1, on every loopback address."""
+"""Runs the device for the poller: 1,000 holding registers, unit 1, on every loopback address."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A closed-loop load of one HTTP request, over a new connection each time; every reply is checked.
+"""A closed-loop load that sends one HTTP request per connection, and checks every reply.
 
-It says what the loads in Rust say, as JSON.
+It prints the same JSON as the loads in Rust.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TIMEOUT = 10
 
 
 class Load:
-    """The clients, and what they saw."""
+    """The clients and their results."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         host, _, port = options.address.rpartition(":")
@@ -33,7 +33,7 @@ class Load:
         self.answered = 0
 
     async def run(self, clients: int) -> None:
-        """All clients, for their time."""
+        """Runs all clients."""
         expected = await self.ask()
         self.begin = time.perf_counter() + WARMUP
         self.end = self.begin + self.seconds
@@ -45,14 +45,14 @@ class Load:
         while now < self.end:
             sent = now
             if await self.ask() != expected:
-                raise RuntimeError("a reply is not what it was at first")
+                raise RuntimeError("a reply differs from the first reply")
             now = time.perf_counter()
             self.answered += 1
             if self.begin <= now < self.end:
                 self.latencies.append(now - sent)
 
     async def ask(self) -> bytes:
-        """The body of the reply, to the end of its connection."""
+        """Sends the request on a new connection. Returns the body of the reply."""
         loop = asyncio.get_running_loop()
         with socket.socket() as connection:
             connection.setblocking(False)
@@ -63,12 +63,12 @@ class Load:
                 reply += received
         head, _, body = reply.partition(b"\r\n\r\n")
         if not head.startswith(b"HTTP/1.1 200 "):
-            raise RuntimeError(f"found {reply[:500]!r}")
+            raise RuntimeError(f"expected status 200, found {reply[:500]!r}")
         return body
 
 
 def main() -> None:
-    """Prints the rate, and latencies in microseconds."""
+    """Prints the rate, and the latencies in microseconds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--address", required=True)
     parser.add_argument("--path", required=True)

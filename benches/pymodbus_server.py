@@ -1,4 +1,4 @@
-"""The pymodbus server that is measured: 1,000 holding registers, unit 1."""
+"""Runs the pymodbus server under test: 1,000 holding registers, unit 1."""
 
 from __future__ import annotations
 

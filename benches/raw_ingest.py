@@ -1,8 +1,8 @@
-"""Measures Raw Ingest, one connection a packet, against a loop that does not look at the packets.
+"""Compares Raw Ingest, with one connection per packet, with a loop that does not parse packets.
 
-The servers share one core, the load has the other. The bare loop accepts, reads as many bytes as it
-was told that a packet has, answers one byte and closes. Each packet is one connection: the latency
-is that from the start of connecting to the reply.
+The servers share one core, the load has the other. The bare loop accepts a connection, reads the
+known size of a packet, answers one byte and closes. Each packet has its own connection; the latency
+is the time from the start of connecting to the reply.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ listeners:
 
 @dataclass
 class Scenario:
-    """What was measured with one kind of packet, and a number of them in flight."""
+    """The results for one kind of packet and one number of packets in flight."""
 
     format: str
     registers: int
@@ -51,7 +51,7 @@ class Scenario:
 
 
 def main() -> None:
-    """Prints a line for each scenario, and writes all results where `--json` says."""
+    """Prints a line for each scenario, and writes all results to the file of `--json`."""
     options = common.parsed(common.parser(__doc__, seconds=1, rounds=7))
     print(
         "\npacket      in    holdfast     bare  p99 us, each  cpu us, each   load's core  "
@@ -84,7 +84,7 @@ def encoded(form: str, registers: int) -> bytes:
 
 
 def check(holdfast: Server, form: str, registers: int, packet: bytes) -> None:
-    """Sends one packet, and reads over Modbus what became of it."""
+    """Sends one packet, and checks over Modbus that it was written."""
     host, _, port = holdfast.addresses[form].rpartition(":")
     raw_ingest.send_packet_sync(host, int(port), packet)
     quantity = min(registers, 125)
@@ -97,7 +97,7 @@ def check(holdfast: Server, form: str, registers: int, packet: bytes) -> None:
 def measure(
     scenario: Scenario, packet: bytes, holdfast: Server, bare: Server, options: argparse.Namespace
 ) -> None:
-    """Both servers once a round."""
+    """Measures both servers once per round."""
     servers = {
         "holdfast": (holdfast, holdfast.addresses[scenario.format]),
         "bare": (bare, bare.address),
@@ -117,7 +117,7 @@ def measure(
 
 
 def show(scenario: Scenario) -> None:
-    """One line. `load's core` is how busy the load was: near 100 % it is a limit too."""
+    """Prints one line. A `load's core` near 100 % means that the load limits the result."""
     rounds, keys = scenario.rounds, ("rate", "p99", "server_us", "busy")
     rate, p99, cpu, busy = common.medians(rounds, "holdfast", *keys)
     bare_rate, bare_p99, bare_cpu, bare_busy = common.medians(rounds, "bare", *keys)

@@ -1,9 +1,10 @@
-"""Measures ingest over REST against a loop that parses the same JSON and does nothing else.
+"""Compares ingest over REST with a loop that only parses the same JSON.
 
-The appliance has one core, the load (in Rust: kept connections, one request in flight on each, all
-answers checked) has the other. The loop runs on the appliance's core while that is idle. It has no
-socket and no HTTP: it parses the body with msgspec, as the appliance does, and packs the values
-with `struct`. The same with the `json` of the standard library is there for information.
+The appliance has one core, the load has the other. The load is written in Rust; it keeps
+connections, has one request in flight on each, and checks all answers. The loop runs on the
+appliance's core while that is idle. It has no socket and no HTTP: it parses the body with msgspec,
+as the appliance does, and packs the values with `struct`. The same loop with the standard library's
+`json` is shown for information.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from common import Result, Server
 TOKEN = "a token that protects nothing"
 CONNECTIONS = (1, 8)
 VALUES = 1000
-# How many commands the values come in.
+# The number of commands that the values are split into.
 BODIES = {"one command": 1, "10 commands": 10}
 CONFIGURATION = f"""
 memories:
@@ -41,7 +42,7 @@ rest:
 
 @dataclass
 class Scenario:
-    """What was measured with one kind of body, and a number of connections."""
+    """The results for one kind of body and one number of connections."""
 
     body: str
     connections: int
@@ -50,7 +51,7 @@ class Scenario:
 
 
 def main() -> None:
-    """Prints a table for each scenario, and writes all results where `--json` says."""
+    """Prints a table for each scenario, and writes all results to the file of `--json`."""
     options = common.parsed(common.parser(__doc__, seconds=2, rounds=7))
     scenarios = []
     with (
@@ -70,7 +71,7 @@ def main() -> None:
 
 
 def body(commands: int) -> bytes:
-    """All values, in this many commands: every length from one digit to five."""
+    """Returns all values in this many commands. The values have one to five digits."""
     values = [(address * 7919) % 65536 >> address % 16 for address in range(VALUES)]
     each = VALUES // commands
     batch = [
@@ -86,7 +87,7 @@ def body(commands: int) -> bytes:
 
 
 def measure(scenario: Scenario, file: Path, holdfast: Server, options: argparse.Namespace) -> None:
-    """The appliance and both loops once a round."""
+    """Measures the appliance and both loops once per round."""
     post = common.bench(
         "post",
         *("--address", holdfast.address),
@@ -107,17 +108,19 @@ def measure(scenario: Scenario, file: Path, holdfast: Server, options: argparse.
 
 
 def show(scenario: Scenario) -> None:
-    """One table."""
+    """Prints one table."""
     rounds = scenario.rounds
     print(f"\n{scenario.body}, {VALUES} values, {scenario.bytes:,} bytes,", end=" ")
     print(f"{scenario.connections} connections:")
-    print("              values/s   us/request  holdfast against it (min to max)")
+    print("              values/s   us/request  ratio of holdfast (min to max)")
     for name in ("holdfast", "msgspec", "json"):
         [rate] = common.medians(rounds, name, "rate")
         against = "" if name == "holdfast" else common.ratio(rounds, "holdfast", name)
         print(f"  {name:8}  {rate * VALUES:12,.0f}   {1e6 / rate:10.1f}  {against}".rstrip())
     p50, p99, cpu, busy = common.medians(rounds, "holdfast", "p50", "p99", "server_us", "busy")
-    print(f"  holdfast: p50 {p50:,.0f} us, p99 {p99:,.0f} us, cpu {cpu:,.0f} us a request;", end="")
+    print(
+        f"  holdfast: p50 {p50:,.0f} us, p99 {p99:,.0f} us, cpu {cpu:,.0f} us per request;", end=""
+    )
     print(f" the load was busy for {busy:.0%}.")
     sys.stdout.flush()
 

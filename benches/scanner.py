@@ -1,8 +1,8 @@
-"""The scanner on one core: values per second through to a subscriber in another process, and 1,000
-devices of 100 tags each once a second.
+"""Measures the scanner on one core: the values per second that reach a subscriber.
 
-Four processes: the scanner, alone on its core; the NATS server, the devices and the subscriber on
-another. All devices are one server at as many loopback addresses, so each has its own connection.
+The scanner has its own core. The NATS server, the devices and the subscriber are three processes on
+another core. One server on many loopback addresses stands for all devices, so each device has its
+own connection.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from holdfast.scanner.tags import Tag
 TAGS = 100
 TICKS = os.sysconf("SC_CLK_TCK")
 SETTLING = 2.0
-"""Seconds after the last subscription before anything is counted."""
+"""Seconds between the last subscription and the start of the measurement."""
 
 
 class Bench:
-    """One scanner with its devices, and what comes out of it."""
+    """One scanner with its devices and a subscriber."""
 
     def __init__(self, options: argparse.Namespace, stack: ExitStack) -> None:
         core, other = options.core, options.other
@@ -49,7 +49,7 @@ class Bench:
         self.listener = stack.enter_context(common.started("listener", listener, other))
 
     def threads(self) -> dict[str, float]:
-        """Processor seconds of the scanner by thread."""
+        """Returns the processor time of the scanner by thread, in seconds."""
         found: dict[str, float] = {}
         for task in Path(f"/proc/{self.scanner.process.pid}/task").iterdir():
             name = (task / "comm").read_text().strip()
@@ -59,13 +59,13 @@ class Bench:
         return found
 
     def nats_cpu(self) -> float:
-        """Processor seconds of the NATS server, which is the child of its process."""
+        """Returns the processor time of the NATS server, a child process, in seconds."""
         pid = self.nats.process.pid
         child = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0]
         return _seconds(Path(f"/proc/{child}/stat"))
 
     def count(self) -> dict[str, float]:
-        """What came since the last call."""
+        """Returns the listener's figures since the last call."""
         assert self.listener.process.stdin is not None
         assert self.listener.process.stdout is not None
         self.listener.process.stdin.write("\n")
@@ -75,13 +75,13 @@ class Bench:
 
 
 def _seconds(stat: Path) -> float:
-    """Processor seconds, as the system tells them of a process or a thread."""
+    """Returns the processor time in a `stat` file, in seconds."""
     user, system = stat.read_text().rpartition(")")[2].split()[11:13]
     return (int(user) + int(system)) / TICKS
 
 
 async def subscribe(bench: Bench, devices: int, rate: int) -> None:
-    """Asks for all tags of all devices."""
+    """Subscribes to all tags of all devices."""
     port = int(bench.devices.address.rpartition(":")[2])
     tags = [
         {"id": f"tag{at}", "address": at, "functionCode": "holding", "datatype": "uint16"}
@@ -106,7 +106,7 @@ async def subscribe(bench: Bench, devices: int, rate: int) -> None:
 
 
 async def browse(bench: Bench) -> tuple[dict[str, int], int]:
-    """The counters of the service, and the scans that all devices missed."""
+    """Returns the counters of the service, and the missed scans of all devices."""
     client = await _connected(bench)
     missed, offset = 0, 0
     while True:
@@ -127,7 +127,7 @@ async def _connected(bench: Bench) -> Client:
 
 
 def measured(options: argparse.Namespace, devices: int, rate: int, seconds: float) -> Any:
-    """What comes through in so many seconds, and what that costs."""
+    """Measures throughput and processor time for some seconds."""
     with ExitStack() as stack:
         bench = Bench(options, stack)
         asyncio.run(subscribe(bench, devices, rate))
@@ -151,15 +151,15 @@ def measured(options: argparse.Namespace, devices: int, rate: int, seconds: floa
 
 
 def show(title: str, found: Any) -> None:
-    """One measurement."""
+    """Prints one measurement."""
     per_second = found["count"] / found["seconds"]
     total = sum(found["cpu"].values())
     print(f"\n{title}")
     print(f"  delivered       {per_second:12,.0f} values/s")
     print(f"  latency         {found['p50']:12.1f} ms p50, {found['p99']:.1f} p99, ", end="")
-    print(f"{found['max']:.1f} max (from the device's answer to the subscriber)")
+    print(f"{found['max']:.1f} max (from the device's response to the subscriber)")
     print(
-        f"  missed scans    {found['missed']:12,d}; lost in here: {found['lostScans']} scans, ",
+        f"  missed scans    {found['missed']:12,d}; lost scans: {found['lostScans']}, ",
         end="",
     )
     print(f"{found['replaced']} replaced, {found['dropped']} dropped")
@@ -170,7 +170,7 @@ def show(title: str, found: Any) -> None:
 
 
 def costs() -> dict[str, float]:
-    """Microseconds a value for what the event loop does with it, alone in this process."""
+    """Returns the microseconds per value that the event loop takes, measured in this process."""
     tags = tuple(
         Tag(f"tag{at}", "holding_registers", at, "uint16", "ABCD", frozenset())
         for at in range(TAGS)
@@ -188,7 +188,7 @@ def costs() -> dict[str, float]:
 
 
 async def publishing(url: str) -> dict[str, float]:
-    """Microseconds a message to hand it to NATS: by the client's `publish`, and in batches."""
+    """Returns the microseconds per message to publish: one by one with nats-py, and in batches."""
     client = Client()
     await client.connect(url)
     subject, payload, count = "bench.data.device1", b"x" * 120, 20_000
@@ -208,7 +208,7 @@ async def publishing(url: str) -> dict[str, float]:
 
 
 def main() -> None:
-    """Prints both measurements, and writes them where `--json` says."""
+    """Prints all measurements, and writes them to the file of `--json`."""
     parser = common.parser(__doc__, seconds=10, rounds=1)
     parser.add_argument("--devices", type=int, default=1000)
     options = common.parsed(parser)
@@ -217,7 +217,7 @@ def main() -> None:
     scan, change = results["us_per_value"]["scan"], results["us_per_value"]["change"]
     with Embedded(0) as server:
         handed = results["us_per_message"] = asyncio.run(publishing(server.url))
-    print(f"\nFrom bytes to messages: {scan:.2f} us a value, {change:.2f} where it did not change.")
+    print(f"\nBytes to messages: {scan:.2f} us per value, {change:.2f} us if unchanged.")
     print(f"To NATS: {handed['publish']:.2f} us each by publish, {handed['batch']:.2f} in batches.")
     for title, devices, rate in (
         (f"{options.devices} devices of {TAGS} tags, once a second", options.devices, 1000),

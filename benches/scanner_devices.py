@@ -1,4 +1,4 @@
-"""Modbus devices at 127.0.0.0/8, each address one: 1,000 holding registers, unit 1."""
+"""Runs Modbus devices, one on each address of 127.0.0.0/8: 1,000 holding registers, unit 1."""
 
 from __future__ import annotations
 

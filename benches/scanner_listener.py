@@ -1,7 +1,7 @@
-"""Counts what the scanner publishes, as a subscriber of NATS has it, and how late it comes.
+"""Subscribes on NATS, and counts the scanner's messages and their latency.
 
-It reads the protocol itself: a client library would be slower than what is measured. A line on
-standard input is answered by what came since the one before, as JSON.
+It parses the protocol itself, because a client library would be slower than the scanner. For each
+line on standard input it prints the figures since the previous line as JSON.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
             found = TIMESTAMP.findall(text)
             rest = text[text.rfind(b"}") + 1 :]
             count += len(found)
-            # A poll has one time: more of it says nothing more.
+            # All values of a poll have the same time, so a sample is enough.
             late += [now - int(moment) for moment in found[::50]]
         if sys.stdin in readable:
             if not sys.stdin.readline():

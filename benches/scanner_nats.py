@@ -1,4 +1,4 @@
-"""A NATS server on a free port, for as long as standard input is open."""
+"""Runs a NATS server on a free port until standard input is closed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scanner that is measured, at the NATS server of the command line."""
+"""Runs the scanner under test, with the NATS server in the first argument."""
 
 from __future__ import annotations
 

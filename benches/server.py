@@ -1,9 +1,9 @@
-"""Measures the server against pymodbus's and against a bare loop, in turn, on one machine.
+"""Compares the server with that of pymodbus and with a bare loop.
 
-The server that is measured has one core, the load the other. All servers run all the time; only one
-is loaded at once, and the turns go round, so that a machine whose speed drifts treats all alike.
-What is compared is the ratio within one round; what is told is the median of all rounds. A server
-that loses or changes a reply has no figures in that scenario: it is told why, and not asked again.
+The measured server has one core, the load the other. All servers run all the time, but only one is
+under load at a time. Their order rotates, so that changes of the machine's speed affect all alike.
+Ratios compare results of the same round; figures are the medians of all rounds. A server that drops
+or changes a reply is reported as failed, and not measured again in that scenario.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SCENARIOS = [(connections, in_flight) for connections in (1, 64) for in_flight i
 
 @dataclass
 class Scenario:
-    """What was measured with one number of connections and of requests in flight on each."""
+    """The results for one number of connections and one number of requests in flight on each."""
 
     connections: int
     in_flight: int
@@ -32,7 +32,7 @@ class Scenario:
 
 
 def main() -> None:
-    """Prints a table for each scenario, and writes all results where `--json` says."""
+    """Prints a table for each scenario, and writes all results to the file of `--json`."""
     options = arguments()
     with ExitStack() as stack:
         servers = start_servers(options, stack)
@@ -54,17 +54,18 @@ def main() -> None:
 
 def arguments() -> argparse.Namespace:
     parser = common.parser(__doc__, seconds=2, rounds=7)
-    parser.add_argument("--null", action="store_true", help="the bare loop against itself")
-    parser.add_argument("--quantity", type=int, default=10, help="registers a read, 1 to 125")
+    parser.add_argument("--null", action="store_true", help="compare the bare loop with itself")
+    parser.add_argument("--quantity", type=int, default=10, help="registers per read, 1 to 125")
     options = common.parsed(parser)
     if not 1 <= options.quantity <= 125:
-        parser.error("1 to 125 registers")
+        parser.error("--quantity must be 1 to 125")
     return options
 
 
 def start_servers(options: argparse.Namespace, stack: ExitStack) -> dict[str, Server]:
-    """All servers, the one first that the others are compared with. The bare loop learns from
-    Holdfast what to answer.
+    """Starts all servers. The others are compared with the first.
+
+    The bare loop answers with a reply of Holdfast.
     """
     servers: dict[str, Server] = {}
 
@@ -82,14 +83,14 @@ def start_servers(options: argparse.Namespace, stack: ExitStack) -> dict[str, Se
         return servers
     address = start("pymodbus", common.python("pymodbus_server.py"))
     if common.ask(address, options.quantity) != reply:
-        raise RuntimeError("pymodbus does not answer the same bytes")
+        raise RuntimeError("the reply of pymodbus differs from the reply of Holdfast")
     return servers
 
 
 def measure(
     servers: dict[str, Server], connections: int, in_flight: int, options: argparse.Namespace
 ) -> Scenario:
-    """Every server once a round."""
+    """Measures every server once per round."""
     scenario = Scenario(connections, in_flight)
     for index in range(options.rounds):
         results: dict[str, Result] = {}
@@ -120,7 +121,7 @@ def command(server: Server, shape: tuple[int, int], options: argparse.Namespace)
 
 
 def beside_a_flood(server: Server, options: argparse.Namespace) -> dict[str, Result]:
-    """What one polite client sees, alone and beside clients that never pause. All share a core."""
+    """Measures one polite client alone, and beside clients that flood the server."""
     alone = load(server, (1, 1), options)
     flood = [*command(server, FLOOD, options), "--seconds", str(options.seconds + 2)]
     with common.running(flood, options.other):
@@ -128,11 +129,11 @@ def beside_a_flood(server: Server, options: argparse.Namespace) -> dict[str, Res
 
 
 def show(scenario: Scenario, names: list[str]) -> None:
-    """One table. `load's core` is how busy the load was: near 100 % it is a limit too."""
+    """Prints one table. A `load's core` near 100 % means that the load limits the result."""
     print(f"\n{scenario.connections} connections, {scenario.in_flight} in flight on each:")
     print(
         "  server      requests/s   p50 us   p99 us  cpu us/request  load's core"
-        f"  {names[0]} against it (min to max)"
+        f"  ratio of {names[0]} (min to max)"
     )
     for name in names:
         if name in scenario.failures:
@@ -151,7 +152,7 @@ def show(scenario: Scenario, names: list[str]) -> None:
 
 def show_flood(beside: dict[str, Result]) -> None:
     if beside:
-        print("\nholdfast, 1 connection with 1 in flight, alone and beside two that flood it:")
+        print("\nholdfast, 1 connection with 1 in flight, alone and beside a flood of 2:")
     for name, result in beside.items():
         print(f"  {name:6}  p50 {result['p50']:,.0f} us, p99 {result['p99']:,.0f} us")
 

@@ -1,7 +1,7 @@
-"""Measures the byte interpreter against pymodbus's conversion and against plain `struct`.
+"""Compares the byte interpreter with the conversion of pymodbus and with plain `struct`.
 
-All do the same work in turn, and the turns go round, so that a machine whose speed drifts treats
-all alike. What is compared is the ratio within one round; what is told is the median of all rounds.
+All do the same work. Their order rotates, so that changes of the machine's speed affect all alike.
+Ratios compare times of the same round; figures are the medians of all rounds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from holdfast.values import Layout, decode
 FLOATS = 10_000
 FIELDS = 100
 ORDERS = {"ABCD": (">", ">"), "DCBA": (">", "<"), "BADC": ("<", ">"), "CDAB": ("<", "<")}
-"""The byte orders of registers and of floats, as `struct` marks them, that make each order."""
+"""The `struct` byte orders of registers and of floats that give each order."""
 FLOAT32 = ModbusClientMixin.DATATYPE.FLOAT32
 
 Work: TypeAlias = Callable[[], Any]
@@ -34,7 +34,7 @@ Times: TypeAlias = dict[str, list[float]]
 
 
 def main() -> None:
-    """Prints a table for each work, and writes all times where `--json` says."""
+    """Prints a table for each task, and writes all times to the file of `--json`."""
     options = arguments()
     print(f"{platform.machine()}, Python {platform.python_version()}; {options.rounds} rounds.")
     results = {}
@@ -47,19 +47,19 @@ def main() -> None:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, help="15 if not said")
-    parser.add_argument("--seconds", type=float, default=0.05, help="of work in each turn")
-    parser.add_argument("--quick", action="store_true", help="2 rounds: does it work?")
-    parser.add_argument("--json", type=Path, help="where to write all times, in seconds")
+    parser.add_argument("--rounds", type=int, help="default 15")
+    parser.add_argument("--seconds", type=float, default=0.05, help="per turn; default 0.05")
+    parser.add_argument("--quick", action="store_true", help="2 rounds, as a smoke test")
+    parser.add_argument("--json", type=Path, help="file for all times, in seconds")
     options = parser.parse_args()
     options.rounds = options.rounds or (2 if options.quick else 15)
     if options.rounds < 1 or options.seconds <= 0:
-        parser.error("1 round or more, more than 0 seconds")
+        parser.error("--rounds must be at least 1, --seconds greater than 0")
     return options
 
 
 def works(chance: random.Random) -> dict[str, dict[str, Work]]:
-    """What is measured: contestants by work, Holdfast first."""
+    """Returns the contestants of each task, Holdfast first."""
     numbers = [chance.uniform(-1000, 1000) for _ in range(FLOATS)]
     made: dict[str, dict[str, Work]] = {}
     for order, (of_registers, of_floats) in ORDERS.items():
@@ -132,14 +132,14 @@ def wire(registers: Sequence[int]) -> bytes:
 
 
 def by_struct(registers: Sequence[int], order: str) -> tuple[float, ...]:
-    """The limit: two calls, for registers that are not checked."""
+    """The upper limit: two calls of `struct`, without checks of the registers."""
     of_registers, of_floats = ORDERS[order]
     data = struct.pack(f"{of_registers}{len(registers)}H", *registers)
     return struct.unpack(f"{of_floats}{len(registers) // 2}f", data)
 
 
 def by_pymodbus(registers: list[int], order: str) -> Any:
-    """Pymodbus knows two orders; for the others the bytes of registers are swapped before it."""
+    """Converts with pymodbus. It has two orders; for others, swaps the bytes of registers first."""
     if order in ("DCBA", "BADC"):
         registers = [register >> 8 | (register & 0xFF) << 8 for register in registers]
     return ModbusClientMixin.convert_from_registers(
@@ -148,7 +148,7 @@ def by_pymodbus(registers: list[int], order: str) -> Any:
 
 
 def measure(contestants: dict[str, Work], rounds: int, seconds: float) -> Times:
-    """Seconds that each takes for the work once; a round begins with another one each time."""
+    """Returns the seconds of each contestant by round. The order of the contestants rotates."""
     times: Times = {name: [] for name in contestants}
     repeats = {
         name: max(1, int(seconds / max(timed(work, 1), 1e-6))) for name, work in contestants.items()
@@ -169,7 +169,7 @@ def timed(work: Work, repeats: int) -> float:
 
 
 def show(title: str, times: Times) -> None:
-    """One table: the median, and how many times the first contestant's time that is."""
+    """Prints one table: the median time, and its ratio to the first contestant's time."""
     first = next(iter(times))
     print(f"\n{title}:\n  {'':22}          us  of {first} (min to max)")
     for name, measured in times.items():
