@@ -1,7 +1,6 @@
-"""What tests stand on: memories, servers on a free port, connections, and servers in a process
-of their own.
+"""Fixtures of all tests: memories, servers on a free port, connections, and server processes.
 
-Nothing here leaves the loopback interface, and everything that is started is stopped.
+Everything stays on the loopback interface, and everything that was started is stopped.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ pytest_plugins = ("support.nats_bus",)
 
 @pytest.fixture
 def ipv6() -> None:
-    """Needs IPv6 on the loopback interface."""
+    """Requires IPv6 on the loopback interface."""
     if not has_ipv6():
         missing("IPv6 on the loopback interface")
 
 
 @pytest.fixture
 def memory() -> holdfast.Memory:
-    """Every area with the addresses 0 to 999, all zero."""
+    """A memory with the addresses 0 to 999 in every area, all zero."""
     return holdfast.Memory(
         coils=1000, discrete_inputs=1000, holding_registers=1000, input_registers=1000
     )
@@ -67,7 +66,7 @@ def serve() -> Iterator[Serve]:
 
 @pytest.fixture
 def server(memory: holdfast.Memory, serve: Serve) -> holdfast.Server:
-    """Unit 1 is `memory`, to read and to write."""
+    """A server with `memory` as unit 1, with read and write access."""
     return serve({1: memory})
 
 
@@ -104,7 +103,7 @@ def server_process() -> Iterator[Process]:
 
 @pytest.fixture(autouse=True)
 def logging_as_it_was() -> Iterator[None]:
-    """Commands that run in a test's own process set up the log: the next finds it as it was."""
+    """Restores the log, which commands that run in the test's process configure."""
     logger = logs.LOGGER
     before = (list(logger.handlers), logger.level, logger.propagate)
     yield
@@ -114,7 +113,7 @@ def logging_as_it_was() -> Iterator[None]:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    """Runs the configuration that a text is; files it names are in `tmp_path`."""
+    """Runs an appliance with a configuration text. Its files are in `tmp_path`."""
     with ExitStack() as running:
 
         def start(text: str) -> Appliance:

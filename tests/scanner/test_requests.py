@@ -247,7 +247,10 @@ def test_devices_on_one_serial_line_have_the_same_settings(
     assert ask("one", "rtu:///dev/ttyNONE0?baud=9600")["success"]
     for url, error in (
         ("rtu:///dev/ttyNONE0", "baud of /dev/ttyNONE0 is already 9600 for one, not 19200; dev"),
-        ("rtu:///dev/ttyNONE0?baud=9600&parity=none", "parity of /dev/ttyNONE0 is already even for one"),
+        (
+            "rtu:///dev/ttyNONE0?baud=9600&parity=none",
+            "parity of /dev/ttyNONE0 is already even for one",
+        ),
         ("ascii:///dev/ttyNONE0?baud=9600", "mode of /dev/ttyNONE0 is already rtu for one"),
         ("rtu:///dev/ttyNONE0?baud=9600&silence=0.1", "is already the default for one, not 0.1"),
     ):

@@ -1,6 +1,6 @@
-"""Certificates of every kind, made by openssl, and the one right answer for each.
+"""Certificates of every kind, created with openssl, and the expected answer for each.
 
-`docs/modbus-tls.md` says why; every face of the product gives these answers.
+`docs/modbus-tls.md` explains the answers. All clients and listeners give the same ones.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ACCEPTED = "accepted"
-"""The answer of a client to a device; any other is the reason of a failure."""
+"""A client accepts the device's certificate. Other answers are reasons of a failure."""
 
 SERVED = "served"
-"""The answer of a listener to a client; any other is the `reason` of `tls_failed`."""
+"""A listener accepts the client's certificate. Other answers are the `reason` of `tls_failed`."""
 
 NAME = "subjectAltName=IP:127.0.0.1"
 CA = "basicConstraints=critical,CA:TRUE"
@@ -42,10 +42,10 @@ for _hash, _salt in (("sha256", 32), ("sha384", 48), ("sha512", 64)):
     _named = (*_PSS, *(part.format(_hash) for part in _PSS_HASH))
     KEYS[f"RSA-PSS {_hash}"] = (*_named, "-pkeyopt", f"rsa_pss_keygen_saltlen:{_salt}")
     KEYS[f"RSA-PSS {_hash}, any salt"] = _named
-"""What `openssl genpkey` makes of each kind."""
+"""Arguments of `openssl genpkey` for each kind of key."""
 
 OWN_KEYS = [kind for kind in KEYS if kind != "RSA 1024"]
-"""Kinds of keys that this side may have itself."""
+"""Kinds of keys that Holdfast itself may use."""
 
 SALT_OF_HASH = ("-sigopt", "rsa_pss_saltlen:digest")
 SALT_OF_KEY = ("-sigopt", "rsa_pss_saltlen:max")
@@ -53,7 +53,7 @@ WITH_PSS = ("-sigopt", "rsa_padding_mode:pss")
 
 
 class Shown(NamedTuple):
-    """What a peer shows, its own certificate first; and what the other side trusts."""
+    """The certificate chain of a peer, its own first, and the CAs that the other side trusts."""
 
     chain: Path
     key: Path
@@ -64,7 +64,7 @@ Show = Callable[["Mint"], Shown]
 
 
 class Mint:
-    """Makes certificates in a folder."""
+    """Creates certificates in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -95,14 +95,14 @@ class Mint:
         listed: bool = False,
         **more: Any,
     ) -> Shown:
-        """A certificate signed by `by`, else the authority; that is also what is trusted."""
+        """Issues a certificate signed by `by`, default the CA; the signer is trusted."""
         by = by or self.authority
         leaf = self.make(by=by, extensions=_whole(extensions), **more)
         trusted = [by] if trusts is None else list(trusts)
         return self.shown([leaf, *above], [leaf] if listed else trusted)
 
     def own(self, *extensions: str, listed: bool = True, **more: Any) -> Shown:
-        """A self-signed certificate, which is trusted itself, or else the authority."""
+        """Creates a self-signed certificate; trusts it if `listed`, otherwise the CA."""
         leaf = self.make(extensions=_whole(extensions), **more)
         return self.shown([leaf], [leaf if listed else self.authority])
 
@@ -123,7 +123,7 @@ class Mint:
         options: Sequence[str] = (),
         dates: tuple[str, str] | None = None,
     ) -> Issued:
-        """A certificate; without `by` it is self-signed."""
+        """Creates a certificate; without `by` it is self-signed."""
         issued = Issued(self._file("pem"), self._key(key))
         request = self._file("csr")
         openssl("req", "-new", "-key", issued.key, "-out", request, "-subj", f"/CN={name}")
@@ -138,7 +138,7 @@ class Mint:
         return issued
 
     def _extended(self, extensions: Sequence[str]) -> tuple[str | Path, ...]:
-        """Without extensions a certificate is one of version 1."""
+        """Without extensions, openssl creates a version 1 certificate."""
         if not extensions:
             return ()
         file = self._file("ext")
@@ -165,7 +165,7 @@ class Mint:
         openssl("ca", "-batch", "-notext", "-config", configuration, *signer, *valid, *written)
 
     def _key(self, kind: str) -> Path:
-        """RSA keys take long: there is one of each kind."""
+        """Creates a key. RSA keys are slow to create, so there is one of each kind."""
         file = self._folder / f"{kind}.key" if kind.startswith("RSA") else self._file("key")
         if not file.exists():
             algorithm, *options = KEYS[kind]
@@ -178,7 +178,7 @@ class Mint:
 
 
 def _whole(extensions: Sequence[str]) -> list[str]:
-    """With the name, and without a CA flag, unless they say otherwise."""
+    """Adds the default name and CA flag, unless the extensions set them."""
     said = {extension.partition("=")[0] for extension in extensions}
     defaults = [default for default in (NAME, NO_CA) if default.partition("=")[0] not in said]
     return [*defaults, *(extension for extension in extensions if extension.partition("=")[2])]
@@ -186,7 +186,7 @@ def _whole(extensions: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Case:
-    """A certificate, and the answers to a device and to a client that show it."""
+    """A certificate, and the expected answers for a device and for a client that presents it."""
 
     name: str
     show: Show
@@ -211,7 +211,7 @@ def own(*extensions: str, **more: Any) -> Show:
 
 
 def below(*, sent: bool = True, **intermediate: Any) -> Show:
-    """A certificate below an intermediate one."""
+    """Issues a certificate below an intermediate CA."""
     return lambda mint: _through(mint, sent=sent, **intermediate)
 
 
@@ -241,7 +241,7 @@ def _twin(mint: Mint) -> Shown:
 
 
 def _impostor(mint: Mint) -> Shown:
-    """Signed by another authority of the same name."""
+    """Issues a certificate signed by another CA of the same name."""
     return mint.signed(by=mint.root(), trusts=[mint.root()])
 
 
@@ -322,7 +322,7 @@ CASES = [
     Case("own, not listed", own(listed=False), *UNKNOWN),
     Case("own, CA:TRUE, not listed", own(CA, listed=False), *IS_CA),
     Case("own, its twin listed", _twin, *UNKNOWN),
-    # Signed, and odd
+    # Signed, unusual
     Case("CA:TRUE", signed(CA), *IS_CA),
     Case("CA:TRUE without keyCertSign", signed(CA, "keyUsage=digitalSignature"), *IS_CA),
     Case("CA:TRUE, listed", signed(CA, listed=True)),

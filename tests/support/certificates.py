@@ -1,4 +1,4 @@
-"""Authorities, and certificates that they vouch for, made by openssl."""
+"""Creates CAs and certificates with openssl."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ROLE = "1.3.6.1.4.1.50316.802.1"
-"""The extension that holds a role (MB-TCP-Security)."""
+"""The extension for a role (Modbus/TCP Security)."""
 
 PAST = ("20200101000000Z", "20200201000000Z")
 FUTURE = ("20900101000000Z", "20910101000000Z")
@@ -46,12 +46,12 @@ class Issued(NamedTuple):
 
 
 def named(role: str, kind: str = "UTF8String") -> str:
-    """The extension that names a role."""
+    """Returns the extension with a role."""
     return f"{ROLE}=ASN1:{kind}:{role}"
 
 
 class Certificates:
-    """An authority, and certificates that it vouches for."""
+    """A CA, and certificates that it issues."""
 
     def __init__(self, folder: Path, name: str = "authority") -> None:
         self._folder = folder
@@ -76,7 +76,7 @@ class Certificates:
         dates: tuple[str, str] | None = None,
         curve: str = "P-256",
     ) -> Issued:
-        """A certificate and its key; `alternative` is such as `IP:127.0.0.1`."""
+        """Issues a certificate and its key; `alternative` is such as `IP:127.0.0.1`."""
         certificate, key, request, file = (
             self._folder / f"{self._name}-{name}.{end}" for end in ("pem", "key", "csr", "ext")
         )
@@ -94,7 +94,7 @@ class Certificates:
         return Issued(certificate, key)
 
     def revoke(self, *issued: Issued) -> Path:
-        """A list of what this authority has revoked, with these."""
+        """Revokes these certificates. Returns the list of all revoked certificates."""
         revoked = self._folder / f"{self._name}.crl"
         for each in issued:
             self._ca("-revoke", each.certificate)
@@ -109,7 +109,7 @@ class Certificates:
 def self_signed(
     folder: Path, name: str, *extensions: str, dates: tuple[str, str] | None = None
 ) -> Issued:
-    """A certificate that vouches for itself alone."""
+    """Creates a self-signed certificate."""
     issued = Issued(folder / f"{name}.pem", folder / f"{name}.key")
     configuration, request, file = (folder / f"{name}.{end}" for end in ("cnf", "csr", "ext"))
     (folder / f"{name}.index").touch()

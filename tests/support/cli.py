@@ -1,4 +1,4 @@
-"""`holdfast` as people and programs call it, in this process."""
+"""Runs `holdfast` in this process, as people and programs call it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def url(server: holdfast.Server) -> str:
 
 
 def invoke(*arguments: str) -> Result:
-    """The result of a command; an error that is none of the program's is raised."""
+    """Returns the result of a command. Raises unexpected exceptions."""
     result = CliRunner().invoke(main, list(arguments), prog_name="holdfast")
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -35,28 +35,28 @@ def invoke(*arguments: str) -> Result:
 
 
 def done(*arguments: str) -> list[str]:
-    """The lines that a command prints, which must succeed and complain of nothing."""
+    """Returns the lines that a command prints. It must succeed without warnings."""
     result = invoke(*arguments)
     assert (result.exit_code, result.stderr) == (0, "")
     return result.stdout.splitlines()
 
 
 def answer(*arguments: str, code: int = 0) -> Any:
-    """The JSON that a command prints."""
+    """Returns the JSON that a command prints."""
     result = invoke(*arguments, "--json")
     assert (result.exit_code, result.stderr) == (code, "")
     return json.loads(result.stdout)
 
 
 def failure(*arguments: str) -> list[str]:
-    """The lines on standard error of a command that fails."""
+    """Returns the lines on standard error of a command that fails."""
     result = invoke(*arguments)
     assert result.exit_code == 1
     return result.stderr.splitlines()
 
 
 def usage_error(*arguments: str) -> str:
-    """The last line of what wrong usage is answered with."""
+    """Returns the last line of the error for wrong usage."""
     result = invoke(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.startswith("Usage: holdfast ")
@@ -64,7 +64,7 @@ def usage_error(*arguments: str) -> str:
 
 
 class RunCommand:
-    """A running `holdfast run`, and where its first listener listens."""
+    """A running `holdfast run`, and the address of its first listener."""
 
     def __init__(self, file: Path) -> None:
         self.process = subprocess.Popen(
@@ -90,7 +90,7 @@ class RunCommand:
         return match[1], int(match[2])
 
     def end(self, number: signal.Signals) -> tuple[int, str]:
-        """Exit code and log, after a signal."""
+        """Sends a signal. Returns the exit code and the log."""
         self.process.send_signal(number)
         _, log = self.process.communicate(timeout=wire.DEADLINE)
         return self.process.returncode, log

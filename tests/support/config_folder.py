@@ -1,4 +1,4 @@
-"""A folder with a configuration in it, and what loading it says."""
+"""A folder with a configuration, and the errors and warnings of loading it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Folder:
         self.path = path
 
     def problems(self, text: str | bytes, **files: str) -> list[str]:
-        """What is wrong with it, without the path of the folder."""
+        """Returns the errors, without the path of the folder."""
         for name, content in files.items():
             (self.path / name.replace("_", ".")).write_text(content, encoding="utf-8")
         raw = text if isinstance(text, bytes) else text.encode()
@@ -30,18 +30,18 @@ class Folder:
         return [str(problem).replace(f"{self.path}/", "") for problem in caught.value.problems]
 
     def config(self, text: str) -> Config:
-        """A configuration that is right."""
+        """Loads a valid configuration."""
         (self.path / "p.yaml").write_text(text, encoding="utf-8")
         return load(self.path / "p.yaml")
 
     def warnings(self, text: str) -> list[str]:
-        """What has no effect in a configuration that is right."""
+        """Returns the warnings of a valid configuration."""
         warnings = self.config(text).warnings
         return [str(warning).replace(f"{self.path}/", "") for warning in warnings]
 
 
 def written(data: object) -> str:
-    """The data as YAML on one line, all text quoted."""
+    """Formats data as YAML on one line, with quoted text."""
     if isinstance(data, dict):
         return "{" + ", ".join(f"{written(k)}: {written(v)}" for k, v in data.items()) + "}"
     if isinstance(data, list):

@@ -1,4 +1,4 @@
-"""Configurations of every kind as plain data, all of them right, for tests that hold for all."""
+"""Strategies for valid configurations of every kind, as plain data."""
 
 from __future__ import annotations
 
@@ -257,7 +257,7 @@ HOLES: st.SearchStrategy[dict[str, Any]] = st.sampled_from(
 
 @st.composite
 def devices(draw: st.DrawFn, memories: dict[str, Any]) -> dict[str, Any]:
-    """Devices of which at most one read has a place in memory."""
+    """Devices of which at most one read has a destination in memory."""
     made: dict[str, Any] = {}
     for name in draw(st.lists(NAMES, max_size=3, unique=True)):
         read = {"area": "input_registers", "address": 65535, "count": 1}
@@ -310,7 +310,7 @@ AUDITS = st.fixed_dictionaries(
 
 @st.composite
 def configurations(draw: st.DrawFn) -> dict[str, Any]:
-    """The data of a file beside which no other files are."""
+    """Configurations that need no other files."""
     areas = st.fixed_dictionaries(
         {"holding_registers": SIZES},
         optional={"coils": SIZES, "discrete_inputs": SIZES, "input_registers": SIZES},

@@ -1,4 +1,4 @@
-"""The two faces of the client behind plain calls, so that one set of tests serves both."""
+"""A blocking interface for both clients, so that the same tests cover both."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     Result = TypeVar("Result")
 
 Face = holdfast.SyncClient
-"""What tests call: a client that waits, or an `Awaited` that looks like one."""
+"""A blocking client, or an `Awaited` with the same methods."""
 
 
 class Awaited:
-    """A `Client` in an event loop that runs all the time, in a thread of its own."""
+    """A `Client` in an event loop that runs in its own thread."""
 
     def __init__(self, url: str, **options: Any) -> None:
         self._client = holdfast.Client(url, **options)
@@ -39,7 +39,7 @@ class Awaited:
         return lambda *args, **named: self._wait(attribute(*args, **named))
 
     def end(self) -> None:
-        """Closes everything; nothing may have gone wrong unseen."""
+        """Closes everything, and checks that no exception was lost."""
         try:
             self.close()
             self._wait(self._loop.shutdown_default_executor())
@@ -54,7 +54,7 @@ class Awaited:
 
 
 class Dial(Protocol):
-    """Makes a client that is closed when the test ends."""
+    """Creates a client that is closed when the test ends."""
 
     def __call__(self, url: str, **options: Any) -> Face: ...
 
@@ -63,7 +63,7 @@ FACES = {"sync": holdfast.SyncClient, "asyncio": Awaited}
 
 
 def dialling(name: str) -> Iterator[Dial]:
-    """What a fixture yields that has one face."""
+    """The type of a fixture for one of the clients."""
     with ExitStack() as opened:
 
         def dial(url: str, **options: Any) -> Face:
@@ -75,7 +75,7 @@ def dialling(name: str) -> Iterator[Dial]:
 
 
 def run(main: Callable[[], Coroutine[Any, Any, Result]]) -> Result:
-    """Runs a coroutine in debug mode; nothing may go wrong unseen."""
+    """Runs a coroutine in debug mode, and checks that no exception was lost."""
     faults: list[dict[str, Any]] = []
 
     async def watched() -> Result:

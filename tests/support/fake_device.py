@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     Answer = Callable[[bytes], bytes | None]
 
 HANG_UP = b""
-"""In place of a reply: the connection is closed."""
+"""Instead of a reply: closes the connection."""
 
 
 def exception(pdu: bytes, code: int) -> bytes:
@@ -25,13 +25,13 @@ def exception(pdu: bytes, code: int) -> bytes:
 
 
 def registers(pdu: bytes, value: int = 0) -> bytes:
-    """The reply to a read of registers, all of one value."""
+    """Builds the reply to a read of registers; all have one value."""
     count = int.from_bytes(pdu[3:5])
     return bytes([pdu[0], 2 * count]) + value.to_bytes(2) * count
 
 
 class FakeDevice:
-    """Answers requests of one connection after the other by a function of their PDUs."""
+    """Answers requests with a function of their PDUs, one connection after the other."""
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer

@@ -1,4 +1,4 @@
-"""Pages of the gateway's console in a browser, on a desk and on a phone."""
+"""Pages of the gateway's console in a browser, at desktop and phone sizes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DESK: Any = {"viewport": {"width": 1100, "height": 820}}
 
 @dataclass
 class View:
-    """A page of the console, and all that it must not do."""
+    """A page of the console. Records errors and requests to other hosts."""
 
     page: Page
     gateway: gateways.Running
@@ -43,12 +43,12 @@ class View:
         self.requests.append(request.url)
 
     def _said(self, kind: str, text: str) -> None:
-        # The browser tells every refusal of the gateway as such an error.
+        # The browser logs every refusal of the gateway as such an error.
         if kind in ("error", "warning") and not text.startswith("Failed to load resource"):
             self.errors.append(text)
 
     def check(self) -> None:
-        """Nothing went wrong, nothing went elsewhere, nothing sticks out at the side."""
+        """Checks for errors, requests to other hosts, and horizontal overflow."""
         assert self.errors == []
         assert [url for url in self.requests if not url.startswith(f"{self.gateway.url}/")] == []
         width = self.page.evaluate("document.documentElement.scrollWidth")
@@ -70,7 +70,7 @@ class View:
         self.button("Connect").click()
 
     def choose(self, **fields: str) -> None:
-        """Fills in what is to be read."""
+        """Fills in the form of a read."""
         for name, value in fields.items():
             place = self.page.locator(f"#{name}")
             if name in ("area", "type", "order"):
@@ -79,7 +79,7 @@ class View:
                 place.fill(value)
 
     def row(self, address: int) -> Locator:
-        """The row of a register."""
+        """Returns the row of a register."""
         return self.page.locator(f"tr[data-address='{address}']")
 
 
@@ -89,7 +89,7 @@ def floats(*values: float) -> list[int]:
 
 
 def plant() -> holdfast.Memory:
-    """A memory with some of everything."""
+    """Creates a memory with values in all areas."""
     memory = holdfast.Memory(
         coils=48,
         discrete_inputs=(100, 20),
@@ -143,7 +143,7 @@ def browsing() -> Iterator[Browser]:
 
 @contextlib.contextmanager
 def opening(browser: Browser, memory: holdfast.Memory, model: str) -> Iterator[Opened]:
-    """What opens pages, beside a device with this memory and this model name."""
+    """Opens pages, with a device that has this memory and this model name."""
     expect.set_options(timeout=1000 * wire.DEADLINE)
     identity = Identity(vendor_name="Acme", product_code="F7", revision="2.1", model_name=model)
     with holdfast.Server(

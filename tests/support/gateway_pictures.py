@@ -1,4 +1,4 @@
-"""Takes the pictures of docs/gateway.md anew: `python tests/gateway_pictures.py [NAME ...]`."""
+"""Takes the pictures of docs/gateway.md: `python tests/support/gateway_pictures.py [NAME ...]`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RANGES = {
 
 
 def like_a_drive(pdu: bytes) -> bytes:
-    """The reply of a device with many ranges; some addresses fail otherwise."""
+    """Answers as a device with many ranges; some addresses fail with other exceptions."""
     first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
     asked = range(first, first + count)
     if pdu[0] == 3 and first < 20100 and asked[-1] >= 20000:
@@ -47,7 +47,7 @@ def like_a_drive(pdu: bytes) -> bytes:
 
 
 def connect(opened: Opened, scheme: Scheme) -> View:
-    """A device that answers."""
+    """A device that responds."""
     view = opened(DESK, scheme)
     view.connect()
     view.says("The device responded")
@@ -55,7 +55,7 @@ def connect(opened: Opened, scheme: Scheme) -> View:
 
 
 def read(opened: Opened, scheme: Scheme) -> View:
-    """Registers, once."""
+    """Registers, read once."""
     view = opened(DESK, scheme)
     view.connect()
     view.choose(quantity="10")
@@ -65,7 +65,7 @@ def read(opened: Opened, scheme: Scheme) -> View:
 
 
 def write(opened: Opened, scheme: Scheme) -> View:
-    """Old and new before a write, on a phone."""
+    """Old and new value before a write, on a phone."""
     view = opened(PHONE, scheme)
     view.connect()
     view.choose(type="uint16", address="4", quantity="4")
@@ -78,7 +78,7 @@ def write(opened: Opened, scheme: Scheme) -> View:
 
 
 def watch(opened: Opened, scheme: Scheme) -> View:
-    """Registers that change, with plots."""
+    """Changing registers, with plots."""
     view = opened(DESK, scheme)
     view.connect()
     view.choose(quantity="6", interval="250")
@@ -104,7 +104,7 @@ def mapped(opened: Opened, scheme: Scheme) -> View:
 
 
 def dead(opened: Opened, scheme: Scheme) -> View:
-    """A device that does not answer."""
+    """A device that does not respond."""
     with FakeDevice(lambda _: None) as mute:
         view = opened(LOW, scheme)
         view.page.get_by_role("spinbutton", name="Timeout").fill("200")
@@ -114,7 +114,7 @@ def dead(opened: Opened, scheme: Scheme) -> View:
 
 
 def refused(opened: Opened, scheme: Scheme) -> View:
-    """A device that the gateway may not connect to."""
+    """A device that the gateway does not allow."""
     view = opened(LOW, scheme, allow=["10.0.0.0/8"])
     view.connect(host="192.168.7.20", port=502)
     view.says("The gateway does not allow this target.")
@@ -133,7 +133,7 @@ SCENES: dict[str, Scene] = {
 
 
 def main() -> None:
-    """Takes the pictures that are named, or all."""
+    """Takes the named pictures, or all."""
     with browsing() as browser:
         for name in sys.argv[1:] or SCENES:
             for scheme in SCHEMES:

@@ -1,4 +1,4 @@
-"""Gateways on a free port, asked as any HTTP client would, and streams read event by event."""
+"""Runs gateways on a free port, sends HTTP requests, and reads event streams."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLC = "plc.factory.local"
 
 
 class Dialed:
-    """Makes clients as the gateway does, and notes of whom; some are led elsewhere."""
+    """Creates clients as the gateway does, and records their targets; can redirect some."""
 
     def __init__(self, elsewhere: dict[tuple[str, int], tuple[str, int]] | None = None) -> None:
         self.calls: list[NetworkTarget] = []
@@ -42,7 +42,7 @@ class Dialed:
 
 
 class Names:
-    """A resolver that gives its answers one after the other, the last one again and again."""
+    """A resolver that returns its answers in order, and repeats the last one."""
 
     def __init__(self, **names: list[list[str]]) -> None:
         self.asked: list[str] = []
@@ -58,14 +58,14 @@ class Names:
 
 @dataclass
 class Event:
-    """One event of a stream; a comment has the name `:`."""
+    """An event of a stream; a comment has the name `:`."""
 
     name: str
     data: Any
 
 
 class Stream:
-    """An answer that goes on."""
+    """A response that is a stream of events."""
 
     def __init__(self, connection: http.client.HTTPConnection) -> None:
         self._connection = connection
@@ -74,7 +74,7 @@ class Stream:
         self.kind = self.reply.headers["Content-Type"]
 
     def __iter__(self) -> Iterator[Event]:
-        """All events and comments to the end of the stream."""
+        """Returns all events and comments until the end of the stream."""
         name = ""
         for line in self.reply:
             text = line.decode().rstrip("\n")
@@ -86,7 +86,7 @@ class Stream:
                 yield Event(name, json.loads(text.removeprefix("data: ")))
 
     def next(self, name: str) -> Any:
-        """The data of the next event of this name."""
+        """Returns the data of the next event of this name."""
         for event in self:
             if event.name == name:
                 return event.data
@@ -98,7 +98,7 @@ class Stream:
 
 
 class Running:
-    """A gateway that runs, and a client of it."""
+    """A running gateway with a client."""
 
     def __init__(self, gateway: Gateway, address: tuple[str, int], stop: Stop) -> None:
         self.gateway = gateway
@@ -108,13 +108,13 @@ class Running:
         self._open = contextlib.ExitStack()
 
     def client(self, secret: str | None = None) -> web.Client:
-        """A client that is closed with the gateway."""
+        """Creates a client that is closed with the gateway."""
         client = web.Client(self.address, secret)
         self._open.callback(client.close)
         return client
 
     def ask(self, path: str, body: Any, secret: str | None = None) -> web.Answer:
-        """The answer to a POST."""
+        """Sends a POST request and returns the response."""
         return self.client(secret).ask("POST", API + path, body)
 
     def stream(
@@ -140,7 +140,7 @@ def running(
     limits: dict[str, Any] | None = None,
     **settings: Any,
 ) -> Iterator[Running]:
-    """A gateway that reads and writes whatever is on loopback, unless told."""
+    """Runs a gateway; by default it reads and writes any device on the loopback interface."""
     listener = listen(bind, 0)
     host, port, *_ = listener.getsockname()
     chosen = Settings(

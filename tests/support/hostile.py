@@ -1,7 +1,7 @@
-"""A device that does with each request what a test tells it, on every transport.
+"""A device on every transport whose behaviour for each request a test defines.
 
-It shares nothing with the library. What it is not told it does as a good device: it has 1000 items
-in every area, and holding register N holds N.
+It shares no code with the library. By default it behaves as a correct device: it has 1000 items in
+every area, and holding register N holds N.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ def good_unit() -> Oracle:
 
 
 class Asked:
-    """A request that came, and what can be done about it."""
+    """A received request, and the possible answers."""
 
     def __init__(self, peer: Peer, frame: bytes, parts: tuple[int, int, bytes]) -> None:
         self.peer = peer
         self.raw = frame
         self.transaction, self.unit, self.pdu = parts
         self.reply = b""
-        """The PDU of a good answer."""
+        """Returns the PDU of a correct reply."""
 
     def frame(
         self, pdu: bytes | None = None, *, unit: int | None = None, transaction: int | None = None
     ) -> bytes:
-        """A frame of the transport; a good reply but for what is given."""
+        """Builds a frame of the transport; by default a correct reply."""
         return self.peer.framing.frame(
             self.reply if pdu is None else pdu,
             self.unit if unit is None else unit,
@@ -59,7 +59,7 @@ class Asked:
         )
 
     def answer(self, pdu: bytes | None = None, **header: int) -> None:
-        """Sends such a frame."""
+        """Sends a frame, with the same arguments as `frame`."""
         self.send(self.frame(pdu, **header))
 
     def send(self, *pieces: bytes) -> None:
@@ -67,20 +67,20 @@ class Asked:
             self.peer.send(piece)
 
     def drip(self, data: bytes) -> None:
-        """Sends byte by byte."""
+        """Sends bytes one by one."""
         self.send(*[bytes([byte]) for byte in data])
 
 
 class Framing(ABC):
-    """How requests are cut out of what came, and how replies are framed."""
+    """How requests are split from received bytes, and how replies are framed."""
 
     @abstractmethod
     def frame(self, pdu: bytes, unit: int, transaction: int) -> bytes:
-        """A frame."""
+        """Builds a frame."""
 
     @abstractmethod
     def cut(self, received: bytes) -> tuple[int, tuple[int, int, bytes]] | None:
-        """The length of the request at the start, and its transaction id, unit id and PDU."""
+        """Parses the first request: its length, transaction id, unit id and PDU."""
 
 
 class Mbap(Framing):
@@ -96,7 +96,7 @@ class Mbap(Framing):
 
 
 class OnLine(Framing):
-    """RTU or ASCII, on a line or over TCP."""
+    """RTU or ASCII framing, on a line or over TCP."""
 
     def __init__(self, mode: lines.Mode) -> None:
         self.mode = mode
@@ -114,7 +114,7 @@ class OnLine(Framing):
 
 
 def request_length(received: bytes) -> int | None:
-    """Bytes of the RTU request at the start of some bytes."""
+    """Returns the length of the RTU request at the start of some bytes."""
     if len(received) < 2:
         return None
     code = received[1]
@@ -125,7 +125,7 @@ def request_length(received: bytes) -> int | None:
 
 
 class Peer:
-    """Somebody who asks: a connection, an address, or the other end of a line."""
+    """The requesting side: a connection, an address, or the other end of a line."""
 
     def __init__(self, framing: Framing) -> None:
         self.framing = framing
@@ -142,23 +142,23 @@ class Connection(Peer):
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes) -> None:
-        # The client may be gone.
+        # The client may have disconnected.
         with contextlib.suppress(OSError):
             self.socket.sendall(data)
 
     def close(self) -> None:
-        """Ends it in good order."""
+        """Closes it cleanly."""
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
 
     def reset(self) -> None:
-        """Ends it with RST."""
+        """Closes it with RST."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.socket.close()
 
 
 class Sender(Peer):
-    """Whoever sent a datagram."""
+    """The sender of a datagram."""
 
     def __init__(self, framing: Framing, own: socket.socket, address: Any) -> None:
         super().__init__(framing)
@@ -183,7 +183,7 @@ class Wire(Peer):
 
 
 def good(asked: Asked) -> None:
-    """Answers as it should be."""
+    """Answers correctly."""
     asked.answer()
 
 
@@ -194,8 +194,7 @@ def silent(asked: Asked) -> None:
 class Hostile(ABC):
     """A device, from construction to `stop`.
 
-    The first request is given to the first of `script`, and so on; all further ones to the last
-    one's successor, `then`.
+    Each request is handled by the next entry of `script`, and by `then` after its end.
     """
 
     url: str
@@ -205,7 +204,7 @@ class Hostile(ABC):
         self.then = then
         self.oracle = good_unit()
         self.asked: list[Asked] = []
-        """All requests that came, in their order."""
+        """All received requests, in order."""
         self.connections = 0
         self._ended, self._end = os.pipe()
         self._thread = threading.Thread(target=self._serve, name="hostile")
@@ -226,21 +225,21 @@ class Hostile(ABC):
         self.release()
 
     def await_requests(self, count: int) -> None:
-        """Waits until exactly so many requests have come."""
+        """Waits until exactly `count` requests have arrived."""
         wire.until(lambda: len(self.asked) >= count, f"{count} requests have come")
         assert len(self.asked) == count
 
     @abstractmethod
     def sources(self) -> list[Any]:
-        """What can be read."""
+        """Returns what can be read."""
 
     @abstractmethod
     def read(self, source: Any) -> Peer | None:
-        """Reads; who has sent something."""
+        """Reads, and returns the senders of new bytes."""
 
     @abstractmethod
     def release(self) -> None:
-        """Gives everything back."""
+        """Releases all resources."""
 
     def _serve(self) -> None:
         while True:
@@ -264,8 +263,9 @@ class Hostile(ABC):
 
 
 class Stream(Hostile):
-    """Behind TCP: MBAP or RTU frames. `greet` is done with each connection first; whoever is `deaf`
-    reads nothing.
+    """Over TCP, with MBAP or RTU frames.
+
+    Calls `greet` with each connection first. With `deaf`, reads nothing.
     """
 
     def __init__(
@@ -335,7 +335,7 @@ class Udp(Hostile):
 
 
 class Serial(Hostile):
-    """On a line."""
+    """On a serial line."""
 
     def __init__(
         self,
@@ -355,7 +355,7 @@ class Serial(Hostile):
         return [self.terminal.end]
 
     def read(self, source: Any) -> Peer:  # noqa: ARG002
-        # Nobody may be there.
+        # There may be no reader.
         with contextlib.suppress(OSError):
             self._peer.received += os.read(self.terminal.end, 65536)
         return self._peer

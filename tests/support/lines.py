@@ -1,6 +1,7 @@
-"""Serial lines made of pseudo terminals, and how Modbus is framed on a line.
+"""Serial lines made of pseudo-terminals, and the framing of Modbus on a line.
 
-It shares nothing with the library: check sums are reckoned bit by bit, as the standard draws them.
+It shares no code with the library: check sums are calculated bit by bit, as the standard describes
+them.
 """
 
 from __future__ import annotations
@@ -48,21 +49,21 @@ def rtu(pdu: bytes, unit: int = UNIT) -> bytes:
 
 
 def from_rtu(frame: bytes) -> tuple[int, bytes]:
-    """Unit id and PDU of a frame."""
+    """Parses a frame to unit id and PDU."""
     if len(frame) < 4 or crc(frame[:-2]) != frame[-2:]:
         raise AssertionError(f"no RTU frame: {frame.hex()}")
     return frame[0], frame[1:-2]
 
 
 def rtu_length(received: bytes) -> int | None:
-    """Bytes of the RTU reply at the start of some bytes, from its function code."""
+    """Returns the length of the RTU reply at the start of some bytes, from its function code."""
     if len(received) < 5:
         return None
     code = received[1]
     if code & 0x80:
         return 5
     if code == 8:
-        # Any number of words may come back: the reply ends where the CRC first fits.
+        # The reply has any number of words. It ends where the CRC first matches.
         ends = range(8, len(received) + 1, 2)
         return next(
             (end for end in ends if received.startswith(crc(received[: end - 2]), end - 2)), None
@@ -75,7 +76,7 @@ def rtu_length(received: bytes) -> int | None:
 
 
 def identification_length(received: bytes) -> int | None:
-    """Bytes of the reply to function 43/14: as many objects as it says, and the CRC."""
+    """Returns the length of the reply to function 43/14, from its number of objects."""
     end = 8
     for _ in range(received[7] if len(received) > 7 else 0):
         if len(received) < end + 2:
@@ -94,7 +95,7 @@ def ascii_frame(pdu: bytes, unit: int = UNIT) -> bytes:
 
 
 def from_ascii(frame: bytes) -> tuple[int, bytes]:
-    """Unit id and PDU of a frame."""
+    """Parses a frame to unit id and PDU."""
     if frame[:1] != b":" or frame[-2:] != b"\r\n" or frame != frame.upper():
         raise AssertionError(f"no ASCII frame: {frame!r}")
     body = bytes.fromhex(frame[1:-2].decode())
@@ -104,29 +105,29 @@ def from_ascii(frame: bytes) -> tuple[int, bytes]:
 
 
 def ascii_length(received: bytes) -> int | None:
-    """Bytes of the ASCII frame at the start of some bytes."""
+    """Returns the length of the ASCII frame at the start of some bytes."""
     return received.index(b"\r\n") + 2 if b"\r\n" in received else None
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A way to frame on a line."""
+    """A mode of framing on a line."""
 
     name: str
     frame: Callable[..., bytes]
-    """Of a PDU and a unit id."""
+    """Builds a frame from a PDU and a unit id."""
     unframe: Callable[[bytes], tuple[int, bytes]]
     length: Callable[[bytes], int | None]
 
     @property
     def listener(self) -> str:
-        """The type of a listener."""
+        """The listener type."""
         return f"modbus-{self.name}"
 
     def damaged(self, pdu: bytes, unit: int = UNIT) -> bytes:
-        """A frame whose check sum is wrong by one bit."""
+        """Builds a frame whose check sum is wrong by one bit."""
         frame = bytearray(self.frame(pdu, unit))
-        # The digits of a check sum stay digits: 0 and 1, 2 and 3… differ in the last bit.
+        # The digits of a check sum stay digits: 0 and 1, 2 and 3… differ only in the last bit.
         frame[-1 if self is RTU else -3] ^= 1
         return bytes(frame)
 
@@ -145,7 +146,7 @@ def configuration(
     serial: dict[str, Any] | None = None,
     **more: Any,
 ) -> str:
-    """The text of a configuration with one listener, `line`, that serves unit 7 unless told."""
+    """Builds a configuration with one listener, `line`, which serves unit 7 by default."""
     everything = dict.fromkeys(
         ("coils", "discrete_inputs", "holding_registers", "input_registers"), 1000
     )
@@ -161,18 +162,18 @@ def configuration(
 
 
 class Terminal:
-    """A pseudo terminal whose device has the path `device`: `end` is where its cable would be."""
+    """A pseudo-terminal whose device has the path `device`. `end` is the other end of its cable."""
 
     def __init__(self, device: Path) -> None:
         self.device = device
         self.end, self._held = os.openpty()
-        # Nobody has set the line yet: no echo, no line editing.
+        # The line is not configured yet: disable echo and line editing.
         tty.setraw(self._held)
         os.set_blocking(self.end, False)
         device.symlink_to(os.ttyname(self._held))
 
     def waiting(self) -> int:
-        """Bytes that whoever has opened the device did not read yet."""
+        """Returns the number of bytes that the opener of the device has not read yet."""
         count: int = struct.unpack("i", fcntl.ioctl(self._held, termios.FIONREAD, b"\0" * 4))[0]
         return count
 
@@ -205,11 +206,11 @@ class Line:
             self.unplug()
 
     def plug(self) -> None:
-        """Makes the device."""
+        """Creates the device."""
         self._terminal = Terminal(self.device)
 
     def unplug(self) -> None:
-        """Takes the device away."""
+        """Removes the device."""
         self._plugged.close()
         self._terminal = None
 
@@ -219,25 +220,25 @@ class Line:
         return self._terminal
 
     def send(self, data: bytes) -> None:
-        """Sends all of it."""
+        """Sends all bytes."""
         rest = self.send_until_full(data, wire.DEADLINE)
         assert not rest, "the line takes no more"
 
     def send_until_full(self, data: bytes, patience: float) -> bytes:
-        """Sends until nothing is taken for so many seconds; what is left over."""
+        """Sends until nothing is accepted for `seconds`. Returns the unsent bytes."""
         while data and select.select([], [self._plugged.end], [], patience)[1]:
             with contextlib.suppress(BlockingIOError):
                 data = data[os.write(self._plugged.end, data) :]
         return data
 
     def send_pieces(self, *pieces: bytes) -> None:
-        """Sends each piece when the one before it was read."""
+        """Sends each piece after the previous one was read."""
         for piece in pieces:
             self.send(piece)
             wire.until(lambda: self._plugged.waiting() == 0, "the server has read the piece")
 
     def receive(self) -> tuple[int, bytes]:
-        """Unit id and PDU of the next frame."""
+        """Returns the unit id and PDU of the next frame."""
         deadline = time.monotonic() + wire.DEADLINE
         while (end := self.mode.length(self._received)) is None:
             patience = deadline - time.monotonic()
@@ -248,19 +249,19 @@ class Line:
         return self.mode.unframe(frame)
 
     def ask(self, pdu: bytes, unit: int = UNIT) -> bytes:
-        """The PDU of the reply to a request, which must be the first that comes."""
+        """Sends a request. Returns the PDU of the reply, which must be the first frame."""
         self.send(self.mode.frame(pdu, unit))
         answered, reply = self.receive()
         assert answered == unit
         return reply
 
     def is_quiet(self) -> bool:
-        """Whether nothing has come that was not received."""
+        """Returns whether no unread bytes have arrived."""
         return not self._received and not select.select([self._plugged.end], [], [], 0)[0]
 
 
 class Cable:
-    """Two serial devices, joined: what is written to one is read from the other."""
+    """Two connected serial devices: what is written to one is read from the other."""
 
     def __init__(self, folder: Path) -> None:
         self._one, self._other = Terminal(folder / "one"), Terminal(folder / "other")

@@ -1,4 +1,4 @@
-"""What the machine has that tests run on: programs, IPv6, /proc."""
+"""Checks for the programs and features of the machine that tests require."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ needs_127_0_0_2 = pytest.mark.skipif(
 
 
 def missing(what: str) -> None:
-    """Skips a test on a developer's machine; in CI, where everything is installed, fails it."""
+    """Skips a test on a developer's machine; fails it in CI, where everything is installed."""
     if os.environ.get("CI") == "true":
         pytest.fail(f"{what} is missing, and this is CI")
     pytest.skip(f"{what} is missing")
 
 
 def tool(name: str) -> str:
-    """The path of an external program."""
+    """Returns the path of an external program."""
     path = shutil.which(name)
     if path is None:
         missing(f"the program {name}")
@@ -40,7 +40,7 @@ def has_ipv6() -> bool:
 
 
 def resident(pid: int) -> int:
-    """Bytes of memory that a process holds."""
+    """Returns the resident memory of a process in bytes."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     [line] = [line for line in lines if line.startswith("VmRSS:")]
     return int(line.split()[1]) * 1024

@@ -1,6 +1,6 @@
-"""The broker's side of MQTT, byte by byte, on purpose independent of any MQTT library.
+"""The broker's side of MQTT at the byte level, independent of any MQTT library.
 
-It sends what a test wants, also what no broker would, and every wait has a deadline.
+It sends whatever a test requires, including malformed packets. Every wait has a deadline.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Packet(NamedTuple):
 
     @property
     def identifier(self) -> int:
-        """Of an acknowledgement or a subscription."""
+        """The packet identifier of an acknowledgement or a subscription."""
         return int.from_bytes(self.body[:2], "big")
 
 
 def variable(number: int) -> bytes:
-    """A variable byte integer."""
+    """Encodes a variable byte integer."""
     digits = bytearray()
     while True:
         number, digit = divmod(number, 128)
@@ -64,7 +64,7 @@ def publish(
     properties: bytes = b"",
     again: bool = False,
 ) -> bytes:
-    """A message; `again` says that it was sent before."""
+    """Builds a PUBLISH; `again` sets the DUP flag."""
     head = string(topic) + (struct.pack(">H", identifier) if qos else b"")
     if version == "5":
         head += variable(len(properties)) + properties
@@ -73,12 +73,12 @@ def publish(
 
 
 def acknowledge(kind: int, identifier: int) -> bytes:
-    """A PUBACK, PUBREC, PUBREL or PUBCOMP."""
+    """Builds a PUBACK, PUBREC, PUBREL or PUBCOMP."""
     return packet(kind, struct.pack(">H", identifier), 2 if kind == PUBREL else 0)
 
 
 class Peer:
-    """A connection that an adapter has opened."""
+    """A connection that an adapter opened."""
 
     def __init__(self, connection: socket.socket, version: str) -> None:
         self.socket = connection
@@ -100,7 +100,7 @@ class Peer:
         self.socket.sendall(data)
 
     def receive(self) -> Packet:
-        """The next packet; `EOFError` at the end of the connection."""
+        """Returns the next packet. Raises `EOFError` at the end of the connection."""
         first = self._exactly(1)[0]
         size = shift = 0
         while True:
@@ -112,7 +112,7 @@ class Peer:
         return Packet(first >> 4, first & 15, self._exactly(size))
 
     def expect(self, kind: int) -> Packet:
-        """The next packet that is not a PINGREQ, which must be of this kind."""
+        """Returns the next packet that is not a PINGREQ, and checks its type."""
         while True:
             got = self.receive()
             if got.kind == kind:
@@ -120,16 +120,16 @@ class Peer:
             assert got.kind == PINGREQ, got
 
     def silent(self) -> bool:
-        """Whether nothing has come that was not received."""
+        """Returns whether no unread bytes have arrived."""
         return not select.select([self.socket], [], [], 0)[0]
 
     def finish(self) -> None:
-        """Says that no more will be sent, if the connection is still open."""
+        """Half-closes the connection, if it is still open."""
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_WR)
 
     def wait_until_closed(self) -> None:
-        """Until the adapter closes the connection, whatever it says before."""
+        """Waits until the adapter closes the connection. Ignores what it sends."""
         try:
             while True:
                 self.receive()
@@ -143,7 +143,7 @@ class Peer:
         self.send(packet(CONNACK, body))
 
     def welcome(self, *, resumed: bool = False, properties: bytes = b"") -> None:
-        """Takes the connection and one subscription."""
+        """Accepts the connection and one subscription."""
         self.expect(CONNECT)
         self.connack(resumed=resumed, properties=properties)
         self.suback(self.expect(SUBSCRIBE).identifier, 1)
@@ -163,7 +163,7 @@ class Peer:
 
 
 class FakeBroker:
-    """Listens; what it answers is up to the test."""
+    """A listening socket. The test sends the answers."""
 
     def __init__(self, version: str = "5") -> None:
         self.version = version
@@ -183,5 +183,5 @@ class FakeBroker:
         self._server.close()
 
     def accept(self) -> Peer:
-        """The next connection of the adapter."""
+        """Returns the next connection of the adapter."""
         return Peer(self._server.accept()[0], self.version)

@@ -1,4 +1,4 @@
-"""The native poller in tests: devices for it, and what it has to tell."""
+"""Devices and results of the native poller."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def device(fake: Fake, name: str = "a", **more: Any) -> PolledDevice:
 
 
 def taken(poller: Poller, wanted: Callable[[list[Any], list[Any]], object]) -> tuple[Any, Any]:
-    """All polls and writes up to those that are wanted."""
+    """Collects polls and writes until `wanted` accepts them. Returns all of them."""
     polls: list[Any] = []
     writes: list[Any] = []
 
@@ -44,7 +44,7 @@ def taken(poller: Poller, wanted: Callable[[list[Any], list[Any]], object]) -> t
 
 
 def written(poller: Poller, number: int) -> int:
-    """What became of a write."""
+    """Returns the fault of a write."""
     _, writes = taken(poller, lambda _, writes: number in dict(writes))
     fault: int = dict(writes)[number]
     return fault

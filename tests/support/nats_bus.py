@@ -1,6 +1,6 @@
-"""NATS in tests: the real server, a caller to talk to it, and scanners that run.
+"""A real NATS server, a client, and scanners, for tests.
 
-Nothing here leaves the loopback interface, and everything that is started is stopped.
+Everything stays on the loopback interface, and everything that was started is stopped.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Result = TypeVar("Result")
 
 
 class NatsServer:
-    """A server of its own, started anew with the same port and store as often as wanted."""
+    """A NATS server of one test. It can restart with the same port and store."""
 
     def __init__(self, folder: Path, *options: str, jetstream: bool = True) -> None:
         self._program = Path(sys.executable).parent / "nats-server"
@@ -61,7 +61,7 @@ class NatsServer:
         return (self._folder / "nats.log").read_text(errors="replace")
 
     def start(self) -> None:
-        """Returns when it serves."""
+        """Starts the server and waits until it is ready."""
         command = [str(self._program), "-a", "127.0.0.1", "-p", str(self.port), *self._options]
         seen = self.log.count("Server is ready") if (self._folder / "nats.log").exists() else 0
         with (self._folder / "nats.log").open("ab") as log:
@@ -78,7 +78,7 @@ class NatsServer:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """Ends it without a word to anyone."""
+        """Kills the server, without a clean shutdown."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
@@ -86,7 +86,7 @@ class NatsServer:
 
 
 class _Loop:
-    """An event loop in a thread of its own."""
+    """An event loop in its own thread."""
 
     def __init__(self) -> None:
         self.loop = asyncio.new_event_loop()
@@ -94,7 +94,7 @@ class _Loop:
         self._thread.start()
 
     def do(self, work: Coroutine[Any, Any, Result], seconds: float = wire.DEADLINE) -> Result:
-        """The result of a coroutine."""
+        """Runs a coroutine and returns its result."""
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(seconds)
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ class _Loop:
 
 
 class Inbox:
-    """What comes on a subject: JSON, in order."""
+    """The received JSON messages of a subject, in order."""
 
     def __init__(self) -> None:
         self._queue: queue.Queue[Any] = queue.Queue()
@@ -122,14 +122,14 @@ class Inbox:
         self._queue.put(json.loads(message.data))
 
     def next(self, seconds: float = wire.DEADLINE) -> Any:
-        """The next message."""
+        """Returns the next message."""
         try:
             return self._queue.get(timeout=seconds)
         except queue.Empty:
             raise AssertionError(f"no message within {seconds} s") from None
 
     def until(self, wanted: Callable[[Any], object], what: str) -> Any:
-        """The next message that is wanted; those before it are skipped."""
+        """Returns the next matching message; skips others."""
         deadline = time.monotonic() + wire.DEADLINE
         last: Any = None
         while (left := deadline - time.monotonic()) > 0:
@@ -140,7 +140,7 @@ class Inbox:
         raise AssertionError(f"not within {wire.DEADLINE} s: {what}; the last message is {last}")
 
     def take(self) -> list[Any]:
-        """All messages that are there."""
+        """Returns all received messages."""
         found = []
         with contextlib.suppress(queue.Empty):
             while True:
@@ -149,7 +149,7 @@ class Inbox:
 
 
 class Caller:
-    """A client of NATS beside the scanner; `options` are those of `Client.connect`."""
+    """A NATS client beside the scanner; `options` are for `Client.connect`."""
 
     def __init__(self, url: str, **options: Any) -> None:
         self._loop = _Loop()
@@ -177,14 +177,14 @@ class Caller:
         self._loop.close()
 
     def request(self, subject: str, payload: object) -> Any:
-        """The answer to a request; text goes as it is, everything else as JSON."""
+        """Sends a request and returns the answer. A string is sent as is, other values as JSON."""
         message = self._loop.do(
             self.client.request(subject, _bytes(payload), timeout=wire.DEADLINE)
         )
         return json.loads(message.data)
 
     def publish(self, subject: str, payload: object = b"") -> None:
-        """Returns when the server has it."""
+        """Publishes a message and waits until the server has it."""
         self._loop.do(self._published(subject, _bytes(payload)))
 
     async def _published(self, subject: str, payload: bytes) -> None:
@@ -192,7 +192,7 @@ class Caller:
         await self.client.flush()
 
     def listen(self, subject: str) -> Inbox:
-        """What comes on a subject from now on."""
+        """Subscribes to a subject and returns its inbox."""
         inbox = Inbox()
         self._loop.do(self._listening(subject, inbox))
         return inbox
@@ -202,7 +202,7 @@ class Caller:
         await self.client.flush()
 
     def do(self, work: Coroutine[Any, Any, Result]) -> Result:
-        """The result of a coroutine in the loop of the client."""
+        """Runs a coroutine in the client's loop and returns its result."""
         return self._loop.do(work)
 
 
@@ -217,7 +217,7 @@ def _bytes(payload: object) -> bytes:
 
 
 class Running:
-    """A scanner in a thread of its own."""
+    """A scanner in its own thread."""
 
     def __init__(self, settings: Settings) -> None:
         loop = _Loop()
@@ -235,16 +235,16 @@ class Running:
 
     @property
     def serves(self) -> bool:
-        """Whether it is connected and has subscribed to its subjects."""
+        """Whether the scanner is connected and subscribed."""
         return self.scanner.serves
 
     def do(self, work: Coroutine[Any, Any, Result]) -> Result:
-        """The result of a coroutine in the loop of the scanner."""
+        """Runs a coroutine in the scanner's loop and returns its result."""
         assert self._loop is not None
         return self._loop.do(work)
 
     def stop(self) -> None:
-        """Ends it, and waits until it has ended."""
+        """Stops the scanner and waits for its end."""
         if self._loop is None:
             return
         loop, self._loop = self._loop, None
@@ -256,7 +256,7 @@ class Running:
 
 
 class Run(Protocol):
-    """Starts a scanner that is stopped when the test ends; waits until it serves."""
+    """Starts a scanner, waits until it serves, and stops it when the test ends."""
 
     def __call__(
         self, server: NatsServer | None = None, *, wait: bool = True, **settings: Any
@@ -265,7 +265,7 @@ class Run(Protocol):
 
 @pytest.fixture(scope="session")
 def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
-    """A server for all tests that do it no harm."""
+    """A server that all tests share, if they do not disturb it."""
     server = NatsServer(tmp_path_factory.mktemp("nats"))
     yield server
     server.kill()
@@ -273,7 +273,7 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
 
 @pytest.fixture
 def own_nats(tmp_path: Path) -> Iterator[NatsServer]:
-    """A server for one test."""
+    """A server of one test."""
     server = NatsServer(tmp_path)
     yield server
     server.kill()
@@ -303,17 +303,17 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
 
 @pytest.fixture
 def scanner(run_scanner: Run) -> Running:
-    """With the settings that it has by itself, at `nats`."""
+    """A scanner with default settings, connected to `nats`."""
     return run_scanner()
 
 
 def tag(id: str, address: int, datatype: str = "uint16", **more: Any) -> dict[str, Any]:
-    """A tag of a request, in holding registers if nothing else is said."""
+    """Builds a tag of a request; by default in holding registers."""
     return {"id": id, "address": address, "functionCode": "holding", "datatype": datatype, **more}
 
 
 def subscription(server: holdfast.Server, *tags: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """A request for tags of a server, known as plc1."""
+    """Builds a request for tags of a server with the id plc1."""
     host, port = server.address
     return {
         "deviceId": "plc1",
@@ -327,5 +327,5 @@ def subscription(server: holdfast.Server, *tags: dict[str, Any], **more: Any) ->
 
 
 def leaving(*ids: str, **more: Any) -> dict[str, Any]:
-    """A request to take tags away."""
+    """Builds a request to remove tags."""
     return {"deviceId": "plc1", "subscriberId": "hmi", "tagIds": list(ids), **more}

@@ -1,4 +1,4 @@
-"""Operators, accounts and users of NATS in tests, with their keys and JWTs, as `nsc` makes them."""
+"""NATS operators, accounts and users, with keys and JWTs in the formats of `nsc`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Key:
         return self._key.sign(text.encode()).signature
 
     def jwt(self, subject: Key, type: str, claims: dict[str, Any], **more: Any) -> str:
-        """What this key says of another one."""
+        """Signs a JWT about another key."""
         nats = {"type": type, "version": 2, **claims}
         now = int(time.time())
         body = {"iss": self.name, "sub": subject.name, "iat": now, "nats": nats, **more}
@@ -50,7 +50,7 @@ class Key:
 
 
 class User:
-    """A user of an account. `more` are claims beside those of NATS, such as `exp`."""
+    """A user of an account. `more` are additional claims, such as `exp`."""
 
     def __init__(
         self, account: Key, permissions: dict[str, Any] | None = None, **more: Any
@@ -61,14 +61,14 @@ class User:
 
     @property
     def options(self) -> dict[str, Any]:
-        """As `Client.connect` has them."""
+        """Returns options for `Client.connect`."""
         return {
             "signature_cb": lambda nonce: base64.b64encode(self.key.sign(nonce)),
             "user_jwt_cb": self.jwt.encode,
         }
 
     def write(self, file: Path) -> Path:
-        """The file, with the credentials in it."""
+        """Writes the credentials to a file and returns it."""
         return written(file, self.jwt, self.key.seed)
 
 
@@ -83,7 +83,7 @@ class Operator:
         """An account without JetStream."""
 
     def account(self, **limits: int) -> Key:
-        """An account of which servers know that are configured from now on."""
+        """Creates an account. Servers configured afterwards know it."""
         account = Key(ACCOUNT)
         unlimited = dict.fromkeys(("subs", "conn", "data", "payload", "imports", "exports"), -1)
         claims = {"limits": {**unlimited, "wildcards": True, **limits}}
@@ -91,7 +91,7 @@ class Operator:
         return account
 
     def configure(self, file: Path) -> Path:
-        """The file, with the configuration in it."""
+        """Writes the server's configuration to a file and returns it."""
         accounts = "\n".join(f"  {name}: {jwt}" for name, jwt in self._accounts.items())
         file.write_text(
             f"operator: {self._key.jwt(self._key, 'operator', {})}\n"
@@ -102,7 +102,7 @@ class Operator:
 
 
 def written(file: Path, jwt: str, seed: str) -> Path:
-    """The file, with credentials in it."""
+    """Writes credentials to a file and returns it."""
     file.write_text(CREDENTIALS.format(jwt=jwt, seed=seed))
     return file
 

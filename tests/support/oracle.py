@@ -1,7 +1,7 @@
-"""What a Modbus server answers, written from docs/modbus.md as plainly as can be.
+"""A model of a Modbus server, written from docs/modbus.md as plainly as possible.
 
-It shares nothing with the library: values are integers in dictionaries, checks are in the order in
-which that page names them. It is slow and has no transport. Counters are not modelled.
+It shares no code with the library: values are integers in dictionaries, and checks are in the order
+of that page. It is slow and has no transport. Counters are not modelled.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def require(condition: bool, code: int) -> None:
 
 
 def pack_bits(bits: list[int]) -> bytes:
-    """Eight to a byte, the first in the lowest bit, the rest of the last byte zero."""
+    """Packs eight bits into a byte, lowest bit first; unused bits of the last byte are zero."""
     packed = bytearray((len(bits) + 7) // 8)
     for index, bit in enumerate(bits):
         packed[index // 8] |= bit << index % 8
@@ -60,7 +60,7 @@ def unpack_registers(packed: bytes) -> list[int]:
 
 
 class Oracle:
-    """One unit behind one listener."""
+    """One unit of one listener."""
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Oracle:
         }
 
     def answer(self, unit: int, pdu: bytes) -> bytes | None:
-        """The PDU of the reply, or None when there is none."""
+        """Returns the PDU of the reply, or `None` if there is no reply."""
         try:
             return self._serve(unit, pdu)
         except Refusal as refusal:

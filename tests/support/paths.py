@@ -1,4 +1,4 @@
-"""Where tests find files of the project."""
+"""The paths of the project's files."""
 
 from __future__ import annotations
 

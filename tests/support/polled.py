@@ -1,4 +1,4 @@
-"""Devices to be polled, that answer as a test wants; and what a status block tells."""
+"""Devices for the poller that answer as a test defines, and parsing of status blocks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     Answer = Callable[[wire.Frame], bytes | None]
 
 HANG_UP = b""
-"""In place of an answer: the connection is closed."""
+"""Instead of a reply: closes the connection."""
 
 AREAS = {
     "coils": 1,
@@ -33,7 +33,7 @@ AREAS = {
     "holding_registers": 3,
     "input_registers": 4,
 }
-"""The function that reads each area."""
+"""The function code that reads each area."""
 
 
 def reply(request: wire.Frame, pdu: bytes) -> bytes:
@@ -41,13 +41,13 @@ def reply(request: wire.Frame, pdu: bytes) -> bytes:
 
 
 def asked(request: wire.Frame) -> tuple[int, int]:
-    """The address and count of a read."""
+    """Parses the address and the count of a read request."""
     address, count = struct.unpack(">HH", request.pdu[1:5])
     return address, count
 
 
 def data(request: wire.Frame, value: int = 0) -> bytes:
-    """The answer to a read: all items of one value."""
+    """Builds the reply to a read: all items have one value."""
     _, count = asked(request)
     if request.pdu[0] <= 2:
         bits = bytes([0xFF * (value & 1)]) * ((count + 7) // 8)
@@ -60,7 +60,7 @@ def exception(request: wire.Frame, code: int) -> bytes:
 
 
 class Fake:
-    """Answers the requests of any number of connections by a function; it can go and come back."""
+    """Answers requests with a function, on any number of connections. Can stop and restart."""
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
@@ -93,7 +93,7 @@ class Fake:
         self._run(self._accept, self._listening)
 
     def stop(self) -> None:
-        """Ends all connections and listens no more."""
+        """Closes all connections and stops listening."""
         for each in (self._listening, *self._open):
             if each is not None:
                 with contextlib.suppress(OSError):
@@ -133,7 +133,7 @@ class Fake:
 
 
 class Datagrams:
-    """Answers requests over UDP by a function, one after the other."""
+    """Answers requests over UDP with a function, one by one."""
 
     def __init__(self, answer: Callable[[wire.Frame], bytes]) -> None:
         self._answer = answer
@@ -170,9 +170,7 @@ class Datagrams:
 
 
 class Receiver:
-    """Takes Raw Ingest packets, one after the other; `taken` is called with each before it is
-    answered.
-    """
+    """Receives Raw Ingest packets one by one. Calls `taken` with each before it answers."""
 
     def __init__(self, taken: Callable[[bytes], object]) -> None:
         self._taken = taken
@@ -209,7 +207,7 @@ class Receiver:
 
 
 class Pymodbus:
-    """A server of pymodbus in a thread of its own."""
+    """A pymodbus server in its own thread."""
 
     def __init__(self, devices: Any) -> None:
         self._devices = devices
@@ -265,7 +263,7 @@ class Status(NamedTuple):
 
 
 def status(memory: holdfast.Memory, slot: int = 0) -> Status:
-    """What a block in the input registers of a memory tells."""
+    """Parses a status block in the input registers of a memory."""
     told = memory.read("input_registers", slot * 30, 30)
     health, last_error, seconds = told[:3]
     name = struct.pack(">8H", *told[3:11])
@@ -280,7 +278,7 @@ def status(memory: holdfast.Memory, slot: int = 0) -> Status:
 def read(
     area: str, address: int, count: int, into: tuple[str, int] | None = None
 ) -> dict[str, Any]:
-    """A read, perhaps into the memory `mirror`."""
+    """Builds the configuration of a read, optionally into the memory `mirror`."""
     made: dict[str, Any] = {"area": area, "address": address, "count": count}
     if into is not None:
         made["into"] = {"memory": "mirror", "area": into[0], "address": into[1]}
@@ -288,38 +286,38 @@ def read(
 
 
 def device(url: str, *reads: dict[str, Any], unit: int = 1, **more: Any) -> dict[str, Any]:
-    """A device that is polled often, and not soon out of date."""
+    """Builds the configuration of a device with a short interval and a long time until stale."""
     often = {"interval": 0.02, "timeout": 5}
     return {"url": url, "unit": unit, **often, "reads": list(reads), **more}
 
 
 def block(slot: int) -> dict[str, Any]:
-    """The place of a status block."""
+    """Builds the place of a status block."""
     return {"memory": "status", "area": "input_registers", "slot": slot}
 
 
 def configuration(devices: dict[str, Any], **more: Any) -> str:
-    """The text of a configuration with the memories `mirror` and `status`."""
+    """Builds a configuration with the memories `mirror` and `status`."""
     areas = dict.fromkeys(AREAS, 65536)
     memories = {"mirror": areas, "status": {"input_registers": 30 * max(len(devices), 1)}}
     return written({"memories": memories, "devices": devices, **more})
 
 
 def counters(appliance: Appliance, name: str) -> dict[str, Any]:
-    """What is counted of a device."""
+    """Returns the counters of a device."""
     told: dict[str, Any] = appliance.diagnostics.stats()["devices"][name]
     return told
 
 
 def until_polled(appliance: Appliance, name: str, more: int = 3) -> None:
-    """Waits for so many polls that begin after now, and end."""
+    """Waits for so many polls that start after the call and finish."""
     enough = counters(appliance, name)["polls"] + more + 1
     wire.until(lambda: counters(appliance, name)["polls"] >= enough, f"{name} is polled")
 
 
 @contextlib.contextmanager
 def in_background(work: Callable[[], object]) -> Iterator[None]:
-    """Does something again and again in a thread; what it raises is raised here."""
+    """Repeats a call in a thread. Raises the exceptions of the call here."""
     stop = threading.Event()
     failed: list[BaseException] = []
 

@@ -1,4 +1,4 @@
-"""pymodbus as a peer: its asyncio clients behind plain calls, and a tour of what it can ask."""
+"""pymodbus as a client: a blocking facade for its asyncio clients, and a tour of all functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OPTIONS: dict[str, Any] = {"timeout": 10, "retries": 0}
 
 @contextlib.contextmanager
 def connected(client: Any) -> Iterator[Any]:
-    """A synchronous client, from its connection to its end."""
+    """Connects a synchronous client, and closes it at the end."""
     assert client.connect()
     try:
         yield client
@@ -25,7 +25,7 @@ def connected(client: Any) -> Iterator[Any]:
 
 
 class Patient:
-    """An asyncio client behind plain calls, so that one set of tests serves both kinds."""
+    """A blocking facade for an asyncio client, so that the same tests cover both kinds."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
         self._loop = asyncio.new_event_loop()
@@ -52,7 +52,7 @@ class Patient:
         return lambda *args, **named: self.run(getattr(self._client, name)(*args, **named))
 
     def many(self, name: str, addresses: Sequence[int]) -> list[Any]:
-        """Calls one method for many addresses at once."""
+        """Calls one method concurrently for many addresses."""
 
         async def gathered() -> list[Any]:
             method = getattr(self._client, name)
@@ -62,14 +62,15 @@ class Patient:
 
     def close(self) -> None:
         self._client.close()
-        # The transport closes its socket in the next turn of the loop.
+        # The transport closes its socket in the next iteration of the loop.
         self._loop.run_until_complete(asyncio.sleep(0))
         self._loop.close()
 
 
 def tour(client: Any, memory: holdfast.Memory, unit: int) -> None:
-    """Every function once, and exceptions. The unit has 1000 items in every area, all zero, and
-    the vendor name Acme.
+    """Calls every function once, and provokes exceptions.
+
+    The unit has 1000 items in every area, all zero, and the vendor name Acme.
     """
     of = {"device_id": unit}
     memory.write("input_registers", 5, range(125))

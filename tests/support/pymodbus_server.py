@@ -1,4 +1,4 @@
-"""pymodbus as a server: one unit with everything in it, and a tour of what a client can ask."""
+"""pymodbus as a server: one unit with all areas, and a tour of a client's functions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from support.lines import Cable
 Identity: Any = ModbusDeviceIdentification
 
 LONG = {"ModelName": "m" * 200, "UserApplicationName": "u" * 200}
-"""Two objects of which a reply holds one."""
+"""Two objects that do not fit into one reply."""
 
 FRAMERS = {
     "tcp": FramerType.SOCKET,
@@ -33,7 +33,7 @@ FRAMERS = {
 
 
 class Pymodbus:
-    """One of pymodbus's servers, in a thread of its own; unit 1 has 1000 items in every area."""
+    """A pymodbus server in its own thread; unit 1 has 1000 items in every area."""
 
     def __init__(self, kind: str, cable: Cable | None = None) -> None:
         self._loop = asyncio.new_event_loop()
@@ -89,7 +89,7 @@ def unit_1() -> SimDevice:
 
 
 def tour(client: Face) -> None:
-    """Whatever reads and writes, and an exception."""
+    """Calls every function that reads or writes, and provokes an exception."""
     assert client.read_input_registers(5, 125) == list(range(5, 130))
     assert client.read_input_registers(0, 1000) == list(range(1000))
     assert client.read_discrete_inputs(3, 4) == [True, False, False, True]

@@ -1,4 +1,4 @@
-"""Servers and appliances that run while a test does, and connections to them."""
+"""Servers, appliances and connections for the duration of a test."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class ServerOptions(TypedDict, total=False):
-    """What `holdfast.Server` takes, apart from units."""
+    """The options of `holdfast.Server`, except units."""
 
     bind: str
     access: Access
@@ -38,7 +38,7 @@ class ServerOptions(TypedDict, total=False):
 
 
 class ConnectOptions(TypedDict, total=False):
-    """What `wire.Connection` takes, apart from the address."""
+    """The options of `wire.Connection`, except the address."""
 
     source: str
     receive_buffer: int
@@ -76,7 +76,7 @@ class Connect(Protocol):
 
 
 class ServerProcess:
-    """A server apart: its file descriptors and its memory are not those of the test."""
+    """A server in its own process, with its own file descriptors and memory."""
 
     def __init__(self, **options: Unpack[ServerOptions]) -> None:
         settings = {"bind": "127.0.0.1:0", "access": "read-write"} | options
@@ -116,13 +116,13 @@ class Run(Protocol):
 
 
 def endpoint(appliance: Appliance, name: str) -> tuple[str, int]:
-    """The address and port that a part of an appliance listens on."""
+    """Returns the address and port on which a part of an appliance listens."""
     [(host, port)] = [(e.host, e.port) for e in appliance.endpoints() if e.name == name]
     assert port is not None
     return host, port
 
 
 def content(memory: holdfast.Memory) -> dict[Area, list[int]]:
-    """All four areas of a memory whose areas start at 0 and have 1000 items."""
+    """Returns all four areas of a memory whose areas start at 0 and have 1000 items."""
     ranges: list[tuple[Area, int, int]] = [(area, 0, 1000) for area in AREAS]
     return dict(zip(AREAS, memory.read_many(ranges), strict=True))

@@ -1,4 +1,4 @@
-"""Devices with TLS: a relay that speaks it in front of any port, and certificates of every kind."""
+"""TLS devices: a relay that adds TLS to any port, and certificates of every kind."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ EC = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
 class Authority(Certificates):
-    """An authority, and what it and others issue."""
+    """A CA, and certificates that it and others issue."""
 
     def issue_expired(self, name: str, alternative: str) -> Owner:
-        """A certificate that was valid long ago."""
+        """Issues a certificate that has expired."""
         return self.issue(name, alternative, dates=PAST)
 
     def self_signed(self, name: str, alternative: str, *, ca: bool) -> Owner:
-        """What a device makes for itself."""
+        """Creates a self-signed certificate, as a device would."""
         certificate, key = self._files(name, "pem", "key")
         told = str(ca).upper()
         openssl(
@@ -44,7 +44,7 @@ class Authority(Certificates):
         return certificate, key
 
     def issue_by(self, owner: Owner, name: str, alternative: str) -> Owner:
-        """A certificate that somebody signed who is perhaps no authority."""
+        """Issues a certificate that is signed by any certificate, even one that is not a CA."""
         certificate, key, request, extensions = self._files(name, "pem", "key", "csr", "ext")
         extensions.write_text(f"subjectAltName={alternative}\n")
         openssl("req", *EC, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
@@ -55,7 +55,7 @@ class Authority(Certificates):
         return certificate, key
 
     def rsa(self, name: str) -> Owner:
-        """A certificate with an RSA key in PKCS#1."""
+        """Issues a certificate with an RSA key in PKCS#1."""
         certificate, key, modern, request, extensions = self._files(
             name, "pem", "key", "pk8", "csr", "ext"
         )
@@ -72,13 +72,13 @@ class Authority(Certificates):
         return certificate, key
 
     def sec1(self, key: Path) -> Path:
-        """An EC key in SEC1."""
+        """Converts an EC key to SEC1."""
         file = key.with_suffix(".sec1")
         openssl("ec", "-in", key, "-out", file)
         return file
 
     def locked(self, key: Path, *, traditional: bool) -> Path:
-        """A key with a passphrase."""
+        """Encrypts a key with a passphrase."""
         file = key.with_suffix(".locked")
         form = ("-traditional",) if traditional else ()
         options = ("-aes128", "-passout", "pass:secret")
@@ -92,9 +92,9 @@ class Authority(Certificates):
 def context(
     owner: Owner, version: str = "TLS 1.3", asks: Path | None = None, *, weak: bool = False
 ) -> ssl.SSLContext:
-    """A server's TLS of one version; it asks for certificates of the authority `asks`.
+    """Returns a server's TLS context for one version; requests certificates of the CA `asks`.
 
-    With `weak` it shows certificates whatever OpenSSL thinks of them.
+    With `weak` it presents certificates that OpenSSL would refuse by default.
     """
     made = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     if weak:
@@ -108,10 +108,10 @@ def context(
 
 
 class Relay:
-    """Passes bytes on to a port, taking TLS off with a context.
+    """Removes TLS with a context, and forwards the bytes to a port.
 
-    With `piece` they go in pieces of so many bytes. After `most` bytes to the client, each
-    connection ends.
+    With `piece`, bytes are sent in pieces of that size. With `most`, each connection ends after
+    that many bytes to the client.
     """
 
     def __init__(
@@ -128,9 +128,9 @@ class Relay:
         self.most = most
         self.connections = 0
         self.agreed = 0
-        """Connections with a handshake that succeeded."""
+        """The number of successful handshakes."""
         self.ends: list[str] = []
-        """How clients ended their connections: in order, or with an error."""
+        """How clients ended their connections: cleanly, or with an error."""
         self._listening = socket.create_server(("127.0.0.1", 0))
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
@@ -159,12 +159,12 @@ class Relay:
         return host, port
 
     def url(self, host: str = "127.0.0.1", **options: Any) -> str:
-        """The URL of a client."""
+        """Returns the URL for a client."""
         query = "&".join(f"{key}={value}" for key, value in options.items())
         return f"tls://{host}:{self.address[1]}?{query}"
 
     def cut(self) -> None:
-        """Ends every connection without a word."""
+        """Closes every connection without close_notify."""
         with self._lock:
             for end in self._open:
                 with contextlib.suppress(OSError):
@@ -183,7 +183,7 @@ class Relay:
                 thread.start()
 
     def _serve(self, near: socket.socket, far: socket.socket) -> None:
-        # What ends a connection from another thread must not meet the TLS of this one.
+        # Closing a connection from another thread must not interfere with its TLS state.
         ends = {near.dup(), far.dup()}
         with self._lock:
             self._open |= ends

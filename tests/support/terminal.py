@@ -1,4 +1,4 @@
-"""A command in a terminal of its own: what it shows there, keys, sizes, signals."""
+"""Runs a command in its own terminal: output, keys, sizes and signals."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ ESCAPES = re.compile(r"\x1b(\[[0-9;?]*[ -/]*[@-~]|[()][A-Z0-9]|[=>78])")
 
 
 def plain(text: str) -> str:
-    """What is on the terminal, without colours and movements."""
+    """Removes colors and cursor movements from the output."""
     return ESCAPES.sub("", text).replace("\r", "")
 
 
 class Terminal:
-    """`holdfast` with these arguments on a pseudo-terminal; killed at the end, if it still runs."""
+    """Runs `holdfast` with these arguments on a pseudo-terminal, and kills it at the end."""
 
     def __init__(
         self, *arguments: str, lines: int = 40, columns: int = 100, **environment: str
@@ -70,7 +70,7 @@ class Terminal:
         os.close(self._own)
 
     def until(self, *texts: str) -> str:
-        """What has been shown, once all texts are in what came since the last call."""
+        """Waits until the output since the last call contains all texts. Returns it."""
         deadline = time.monotonic() + wire.DEADLINE
         since = len(self.shown)
         while not all(text in plain(self.shown[since:]) for text in texts):
@@ -86,7 +86,7 @@ class Terminal:
         self.process.send_signal(signal.SIGWINCH)
 
     def end(self, number: signal.Signals | None = None) -> int:
-        """The exit code, after a signal if one is given."""
+        """Returns the exit code, after an optional signal."""
         if number is not None:
             self.process.send_signal(number)
         deadline = time.monotonic() + wire.DEADLINE
@@ -95,12 +95,12 @@ class Terminal:
         return self.process.wait(wire.DEADLINE)
 
     def _look(self, deadline: float) -> bool:
-        """Takes what is there; whether there may be more."""
+        """Reads available output. Returns whether more may follow."""
         patience = max(0.0, deadline - time.monotonic())
         if not select.select([self._own], [], [], patience)[0]:
             return True
         piece = b""
-        with contextlib.suppress(OSError):  # Linux says so when the other side is closed.
+        with contextlib.suppress(OSError):  # Linux raises OSError when the other end is closed.
             piece = os.read(self._own, 65536)
         self.shown += piece.decode(errors="replace")
         return bool(piece)
@@ -110,11 +110,11 @@ class Terminal:
 
 
 def interruptible() -> None:
-    """For `preexec_fn`: lets Ctrl-C end the process also where that is ignored, as behind `&`."""
+    """For `preexec_fn`: lets Ctrl-C end the process even if SIGINT is ignored, as after `&`."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _take_terminal() -> None:
-    """Makes standard input the terminal of the new session."""
+    """Makes standard input the controlling terminal of the new session."""
     interruptible()
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)

@@ -1,4 +1,4 @@
-"""A Modbus client inside TLS whose records a test has in its hands, and appliances to talk to."""
+"""A Modbus client that controls its TLS records, and appliances for it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VERSIONS = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
 def context(
     ca: Path, issued: Issued | None = None, version: str | None = None, *, weak: bool = False
 ) -> ssl.SSLContext:
-    """Trusts `ca`, and shows what was issued, with `weak` whatever OpenSSL thinks of it."""
+    """Trusts `ca`, and presents a certificate; with `weak`, even one that OpenSSL refuses."""
     made = ssl.create_default_context(cafile=str(ca))
     if weak:
         made.set_ciphers("DEFAULT:@SECLEVEL=0")
@@ -41,11 +41,11 @@ def context(
 
 
 class Refused(Exception):
-    """The server ended the connection, by an alert, or by none."""
+    """The server closed the connection, with or without an alert."""
 
 
 class Peer:
-    """One connection; `shake` makes it one of TLS."""
+    """A connection; `shake` starts TLS on it."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Peer:
         self._in, self._out = ssl.MemoryBIO(), ssl.MemoryBIO()
         self.tls = trust.wrap_bio(self._in, self._out, server_hostname="localhost", session=session)
         self.drips = False
-        """Whether every byte is sent alone."""
+        """Whether bytes are sent one by one."""
         self._received = b""
         self._transaction = 0
 
@@ -76,7 +76,7 @@ class Peer:
         self.wire.close()
 
     def shake(self) -> Self:
-        """The handshake, as far as a client can see it."""
+        """Performs the handshake, as far as the client takes part in it."""
         while True:
             try:
                 self.tls.do_handshake()
@@ -90,28 +90,28 @@ class Peer:
                 return self
 
     def hello(self) -> bytes:
-        """What begins the handshake; it is not sent."""
+        """Returns the ClientHello without sending it."""
         with contextlib.suppress(ssl.SSLWantReadError):
             self.tls.do_handshake()
         return self._out.read()
 
     def goodbye(self) -> bytes:
-        """What tells the server of the end; it is not sent."""
+        """Returns the close_notify without sending it."""
         with contextlib.suppress(ssl.SSLWantReadError):
             self.tls.unwrap()
         return self._out.read()
 
     def seal(self, data: bytes) -> bytes:
-        """The records that carry some bytes; they are not sent."""
+        """Returns the records for some bytes without sending them."""
         self.tls.write(data)
         return self._out.read()
 
     def send(self, data: bytes) -> None:
-        """Sends bytes in records of their own."""
+        """Sends bytes in separate records."""
         self._send(self.seal(data))
 
     def flush(self) -> None:
-        """Sends what TLS has to say."""
+        """Sends pending TLS data."""
         self._send(self._out.read())
 
     def _send(self, records: bytes) -> None:
@@ -119,7 +119,7 @@ class Peer:
             self.wire.send(piece)
 
     def ask(self, pdu: bytes, unit: int = 1) -> bytes:
-        """The PDU of the reply to one request."""
+        """Returns the PDU of the reply to one request."""
         self._transaction = (self._transaction + 1) & 0xFFFF
         self.send(wire.frame(pdu, unit, self._transaction))
         [reply] = self.receive_many(1)
@@ -127,13 +127,13 @@ class Peer:
         return reply.pdu
 
     def ask_many(self, pdus: Iterable[bytes]) -> list[bytes]:
-        """The PDUs of the replies to requests that are sent at once, in order."""
+        """Returns the PDUs of the replies to pipelined requests, in order."""
         asked = list(pdus)
         self.send(wire.frames(asked))
         return [reply.pdu for reply in self.receive_many(len(asked))]
 
     def receive_many(self, count: int) -> list[wire.Frame]:
-        """The next frames, exactly as many; raises `Refused` when the connection ends before."""
+        """Returns exactly `count` frames; raises `Refused` if the connection ends before."""
         got: list[wire.Frame] = []
         while len(got) < count:
             got += self.receive_some()
@@ -141,7 +141,7 @@ class Peer:
         return got
 
     def receive_some(self) -> list[wire.Frame]:
-        """The frames that come next, perhaps none."""
+        """Returns the frames that have arrived, possibly none."""
         piece = self._read()
         if not piece:
             raise Refused("close_notify")
@@ -149,7 +149,7 @@ class Peer:
         return whole
 
     def end(self) -> str:
-        """How the server ends the connection: `close_notify`, an alert, or `cut`."""
+        """Returns how the server closes the connection: `close_notify`, an alert, or `cut`."""
         try:
             while self._read():
                 pass
@@ -158,7 +158,7 @@ class Peer:
         return "close_notify"
 
     def _read(self) -> bytes:
-        """Plain text, nothing at the end."""
+        """Returns decrypted bytes; empty at the end of the connection."""
         while True:
             try:
                 return self.tls.read(65536)
@@ -186,7 +186,7 @@ class Peer:
 
 
 def configuration(tls: dict[str, Path], rules: list[dict[str, Any]], **listener: Any) -> str:
-    """The text of a configuration with one listener, `secure`, for the memory `plant`."""
+    """Builds a configuration with one listener, `secure`, for the memory `plant`."""
     secure = {
         "type": "modbus-tls",
         "bind": "127.0.0.1:0",
@@ -199,7 +199,7 @@ def configuration(tls: dict[str, Path], rules: list[dict[str, Any]], **listener:
 
 
 def connections(appliance: Appliance) -> dict[str, int]:
-    """What became of the connections."""
+    """Returns the listener's counts of connections."""
     counted: dict[str, int] = appliance.diagnostics.stats()["listeners"]["secure"]["connections"]
     return counted
 
@@ -209,7 +209,7 @@ def address(appliance: Appliance) -> tuple[str, int]:
 
 
 def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
-    """`served`, or how the server refused; over TLS 1.3 it does so when the client is done."""
+    """Returns `served` or the reason. Over TLS 1.3 a refusal follows the client's handshake."""
     with Peer(address(appliance), trust) as client:
         try:
             return "served" if client.shake().ask(READ) == ZERO else "answered"
@@ -218,7 +218,7 @@ def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
 
 
 def reasons(appliance: Appliance, caplog: pytest.LogCaptureFixture, count: int = 1) -> list[str]:
-    """Why TLS failed, as the log says, when it has said it so often."""
+    """Returns the logged reasons of TLS failures, once there are `count`."""
     wire.until(lambda: connections(appliance)["tls_failed"] >= count, "failures are counted")
 
     def told() -> list[Any]:

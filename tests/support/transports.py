@@ -1,5 +1,5 @@
-"""Modbus over UDP, and RTU frames over TCP: clients as plain as that of `wire`, and appliances
-with one listener.
+"""Modbus over UDP, and RTU frames over TCP: simple clients as in `wire`, and appliances with one
+listener.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from typing import Self
 
 TYPES = {"tcp": "modbus-tcp", "udp": "modbus-udp", "rtu": "modbus-rtu-over-tcp"}
-"""The types of listener by the names that tests go by."""
+"""The listener types by the names in tests."""
 
 ALL: dict[str, Any] = dict.fromkeys(AREAS, 1000)
 """Every area with the addresses 0 to 999."""
 
 
 def rule(sources: list[str], unit: int = 1, memory: str = "plant", **more: Any) -> dict[str, Any]:
-    """A rule for one unit id, to read and to write unless told."""
+    """Builds a rule for one unit id; by default with read and write access."""
     return {"sources": sources, "units": {unit: memory}, "access": "read-write", **more}
 
 
@@ -44,7 +44,7 @@ def configuration(
     more: dict[str, Any] | None = None,
     **listener: Any,
 ) -> str:
-    """The text of a configuration with one listener, `scada`."""
+    """Builds a configuration with one listener, `scada`."""
     scada = {
         "type": TYPES[kind],
         "bind": bind,
@@ -66,13 +66,13 @@ def running(folder: Path, text: str) -> Iterator[Appliance]:
 
 
 def counters(appliance: Appliance) -> dict[str, Any]:
-    """What the listener has counted."""
+    """Returns the listener's counters."""
     counted: dict[str, Any] = appliance.diagnostics.stats()["listeners"]["scada"]
     return counted
 
 
 def await_count(appliance: Appliance, group: str, key: str | int, number: int) -> None:
-    """Waits until a counter has come to a number."""
+    """Waits until a counter reaches a number."""
 
     def count() -> int:
         counted: int = counters(appliance)[group].get(key, 0)
@@ -120,7 +120,7 @@ class Datagrams:
         self.socket.send(datagram)
 
     def receive(self) -> wire.Frame:
-        """The frame of the next datagram, which must be one and whole."""
+        """Returns the frame of the next datagram, which must contain exactly one."""
         datagram = self.socket.recv(65536)
         whole, left = wire.split(datagram)
         if len(whole) != 1 or left:
@@ -128,7 +128,7 @@ class Datagrams:
         return whole[0]
 
     def ask(self, pdu: bytes, unit: int = 1) -> bytes:
-        """The PDU of the next reply, whose header must be that of the request."""
+        """Returns the PDU of the next reply, and checks its header against the request."""
         self._transaction = (self._transaction + 1) & 0xFFFF
         self.send(wire.frame(pdu, unit, self._transaction))
         reply = self.receive()
@@ -139,7 +139,7 @@ class Datagrams:
         return reply.pdu
 
     def is_quiet(self) -> bool:
-        """Whether no datagram is there."""
+        """Returns whether no datagram has arrived."""
         return not select.select([self.socket], [], [], 0)[0]
 
 
@@ -153,7 +153,7 @@ class RtuConnection(wire.Connection):
         return reply
 
     def replies(self, count: int) -> list[tuple[int, bytes]]:
-        """Unit ids and PDUs of the next frames, exactly as many."""
+        """Returns the unit ids and PDUs of exactly `count` frames."""
         deadline = time.monotonic() + self.deadline
         got: list[tuple[int, bytes]] = []
         while len(got) < count:
@@ -168,7 +168,7 @@ class RtuConnection(wire.Connection):
         return got
 
     def is_quiet(self) -> bool:
-        """Whether nothing has come that was not received."""
+        """Returns whether no unread bytes have arrived."""
         return not self._received and not select.select([self.socket], [], [], 0)[0]
 
 
@@ -176,14 +176,14 @@ Client = wire.Connection | Datagrams
 
 
 def client(kind: str, to: tuple[str, int], source: str | None = None) -> Client:
-    """A client of a transport, to be closed."""
+    """Creates a client of a transport; the caller closes it."""
     if kind == "udp":
         return Datagrams(to, source=source)
     return (RtuConnection if kind == "rtu" else wire.Connection)(to, source=source)
 
 
 def is_stranger(kind: str, appliance: Appliance, to: tuple[str, int], source: str | None) -> bool:
-    """Whether a peer gets no answer, and is counted as one that no rule names."""
+    """Returns whether a peer gets no reply and is counted as not allowed by any rule."""
     request = bytes.fromhex("0300000001")
     refused = counters(appliance)["connections"]["refused_source"]
     with client(kind, to, source) as stranger:

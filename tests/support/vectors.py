@@ -1,4 +1,4 @@
-"""The test vectors, and what they say of memories."""
+"""The test vectors, and the memories they define."""
 
 from __future__ import annotations
 

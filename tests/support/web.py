@@ -1,6 +1,6 @@
-"""HTTP adapters in a thread, as the appliance runs them, and clients that know only HTTP.
+"""Runs HTTP adapters in a thread, as the appliance does, and HTTP clients for them.
 
-`Client` speaks through the standard library's client, `raw` sends the bytes it is given.
+`Client` uses the standard library's client, `raw` sends bytes as given.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def token(
     areas: tuple[str, ...] = AREAS,
     access: str = "read-write",
 ) -> dict[str, object]:
-    """A token as the configuration has it."""
+    """Builds the configuration of a token."""
     digest = hashlib.sha256(secret.encode()).hexdigest()
     return {
         "name": name,
@@ -63,7 +63,7 @@ def command(area: str, address: Any, values: Any, memory: Any = "plant_a") -> di
 
 @dataclass
 class Answer:
-    """What came back."""
+    """A response."""
 
     status: int
     headers: dict[str, str]
@@ -75,7 +75,7 @@ class Answer:
 
 
 class Client:
-    """A connection that stays open, as far as the server lets it."""
+    """A connection that stays open, as far as the server allows it."""
 
     def __init__(self, address: tuple[str, int], secret: str | None = None) -> None:
         self._connection = http.client.HTTPConnection(*address, timeout=wire.DEADLINE)
@@ -84,7 +84,7 @@ class Client:
     def ask(
         self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = JSON
     ) -> Answer:
-        """One request; a body that is not bytes is sent as JSON."""
+        """Sends one request; a body that is not bytes is sent as JSON."""
         if body is not None and not isinstance(body, bytes):
             body = json.dumps(body).encode()
         self._connection.request(method, path, body, {**headers, **self._more})
@@ -107,7 +107,7 @@ class Client:
 
 @dataclass
 class StandIn:
-    """An engine as far as diagnostics look at it."""
+    """Replaces the engine for diagnostics."""
 
     listeners: dict[str, Any] = field(default_factory=dict)
     lost_events: int = 0
@@ -124,7 +124,7 @@ def diagnostics_of(
 
 
 class Service:
-    """A REST adapter under its supervisor."""
+    """A REST adapter with its supervisor."""
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class Service:
 
 @contextlib.contextmanager
 def supervised(supervisor: Supervisor, listener: socket.socket) -> Iterator[None]:
-    """Runs an adapter; when it is over, its thread must have ended, and never have failed."""
+    """Runs an adapter. At the end its thread must have stopped, without a failure."""
     supervisor.start()
     wire.until(lambda: supervisor.status()["state"] == "running", "it runs")
     try:
@@ -186,7 +186,7 @@ class Runs(Protocol):
 
 @contextlib.contextmanager
 def in_a_thread(what: Runs, stop: Stop | None = None) -> Iterator[None]:
-    """Runs it; when it is over, its thread must have ended without an error."""
+    """Runs an adapter or a host. At the end its thread must have stopped without an error."""
     stop = stop or Stop()
     with ThreadPoolExecutor(1) as threads:
         running = threads.submit(what.run, stop)
@@ -200,19 +200,19 @@ def in_a_thread(what: Runs, stop: Stop | None = None) -> Iterator[None]:
 def head(
     method: str, path: str, *headers: str, host: str = "127.0.0.1", version: str = "1.1"
 ) -> bytes:
-    """The header of a request."""
+    """Builds the header of a request."""
     lines = [f"{method} {path} HTTP/{version}", f"Host: {host}", *headers, "", ""]
     return "\r\n".join(lines).encode("latin-1")
 
 
 def post(body: bytes, *headers: str) -> bytes:
-    """A whole request to ingest."""
+    """Builds a whole ingest request."""
     length = f"Content-Length: {len(body)}"
     return head("POST", INGEST, "Content-Type: application/json", length, *headers) + body
 
 
 def answers(received: bytes) -> list[Answer]:
-    """The answers, one behind the other, that a connection brought until it was closed."""
+    """Splits the received bytes of a closed connection into responses."""
     found, at = [], 0
     while at < len(received):
         end = received.index(b"\r\n\r\n", at)
@@ -225,7 +225,7 @@ def answers(received: bytes) -> list[Answer]:
 
 
 class Records(logging.Handler):
-    """What was logged, as text with all its fields."""
+    """The log records as text with all their fields."""
 
     def __init__(self) -> None:
         super().__init__()

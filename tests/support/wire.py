@@ -1,8 +1,7 @@
-"""A raw Modbus TCP client, on purpose independent of the library.
+"""A raw Modbus TCP client, independent of the library.
 
-It sends the bytes it is given and hands back what comes, whole frames at a time. It judges nothing
-but the framing, and every wait has a deadline: a server that keeps silent fails a test, it does
-not hang it.
+It sends bytes as given and returns whole frames. It checks only the framing. Every wait has a
+deadline, so a silent server fails a test instead of blocking it.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ if TYPE_CHECKING:
     from typing import Self
 
 DEADLINE = 10.0
-"""Seconds that a condition has to come true. Generous: only a failing test waits for it."""
+"""Seconds to wait for a condition. Generous, because only a failing test waits that long."""
 
 MAX_PDU = 253
 
 
 class Frame(NamedTuple):
-    """One frame that came back."""
+    """A received frame."""
 
     transaction: int
     unit: int
@@ -44,18 +43,18 @@ def frame(
     protocol: int = 0,
     length: int | None = None,
 ) -> bytes:
-    """An MBAP header and a PDU; `length` puts a lie in the header."""
+    """Builds an MBAP header and a PDU; `length` overrides the length field."""
     told = len(pdu) + 1 if length is None else length
     return struct.pack(">HHHB", transaction, protocol, told, unit) + pdu
 
 
 def frames(pdus: Iterable[bytes], unit: int = 1) -> bytes:
-    """Frames one behind the other, with the transaction ids 0, 1, 2…"""
+    """Builds consecutive frames with the transaction ids 0, 1, 2…"""
     return b"".join(frame(pdu, unit, index & 0xFFFF) for index, pdu in enumerate(pdus))
 
 
 def split(received: bytes) -> tuple[list[Frame], bytes]:
-    """The whole frames at the start of some bytes, and what is left over."""
+    """Splits bytes into whole frames and the rest."""
     whole, at = [], 0
     while len(received) - at >= 7:
         transaction, protocol, length, unit = struct.unpack_from(">HHHB", received, at)
@@ -70,7 +69,7 @@ def split(received: bytes) -> tuple[list[Frame], bytes]:
 
 
 def until(condition: Callable[[], object], what: str, seconds: float = DEADLINE) -> None:
-    """Returns when the condition holds; fails when it does not within the deadline."""
+    """Waits until the condition holds; fails after the deadline."""
     deadline = time.monotonic() + seconds
     between_looks = threading.Event()
     while not condition():
@@ -80,7 +79,7 @@ def until(condition: Callable[[], object], what: str, seconds: float = DEADLINE)
 
 
 class Connection:
-    """One TCP connection to a server."""
+    """A TCP connection to a server."""
 
     def __init__(
         self,
@@ -122,12 +121,12 @@ class Connection:
         self.socket.close()
 
     def reset(self) -> None:
-        """Ends the connection with RST instead of FIN."""
+        """Closes the connection with RST instead of FIN."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.socket.close()
 
     def finish(self) -> None:
-        """Says that no more will be sent."""
+        """Half-closes the connection."""
         self.socket.shutdown(socket.SHUT_WR)
 
     def send(self, data: bytes) -> None:
@@ -135,7 +134,7 @@ class Connection:
         self.socket.sendall(data)
 
     def ask(self, pdu: bytes, unit: int = 1) -> bytes:
-        """Sends one request; the PDU of the reply, whose header must be that of the request."""
+        """Sends one request. Returns the PDU of the reply, and checks its header."""
         self._transaction = (self._transaction + 1) & 0xFFFF
         self.send(frame(pdu, unit, self._transaction))
         reply = self.receive()
@@ -146,7 +145,7 @@ class Connection:
         return reply.pdu
 
     def ask_many(self, pdus: Iterable[bytes], unit: int = 1) -> list[bytes]:
-        """Sends all requests without waiting; the PDUs of the replies, which must be in order."""
+        """Sends pipelined requests. Returns the PDUs of the replies, which must be in order."""
         asked = list(pdus)
         replies = self.converse(frames(asked, unit), len(asked))
         order = [(reply.transaction, reply.unit) for reply in replies]
@@ -155,15 +154,15 @@ class Connection:
         return [reply.pdu for reply in replies]
 
     def receive(self) -> Frame:
-        """The next frame."""
+        """Returns the next frame."""
         return self.receive_many(1)[0]
 
     def receive_many(self, count: int) -> list[Frame]:
-        """The next frames, exactly as many; more would be kept for later."""
+        """Returns exactly `count` frames; keeps further ones."""
         return self.converse(b"", count)
 
     def converse(self, data: bytes, count: int) -> list[Frame]:
-        """Sends and receives at once, so that neither side waits for the other's buffer."""
+        """Sends and receives concurrently, so that full buffers can't block either side."""
         deadline = time.monotonic() + self.deadline
         unsent = memoryview(data)
         got: list[Frame] = []
@@ -199,7 +198,7 @@ class Connection:
         self._received = kept + self._received
 
     def rest(self) -> bytes:
-        """All bytes up to the end of the connection, which must come within the deadline."""
+        """Returns all bytes until the end of the connection, which must come in time."""
         pieces, self._received = [self._received], b""
         deadline = time.monotonic() + self.deadline
         while True:
@@ -216,7 +215,7 @@ class Connection:
 
 
 def rounds(enough: threading.Event, least: int = 1) -> Iterator[int]:
-    """Counts rounds until there are enough: on a slow machine threads meet later, not never."""
+    """Counts rounds until there are enough, because threads of a slow machine meet later."""
     deadline = time.monotonic() + 3 * DEADLINE
     for number in itertools.count():
         if number >= least and enough.is_set():
