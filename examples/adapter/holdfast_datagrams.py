@@ -1,4 +1,4 @@
-"""An adapter: datagrams of text, `address value value …`, become input registers."""
+"""An adapter that writes text datagrams, `address value value …`, to input registers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Datagrams:
                         [command | {"values": values}], self.context.grant, f"{peer[0]}:{peer[1]}"
                     )
                 except (TimeoutError, ValueError, Refused):
-                    continue  # A refusal has been counted and logged.
+                    continue  # The memory access has counted and logged the refusal.
 
     def status(self) -> dict[str, object]:
         return {"port": self.context.options["port"]}

@@ -1,18 +1,18 @@
-// Lets one packet at a time to the "tcp request" node; for a function node.
+// Passes one packet at a time to the "tcp request" node; for a function node.
 //
-// A Raw Ingest connection carries one packet. "tcp request" puts all that comes before the reply on
-// one connection, and then the receiver refuses what is too much. So packets wait here until what
-// became of the one before comes back: its reply, or the error of "tcp request".
+// A Raw Ingest connection carries one packet. "tcp request" sends all messages before the reply on
+// one connection, and the receiver refuses the additional bytes. So packets wait here until the
+// outcome of the previous packet arrives: its reply, or the error of "tcp request".
 
-const PATIENCE = 15000; // Milliseconds for a reply. A receiver gives up after 10 seconds by default.
-const MOST = 100; // Packets that may wait.
+const PATIENCE = 15000; // Milliseconds to wait for a reply. A receiver's default timeout is 10 seconds.
+const MOST = 100; // The most packets that can wait.
 
 const state = context.get('state') || { number: 0, sent: null, waiting: [] };
 context.set('state', state);
 
 if (msg.rawIngest === undefined) {
     if (state.waiting.length >= MOST) {
-        node.error(`Raw Ingest: ${MOST} packets wait already, this one is dropped`, msg);
+        node.error(`Raw Ingest: ${MOST} packets are already waiting, this packet is dropped`, msg);
         return null;
     }
     state.waiting.push(msg);

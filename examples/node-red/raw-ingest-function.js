@@ -1,14 +1,14 @@
-// Makes a Raw Ingest packet of a message; for a function node.
+// Builds a Raw Ingest packet from a message; for a function node.
 //
-//   msg.payload   numbers (0 to 65535; for bits 0, 1, false, true), or a Buffer with the payload as
-//                 it is on the wire: registers high byte first, bits packed lowest first
+//   msg.payload   numbers (0 to 65535; for bits 0, 1, false, true), or a Buffer with the payload of
+//                 the packet: registers high byte first, bits packed lowest first
 //   msg.area      'coils', 'discrete_inputs', 'holding_registers' or 'input_registers'
-//   msg.address   of the first value, from 0
-//   msg.unit      unit id: a packet of format v1; or
-//   msg.memoryId  memory id: a packet of format crc; msg.crc = 'none' leaves out the CRC
-//   msg.count     how many bits a Buffer has
+//   msg.address   the address of the first value, from 0
+//   msg.unit      the unit id, for a packet of format v1; or
+//   msg.memoryId  the memory id, for a packet of format crc; msg.crc = 'none' omits the CRC
+//   msg.count     the number of bits in a Buffer
 //
-// What can't be right is refused with an error. Nothing is cut, rounded or converted.
+// Invalid values are refused with an error. They are never truncated, rounded or converted.
 
 const AREAS = ['coils', 'discrete_inputs', 'holding_registers', 'input_registers'];
 
@@ -69,7 +69,7 @@ function packet() {
     const bits = area <= 2;
     const v1 = msg.unit !== undefined;
     if (v1 === (msg.memoryId !== undefined)) {
-        refuse('a packet has either unit (format v1) or memoryId (format crc)');
+        refuse('give either unit (format v1) or memoryId (format crc)');
     }
     if (msg.crc !== undefined && (v1 || !['required', 'none'].includes(msg.crc))) {
         refuse(`crc is ${shown(msg.crc)}, allowed is 'required' or 'none' with memoryId`);

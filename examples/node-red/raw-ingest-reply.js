@@ -1,5 +1,4 @@
-// Says what the reply of a receiver means; for a function node with two outputs: written, not
-// written.
+// Interprets the reply of a receiver; for a function node with two outputs: written, not written.
 
 const reply = Buffer.isBuffer(msg.payload) && msg.payload.length === 1 ? msg.payload[0] : null;
 if (reply === 0) {

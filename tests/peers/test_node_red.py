@@ -161,7 +161,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"address": 65535}, "2 values from address 65535, the last address is 65535"),
     ({"unit": 65536}, "unit is 65536, allowed are 0 to 65535"),
     ({"unit": None}, "unit is null, allowed are 0 to 65535"),
-    ({"memoryId": 1}, "a packet has either unit (format v1) or memoryId (format crc)"),
+    ({"memoryId": 1}, "give either unit (format v1) or memoryId (format crc)"),
     ({"crc": "none"}, "crc is none, allowed is 'required' or 'none' with memoryId"),
 ]
 
@@ -170,7 +170,7 @@ def test_what_can_not_be_is_refused_with_an_error(run: Run) -> None:
     right = {"area": "holding_registers", "address": 0, "payload": [1, 2], "unit": 1}
     cases = [({**right, **changes}, text) for changes, text in WRONG]
     lacking = {key: value for key, value in right.items() if key != "unit"}
-    cases.append((lacking, "a packet has either unit (format v1) or memoryId (format crc)"))
+    cases.append((lacking, "give either unit (format v1) or memoryId (format crc)"))
     answers = run("packet", *(message for message, _ in cases))
     for (_, text), answer in zip(cases, answers, strict=True):
         assert answer["out"] is None, text
