@@ -1,4 +1,4 @@
-"""How a service is told to end: an adapter, the scanner, the gateway, an HTTP host."""
+"""A request to stop a service: an adapter, the scanner, the gateway or an HTTP host."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Stop:
-    """Says that a service is to end. From any thread."""
+    """A request to stop a service. Thread-safe."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -18,7 +18,7 @@ class Stop:
         self._then: list[Callable[[], object]] = []
 
     def set(self) -> None:
-        """Tells the service."""
+        """Requests the stop."""
         with self._lock:
             self._event.set()
             then, self._then = self._then, []
@@ -26,15 +26,15 @@ class Stop:
             callback()
 
     def is_set(self) -> bool:
-        """Whether the service is to end."""
+        """Returns whether a stop was requested."""
         return self._event.is_set()
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Waits until the service is to end, at most `seconds`; whether it is."""
+        """Waits at most `seconds` for a stop request. Returns whether there was one."""
         return self._event.wait(seconds)
 
     def then(self, callback: Callable[[], object]) -> None:
-        """Calls `callback` when the service is to end: at once, when it is already."""
+        """Calls `callback` when a stop is requested; immediately if it already was."""
         with self._lock:
             if not self._event.is_set():
                 self._then.append(callback)

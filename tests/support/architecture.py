@@ -1,8 +1,8 @@
 """Compares the imports of a tree with the table of rooms in a page such as docs/architecture.md.
 
-A room is a package, a crate, or a part of one. The table has a row for each, with the rooms and the
-libraries that it may import. Where the table lists parts of a crate or package, the row of the
-whole is for its top file only.
+A room is a package, a crate, or a part of one. The table has a row for each room, with the rooms
+and the libraries that it may import. If the table lists parts of a crate or package, the row of the
+whole applies only to its top file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ HEADINGS = ["room", "may import of ours", "may import of others"]
 
 @dataclass(frozen=True)
 class Row:
-    """What one room may import."""
+    """The allowed imports of one room."""
 
     rooms: tuple[str, ...]
     libraries: tuple[str, ...]
@@ -39,7 +39,7 @@ class Architecture:
         self.rows = _rows(page)
 
     def room(self, module: str) -> str | None:
-        """The room that a module is in."""
+        """Returns the room of a module."""
         if module in self.rows:
             return module
         above = [room for room in self.rows if _is_in(module, room)]
@@ -47,7 +47,7 @@ class Architecture:
         return parents[0] if parents else None
 
     def modules_without_a_room(self, modules: Mapping[str, Path]) -> list[str]:
-        """Files that no row is for."""
+        """Returns the files without a row."""
         return [
             f"{file}: {self.page.name} has no row for {module}"
             for module, file in modules.items()
@@ -55,12 +55,12 @@ class Architecture:
         ]
 
     def rooms_without_a_module(self, modules: Iterable[str]) -> list[str]:
-        """Rows that no file is for."""
+        """Returns the rows without a file."""
         found = {self.room(module) for module in modules}
         return [room for room in self.rows if room not in found]
 
     def forbidden(self, imports: Iterable[Import], modules: Iterable[str]) -> list[str]:
-        """Imports that the table does not allow, each with what it allows there."""
+        """Returns the imports that the table does not allow, each with what it allows."""
         ours = set(modules)
         return [
             f"{one}; {self.page.name} allows {room} to import: {self.rows[room]}"
@@ -69,7 +69,7 @@ class Architecture:
         ]
 
     def unused(self, imports: Iterable[Import], modules: Iterable[str]) -> list[str]:
-        """What the table allows and no file needs."""
+        """Returns allowed imports that no file uses."""
         ours = set(modules)
         used: set[tuple[str | None, str | None]] = set()
         for one in imports:
@@ -87,7 +87,7 @@ class Architecture:
         ]
 
     def circles_of_rooms(self, imports: Iterable[Import]) -> list[list[Import]]:
-        """Rooms that import each other, in turn."""
+        """Returns circles of rooms that import each other."""
         return circles(
             replace(one, importer=importer, target=target)
             for one in imports
@@ -102,7 +102,7 @@ class Architecture:
 
 
 def shown(circle: list[Import]) -> str:
-    """A circle for people: its imports in order."""
+    """Formats the imports of a circle, in order."""
     return "\n  ".join(["a circle of imports:", *map(str, circle)])
 
 
@@ -129,7 +129,7 @@ def _rows(page: Path) -> dict[str, Row]:
         rows[room[0]] = Row(tuple(rooms), tuple(libraries))
     for name, row in rows.items():
         if unknown := [room for room in row.rooms if room not in rows]:
-            raise ValueError(f"{page}: {name} may import {unknown}, which are no rooms")
+            raise ValueError(f"{page}: {name} may import {unknown}, which are not rooms")
     return rows
 
 

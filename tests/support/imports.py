@@ -1,4 +1,4 @@
-"""One import in the source, and what follows from many of them: circles."""
+"""An import in the source, and circles of imports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 class Import:
     """An import of `name` by `importer`, at a line of its file.
 
-    `target` is the module that holds the name: one of ours, which is one file, or a library.
+    `target` is the module that defines the name: a file of the project, or a library.
     """
 
     importer: str
@@ -29,7 +29,7 @@ class Import:
 
 
 def circles(imports: Iterable[Import]) -> list[list[Import]]:
-    """For each group of modules that import each other, the shortest circle through its first."""
+    """Returns the shortest circle for each group of modules that import each other."""
     by_importer: dict[str, dict[str, Import]] = {}
     for one in imports:
         if one.target != one.importer:
@@ -45,7 +45,7 @@ def circles(imports: Iterable[Import]) -> list[list[Import]]:
 
 
 def _group(by_importer: dict[str, dict[str, Import]], module: str) -> set[str]:
-    """Every module that `module` reaches and that reaches `module`."""
+    """Returns every module that `module` reaches and that reaches `module`."""
     reached = set(_reached(by_importer, module))
     return {one for one in reached if module in _reached(by_importer, one)}
 
@@ -61,7 +61,7 @@ def _reached(by_importer: dict[str, dict[str, Import]], start: str) -> Iterator[
 
 
 def _way(by_importer: dict[str, dict[str, Import]], start: str, end: str) -> list[Import] | None:
-    """The shortest way over imports from one module to another."""
+    """Returns the shortest path of imports from one module to another."""
     ways: deque[list[Import]] = deque([[one] for one in by_importer[start].values()])
     seen = set()
     while ways:

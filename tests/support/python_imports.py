@@ -1,4 +1,4 @@
-"""Reads the imports of a Python package, wherever in a file they are: also lazy and typing ones."""
+"""Reads all imports of a Python package, including lazy imports and imports for typing."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 def modules(package: Path) -> dict[str, Path]:
-    """The file of every module of a package, by the module's full name."""
+    """Returns the file of every module of a package, by the module's full name."""
     files = [file for suffix in ("py", "pyi") for file in package.rglob(f"*.{suffix}")]
     return {_name(file, package.parent): file for file in sorted(files)}
 
 
 def python_imports(package: Path, root: Path) -> list[Import]:
-    """All imports in a package, except of the standard library. Files are relative to `root`."""
+    """Returns all imports of a package except of the standard library; paths relative to `root`."""
     files = modules(package)
     return [
         Import(importer, file.relative_to(root), line, name, _target(name, files))
@@ -36,7 +36,7 @@ def _name(file: Path, above: Path) -> str:
 
 
 def _target(name: str, files: dict[str, Path]) -> str:
-    """The module of ours that a name is in, or the name itself if it is of a library."""
+    """Returns the project's module of a name; the name itself if it is from a library."""
     module = name
     while module not in files and "." in module:
         module = module.rpartition(".")[0]
@@ -44,7 +44,7 @@ def _target(name: str, files: dict[str, Path]) -> str:
 
 
 def _names(file: Path, importer: str, files: dict[str, Path]) -> Iterator[tuple[int, str]]:
-    """Lines and full names of what a file imports."""
+    """Returns the lines and the full names of a file's imports."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), file)):
         match node:
             case ast.Import():
@@ -58,7 +58,7 @@ def _names(file: Path, importer: str, files: dict[str, Path]) -> Iterator[tuple[
             ):
                 yield node.lineno, name
             case ast.Constant(value=str(name)) if name in files and "." in name:
-                # The name of a module as text: what a table of lazy imports holds.
+                # The name of a module as a string, as in a table of lazy imports.
                 yield node.lineno, name
 
 

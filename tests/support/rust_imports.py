@@ -1,7 +1,7 @@
-"""Reads the imports of Rust crates: `use` items, and paths written out where they are used.
+"""Reads the imports of Rust crates: `use` items, and paths in the code.
 
-Comments, strings and tests do not count. A module's re-export of what is below it is its face and
-not an import: a path through it leads to the file that defines the name.
+Comments, strings and tests are ignored. A module's re-export of its submodules is not an import: a
+path through it leads to the file that defines the name.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ IDENT = re.compile(r"[^\W\d]\w*")
 
 @dataclass(frozen=True)
 class Token:
-    """A word, `::`, or another character; and its line."""
+    """A word, `::`, or another character, and its line."""
 
     text: str
     line: int
@@ -42,7 +42,7 @@ class Token:
 
 @dataclass(frozen=True)
 class WrittenPath:
-    """A path as it is written, with the depth of modules inside the file that it is in."""
+    """A path in the source, with the depth of nested modules inside its file."""
 
     segments: tuple[str, ...]
     line: int
@@ -53,7 +53,7 @@ class WrittenPath:
 
 @dataclass
 class Module:
-    """One file: the modules below it, the paths in it, and the names that `use` items give."""
+    """One file: its submodules, its paths, and the names from `use` items."""
 
     name: str
     file: Path
@@ -63,22 +63,22 @@ class Module:
 
 
 def dependencies(crate: Path) -> set[str]:
-    """What the manifest of a crate names as its dependencies, as its code calls them."""
+    """Returns the dependencies in a crate's manifest, as the code names them."""
     manifest = tomllib.loads((crate / "Cargo.toml").read_text(encoding="utf-8"))
     tables = [manifest, *manifest.get("target", {}).values()]
     return {name.replace("-", "_") for table in tables for name in table.get("dependencies", {})}
 
 
 def crate_name(crate: Path) -> str:
-    """The name of a crate, as the code of others calls it."""
+    """Returns the name of a crate, as the code of other crates names it."""
     manifest = tomllib.loads((crate / "Cargo.toml").read_text(encoding="utf-8"))
     return str(manifest["package"]["name"]).replace("-", "_")
 
 
 def rust_imports(modules: Iterable[Module], crates: Iterable[Path], root: Path) -> list[Import]:
-    """All imports in the modules of crates, except of the standard library.
+    """Returns all imports in the modules of crates, except the standard library.
 
-    Files are relative to `root`.
+    Paths are relative to `root`.
     """
     house = {module.name: module for module in modules}
     outside = {crate_name(crate): dependencies(crate) | STANDARD for crate in crates}
@@ -100,7 +100,7 @@ def rust_imports(modules: Iterable[Module], crates: Iterable[Path], root: Path) 
 
 
 def exceptions_from_python(modules: Iterable[Module], root: Path, importer: str) -> list[Import]:
-    """The exceptions that native code takes from Python when it runs, as imports of `importer`."""
+    """Returns the exceptions that native code imports from Python at run time."""
     found = []
     for module in modules:
         text = module.file.read_text(encoding="utf-8")
@@ -111,7 +111,7 @@ def exceptions_from_python(modules: Iterable[Module], root: Path, importer: str)
 
 
 def modules(crate: Path) -> list[Module]:
-    """Every file of a crate that is not only for tests, read."""
+    """Reads every file of a crate, except test files."""
     found = []
     waiting = [Module(crate_name(crate), crate / "src" / "lib.rs")]
     while waiting:
@@ -128,7 +128,7 @@ def modules(crate: Path) -> list[Module]:
 
 
 def tokens(text: str) -> Iterator[Token]:
-    """The tokens of a source, without comments, strings, numbers and lifetimes."""
+    """Returns the tokens of a source, without comments, strings, numbers and lifetimes."""
     at, line = 0, 1
     while at < len(text):
         match = TOKEN.match(text, at)
@@ -150,7 +150,7 @@ def _comment_end(text: str, at: int) -> int:
 
 
 def _without_tests(source: list[Token]) -> list[Token]:
-    """The tokens without attributes, and without the items that are only for tests."""
+    """Returns the tokens without attributes and without items that are only for tests."""
     kept = []
     at = 0
     while at < len(source):
@@ -174,7 +174,7 @@ def _item_end(source: list[Token], at: int) -> int:
 
 
 def _closing(source: list[Token], at: int) -> int:
-    """Where the bracket at a place is closed."""
+    """Returns the position of the closing bracket."""
     depth = 0
     for index in range(at, len(source)):
         depth += (source[index].text in "([{") - (source[index].text in ")]}")
@@ -184,7 +184,7 @@ def _closing(source: list[Token], at: int) -> int:
 
 
 class _Reader:
-    """Goes through the tokens of a file once."""
+    """Reads the tokens of a file in one pass."""
 
     def __init__(self, module: Module, source: list[Token]) -> None:
         self.module = module
@@ -237,7 +237,7 @@ class _Reader:
             self.module.paths.append(WrittenPath(tuple(segments), line, len(self.inner)))
 
     def _use(self, start: tuple[str, ...], exported: bool) -> None:
-        """Reads one tree of a `use` item, to the `;`, `,` or `}` behind it."""
+        """Reads one tree of a `use` item, up to the next `;`, `,` or `}`."""
         segments = list(start)
         line = self.source[self.at].line
         if self.text() == "::":
@@ -274,14 +274,14 @@ class _Reader:
 
 
 class _Resolver:
-    """Follows a path to the file that defines what it names."""
+    """Finds the file that defines the name of a path."""
 
     def __init__(self, house: dict[str, Module], outside: dict[str, set[str]]) -> None:
         self.house = house
         self.outside = outside
 
     def absolute(self, module: Module, path: WrittenPath) -> tuple[str, ...] | None:
-        """The path from the root of a crate; nothing for names that are local to their file."""
+        """Returns the path from the root of a crate; `None` for names local to their file."""
         here = module.name.split("::")
         first, *rest = path.segments
         if first == "crate":
@@ -302,9 +302,9 @@ class _Resolver:
         return (*start_of_known, *rest) if start_of_known else None
 
     def target(self, path: tuple[str, ...], seen: frozenset[object] = frozenset()) -> str | None:
-        """The module of ours that defines what a path names, or the crate of others it is in.
+        """Returns the project's module, or the library, that defines the name of a path.
 
-        Nothing if the path only names a module, to be the start of other paths.
+        Returns `None` if the path only names a module, as the start of other paths.
         """
         if path[0] not in self.outside:
             return path[0]

@@ -1,4 +1,4 @@
-"""What adapters show of a running appliance. Whoever runs them provides it."""
+"""The interface of the diagnostics that adapters show. The appliance implements it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Any, Protocol
 
 
 class DiagnosticsSource(Protocol):
-    """Snapshots of counters and states, from any thread: plain data, nothing secret."""
+    """Snapshots of counters and states. Thread-safe; plain data without secrets."""
 
     def memories(self) -> dict[str, Any]:
-        """Each memory: its areas with start and size, sealed or not, how often it opened."""
+        """Returns, for each memory, the start and size of its areas and the state of its seal."""
 
     def stats(self) -> dict[str, Any]:
-        """Every counter, since the start."""
+        """Returns all counters since the start."""
 
     def adapter(self, name: str) -> dict[str, Any] | None:
-        """How one adapter does, and what came in by it; `None` when there is none."""
+        """Returns the state and the counters of one adapter; `None` if it does not exist."""
