@@ -1,4 +1,4 @@
-"""Takes the pictures of docs/gateway.md: `python tests/support/gateway_pictures.py [NAME ...]`."""
+"""Takes pictures for docs/gateway.md: `python -m support.gateway_pictures [NAME …]` in `tests`."""
 
 from __future__ import annotations
 

@@ -197,10 +197,11 @@ class Mqtt:
         self._connected_at = time.monotonic()
 
     def _subscribe(self, link: BrokerConnection, topic: _Topic, *, resumed: bool) -> None:
-        """Subscribes to a topic, unless the resumed session already has the subscription.
+        """Subscribes to a topic, again if the session was resumed.
 
-        With MQTT 3.1.1, subscribing again would deliver retained messages again. With MQTT 5 the
-        retain handling option prevents that.
+        With MQTT 3.1.1 it skips a topic that this process subscribed to in the resumed session,
+        because the broker would send retained messages again. With MQTT 5 the retain handling
+        option prevents that.
         """
         again = resumed and topic.known is not None
         if again and self._settings.version != "5":
