@@ -12,6 +12,7 @@ mod cost;
 mod device;
 mod forward;
 mod handshake;
+mod health;
 mod learned;
 mod link;
 pub mod plan;
@@ -24,8 +25,9 @@ mod thread;
 
 pub use device::{DeviceSettings, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
+pub use health::Health;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};
-pub use status::{Fault, Health, StatusSettings};
+pub use status::{Fault, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::status::{Fault, Health, Status};
+use super::health::Health;
+use super::status::{Fault, Status};
 use crate::counter::Counter;
 
 /// Counters and health of a device.
@@ -53,9 +54,8 @@ pub struct DeviceCounters {
 }
 
 impl DeviceState {
-    /// An answer is stale after three intervals plus the timeout.
     pub(super) fn set_stale_after(&self, interval: Duration, timeout: Duration) {
-        let after = interval.saturating_mul(3).saturating_add(timeout).as_millis();
+        let after = Health::stale_after(interval, timeout).as_millis();
         self.stale_after.store(u64::try_from(after).unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 
@@ -63,15 +63,8 @@ impl DeviceState {
         if self.broken.load(Ordering::Relaxed) {
             return Health::Error;
         }
-        match self.health.load(Ordering::Relaxed) {
-            0 => Health::Unknown,
-            1 if self.age().is_some_and(|age| age > self.stale_after()) => Health::Stale,
-            1 => Health::Ok,
-            code => {
-                debug_assert_eq!(code, Health::Error.code());
-                Health::Error
-            }
-        }
+        let health = Health::from_code(self.health.load(Ordering::Relaxed));
+        health.at(self.age(), self.stale_after())
     }
 
     /// The last error as in the status block: an exception code, or 0x8000 plus the number of a

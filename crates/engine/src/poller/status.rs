@@ -4,6 +4,8 @@ use std::sync::Arc;
 
 use holdfast_memory::{Access, Area, Memory, Refusal, Write};
 
+use super::health::Health;
+
 /// Registers of one block.
 pub const STATUS_BLOCK_LEN: u16 = 30;
 
@@ -32,37 +34,6 @@ impl StatusSettings {
         let span = self.memory.span(self.area);
         let inside = |address| span.holds(address, usize::from(STATUS_BLOCK_LEN));
         !self.area.is_bits() && self.address().is_some_and(inside)
-    }
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Health {
-    /// The device has not been polled yet.
-    #[default]
-    Unknown,
-    Ok,
-    Error,
-    /// The device answers, but its polls are late.
-    Stale,
-}
-
-impl Health {
-    pub const fn code(self) -> u16 {
-        match self {
-            Health::Unknown => 0,
-            Health::Ok => 1,
-            Health::Error => 2,
-            Health::Stale => 3,
-        }
-    }
-
-    pub const fn name(self) -> &'static str {
-        match self {
-            Health::Unknown => "unknown",
-            Health::Ok => "ok",
-            Health::Error => "error",
-            Health::Stale => "stale",
-        }
     }
 }
 

@@ -10,6 +10,7 @@ mod diagnostics;
 mod encoded;
 mod function;
 pub mod identification;
+pub mod limit;
 mod range;
 pub mod reply;
 mod request;
@@ -32,17 +33,3 @@ pub const MAX_LEN: usize = 253;
 
 /// A buffer for one PDU of any kind.
 pub type Buffer = [u8; MAX_LEN];
-
-/// The most items per request (V1.1b3, 6).
-pub mod limit {
-    /// Coils or discrete inputs that functions 1 and 2 read.
-    pub const READ_BITS: u16 = 2000;
-    /// Registers that functions 3, 4 and 23 read.
-    pub const READ_REGISTERS: u16 = 125;
-    /// Coils that function 15 writes.
-    pub const WRITE_BITS: u16 = 1968;
-    /// Registers that function 16 writes.
-    pub const WRITE_REGISTERS: u16 = 123;
-    /// Registers that function 23 writes. Its request also carries a read.
-    pub const READ_WRITE_REGISTERS: u16 = 121;
-}

@@ -10,7 +10,7 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::poller::caught::spawn_watched;
-use crate::poller::status::Health;
+use crate::poller::health::Health;
 
 #[test]
 fn polls_stay_due_at_whole_intervals_after_missed_polls() {
