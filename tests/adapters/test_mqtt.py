@@ -123,6 +123,8 @@ def test_a_retained_message_is_not_delivered_again_when_only_the_connection_brok
     broker.publish("plant/ingest", text(command([42])), "-r", "-q", "1")
     running = rig.run(settings(proxy.url, version=version))
     running.wait_until_received(1)
+    # A message whose acknowledgement has not come is sent again, and rightly so.
+    wire.until(lambda: "Received PUBACK from holdfast-test" in broker.log, "acknowledged")
     rig.memory.write("holding_registers", 0, [43])
 
     proxy.cut()

@@ -623,6 +623,7 @@ def test_a_late_reply_is_thrown_away_where_replies_have_no_ids(
     client = dial(device.url, timeout=SHORT)
     with pytest.raises(holdfast.RequestTimeout):
         client.read_holding_registers(7, 1)
+    device.await_requests(1)
     device.asked[0].answer()
     client.timeout = wire.DEADLINE
 

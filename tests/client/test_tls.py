@@ -26,7 +26,7 @@ from holdfast.client.target import parse
 from support import wire
 from support.cli import answer, done, failure, usage_error
 from support.faces import FACES, dialling, run
-from support.hostile import Asked, Stream, silent
+from support.hostile import Asked, Stream, good, silent
 from support.pymodbus_server import Pymodbus, tour, unit_1
 from support.secured import VERSIONS, Authority, Relay, context
 
@@ -518,13 +518,17 @@ def test_a_late_reply_is_dropped(
     dial: Dial, version: str, authority: Authority, plc: Owner
 ) -> None:
     with (
-        Stream("tcp", silent) as device,
+        Stream("tcp", good, silent) as device,
         Relay(("127.0.0.1", device.port), context(plc, version)) as relay,
     ):
-        client = dial(relay.url(ca=authority.ca), timeout=SHORT)
+        client = dial(relay.url(ca=authority.ca), timeout=wire.DEADLINE)
+        assert client.read_holding_registers(6, 1) == [6]
+        client.timeout = SHORT
         with pytest.raises(holdfast.RequestTimeout):
             client.read_holding_registers(7, 1)
-        device.asked[0].answer()
+        device.await_requests(2)
+        device.asked[1].answer()
+        client.timeout = wire.DEADLINE
         wire.until(lambda: client.read_holding_registers(8, 1) == [8] and client.late == 1, "late")
         assert relay.connections == 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
@@ -285,11 +286,15 @@ def test_a_device_that_is_silent_is_no_map(gateway: Running) -> None:
 
 
 def test_a_device_that_falls_silent_ends_its_map(gateway: Running) -> None:
+    silent = threading.Event()
+
     def answer(pdu: bytes) -> bytes | None:
-        return registers(pdu) if len(device.asked) < 20 else None
+        if int.from_bytes(pdu[1:3]) >= 1000:
+            silent.set()
+        return None if silent.is_set() else registers(pdu)
 
     with FakeDevice(answer) as device:
-        options = {"areas": ["holding_registers"], "timeout": 20}
+        options = {"areas": ["holding_registers"], "timeout": 200}
         result = mapped(gateway, device.port, **options).next("result")
     assert result["success"] is False
     assert "ceased to answer" in result["error"]

@@ -314,7 +314,8 @@ def test_every_fault_has_its_code_and_writes_nothing(
     good.set()
     reads = [read("holding_registers", 5, 3, ("input_registers", 5))]
     with Fake(lambda request: data(request, 9) if good.is_set() else answer(request)) as fake:
-        meter = device(fake.url, *reads, timeout=0.1, status=block(0))
+        timeout = 0.1 if code == TIMEOUT else wire.DEADLINE
+        meter = device(fake.url, *reads, timeout=timeout, status=block(0))
         appliance = run(configuration({"meter": meter}))
         until_told(appliance, health=OK)
         good.clear()
@@ -642,7 +643,7 @@ def test_units_of_a_serial_line_are_polled_in_turn_with_a_dead_one(
         devices = {
             f"unit-{unit}": device(
                 line, read("holding_registers", 0, 50, ("input_registers", unit * 50)), unit=unit,
-                timeout=0.2, status=block(slot),
+                timeout=0.2 if unit == 9 else wire.DEADLINE, status=block(slot),
             )
             for slot, unit in enumerate((7, 8, 9))
         }  # fmt: skip

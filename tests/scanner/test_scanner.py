@@ -397,7 +397,8 @@ def test_the_prefix_of_all_subjects_can_be_chosen(
 def test_who_subscribes_to_known_tags_of_a_slow_device_gets_values_and_the_state_soon(
     caller: Caller, server: holdfast.Server, who: str
 ) -> None:
-    request = subscription(server, tag("a", 0), tag("b", 1), scanRate=3_600_000)
+    rates = {"scanRate": 3_600_000, "timeout": 30_000}
+    request = subscription(server, tag("a", 0), tag("b", 1), **rates)
     data = caller.listen("modbus.data.plc1")
     assert caller.request("modbus.subscribe", request)["success"]
     assert {data.next()["variableId"] for _ in range(2)} == {"a", "b"}
@@ -427,7 +428,9 @@ def test_who_leaves_a_slow_device_causes_no_scan(
     monkeypatch.setattr(polling, "_poller", Spy())
     data = caller.listen("modbus.data.plc1")
     for who, id, address in (("hmi", "a", 0), ("historian", "b", 100)):
-        request = subscription(server, tag(id, address), scanRate=3_600_000, subscriberId=who)
+        # A scan without an answer in time would be followed by the next an hour later.
+        rates = {"scanRate": 3_600_000, "timeout": 30_000}
+        request = subscription(server, tag(id, address), subscriberId=who, **rates)
         assert caller.request("modbus.subscribe", request)["success"]
         while data.next()["variableId"] != id:
             pass
