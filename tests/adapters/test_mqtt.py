@@ -554,7 +554,8 @@ def test_a_password_too_long_is_a_failure_like_others(rig: Rig, tmp_path: Path) 
     ),
 )
 @hypothesis_settings(
-    deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=50,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 def test_one_bad_command_at_the_end_of_a_batch_changes_nothing(
     batches: Batches, good: list[tuple[int, list[int]]], bad: dict[str, Any]

@@ -100,8 +100,7 @@ def bad_batches(draw: st.DrawFn) -> tuple[list[dict[str, Any]], int]:
 
 random_requests = settings(
     max_examples=150,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 
 

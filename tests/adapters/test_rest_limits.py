@@ -436,8 +436,7 @@ def test_what_is_not_http_is_refused(service: web.Service, connect: Connect, sen
 
 @settings(
     max_examples=100,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(st.data())
 def test_bytes_of_any_kind_do_no_harm(hasty: web.Service, data: st.DataObject) -> None:
@@ -455,8 +454,7 @@ def test_bytes_of_any_kind_do_no_harm(hasty: web.Service, data: st.DataObject) -
 
 @settings(
     max_examples=50,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(cuts=st.lists(st.integers(0, 400), max_size=12), way=st.sampled_from(["plain", "chunked"]))
 def test_a_request_may_come_in_any_pieces(service: web.Service, cuts: list[int], way: str) -> None:

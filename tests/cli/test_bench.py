@@ -11,7 +11,7 @@ import signal
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.tools.load import Latencies, Load
@@ -150,7 +150,6 @@ def test_progress_is_told(server: holdfast.Server) -> None:
 
 
 @given(st.lists(st.floats(1e-6, 1000), min_size=1))
-@settings(deadline=None)
 def test_quantiles_are_right_to_2_percent(times: list[float]) -> None:
     latencies = Latencies()
     for each in times:

@@ -1066,7 +1066,8 @@ ANYTHING = st.tuples(st.lists(FRAMES, min_size=1, max_size=3), st.booleans())
 
 @pytest.mark.parametrize("kind", [*STREAMS, "udp"])
 @settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=100,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(ANYTHING)
 def test_whatever_comes_is_a_reply_only_if_it_is_one(

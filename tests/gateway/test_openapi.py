@@ -88,7 +88,6 @@ def test_what_is_answered_is_what_the_document_says(
     @seed(7)
     @settings(
         max_examples=EXAMPLES,
-        deadline=None,
         database=None,
         phases=[Phase.explicit, Phase.generate],
         suppress_health_check=list(HealthCheck),

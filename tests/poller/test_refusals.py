@@ -181,7 +181,7 @@ def test_a_write_that_succeeds_ends_a_rest(poller: Poller) -> None:
         assert polls[0][2][0][4] == 0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.sets(st.integers(0, 60), min_size=1, max_size=40),
     st.sets(st.integers(0, 61), max_size=8),

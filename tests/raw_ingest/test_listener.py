@@ -875,7 +875,6 @@ def packets(draw: st.DrawFn, kind: str) -> bytes:
 
 @settings(
     max_examples=400,
-    deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())

@@ -169,7 +169,7 @@ def test_requests_may_arrive_in_pieces_of_any_size(
     assert client.is_quiet()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_requests_may_arrive_cut_anywhere(data: st.DataObject, sturdy: Appliance) -> None:
     values = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
@@ -294,7 +294,7 @@ def test_a_frame_longer_than_any_ends_the_connection_behind_what_was_answered(
         assert other.ask(READ) == ZERO
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(garbage=st.binary(max_size=2000))
 def test_no_bytes_end_the_service(garbage: bytes, sturdy: Appliance) -> None:
     with RtuConnection(address(sturdy)) as noisy:

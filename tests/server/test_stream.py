@@ -479,7 +479,6 @@ units = st.sampled_from([1] * 12 + [0, 2, 255])
 @pytest.mark.parametrize("access", ["read-write", "read-only"])
 @settings(
     max_examples=150,
-    deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(asked=st.lists(st.tuples(units, requests), min_size=1, max_size=60), seed=st.integers(0, 99))

@@ -182,7 +182,7 @@ datagrams = st.one_of(
 )
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
 @given(garbage=st.lists(datagrams, max_size=20))
 def test_no_datagram_ends_the_service(garbage: list[bytes], sturdy: Appliance) -> None:
     with Datagrams(address(sturdy)) as client:

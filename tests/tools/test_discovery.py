@@ -86,7 +86,6 @@ def follow_cost(present: Iterable[range], limit: int) -> int:
     area=st.sampled_from(AREAS),
     quantity=st.integers(1, 2000),
 )
-@settings(deadline=None)
 def test_exact_finds_the_truth_with_few_reads(
     layout: list[range], area: Area, quantity: int
 ) -> None:
@@ -104,7 +103,6 @@ def test_exact_finds_the_truth_with_few_reads(
     largest=st.integers(1, 125),
     code=st.sampled_from([2, 3, 4, "timeout"]),
 )
-@settings(deadline=None)
 def test_exact_finds_the_truth_on_a_device_that_reads_only_so_many_at_once(
     layout: list[range], largest: int, code: Outcome
 ) -> None:
@@ -121,7 +119,7 @@ def test_too_large_blocks_are_not_tried_for_ever() -> None:
 
 
 @given(layout=layouts(last=65536), step=st.integers(1, 3000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_fast_finds_every_range_that_holds_a_sample_and_nothing_that_is_not_there(
     layout: list[range], step: int
 ) -> None:
@@ -143,7 +141,7 @@ def test_fast_finds_ranges_where_devices_like_to_have_them(layout: list[range]) 
 
 
 @given(layout=layouts(last=65536))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_fast_takes_few_reads(layout: list[range]) -> None:
     found = mapped(device(layout))
     assert found.requests <= 620 + follow_cost(layout, 125) + 8 * len(layout)
@@ -252,7 +250,7 @@ def test_what_can_not_be_is_refused(options: dict[str, object], told: str) -> No
     sizes=st.lists(st.integers(1, 500), min_size=4, max_size=4),
     exact=st.booleans(),
 )
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_a_real_server_is_mapped(starts: list[int], sizes: list[int], exact: bool) -> None:
     extents = dict(zip(AREAS, zip(starts, sizes, strict=True), strict=True))
     memory = holdfast.Memory(**extents)  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast import values
@@ -152,7 +152,6 @@ def test_zero_can_be_known() -> None:
     assert guess([[0, 0]], like=0)[0].reasons[0] == "equal"
 
 
-@settings(deadline=None)
 @given(
     found=st.lists(st.lists(st.integers(0, 65535), min_size=4, max_size=4), min_size=1, max_size=4),
     anywhere=st.booleans(),
@@ -200,7 +199,6 @@ def test_floats_are_told_shortly(value: float, kind: str, text: str) -> None:
     assert shortest(value, kind) == text
 
 
-@settings(deadline=None)
 @given(st.floats(width=32, allow_nan=False))
 def test_a_short_float_is_the_same_float(value: float) -> None:
     assert struct.pack("f", float(shortest(value, "float32"))) == struct.pack("f", value)

@@ -139,7 +139,6 @@ def test_what_a_vector_says_is_wrong_is_refused(case: dict[str, Any]) -> None:
 # There and back
 
 
-@settings(deadline=None)
 @given(typed())
 def test_decode_undoes_encode(case: tuple[str, str, Any]) -> None:
     name, order, value = case
@@ -151,7 +150,7 @@ def test_decode_undoes_encode(case: tuple[str, str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", SIZES)
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_every_order_puts_bytes_where_its_definition_says(name: str, data: st.DataObject) -> None:
     value = data.draw(single_values(name))
@@ -163,7 +162,6 @@ def test_every_order_puts_bytes_where_its_definition_says(name: str, data: st.Da
         assert decode(wire, name, order) == value
 
 
-@settings(deadline=None)
 @given(st.sampled_from([2, 4, 6, 8, 12]), st.data())
 def test_an_order_applied_twice_changes_nothing(size: int, data: st.DataObject) -> None:
     order = data.draw(st.sampled_from(orders_of(size)))
@@ -174,7 +172,6 @@ def test_an_order_applied_twice_changes_nothing(size: int, data: st.DataObject) 
     assert decode(registers_of(once), f"bytes:{size}", order) == field
 
 
-@settings(deadline=None)
 @given(st.sampled_from(sorted(SIZES)), st.data())
 def test_an_array_is_its_elements_one_after_the_other(name: str, data: st.DataObject) -> None:
     order = data.draw(st.sampled_from(orders_of(SIZES[name])))
@@ -185,7 +182,6 @@ def test_an_array_is_its_elements_one_after_the_other(name: str, data: st.DataOb
     assert decode(registers, f"{name}[{len(elements)}]", order) == elements
 
 
-@settings(deadline=None)
 @given(typed())
 def test_all_forms_of_registers_decode_alike(case: tuple[str, str, Any]) -> None:
     name, order, value = case
@@ -424,13 +420,11 @@ def test_a_register_that_is_not_zero_is_true() -> None:
     assert decode([0x0100, 0, 2], "bool[3]") == [True, False, True]
 
 
-@settings(deadline=None)
 @given(st.integers(0, 65535), st.integers(0, 15))
 def test_bit_0_is_the_least_significant(register: int, bit: int) -> None:
     assert decode([register], f"bit:{bit}") is bool(register >> bit & 1)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 65535), st.integers(0, 15))
 def test_a_bit_encodes_to_a_mask_that_changes_no_other(register: int, bit: int) -> None:
     assert register | encode(True, f"bit:{bit}")[0] == register | 1 << bit
