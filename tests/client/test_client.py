@@ -27,7 +27,7 @@ from holdfast.server import Identity
 from holdfast.types import AREAS
 from support import lines, transports, wire
 from support.faces import FACES, Awaited, Dial, Face, dialling, run
-from support.hostile import Hostile, Stream, Udp, silent
+from support.fake_device import ScriptedDevice, Stream, Udp, silent
 from support.paths import DOCS
 from support.running import endpoint
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Iterator, Sequence
 
     from holdfast.types import Area
-    from support.hostile import Behaviour
+    from support.fake_device import Behaviour
     from support.running import Run, Serve
 
 REGISTERS = [0, 1, 255, 256, 32767, 32768, 65535]
@@ -696,14 +696,14 @@ def test_no_more_requests_are_in_flight_than_allowed() -> None:
             async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=3) as plc:
                 tasks = [asyncio.create_task(plc.read_coils(at, 1)) for at in range(5)]
                 await asyncio.to_thread(device.await_requests, 3)
-                device.asked[1].answer()
+                device.requests[1].answer()
                 assert await tasks[1] == [False]
                 await asyncio.to_thread(device.await_requests, 4)
                 device.then = lambda asked: asked.answer()
-                for asked in [device.asked[3], device.asked[0], device.asked[2]]:
+                for asked in [device.requests[3], device.requests[0], device.requests[2]]:
                     asked.answer()
                 assert await gathered(tasks) == [[False]] * 5
-                assert [asked.pdu[2] for asked in device.asked] == [0, 1, 2, 3, 4]
+                assert [asked.pdu[2] for asked in device.requests] == [0, 1, 2, 3, 4]
 
     run(main)
 
@@ -723,7 +723,7 @@ def test_a_call_that_is_cancelled_before_it_ran_sends_nothing() -> None:
             async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
                 await cancelled(asyncio.create_task(plc.write_register(0, 1)))
                 assert await plc.read_holding_registers(7, 1) == [7]
-                assert [asked.pdu[0] for asked in device.asked] == [3]
+                assert [asked.pdu[0] for asked in device.requests] == [3]
 
     run(main)
 
@@ -737,7 +737,7 @@ def test_a_call_that_is_cancelled_while_it_connects_sends_nothing() -> None:
                 await cancelled(both[0])
                 await both[1]
                 assert await plc.read_holding_registers(1, 1) == [1]
-                assert [asked.pdu[2] for asked in device.asked] == [1, 1]
+                assert [asked.pdu[2] for asked in device.requests] == [1, 1]
                 assert device.connections == 1
 
     run(main)
@@ -751,7 +751,7 @@ def test_the_only_call_may_be_cancelled_while_it_connects() -> None:
                 await asyncio.sleep(0)
                 await cancelled(task)
                 assert await plc.read_holding_registers(7, 1) == [7]
-                assert len(device.asked) == 1
+                assert len(device.requests) == 1
 
     run(main)
 
@@ -770,13 +770,13 @@ def test_a_call_that_is_cancelled_in_the_queue_sends_nothing_and_keeps_no_place(
                 tasks = [asyncio.create_task(call) for call in calls]
                 await asyncio.to_thread(device.await_requests, 1)
                 await cancelled(tasks[1])
-                device.asked[0].answer()
+                device.requests[0].answer()
                 await tasks[0]
                 with pytest.raises(asyncio.CancelledError):
                     await tasks[2]
                 assert await tasks[3] == [3]
                 assert await plc.read_holding_registers(9, 1) == [9]
-                assert [asked.pdu[2] for asked in device.asked] == [0, 3, 9]
+                assert [asked.pdu[2] for asked in device.requests] == [0, 3, 9]
 
     run(main)
 
@@ -788,7 +788,7 @@ def test_the_reply_to_a_cancelled_call_is_dropped_and_counted() -> None:
                 task = asyncio.create_task(plc.read_holding_registers(1, 1))
                 await asyncio.to_thread(device.await_requests, 1)
                 await cancelled(task)
-                device.asked[0].answer()
+                device.requests[0].answer()
                 assert await plc.read_holding_registers(2, 1) == [2]
                 assert plc.late == 1
                 assert device.connections == 1
@@ -805,7 +805,7 @@ def test_a_call_may_be_cancelled_while_its_reply_is_read() -> None:
                 await asyncio.to_thread(device.await_requests, 1)
                 # Both happen in one turn of the loop, first this, then that.
                 asyncio.get_running_loop().call_soon(task.cancel)
-                device.asked[0].answer()
+                device.requests[0].answer()
                 with pytest.raises(asyncio.CancelledError):
                     await task
                 assert await plc.read_holding_registers(2, 1) == [2]
@@ -826,12 +826,12 @@ def test_a_call_in_a_thread_may_be_cancelled(kind: str) -> None:
                 await cancelled(waiting)
                 await cancelled(under_way)
                 assert await plc.read_holding_registers(7, 1) == [7]
-                assert [asked.pdu[2] for asked in device.asked] == [1, 7]
+                assert [asked.pdu[2] for asked in device.requests] == [1, 7]
 
     run(main)
 
 
-def device_of(kind: str, *script: Behaviour, **options: Any) -> Hostile:
+def device_of(kind: str, *script: Behaviour, **options: Any) -> ScriptedDevice:
     return Udp(*script, **options) if kind == "udp" else Stream(kind, *script, **options)
 
 
@@ -867,7 +867,7 @@ def test_calls_that_wait_are_told_that_the_client_was_closed() -> None:
             assert device.connections == 1
             assert await plc.read_holding_registers(7, 1) == [7]
             assert device.connections == 2
-            assert len(device.asked) == 3
+            assert len(device.requests) == 3
             await plc.close()
 
     run(main)
@@ -885,7 +885,7 @@ def test_calls_that_wait_for_a_connection_are_told_that_the_client_was_closed() 
             for task in tasks:
                 with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
                     await task
-            assert device.asked == []
+            assert device.requests == []
 
     run(main)
 
@@ -904,7 +904,7 @@ def test_calls_that_wait_for_a_thread_are_told_that_the_client_was_closed() -> N
             for task in tasks[1:]:
                 with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
                     await task
-            assert len(device.asked) == 1
+            assert len(device.requests) == 1
             assert await plc.read_holding_registers(7, 1) == [7]
             await plc.close()
 

@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 import holdfast
 from support import lines, wire
 from support.faces import FACES, Dial, dialling, run
-from support.hostile import (
+from support.fake_device import (
     LINES,
     STREAMS,
     Asked,
     Connection,
-    Hostile,
+    ScriptedDevice,
     Serial,
     Stream,
     Udp,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from support.hostile import Behaviour
+    from support.fake_device import Behaviour
 
 SHORT = 0.1
 """A timeout that is waited for."""
@@ -55,10 +55,12 @@ class Make:
         self._stack = stack
         self._folder = folder
 
-    def __call__(self, kind: str, *script: Behaviour, **options: Any) -> Hostile:
+    def __call__(self, kind: str, *script: Behaviour, **options: Any) -> ScriptedDevice:
         return self._stack.enter_context(self._made(kind, script, options))
 
-    def _made(self, kind: str, script: tuple[Behaviour, ...], options: dict[str, Any]) -> Hostile:
+    def _made(
+        self, kind: str, script: tuple[Behaviour, ...], options: dict[str, Any]
+    ) -> ScriptedDevice:
         if kind in LINES:
             mode = lines.RTU if kind == "rtu" else lines.ASCII
             return Serial(mode, self._folder / "line", *script, **options)
@@ -73,7 +75,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
         yield Make(stack, tmp_path)
 
 
-def connections(device: Hostile) -> int:
+def connections(device: ScriptedDevice) -> int:
     assert isinstance(device, Stream)
     return device.connections
 
@@ -148,13 +150,13 @@ TCP_ONLY: dict[str, tuple[Behaviour, str]] = {
 }
 
 
-def invalid_then_good(device: Hostile, dial: Dial, text: str = "invalid response") -> None:
+def invalid_then_good(device: ScriptedDevice, dial: Dial, text: str = "invalid response") -> None:
     """The next call after what is no reply has a new connection."""
     client = dial(device.url)
     with pytest.raises(holdfast.InvalidResponse, match=text):
         client.read_holding_registers(7, 2)
     assert client.read_holding_registers(8, 2) == [8, 9]
-    assert len(device.asked) == 2
+    assert len(device.requests) == 2
 
 
 @pytest.mark.parametrize("lie", WRONG_PDUS)
@@ -247,7 +249,7 @@ def test_a_write_is_done_when_the_device_says_the_same(
         client.write_register(3, 7)
     client.write_register(3, 7)
 
-    assert len(device.asked) == 2
+    assert len(device.requests) == 2
 
 
 # Identification
@@ -274,7 +276,7 @@ def test_an_identification_that_makes_no_sense_is_refused(
     device = make("tcp", replies(reply))
     with pytest.raises(holdfast.InvalidResponse, match=text):
         dial(device.url).identify()
-    assert len(device.asked) == 1
+    assert len(device.requests) == 1
 
 
 def test_an_identification_ends_though_a_device_always_has_more(make: Make, dial: Dial) -> None:
@@ -285,7 +287,7 @@ def test_an_identification_ends_though_a_device_always_has_more(make: Make, dial
     device = make("tcp", then=more)
     with pytest.raises(holdfast.InvalidResponse, match="object 255 is said to follow after"):
         dial(device.url).identify()
-    assert len(device.asked) == 256
+    assert len(device.requests) == 256
 
 
 def test_a_device_of_a_lower_level_is_asked_for_less(make: Make, dial: Dial) -> None:
@@ -296,7 +298,7 @@ def test_a_device_of_a_lower_level_is_asked_for_less(make: Make, dial: Dial) -> 
 
     assert (who.vendor_name, who.product_code, who.revision) == ("A", "B", "C")
     assert (who.product_name, who.conformity_level) == (None, 1)
-    assert [asked.pdu[2] for asked in device.asked] == [3, 2, 1]
+    assert [asked.pdu[2] for asked in device.requests] == [3, 2, 1]
 
 
 @pytest.mark.parametrize(("reply", "requests"), [("ab01", 1), ("ab03", 3)])
@@ -306,7 +308,7 @@ def test_a_device_may_know_no_identification(
     device = make("tcp", then=replies(reply))
     with pytest.raises(holdfast.ModbusException):
         dial(device.url).identify()
-    assert len(device.asked) == requests
+    assert len(device.requests) == requests
 
 
 # Exceptions
@@ -354,7 +356,7 @@ def test_an_exception_leaves_any_transport_usable(kind: str, make: Make, dial: D
             client.read_holding_registers(7, 2)
         assert caught.value.code == code
     assert client.read_holding_registers(8, 1) == [8]
-    assert len(device.asked) == 3
+    assert len(device.requests) == 3
     if kind == "rtu+tcp":
         assert connections(device) == 1
 
@@ -397,7 +399,7 @@ def test_a_connection_that_ends_is_lost_and_made_anew(
         client.read_holding_registers(7, 2)
 
     assert client.read_holding_registers(8, 2) == [8, 9]
-    assert (connections(device), len(device.asked)) == (2, 2)
+    assert (connections(device), len(device.requests)) == (2, 2)
 
 
 @pytest.mark.parametrize("end", [close, reset])
@@ -423,7 +425,7 @@ def test_what_ends_a_connection_behind_a_reply_does_not_matter(
     wire.until(lambda: time.monotonic() > ended + 0.06, "the connection is idle")
 
     assert client.read_holding_registers(8, 1) == [8]
-    assert (connections(device), len(device.asked)) == (2, 3)
+    assert (connections(device), len(device.requests)) == (2, 3)
 
 
 @pytest.mark.parametrize("end", ["close", "reset"])
@@ -519,7 +521,7 @@ def test_a_reply_that_does_not_come_times_out(
     assert SHORT <= time.monotonic() - began < wire.DEADLINE
     client.timeout = wire.DEADLINE
     assert client.read_holding_registers(8, 2) == [8, 9]
-    assert len(device.asked) == 2
+    assert len(device.requests) == 2
     if kind in STREAMS:
         # Over TCP a late reply is known by its id. Where it is not, or where a reply broke off,
         # the next call has a connection of its own.
@@ -553,7 +555,7 @@ def test_a_connection_that_has_gone_silent_is_made_anew(
 
 def test_a_late_reply_shows_that_a_connection_is_alive(make: Make, dial: Dial) -> None:
     device = make("tcp", silent, silent)
-    device.script.append(lambda _: device.asked[0].answer())
+    device.script.append(lambda _: device.requests[0].answer())
     device.script.append(silent)
     client = dial(device.url, timeout=SHORT)
     for _ in range(4):
@@ -569,7 +571,7 @@ def test_a_late_reply_is_not_taken_for_the_next_one(make: Make, dial: Dial) -> N
     device = make("tcp", silent)
 
     def late_then_own(asked: Asked) -> None:
-        asked.send(device.asked[0].frame() + asked.frame())
+        asked.send(device.requests[0].frame() + asked.frame())
 
     device.script.append(late_then_own)
     client = dial(device.url, timeout=SHORT)
@@ -584,13 +586,13 @@ def test_a_late_reply_is_not_taken_for_the_next_one(make: Make, dial: Dial) -> N
     client.close()
     assert client.late == 1
     assert client.read_holding_registers(9, 1) == [9]
-    assert (client.late, len(device.asked)) == (1, 3)
+    assert (client.late, len(device.requests)) == (1, 3)
 
 
 def test_a_late_reply_that_is_wrong_does_no_harm(make: Make, dial: Dial) -> None:
     device = make("tcp", silent)
     device.script.append(
-        lambda asked: asked.send(device.asked[0].frame(b"\x63", unit=9) + asked.frame())
+        lambda asked: asked.send(device.requests[0].frame(b"\x63", unit=9) + asked.frame())
     )
     client = dial(device.url, timeout=SHORT)
     with pytest.raises(holdfast.RequestTimeout):
@@ -603,7 +605,7 @@ def test_a_late_reply_that_is_wrong_does_no_harm(make: Make, dial: Dial) -> None
 
 def test_a_late_reply_that_comes_twice_ends_the_connection(make: Make, dial: Dial) -> None:
     device = make("tcp", silent)
-    device.script.append(lambda asked: asked.send(device.asked[0].frame() * 2 + asked.frame()))
+    device.script.append(lambda asked: asked.send(device.requests[0].frame() * 2 + asked.frame()))
     client = dial(device.url, timeout=SHORT)
     with pytest.raises(holdfast.RequestTimeout):
         client.read_holding_registers(7, 1)
@@ -612,7 +614,7 @@ def test_a_late_reply_that_comes_twice_ends_the_connection(make: Make, dial: Dia
     with pytest.raises(holdfast.InvalidResponse, match=r"transaction id . matches no request"):
         client.read_holding_registers(8, 1)
     assert client.read_holding_registers(9, 1) == [9]
-    assert (client.late, connections(device), len(device.asked)) == (1, 2, 3)
+    assert (client.late, connections(device), len(device.requests)) == (1, 2, 3)
 
 
 @pytest.mark.parametrize("kind", ["rtu+tcp", *LINES])
@@ -624,11 +626,11 @@ def test_a_late_reply_is_thrown_away_where_replies_have_no_ids(
     with pytest.raises(holdfast.RequestTimeout):
         client.read_holding_registers(7, 1)
     device.await_requests(1)
-    device.asked[0].answer()
+    device.requests[0].answer()
     client.timeout = wire.DEADLINE
 
     assert client.read_holding_registers(8, 1) == [8]
-    assert len(device.asked) == 2
+    assert len(device.requests) == 2
 
 
 # Two replies
@@ -642,7 +644,7 @@ def test_a_second_reply_ends_the_connection_and_leaves_the_first_valid(
 
     assert client.read_holding_registers(7, 2) == [7, 8]
     assert client.read_holding_registers(8, 2) == [8, 9]
-    assert (connections(device), len(device.asked)) == (2, 2)
+    assert (connections(device), len(device.requests)) == (2, 2)
 
 
 @pytest.mark.parametrize("junk", [b"\0" * 20, b"\0\0\0\0\0\3\1\3\0", b"\xff\xff\0\0\0\4\1\3\2\0"])
@@ -650,7 +652,7 @@ def test_what_comes_unasked_ends_the_connection(junk: bytes, make: Make, dial: D
     device = make("tcp")
     client = dial(device.url)
     assert client.read_holding_registers(7, 1) == [7]
-    device.asked[0].send(junk)
+    device.requests[0].send(junk)
 
     calls = 0
     while connections(device) == 1:
@@ -658,7 +660,7 @@ def test_what_comes_unasked_ends_the_connection(junk: bytes, make: Make, dial: D
         with suppress(holdfast.InvalidResponse):
             assert client.read_holding_registers(8, 1) == [8]
     assert client.read_holding_registers(9, 1) == [9]
-    assert len(device.asked) <= calls + 2
+    assert len(device.requests) <= calls + 2
     assert connections(device) == 2
 
 
@@ -669,9 +671,9 @@ def test_a_second_reply_is_not_taken_for_the_next_one(kind: str, make: Make, dia
 
     assert client.read_holding_registers(7, 1) == [7]
     assert client.read_holding_registers(8, 1) == [8]
-    device.asked[1].answer()
+    device.requests[1].answer()
     assert client.read_holding_registers(9, 1) == [9]
-    assert len(device.asked) == 3
+    assert len(device.requests) == 3
 
 
 # Lines
@@ -696,7 +698,7 @@ def test_an_echo_is_noticed_by_the_first_read(kind: str, make: Make, dial: Dial)
     client.write_register(3, 11)
     client.write_registers(4, [12, 13])
     assert client.read_holding_registers(3, 3) == [11, 12, 13]
-    assert len(device.asked) == 4
+    assert len(device.requests) == 4
 
 
 @pytest.mark.parametrize("kind", LINES)
@@ -707,7 +709,7 @@ def test_an_echo_may_be_announced(kind: str, make: Make, dial: Dial) -> None:
     client.write_register(3, 11)
     client.write_registers(4, [12, 13])
     assert client.read_holding_registers(3, 3) == [11, 12, 13]
-    assert len(device.asked) == 3
+    assert len(device.requests) == 3
 
 
 @pytest.mark.parametrize("kind", LINES)
@@ -719,7 +721,7 @@ def test_an_echo_alone_is_no_reply(kind: str, make: Make, dial: Dial) -> None:
         client.write_register(3, 11)
     with pytest.raises(holdfast.RequestTimeout):
         client.read_holding_registers(7, 1)
-    assert len(device.asked) == 2
+    assert len(device.requests) == 2
 
 
 @pytest.mark.parametrize("kind", LINES)
@@ -758,7 +760,7 @@ def test_a_call_waits_until_the_line_is_silent(
     assert client.read_holding_registers(7, 1) == [7]
     used = time.monotonic()
     wire.until(lambda: time.monotonic() > used + 0.2, "the line was silent for long")
-    device.asked[0].send(b"\x01\x03\x02")
+    device.requests[0].send(b"\x01\x03\x02")
 
     began = time.monotonic()
     assert client.read_holding_registers(8, 1) == [8]
@@ -774,7 +776,7 @@ def test_a_broadcast_waits_for_no_reply(kind: str, make: Make, dial: Dial) -> No
     client.write_register(3, 11)
 
     assert client.read_holding_registers(3, 1, unit=1) == [3]
-    assert [asked.unit for asked in device.asked] == [0, 1]
+    assert [asked.unit for asked in device.requests] == [0, 1]
 
 
 @pytest.mark.parametrize("kind", LINES)
@@ -801,7 +803,7 @@ def test_a_read_whose_datagram_was_lost_is_sent_again(make: Make, dial: Dial) ->
     client = dial(device.url, timeout=0.6)
 
     assert client.read_holding_registers(7, 2) == [7, 8]
-    assert [asked.raw for asked in device.asked] == [device.asked[0].raw] * 3
+    assert [asked.raw for asked in device.requests] == [device.requests[0].raw] * 3
 
 
 @pytest.mark.parametrize(
@@ -822,7 +824,7 @@ def test_a_write_is_sent_once(write: Callable[[Any], object], make: Make, dial: 
         write(client)
     client.timeout = wire.DEADLINE
     assert client.read_holding_registers(8, 1) == [8]
-    assert len(device.asked) == 2
+    assert len(device.requests) == 2
 
 
 def test_a_read_is_sent_at_most_three_times(make: Make, dial: Dial) -> None:
@@ -836,12 +838,12 @@ def test_a_read_is_sent_at_most_three_times(make: Make, dial: Dial) -> None:
     assert SHORT <= time.monotonic() - began < wire.DEADLINE
     client.timeout = wire.DEADLINE
     assert client.read_holding_registers(8, 1) == [8]
-    assert len(device.asked) == 4
+    assert len(device.requests) == 4
 
 
 def test_datagrams_that_are_late_or_come_twice_are_counted(make: Make, dial: Dial) -> None:
     device = make("udp", lambda asked: asked.send(asked.frame(), asked.frame()), silent)
-    device.script.append(lambda asked: asked.send(device.asked[1].frame(), asked.frame()))
+    device.script.append(lambda asked: asked.send(device.requests[1].frame(), asked.frame()))
     client = dial(device.url, timeout=SHORT)
 
     assert client.read_holding_registers(7, 1) == [7]
@@ -851,7 +853,7 @@ def test_datagrams_that_are_late_or_come_twice_are_counted(make: Make, dial: Dia
     assert client.read_holding_registers(9, 1) == [9]
 
     assert client.late == 2
-    assert len(device.asked) == 3
+    assert len(device.requests) == 3
 
 
 @pytest.mark.parametrize("lie", [{"transaction": 7}, {"unit": 9}])
@@ -917,7 +919,9 @@ def test_replies_may_come_in_any_order() -> None:
             async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
                 tasks = read_all(plc, 16)
                 await asyncio.to_thread(device.await_requests, 16)
-                device.asked[0].send(b"".join(asked.frame() for asked in reversed(device.asked)))
+                device.requests[0].send(
+                    b"".join(asked.frame() for asked in reversed(device.requests))
+                )
                 assert await asyncio.gather(*tasks) == [[at] for at in range(16)]
 
     run(main)
@@ -939,7 +943,7 @@ def test_all_calls_in_flight_end_with_their_connection(
 ) -> None:
     async def main() -> None:
         with Stream("tcp", silent, silent) as device:
-            device.script.append(lambda _: behaviour(device.asked[1]))
+            device.script.append(lambda _: behaviour(device.requests[1]))
             async with holdfast.Client(device.url, timeout=wire.DEADLINE, max_in_flight=3) as plc:
                 tasks = read_all(plc, 4)
                 for task in tasks[:3]:
@@ -947,7 +951,7 @@ def test_all_calls_in_flight_end_with_their_connection(
                         await task
                 # It waited for its turn, and has a new connection.
                 assert await tasks[3] == [3]
-                assert (device.connections, len(device.asked)) == (2, 4)
+                assert (device.connections, len(device.requests)) == (2, 4)
 
     run(main)
 
@@ -977,8 +981,8 @@ def test_a_call_with_a_shorter_timeout_ends_first() -> None:
                 for plc.timeout in (SHORT, SHORT / 2):
                     with pytest.raises(holdfast.RequestTimeout, match=f"within {plc.timeout:g} s"):
                         await plc.read_holding_registers(9, 1)
-                device.asked[1].answer()
-                device.asked[0].answer()
+                device.requests[1].answer()
+                device.requests[0].answer()
                 assert await asyncio.gather(*patient) == [[0], [1]]
 
     run(main)
@@ -1009,7 +1013,7 @@ def test_a_lost_connection_is_made_anew_once_for_all_calls() -> None:
                 results = await asyncio.gather(*read_all(plc, 24), return_exceptions=True)
                 assert {type(result) for result in results[:8]} == {holdfast.ConnectionLost}
                 assert results[8:] == [[at] for at in range(8, 24)]
-                assert (device.connections, len(device.asked)) == (2, 24)
+                assert (device.connections, len(device.requests)) == (2, 24)
 
     run(main)
 
@@ -1092,14 +1096,14 @@ def test_whatever_comes_is_a_reply_only_if_it_is_one(
         make.device = make(kind)  # type: ignore[attr-defined]
         make.client = dial(make.device.url)  # type: ignore[attr-defined]
     device, client = make.device, make.client  # type: ignore[attr-defined]
-    first = len(device.asked)
+    first = len(device.requests)
     device.then = behave
     try:
         result = client.read_holding_registers(7, 2)
     except holdfast.ModbusError:
         result = None
     client.close()
-    asked = device.asked[first]
+    asked = device.requests[first]
     reply = rtu_reply(2, sent) if kind == "rtu+tcp" else mbap_reply(asked, 2, sent)
     if kind == "udp" and len(sent) != 13:
         reply = None

@@ -26,7 +26,7 @@ from holdfast.client.target import parse
 from support import wire
 from support.cli import answer, done, failure, usage_error
 from support.faces import FACES, dialling, run
-from support.hostile import Asked, Stream, good, silent
+from support.fake_device import Asked, Stream, good, silent
 from support.pymodbus_server import Pymodbus, tour, unit_1
 from support.secured import VERSIONS, Authority, Relay, context
 
@@ -527,7 +527,7 @@ def test_a_late_reply_is_dropped(
         with pytest.raises(holdfast.RequestTimeout):
             client.read_holding_registers(7, 1)
         device.await_requests(2)
-        device.asked[1].answer()
+        device.requests[1].answer()
         client.timeout = wire.DEADLINE
         wire.until(lambda: client.read_holding_registers(8, 1) == [8] and client.late == 1, "late")
         assert relay.connections == 1
@@ -574,7 +574,7 @@ def test_calls_that_wait_end_when_the_client_is_closed(
     async def main() -> None:
         client = holdfast.Client(relay.url(ca=authority.ca), timeout=wire.DEADLINE)
         calls = [asyncio.create_task(client.read_holding_registers(at, 1)) for at in range(3)]
-        while len(device.asked) < 3:
+        while len(device.requests) < 3:
             await asyncio.sleep(0.001)
         await client.close()
         for call in calls:

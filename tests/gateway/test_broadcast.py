@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import queue
-import socket
-import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,12 +11,13 @@ from hypothesis import strategies as st
 
 from holdfast.gateway.broadcasting import crc
 from support import gateways, lines, wire
-from support.fake_device import FakeDevice
+from support.fake_device import HANG_UP, FakeDevice, Stream
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from support import web
+    from support.fake_device import Asked
     from support.gateways import Running
 
 
@@ -35,49 +33,24 @@ WRITES: dict[str, tuple[dict[str, Any], bytes]] = {
 }
 
 
-class Line:
+class Line(Stream):
     """A serial gateway that takes frames and, unless told, says nothing."""
 
     def __init__(self) -> None:
+        super().__init__("rtu+tcp", then=self._take, in_turn=True)
         self.frames: queue.Queue[bytes] = queue.Queue()
-        self.reply: bytes | None = b""
-        """What is sent back; `None` to hang up."""
-        self.connections = 0
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
+        self.reply: bytes | None = None
+        """What is sent back."""
 
-    @property
-    def port(self) -> int:
-        found: int = self._listening.getsockname()[1]
-        return found
-
-    def close(self) -> None:
-        self._listening.shutdown(socket.SHUT_RDWR)
-        self._thread.join()
-        self._listening.close()
-
-    def _serve(self) -> None:
-        while True:
-            try:
-                connection, _ = self._listening.accept()
-            except OSError:
-                return
-            self.connections += 1
-            with connection, contextlib.suppress(OSError):
-                connection.settimeout(wire.DEADLINE)
-                while frame := connection.recv(256):
-                    self.frames.put(frame)
-                    if self.reply is None:
-                        break
-                    connection.sendall(self.reply)
+    def _take(self, asked: Asked) -> None:
+        self.frames.put(asked.raw)
+        asked.end_with(self.reply)
 
 
 @pytest.fixture
 def line() -> Iterator[Line]:
-    made = Line()
-    yield made
-    made.close()
+    with Line() as made:
+        yield made
 
 
 @pytest.fixture
@@ -111,7 +84,7 @@ def test_another_unit_of_the_line_is_asked_afterwards(gateway: Running, line: Li
     line.reply = lines.rtu(pdu, unit=5)
     for unit in (5, 0, 5):
         if unit == 0:
-            line.reply = b""
+            line.reply = None
         answer = gateway.ask("/write/register", to_all(line, **{**one, "unitId": unit}))
         assert answer.json["success"] is True, unit
         assert ("note" in answer.json) == (unit == 0)
@@ -130,7 +103,7 @@ def test_a_line_that_is_not_there_is_told(gateway: Running, line: Line) -> None:
 @pytest.mark.parametrize(
     ("reply", "reason", "says"),
     [
-        (None, "connection_lost", "closed by the peer"),
+        (HANG_UP, "connection_lost", "closed by the peer"),
         (lines.rtu(b"\x85\x02", unit=0), "invalid_reply", "00 85 02"),
     ],
 )

@@ -9,8 +9,9 @@ import pytest
 
 from holdfast._core import Poller, Request
 from support import wire
+from support.fake_device import HANG_UP
 from support.native_poller import INVALID, REFUSED, RESET, TIMEOUT, device, taken, written
-from support.polled import HANG_UP, Fake, asked, data, exception, reply
+from support.polled import Fake, asked, data, exception, reply
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,9 +16,9 @@ from holdfast.appliance import running
 from holdfast.types import AREAS
 from support import polled, web, wire
 from support.brokers import free_port
+from support.fake_device import HANG_UP
 from support.lines import Cable
 from support.polled import (
-    HANG_UP,
     Datagrams,
     Fake,
     Receiver,

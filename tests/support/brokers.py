@@ -129,7 +129,11 @@ class Proxy:
                 near = self._server.accept()[0]
             except OSError:
                 return
-            far = socket.create_connection(("127.0.0.1", self._to))
+            try:
+                far = socket.create_connection(("127.0.0.1", self._to))
+            except OSError:
+                near.close()
+                continue
             with self._lock:
                 self._open += [near, far]
             for ends in ((near, far), (far, near)):
@@ -157,6 +161,7 @@ class Proxy:
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
+        self._threads[0].join(wire.DEADLINE)
         self._server.close()
         self.cut()
         for thread in self._threads:

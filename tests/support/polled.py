@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from support import wire
 from support.brokers import free_port
 from support.config_folder import written
+from support.fake_device import Stream, Udp
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -21,11 +22,9 @@ if TYPE_CHECKING:
 
     import holdfast
     from holdfast.appliance import Appliance
+    from support.fake_device import Asked
 
     Answer = Callable[[wire.Frame], bytes | None]
-
-HANG_UP = b""
-"""Instead of a reply: closes the connection."""
 
 AREAS = {
     "coils": 1,
@@ -40,8 +39,8 @@ def reply(request: wire.Frame, pdu: bytes) -> bytes:
     return wire.frame(pdu, request.unit, request.transaction)
 
 
-def asked(request: wire.Frame) -> tuple[int, int]:
-    """Parses the address and the count of a read request."""
+def asked(request: wire.Frame | Asked) -> tuple[int, int]:
+    """The address and count of a read."""
     address, count = struct.unpack(">HH", request.pdu[1:5])
     return address, count
 
@@ -59,114 +58,28 @@ def exception(request: wire.Frame, code: int) -> bytes:
     return reply(request, bytes([request.pdu[0] | 0x80, code]))
 
 
-class Fake:
-    """Answers requests with a function, on any number of connections. Can stop and restart."""
+class Fake(Stream):
+    """Answers frames of any number of connections by a function; it can go and come back."""
 
     def __init__(self, answer: Answer) -> None:
+        super().__init__("tcp", then=self._reply, port=free_port())
         self.answer = answer
-        self.port = free_port()
-        self.requests: list[wire.Frame] = []
         self.by_unit: Counter[int] = Counter()
-        self.connections = 0
-        self._open: list[socket.socket] = []
-        self._threads: list[threading.Thread] = []
-        self._listening: socket.socket | None = None
 
-    @property
-    def url(self) -> str:
-        return f"tcp://127.0.0.1:{self.port}"
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.stop()
-
-    def start(self) -> None:
-        self._listening = socket.create_server(("127.0.0.1", self.port))
-        self._run(self._accept, self._listening)
-
-    def stop(self) -> None:
-        """Closes all connections and stops listening."""
-        for each in (self._listening, *self._open):
-            if each is not None:
-                with contextlib.suppress(OSError):
-                    each.shutdown(socket.SHUT_RDWR)
-        while self._threads:
-            self._threads.pop().join()
-        if self._listening is not None:
-            self._listening.close()
-        self._open.clear()
-
-    def _run(self, work: Callable[[socket.socket], None], of: socket.socket) -> None:
-        thread = threading.Thread(target=work, args=(of,), name="fake")
-        self._threads.append(thread)
-        thread.start()
-
-    def _accept(self, listening: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                connection, _ = listening.accept()
-                self.connections += 1
-                self._open.append(connection)
-                self._run(self._talk, connection)
-
-    def _talk(self, connection: socket.socket) -> None:
-        received = b""
-        with connection, contextlib.suppress(OSError):
-            while piece := connection.recv(65536):
-                whole, received = wire.split(received + piece)
-                for request in whole:
-                    self.requests.append(request)
-                    self.by_unit[request.unit] += 1
-                    answer = self.answer(request)
-                    if answer == HANG_UP:
-                        return
-                    if answer is not None:
-                        connection.sendall(answer)
+    def _reply(self, asked: Asked) -> None:
+        self.by_unit[asked.unit] += 1
+        asked.end_with(self.answer(wire.Frame(asked.transaction, asked.unit, asked.pdu)))
 
 
-class Datagrams:
-    """Answers requests over UDP with a function, one by one."""
+class Datagrams(Udp):
+    """Answers frames over UDP by a function."""
 
-    def __init__(self, answer: Callable[[wire.Frame], bytes]) -> None:
+    def __init__(self, answer: Answer) -> None:
+        super().__init__(then=self._reply)
         self._answer = answer
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", 0))
-        self._thread = threading.Thread(target=self._serve, name="fake")
 
-    @property
-    def url(self) -> str:
-        return f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
-            last.sendto(b"", self._socket.getsockname())
-        self._thread.join()
-        self._socket.close()
-
-    def _serve(self) -> None:
-        while True:
-            received, peer = self._socket.recvfrom(65536)
-            if not received:
-                return
-            [request], _ = wire.split(received)
-            self._socket.sendto(self._answer(request), peer)
+    def _reply(self, asked: Asked) -> None:
+        asked.end_with(self._answer(wire.Frame(asked.transaction, asked.unit, asked.pdu)))
 
 
 class Receiver:

@@ -175,18 +175,22 @@ class Relay:
             while True:
                 near, _ = self._listening.accept()
                 self.connections += 1
-                far = socket.create_connection(self._to)
+                try:
+                    far = socket.create_connection(self._to)
+                except OSError:
+                    near.close()
+                    raise
                 for end in (near, far):
                     end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                thread = threading.Thread(target=self._serve, args=(near, far), name="relay")
+                # What ends a connection from another thread must not meet the TLS of this one.
+                ends = {near.dup(), far.dup()}
+                with self._lock:
+                    self._open |= ends
+                thread = threading.Thread(target=self._serve, args=(near, far, ends), name="relay")
                 self._threads.append(thread)
                 thread.start()
 
-    def _serve(self, near: socket.socket, far: socket.socket) -> None:
-        # Closing a connection from another thread must not interfere with its TLS state.
-        ends = {near.dup(), far.dup()}
-        with self._lock:
-            self._open |= ends
+    def _serve(self, near: socket.socket, far: socket.socket, ends: set[socket.socket]) -> None:
         try:
             with contextlib.suppress(OSError):
                 near = self._secured(near)
