@@ -447,7 +447,6 @@ impl Device {
             fault = fault.or(self.look_at_unreadable(&known, &mut gathered).await);
             answered |= fault.is_some_and(Fault::is_answer);
         }
-        self.hand_over(due, gathered);
         if self.settings.release {
             self.link.release();
         }
@@ -458,6 +457,7 @@ impl Device {
             None => self.state.good(),
             Some(fault) => self.state.bad(fault),
         }
+        self.hand_over(due, gathered);
     }
 
     /// A poll without a plan: nothing is sent, and every field gets the fault.
@@ -467,11 +467,11 @@ impl Device {
             let block = Block { area, address, count, fields: Vec::new(), gaps: 0 };
             gathered.note(&block, Err(Fault::Unplanned));
         }
-        self.hand_over(due, gathered);
         self.state.bad(Fault::Unplanned);
+        self.hand_over(due, gathered);
     }
 
-    /// Sends the blocks of a poll to the results.
+    /// Hands the blocks of a poll to whoever takes results, who finds the health that it left.
     fn hand_over(&self, due: Instant, gathered: Gathered) {
         if let Some(results) = &self.report {
             let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
