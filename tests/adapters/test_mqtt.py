@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -22,8 +21,9 @@ from hypothesis import strategies as st
 from holdfast.adapters.mqtt import backoff, inbox
 from holdfast.ingest import MemoryAccess
 from support import wire
-from support.brokers import Rig, command, free_port, handled, settings, subscription, text
+from support.brokers import free_port
 from support.machine import tool
+from support.mqtt_rig import Rig, command, handled, settings, subscription, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -388,9 +388,9 @@ def test_a_broker_that_hangs_is_left_and_found_again(rig: Rig) -> None:
     broker = rig.broker()
     running = rig.connected(broker, keep_alive=1)
 
-    broker.signal(signal.SIGSTOP)
+    broker.freeze()
     wire.until(lambda: not running.status()["connected"], "the silence is noticed")
-    broker.signal(signal.SIGCONT)
+    broker.thaw()
     running.wait_until_connected()
     broker.publish("plant/ingest", text(command([1])), "-q", "1")
     running.wait_until_received(1)

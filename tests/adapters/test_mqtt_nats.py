@@ -2,55 +2,36 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from support import wire
-from support.brokers import Rig, command, free_port, settings, subscription, text
-from support.machine import missing, tool
+from support.brokers import NatsServer
+from support.machine import tool
+from support.mqtt_rig import Rig, command, settings, subscription, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 CONFIGURATION = """
 server_name: holdfast-test
-listen: "127.0.0.1:-1"
-jetstream {{ store_dir: "{folder}" }}
-mqtt {{ listen: "127.0.0.1:{port}" }}
+mqtt { listen: "127.0.0.1:-1" }
 """
 
 
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[int]:
     """Where a nats-server takes MQTT."""
-    program = Path(sys.executable).with_name("nats-server")
-    if not program.exists():
-        missing("the program nats-server")
-    for _ in range(10):
-        port = free_port()
-        file = tmp_path / "nats.conf"
-        file.write_text(CONFIGURATION.format(folder=tmp_path / "store", port=port))
-        log = tmp_path / "nats.log"
-        process = subprocess.Popen([program, "-c", file, "-l", log])
-        try:
-            wire.until(
-                lambda process=process, log=log: (  # type: ignore[misc]
-                    process.poll() is not None
-                    or (log.exists() and "Server is ready" in log.read_text())
-                ),
-                "nats-server starts",
-            )
-            if process.poll() is None:
-                yield port
-                return
-        finally:
-            process.kill()
-            process.wait()
-    raise AssertionError(log.read_text())
+    file = tmp_path / "nats.conf"
+    file.write_text(CONFIGURATION)
+    server = NatsServer(tmp_path, "-c", str(file))
+    [port] = re.findall(r"Listening for MQTT clients on mqtt://127\.0\.0\.1:(\d+)", server.log)
+    yield int(port)
+    server.kill()
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])

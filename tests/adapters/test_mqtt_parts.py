@@ -11,7 +11,7 @@ from holdfast.adapters.mqtt.backoff import Backoff
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.packets import parse_publish
 from support import mqtt_peer as mqtt
-from support.brokers import settings, subscription
+from support.mqtt_rig import settings, subscription
 
 # Packets
 

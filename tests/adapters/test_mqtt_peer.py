@@ -14,16 +14,16 @@ from holdfast.adapters.mqtt import adapter, backoff, dialing, inbox, link
 from holdfast.ingest import MemoryAccess
 from support import mqtt_peer as mqtt
 from support import wire
-from support.brokers import Rig, command, settings, subscription, text
 from support.mqtt_peer import FakeBroker, publish
+from support.mqtt_rig import Rig, command, settings, subscription, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from holdfast.ingest import Grant, Written
-    from support.brokers import Running
     from support.mqtt_peer import Peer
+    from support.mqtt_rig import Running
 
 VERSIONS = ["5", "3.1.1"]
 ACKNOWLEDGEMENTS = {1: mqtt.PUBACK, 2: mqtt.PUBREC}

@@ -12,14 +12,15 @@ import pytest
 from holdfast.adapters.mqtt import backoff, dialing
 from holdfast.net.tls import NO_FILES, broker_context
 from support import wire
-from support.brokers import Rig, command, settings, text
 from support.certificates import Certificates
+from support.mqtt_rig import Rig, command, settings, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from support.brokers import Mosquitto, Running
+    from support.brokers import Mosquitto
+    from support.mqtt_rig import Running
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from nats.errors import NoRespondersError
 
 from holdfast import logs
 from support import web, wire
-from support.brokers import free_port
+from support.brokers import NatsServer, free_port
 from support.cli import RunCommand as Command
-from support.nats_bus import Caller, NatsServer, subscription, tag
+from support.nats_bus import Caller, subscription, tag
 from support.running import endpoint
 
 if TYPE_CHECKING:

@@ -19,8 +19,9 @@ from nats.errors import NoRespondersError
 
 from holdfast.scanner.schema import json_schema
 from support import wire
+from support.brokers import NatsServer
 from support.cli import done, invoke, usage_error
-from support.nats_bus import Caller, NatsServer, subscription, tag
+from support.nats_bus import Caller, subscription, tag
 from support.nats_keys import Operator, User
 
 if TYPE_CHECKING:

@@ -16,8 +16,9 @@ import pytest
 from holdfast import logs
 from holdfast.scanner import devices
 from support import wire
+from support.brokers import NatsServer
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
-from support.nats_bus import Caller, NatsServer, leaving, subscription, tag
+from support.nats_bus import Caller, leaving, subscription, tag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -142,7 +143,7 @@ def test_nats_that_hangs_holds_up_nothing(
     tags = [tag(f"t{address}", address) for address in range(900)]
     own_caller.request("modbus.subscribe", subscription(server, *tags))
     data.next()
-    own_nats.signal(signal.SIGSTOP)
+    own_nats.freeze()
     try:
         outbox = scanner.scanner.outbox
         wire.until(lambda: outbox.replaced > 1000, "the newest values are kept", 30)
@@ -150,7 +151,7 @@ def test_nats_that_hangs_holds_up_nothing(
         replaced = outbox.replaced
         wire.until(lambda: outbox.replaced > replaced + 800, "scans go on")
     finally:
-        own_nats.signal(signal.SIGCONT)
+        own_nats.thaw()
     data.until(lambda message: message["value"] == 7, "the newest values")
 
 
@@ -171,7 +172,7 @@ def test_what_nats_took_before_it_died_is_published_anew(
     assert {data.next()["variableId"] for _ in range(3)} == {"a", "b", "c"}
     status.until(lambda message: message["state"] == "online", "it is online")
 
-    own_nats.signal(signal.SIGSTOP)
+    own_nats.freeze()
     memory.write("holding_registers", 0, [7])
     device = scanner.scanner._registry.devices["plc1"]
     seen = device.health.scans + 3
@@ -460,13 +461,13 @@ def test_it_ends_while_everything_hangs(
     os.kill(plc.pid, signal.SIGSTOP)
     own_caller.publish("modbus.command.tcp-1", "1")
     own_caller.publish("modbus.command.rtu-1", "1")
-    own_nats.signal(signal.SIGSTOP)
+    own_nats.freeze()
     try:
         began = time.monotonic()
         scanner.stop()
         assert time.monotonic() - began < 15
     finally:
-        own_nats.signal(signal.SIGCONT)
+        own_nats.thaw()
         os.kill(plc.pid, signal.SIGCONT)
 
 

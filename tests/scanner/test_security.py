@@ -15,8 +15,9 @@ from holdfast import logs
 from holdfast.net.tls import Tls
 from holdfast.scanner import Scanner, Servers, Settings, broker
 from support import wire
+from support.brokers import NatsServer
 from support.certificates import Certificates
-from support.nats_bus import Caller, NatsServer, subscription, tag
+from support.nats_bus import Caller, subscription, tag
 from support.nats_keys import ACCOUNT, Key, Operator, User, written
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from support.nats_bus import Caller
 from support.wire import until as wire_until
 
 if TYPE_CHECKING:
-    from support.nats_bus import NatsServer
+    from support.brokers import NatsServer
 
 
 def test_texts_are_messages_in_their_order(nats: NatsServer, caller: Caller) -> None:

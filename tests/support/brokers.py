@@ -1,40 +1,19 @@
-"""MQTT in tests: Mosquitto, a client, and running adapters.
+"""Brokers in tests: Mosquitto and nats-server, in processes of their own.
 
-Everything stays on the loopback interface, and a `Rig` stops everything that it started.
+They listen on the loopback interface only, on ports that nobody else has.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
-import queue
 import signal
 import socket
 import subprocess
-import threading
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, NamedTuple
+import sys
+from abc import ABC, abstractmethod
+from pathlib import Path
 
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
-from paho.mqtt.packettypes import PacketTypes
-from paho.mqtt.properties import Properties
-
-import holdfast
-from holdfast.adapters import Stop
-from holdfast.adapters.mqtt import Mqtt
-from holdfast.config import MqttConfig
-from holdfast.ingest import MemoryAccess
 from support import wire
-from support.machine import tool
-from support.running import content
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
-    from typing import Self
-
-    from holdfast.types import Area
+from support.machine import missing, tool
 
 
 def free_port(host: str = "127.0.0.1") -> int:
@@ -44,44 +23,44 @@ def free_port(host: str = "127.0.0.1") -> int:
         return int(taken.getsockname()[1])
 
 
-class Mosquitto:
-    """A Mosquitto broker of one test. It can restart with the same port and session file."""
+class Broker(ABC):
+    """A broker of its own, started anew with the same port and store as often as wanted."""
 
-    def __init__(self, folder: Path, *options: str, host: str = "127.0.0.1") -> None:
+    name: str
+
+    def __init__(self, folder: Path, host: str = "127.0.0.1") -> None:
         self.host = host
         self.port = 0
         self._folder = folder
-        self._options = options or ("allow_anonymous true",)
         self._process: subprocess.Popen[bytes] | None = None
         for _ in range(10):
             self.port = free_port(host)
             if self._starts():
                 return
-        raise AssertionError(f"mosquitto does not start: {self.log}")
+        raise AssertionError(f"{self.name} does not start: {self.log}")
 
-    @property
-    def url(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"mqtt://{host}:{self.port}"
+    @abstractmethod
+    def command(self) -> list[str]:
+        """The program and its arguments."""
 
     @property
     def log(self) -> str:
-        return (self._folder / "mosquitto.log").read_text(errors="replace")
+        return self._log_file.read_text(errors="replace")
+
+    @property
+    def _log_file(self) -> Path:
+        return self._folder / f"{self.name}.log"
 
     def start(self) -> None:
+        """Returns when it serves."""
         assert self._starts(), self.log
 
     def _starts(self) -> bool:
-        """Returns whether it runs and listens; the port may be taken."""
-        file = self._folder / "mosquitto.conf"
-        lines = [f"listener {self.port} {self.host}", "user root", *self._options]
-        file.write_text("\n".join(lines) + "\n")
-        with (self._folder / "mosquitto.log").open("ab") as log:
-            process = subprocess.Popen(
-                [tool("mosquitto"), "-v", "-c", str(file)], stdout=log, stderr=log
-            )
+        """Whether it runs and listens; another one may have taken the port."""
+        with self._log_file.open("ab") as log:
+            process = subprocess.Popen(self.command(), stdout=log, stderr=log)
         self._process = process
-        wire.until(lambda: process.poll() is not None or self._listens(), "mosquitto starts")
+        wire.until(lambda: process.poll() is not None or self._listens(), f"{self.name} starts")
         if process.poll() is None:
             return True
         self._process = None
@@ -94,7 +73,15 @@ class Mosquitto:
             return False
         return True
 
-    def signal(self, number: signal.Signals) -> None:
+    def freeze(self) -> None:
+        """Stops it where it is; its connections stay."""
+        self._signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """It goes on where it was."""
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, number: signal.Signals) -> None:
         assert self._process is not None
         self._process.send_signal(number)
 
@@ -105,270 +92,56 @@ class Mosquitto:
             process.kill()
             process.wait()
 
+
+class Mosquitto(Broker):
+    """With these lines of configuration; without any, it lets everyone in."""
+
+    name = "mosquitto"
+
+    def __init__(self, folder: Path, *options: str, host: str = "127.0.0.1") -> None:
+        self._options = options or ("allow_anonymous true",)
+        super().__init__(folder, host)
+
+    @property
+    def url(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"mqtt://{host}:{self.port}"
+
+    def command(self) -> list[str]:
+        file = self._folder / "mosquitto.conf"
+        lines = [f"listener {self.port} {self.host}", "user root", *self._options]
+        file.write_text("\n".join(lines) + "\n")
+        return [tool("mosquitto"), "-v", "-c", str(file)]
+
     def publish(self, topic: str, message: str, *options: str) -> None:
         """Publishes with Mosquitto's own tool."""
         command = [tool("mosquitto_pub"), "-h", self.host, "-p", str(self.port), "-t", topic]
         subprocess.run([*command, "-m", message, *options], check=True, timeout=wire.DEADLINE)
 
 
-class Proxy:
-    """A proxy to a broker. It can cut connections while the broker keeps running."""
+class NatsServer(Broker):
+    """With these options, and JetStream unless told."""
 
-    def __init__(self, port: int) -> None:
-        self._to = port
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.url = f"mqtt://127.0.0.1:{self._server.getsockname()[1]}"
-        self._lock = threading.Lock()
-        self._open: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
+    name = "nats"
 
-    def _accept(self) -> None:
-        while True:
-            try:
-                near = self._server.accept()[0]
-            except OSError:
-                return
-            try:
-                far = socket.create_connection(("127.0.0.1", self._to))
-            except OSError:
-                near.close()
-                continue
-            with self._lock:
-                self._open += [near, far]
-            for ends in ((near, far), (far, near)):
-                thread = threading.Thread(target=self._pump, args=ends)
-                self._threads.append(thread)
-                thread.start()
-
-    @staticmethod
-    def _pump(here: socket.socket, there: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while piece := here.recv(65536):
-                there.sendall(piece)
-        for end in (here, there):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def cut(self) -> None:
-        """Closes every connection."""
-        with self._lock:
-            ends = list(self._open)
-        for end in ends:
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._server.shutdown(socket.SHUT_RDWR)
-        self._threads[0].join(wire.DEADLINE)
-        self._server.close()
-        self.cut()
-        for thread in self._threads:
-            thread.join(wire.DEADLINE)
-        for end in self._open:
-            end.close()
-
-
-class Message(NamedTuple):
-    topic: str
-    payload: bytes
-    properties: Properties | None
-
-
-class Probe:
-    """A client beside the adapter that publishes and subscribes."""
-
-    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
-        self.messages: queue.Queue[Message] = queue.Queue()
-        self._subscribed = threading.Event()
-        self._client = Client(
-            CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5, client_id=""
-        )
-        self._client.on_message = lambda _client, _data, message: self.messages.put(
-            Message(message.topic, bytes(message.payload), message.properties)
-        )
-        self._client.on_subscribe = lambda *_: self._subscribed.set()
-        self._client.connect(host, port)
-        self._client.loop_start()
-        wire.until(self._client.is_connected, "the probe is connected")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
-
-    def subscribe(self, topic: str, qos: int = 1) -> None:
-        self._subscribed.clear()
-        self._client.subscribe(topic, qos)
-        assert self._subscribed.wait(wire.DEADLINE)
-
-    def publish(
-        self,
-        topic: str,
-        payload: str | bytes,
-        qos: int = 1,
-        *,
-        retain: bool = False,
-        **properties: Any,
-    ) -> None:
-        """Publishes a message and waits until the broker has it."""
-        packed = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
-        for name, value in properties.items():
-            setattr(packed, name, value)
-        info = self._client.publish(topic, payload, qos, retain, packed)
-        info.wait_for_publish(wire.DEADLINE)
-        assert info.is_published()
-
-    def get(self) -> Message:
-        return self.messages.get(timeout=wire.DEADLINE)
-
-
-def subscription(topic: str = "plant/ingest", qos: int = 1, **more: Any) -> dict[str, Any]:
-    """Builds an entry of `subscriptions`."""
-    areas = ["holding_registers", "coils"]
-    return {"topic": topic, "qos": qos, "memories": ["plant"], "areas": areas} | more
-
-
-def settings(url: str, *subscriptions: dict[str, Any], **more: Any) -> MqttConfig:
-    """Builds the configuration of an adapter; by default with one subscription."""
-    entries = list(subscriptions) or [subscription()]
-    fields = {"url": url, "client_id": "holdfast-test", "subscriptions": entries} | more
-    return MqttConfig.model_validate(fields)
-
-
-def command(values: list[Any], address: int = 0, **more: Any) -> dict[str, Any]:
-    """Builds a command for holding registers of `plant`; `more` overrides fields."""
-    plain = {"memory": "plant", "area": "holding_registers", "address": address, "values": values}
-    return plain | more
-
-
-def text(*commands: dict[str, Any]) -> str:
-    """Encodes one command as JSON, or several as a batch."""
-    return json.dumps(commands[0] if len(commands) == 1 else commands)
-
-
-class Running:
-    """An adapter in a thread, until the test ends."""
-
-    def __init__(self, config: MqttConfig, memory_access: MemoryAccess) -> None:
-        self.adapter = Mqtt(config, memory_access)
-        self.memory_access = memory_access
-        self._stop = Stop()
-        self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="mqtt under test")
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self.adapter.run(self._stop)
-        except BaseException as error:
-            self._failure = error
-            raise
-
-    def status(self) -> dict[str, Any]:
-        return self.adapter.status()
-
-    def tell_to_stop(self) -> None:
-        self._stop.set()
-
-    def stop(self, seconds: float = wire.DEADLINE) -> None:
-        """Stops the adapter within `seconds`. It must not have failed."""
-        self._stop.set()
-        self._thread.join(seconds)
-        assert not self._thread.is_alive(), f"does not end within {seconds} s"
-        assert self._failure is None
+    def __init__(self, folder: Path, *options: str, jetstream: bool = True) -> None:
+        self._program = Path(sys.executable).parent / "nats-server"
+        if not self._program.exists():
+            missing("the program nats-server")
+        self._options = (*options, *(("-js", "-sd", str(folder / "store")) if jetstream else ()))
+        super().__init__(folder)
 
     @property
-    def alive(self) -> bool:
-        return self._thread.is_alive()
+    def url(self) -> str:
+        return f"nats://{self.host}:{self.port}"
 
-    def wait_until_connected(self) -> None:
-        """Waits until it is connected and each subscription is acknowledged."""
-        wire.until(self._ready, "connected")
+    def command(self) -> list[str]:
+        self._before = self.log.count(READY)
+        return [str(self._program), "-a", self.host, "-p", str(self.port), *self._options]
 
-    def _ready(self) -> bool:
-        status = self.status()
-        return status["connected"] and all(
-            topic["granted"] is not None for topic in status["topics"]
-        )
-
-    def wait_until_received(self, count: int) -> None:
-        """Waits until `count` messages were accepted or refused."""
-        wire.until(lambda: handled(self.memory_access) >= count, f"{count} messages")
+    def _listens(self) -> bool:
+        return self.log.count(READY) > self._before
 
 
-def handled(memory_access: MemoryAccess) -> int:
-    """Returns the number of messages that were accepted or refused."""
-    counts: Any = memory_access.counts()
-    return int(counts["accepted"] + sum(counts["refused"].values()))
-
-
-class Rig:
-    """Two memories with memory access, and everything that a test starts."""
-
-    def __init__(self, folder: Path) -> None:
-        self.memory = _memory()
-        self.other = _memory()
-        self.memory_access = MemoryAccess("mqtt", {"plant": self.memory, "other": self.other})
-        self._folder = folder
-        self._running = ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._running.close()
-
-    def broker(self, *options: str, host: str = "127.0.0.1") -> Mosquitto:
-        """Starts Mosquitto with these configuration lines; default: allows anonymous clients."""
-        started = Mosquitto(self._folder, *options, host=host)
-        self._running.callback(started.kill)
-        return started
-
-    def run(self, config: MqttConfig, memory_access: MemoryAccess | None = None) -> Running:
-        """Starts an adapter without waiting for its connection."""
-        running = Running(config, memory_access or self.memory_access)
-        self._running.callback(running.stop)
-        return running
-
-    def connected(self, broker: Mosquitto, *subscriptions: dict[str, Any], **more: Any) -> Running:
-        """Starts an adapter and waits until it is connected."""
-        running = self.run(settings(broker.url, *subscriptions, **more))
-        running.wait_until_connected()
-        return running
-
-    def proxy(self, broker: Mosquitto) -> Proxy:
-        """Starts a proxy to the broker."""
-        proxy = Proxy(broker.port)
-        self._running.callback(proxy.close)
-        return proxy
-
-    def probe(self, broker: Mosquitto) -> Probe:
-        return self._running.enter_context(Probe(broker.port, broker.host))
-
-    def registers(self, address: int, count: int) -> list[int]:
-        """Reads holding registers of `plant`."""
-        return self.memory.read("holding_registers", address, count)
-
-    def all_content(self) -> list[dict[Area, list[int]]]:
-        """Returns the content of both memories."""
-        return [content(self.memory), content(self.other)]
-
-
-def _memory() -> holdfast.Memory:
-    return holdfast.Memory(
-        coils=1000, discrete_inputs=1000, holding_registers=1000, input_registers=1000
-    )
+READY = "Server is ready"
+"""What nats-server logs when it serves."""

@@ -1,4 +1,4 @@
-"""A real NATS server, a client, and scanners, for tests.
+"""NATS in tests: a caller to talk to it, and scanners that run.
 
 Everything stays on the loopback interface, and everything that was started is stopped.
 """
@@ -9,9 +9,6 @@ import asyncio
 import contextlib
 import json
 import queue
-import signal
-import subprocess
-import sys
 import threading
 import time
 from contextlib import ExitStack
@@ -24,8 +21,7 @@ from nats.aio.client import Client
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import Scanner, Servers, Settings
 from support import wire
-from support.brokers import free_port
-from support.machine import missing
+from support.brokers import NatsServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -37,52 +33,6 @@ if TYPE_CHECKING:
     import holdfast
 
 Result = TypeVar("Result")
-
-
-class NatsServer:
-    """A NATS server of one test. It can restart with the same port and store."""
-
-    def __init__(self, folder: Path, *options: str, jetstream: bool = True) -> None:
-        self._program = Path(sys.executable).parent / "nats-server"
-        if not self._program.exists():
-            missing("the program nats-server")
-        self._folder = folder
-        self._options = (*options, *(("-js", "-sd", str(folder / "store")) if jetstream else ()))
-        self._process: subprocess.Popen[bytes] | None = None
-        self.port = free_port()
-        self.start()
-
-    @property
-    def url(self) -> str:
-        return f"nats://127.0.0.1:{self.port}"
-
-    @property
-    def log(self) -> str:
-        return (self._folder / "nats.log").read_text(errors="replace")
-
-    def start(self) -> None:
-        """Starts the server and waits until it is ready."""
-        command = [str(self._program), "-a", "127.0.0.1", "-p", str(self.port), *self._options]
-        seen = self.log.count("Server is ready") if (self._folder / "nats.log").exists() else 0
-        with (self._folder / "nats.log").open("ab") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=log)
-        self._process = process
-        wire.until(
-            lambda: process.poll() is not None or self.log.count("Server is ready") > seen,
-            "nats-server starts",
-        )
-        assert process.poll() is None, self.log
-
-    def signal(self, number: signal.Signals) -> None:
-        assert self._process is not None
-        self._process.send_signal(number)
-
-    def kill(self) -> None:
-        """Kills the server, without a clean shutdown."""
-        process, self._process = self._process, None
-        if process is not None:
-            process.kill()
-            process.wait()
 
 
 class _Loop:

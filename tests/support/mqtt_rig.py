@@ -1,0 +1,298 @@
+"""MQTT in tests: a client to talk to a broker, a way to it that can be cut, and adapters that run.
+
+Nothing here leaves the loopback interface, and a `Rig` stops all that it started.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import socket
+import threading
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+import holdfast
+from holdfast.adapters import Stop
+from holdfast.adapters.mqtt import Mqtt
+from holdfast.config import MqttConfig
+from holdfast.ingest import MemoryAccess
+from support import wire
+from support.brokers import Mosquitto
+from support.running import content
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+    from typing import Self
+
+    from holdfast.types import Area
+
+
+class Proxy:
+    """A way to a broker that can be cut, while the broker itself stays as it is."""
+
+    def __init__(self, port: int) -> None:
+        self._to = port
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"mqtt://127.0.0.1:{self._server.getsockname()[1]}"
+        self._lock = threading.Lock()
+        self._open: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept)]
+        self._threads[0].start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near = self._server.accept()[0]
+            except OSError:
+                return
+            try:
+                far = socket.create_connection(("127.0.0.1", self._to))
+            except OSError:
+                near.close()
+                continue
+            with self._lock:
+                self._open += [near, far]
+            for ends in ((near, far), (far, near)):
+                thread = threading.Thread(target=self._pump, args=ends)
+                self._threads.append(thread)
+                thread.start()
+
+    @staticmethod
+    def _pump(here: socket.socket, there: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while piece := here.recv(65536):
+                there.sendall(piece)
+        for end in (here, there):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def cut(self) -> None:
+        """Ends every connection."""
+        with self._lock:
+            ends = list(self._open)
+        for end in ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._server.shutdown(socket.SHUT_RDWR)
+        self._threads[0].join(wire.DEADLINE)
+        self._server.close()
+        self.cut()
+        for thread in self._threads:
+            thread.join(wire.DEADLINE)
+        for end in self._open:
+            end.close()
+
+
+class Message(NamedTuple):
+    topic: str
+    payload: bytes
+    properties: Properties | None
+
+
+class Probe:
+    """A client beside the adapter: publishes, and gets what is published."""
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self.messages: queue.Queue[Message] = queue.Queue()
+        self._subscribed = threading.Event()
+        self._client = Client(
+            CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5, client_id=""
+        )
+        self._client.on_message = lambda _client, _data, message: self.messages.put(
+            Message(message.topic, bytes(message.payload), message.properties)
+        )
+        self._client.on_subscribe = lambda *_: self._subscribed.set()
+        self._client.connect(host, port)
+        self._client.loop_start()
+        wire.until(self._client.is_connected, "the probe is connected")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def subscribe(self, topic: str, qos: int = 1) -> None:
+        self._subscribed.clear()
+        self._client.subscribe(topic, qos)
+        assert self._subscribed.wait(wire.DEADLINE)
+
+    def publish(
+        self,
+        topic: str,
+        payload: str | bytes,
+        qos: int = 1,
+        *,
+        retain: bool = False,
+        **properties: Any,
+    ) -> None:
+        """Returns when the broker has it."""
+        packed = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        for name, value in properties.items():
+            setattr(packed, name, value)
+        info = self._client.publish(topic, payload, qos, retain, packed)
+        info.wait_for_publish(wire.DEADLINE)
+        assert info.is_published()
+
+    def get(self) -> Message:
+        return self.messages.get(timeout=wire.DEADLINE)
+
+
+def subscription(topic: str = "plant/ingest", qos: int = 1, **more: Any) -> dict[str, Any]:
+    """One entry of `subscriptions`."""
+    areas = ["holding_registers", "coils"]
+    return {"topic": topic, "qos": qos, "memories": ["plant"], "areas": areas} | more
+
+
+def settings(url: str, *subscriptions: dict[str, Any], **more: Any) -> MqttConfig:
+    """The configuration of an adapter; with one subscription when none is given."""
+    entries = list(subscriptions) or [subscription()]
+    fields = {"url": url, "client_id": "holdfast-test", "subscriptions": entries} | more
+    return MqttConfig.model_validate(fields)
+
+
+def command(values: list[Any], address: int = 0, **more: Any) -> dict[str, Any]:
+    """A command for holding registers of `plant`, unless `more` says something else."""
+    plain = {"memory": "plant", "area": "holding_registers", "address": address, "values": values}
+    return plain | more
+
+
+def text(*commands: dict[str, Any]) -> str:
+    """One command as JSON, or several as a batch."""
+    return json.dumps(commands[0] if len(commands) == 1 else commands)
+
+
+class Running:
+    """An adapter in a thread, until the test ends."""
+
+    def __init__(self, config: MqttConfig, memory_access: MemoryAccess) -> None:
+        self.adapter = Mqtt(config, memory_access)
+        self.memory_access = memory_access
+        self._stop = Stop()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="mqtt under test")
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.adapter.run(self._stop)
+        except BaseException as error:
+            self._failure = error
+            raise
+
+    def status(self) -> dict[str, Any]:
+        return self.adapter.status()
+
+    def tell_to_stop(self) -> None:
+        self._stop.set()
+
+    def stop(self, seconds: float = wire.DEADLINE) -> None:
+        """Stops it, which must not take longer than that; it must not have failed."""
+        self._stop.set()
+        self._thread.join(seconds)
+        assert not self._thread.is_alive(), f"does not end within {seconds} s"
+        assert self._failure is None
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def wait_until_connected(self) -> None:
+        """Until it is connected and each subscription is answered."""
+        wire.until(self._ready, "connected")
+
+    def _ready(self) -> bool:
+        status = self.status()
+        return status["connected"] and all(
+            topic["granted"] is not None for topic in status["topics"]
+        )
+
+    def wait_until_received(self, count: int) -> None:
+        """Until so many messages were carried out or refused."""
+        wire.until(lambda: handled(self.memory_access) >= count, f"{count} messages")
+
+
+def handled(memory_access: MemoryAccess) -> int:
+    """How many messages were accepted or refused."""
+    counts: Any = memory_access.counts()
+    return int(counts["accepted"] + sum(counts["refused"].values()))
+
+
+class Rig:
+    """Two memories with a door to them, and all that a test starts."""
+
+    def __init__(self, folder: Path) -> None:
+        self.memory = _memory()
+        self.other = _memory()
+        self.memory_access = MemoryAccess("mqtt", {"plant": self.memory, "other": self.other})
+        self._folder = folder
+        self._running = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._running.close()
+
+    def broker(self, *options: str, host: str = "127.0.0.1") -> Mosquitto:
+        """Mosquitto with these lines of configuration; without any, it lets everyone in."""
+        started = Mosquitto(self._folder, *options, host=host)
+        self._running.callback(started.kill)
+        return started
+
+    def run(self, config: MqttConfig, memory_access: MemoryAccess | None = None) -> Running:
+        """An adapter, that may not be connected yet."""
+        running = Running(config, memory_access or self.memory_access)
+        self._running.callback(running.stop)
+        return running
+
+    def connected(self, broker: Mosquitto, *subscriptions: dict[str, Any], **more: Any) -> Running:
+        """An adapter that is connected."""
+        running = self.run(settings(broker.url, *subscriptions, **more))
+        running.wait_until_connected()
+        return running
+
+    def proxy(self, broker: Mosquitto) -> Proxy:
+        """A way to the broker that can be cut."""
+        proxy = Proxy(broker.port)
+        self._running.callback(proxy.close)
+        return proxy
+
+    def probe(self, broker: Mosquitto) -> Probe:
+        return self._running.enter_context(Probe(broker.port, broker.host))
+
+    def registers(self, address: int, count: int) -> list[int]:
+        """Holding registers of `plant`."""
+        return self.memory.read("holding_registers", address, count)
+
+    def all_content(self) -> list[dict[Area, list[int]]]:
+        """Everything in both memories."""
+        return [content(self.memory), content(self.other)]
+
+
+def _memory() -> holdfast.Memory:
+    return holdfast.Memory(
+        coils=1000, discrete_inputs=1000, holding_registers=1000, input_registers=1000
+    )
