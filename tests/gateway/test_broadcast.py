@@ -36,6 +36,8 @@ WRITES: dict[str, tuple[dict[str, Any], bytes]] = {
 class Line(Stream):
     """A serial gateway that takes frames and, unless told, says nothing."""
 
+    is_modelled = False
+
     def __init__(self) -> None:
         super().__init__("rtu+tcp", then=self._take, in_turn=True)
         self.frames: queue.Queue[bytes] = queue.Queue()

@@ -38,6 +38,14 @@ class Awaited:
             return attribute
         return lambda *args, **named: self._wait(attribute(*args, **named))
 
+    @property
+    def timeout(self) -> float:
+        return self._client.timeout
+
+    @timeout.setter
+    def timeout(self, seconds: float) -> None:
+        self._client.timeout = seconds
+
     def end(self) -> None:
         """Closes everything, and checks that no exception was lost."""
         try:

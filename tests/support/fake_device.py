@@ -229,6 +229,8 @@ class ScriptedDevice(ABC):
     """
 
     url: str
+    is_modelled = True
+    """Whether there is a good reply to every request, as a model of a device has it."""
 
     def __init__(self, *script: Behaviour, then: Behaviour = good) -> None:
         self.script = list(script)
@@ -304,7 +306,8 @@ class ScriptedDevice(ABC):
                     self._deal_with(asked)
 
     def _deal_with(self, asked: Asked) -> None:
-        asked.reply = self.oracle.answer(asked.unit, asked.pdu) or b""
+        if self.is_modelled:
+            asked.reply = self.oracle.answer(asked.unit, asked.pdu) or b""
         number = len(self.requests)
         self.requests.append(asked)
         behaviour = self.script[number] if number < len(self.script) else self.then
@@ -378,6 +381,8 @@ class Stream(ScriptedDevice):
 
 class FakeDevice(Stream):
     """Modbus TCP, one connection after the other: a PDU is answered by a function, `answer`."""
+
+    is_modelled = False
 
     def __init__(self, answer: Answer) -> None:
         super().__init__("tcp", then=self._reply, in_turn=True)

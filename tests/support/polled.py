@@ -61,6 +61,8 @@ def exception(request: wire.Frame, code: int) -> bytes:
 class Fake(Stream):
     """Answers frames of any number of connections by a function; it can go and come back."""
 
+    is_modelled = False
+
     def __init__(self, answer: Answer) -> None:
         super().__init__("tcp", then=self._reply, port=free_port())
         self.answer = answer
@@ -73,6 +75,8 @@ class Fake(Stream):
 
 class Datagrams(Udp):
     """Answers frames over UDP by a function."""
+
+    is_modelled = False
 
     def __init__(self, answer: Answer) -> None:
         super().__init__(then=self._reply)
