@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 pytest_plugins = ("support.nats_bus",)
 
-# How long an example takes says how busy the machine is.
+# The time that an example takes depends on the load of the machine.
 settings.register_profile(
     "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )

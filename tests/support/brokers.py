@@ -1,6 +1,6 @@
-"""Brokers in tests: Mosquitto and nats-server, in processes of their own.
+"""Mosquitto and nats-server, as processes, for tests.
 
-They listen on the loopback interface only, on ports that nobody else has.
+They listen only on the loopback interface, on free ports.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def free_port(host: str = "127.0.0.1") -> int:
 
 
 class Broker(ABC):
-    """A broker of its own, started anew with the same port and store as often as wanted."""
+    """A broker of one test. It can restart with the same port and store."""
 
     name: str
 
@@ -52,11 +52,11 @@ class Broker(ABC):
         return self._folder / f"{self.name}.log"
 
     def start(self) -> None:
-        """Returns when it serves."""
+        """Starts the server and waits until it is ready."""
         assert self._starts(), self.log
 
     def _starts(self) -> bool:
-        """Whether it runs and listens; another one may have taken the port."""
+        """Returns whether it runs and listens; the port may be taken."""
         with self._log_file.open("ab") as log:
             process = subprocess.Popen(self.command(), stdout=log, stderr=log)
         self._process = process
@@ -74,11 +74,11 @@ class Broker(ABC):
         return True
 
     def freeze(self) -> None:
-        """Stops it where it is; its connections stay."""
+        """Suspends the process; its connections stay open."""
         self._signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """It goes on where it was."""
+        """Resumes the process."""
         self._signal(signal.SIGCONT)
 
     def _signal(self, number: signal.Signals) -> None:
@@ -94,7 +94,7 @@ class Broker(ABC):
 
 
 class Mosquitto(Broker):
-    """With these lines of configuration; without any, it lets everyone in."""
+    """Mosquitto with these configuration lines; default: allows anonymous clients."""
 
     name = "mosquitto"
 
@@ -120,7 +120,7 @@ class Mosquitto(Broker):
 
 
 class NatsServer(Broker):
-    """With these options, and JetStream unless told."""
+    """nats-server with these options; by default with JetStream."""
 
     name = "nats"
 
@@ -144,4 +144,4 @@ class NatsServer(Broker):
 
 
 READY = "Server is ready"
-"""What nats-server logs when it serves."""
+"""The log line of nats-server when it is ready."""

@@ -1,7 +1,7 @@
-"""A device that does with each request what a test tells it, on every transport.
+"""A device on every transport whose behaviour for each request a test defines.
 
-It shares nothing with the library. What it is not told it does as a good device: it has 1000 items
-in every area, and holding register N holds N. TLS is taken off by `secured.Relay` in front of it.
+It shares no code with the library. By default it behaves as a correct device: it has 1000 items in
+every area, and holding register N holds N. For TLS, put a `secured.Relay` in front of it.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ def good_unit() -> Oracle:
 
 
 class Asked:
-    """A request that came, and what can be done about it."""
+    """A received request, and the possible answers."""
 
     def __init__(self, peer: Peer, frame: bytes, parts: tuple[int, int, bytes]) -> None:
         self.peer = peer
         self.raw = frame
         self.transaction, self.unit, self.pdu = parts
         self.reply = b""
-        """The PDU of a good answer."""
+        """Returns the PDU of a correct reply."""
 
     def frame(
         self, pdu: bytes | None = None, *, unit: int | None = None, transaction: int | None = None
     ) -> bytes:
-        """A frame of the transport; a good reply but for what is given."""
+        """Builds a frame of the transport; by default a correct reply."""
         return self.peer.framing.frame(
             self.reply if pdu is None else pdu,
             self.unit if unit is None else unit,
@@ -73,7 +73,7 @@ class Asked:
         )
 
     def answer(self, pdu: bytes | None = None, **header: int) -> None:
-        """Sends such a frame."""
+        """Sends a frame, with the same arguments as `frame`."""
         self.send(self.frame(pdu, **header))
 
     def send(self, *pieces: bytes) -> None:
@@ -81,27 +81,27 @@ class Asked:
             self.peer.send(piece)
 
     def end_with(self, data: bytes | None) -> None:
-        """Sends bytes, or nothing for `None`, or ends the connection for `HANG_UP`."""
+        """Sends bytes; `None` sends nothing, `HANG_UP` closes the connection."""
         if data == HANG_UP:
             self.peer.hang_up()
         elif data is not None:
             self.send(data)
 
     def drip(self, data: bytes) -> None:
-        """Sends byte by byte."""
+        """Sends bytes one by one."""
         self.send(*[bytes([byte]) for byte in data])
 
 
 class Framing(ABC):
-    """How requests are cut out of what came, and how replies are framed."""
+    """How requests are split from received bytes, and how replies are framed."""
 
     @abstractmethod
     def frame(self, pdu: bytes, unit: int, transaction: int) -> bytes:
-        """A frame."""
+        """Builds a frame."""
 
     @abstractmethod
     def cut(self, received: bytes) -> tuple[int, tuple[int, int, bytes]] | None:
-        """The length of the request at the start, and its transaction id, unit id and PDU."""
+        """Parses the first request: its length, transaction id, unit id and PDU."""
 
 
 class Mbap(Framing):
@@ -117,7 +117,7 @@ class Mbap(Framing):
 
 
 class OnLine(Framing):
-    """RTU or ASCII, on a line or over TCP."""
+    """RTU or ASCII framing, on a line or over TCP."""
 
     def __init__(self, mode: lines.Mode) -> None:
         self.mode = mode
@@ -135,7 +135,7 @@ class OnLine(Framing):
 
 
 def request_length(received: bytes) -> int | None:
-    """Bytes of the RTU request at the start of some bytes."""
+    """Returns the length of the RTU request at the start of some bytes."""
     if len(received) < 2:
         return None
     code = received[1]
@@ -146,7 +146,7 @@ def request_length(received: bytes) -> int | None:
 
 
 class Peer:
-    """Somebody who asks: a connection, an address, or the other end of a line."""
+    """The requesting side: a connection, an address, or the other end of a line."""
 
     def __init__(self, framing: Framing) -> None:
         self.framing = framing
@@ -156,7 +156,7 @@ class Peer:
         raise NotImplementedError
 
     def hang_up(self) -> None:
-        """Ends a connection at once; what has come and was not read yet is dropped."""
+        """Closes the connection at once, and drops unread requests."""
         raise NotImplementedError
 
 
@@ -167,7 +167,7 @@ class Connection(Peer):
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes) -> None:
-        # The client may be gone.
+        # The client may have disconnected.
         with contextlib.suppress(OSError):
             self.socket.sendall(data)
 
@@ -176,18 +176,18 @@ class Connection(Peer):
         self.socket.close()
 
     def close(self) -> None:
-        """Ends it in good order."""
+        """Closes it cleanly."""
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
 
     def reset(self) -> None:
-        """Ends it with RST."""
+        """Closes it with RST."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.socket.close()
 
 
 class Sender(Peer):
-    """Whoever sent a datagram."""
+    """The sender of a datagram."""
 
     def __init__(self, framing: Framing, own: socket.socket, address: Any) -> None:
         super().__init__(framing)
@@ -212,7 +212,7 @@ class Wire(Peer):
 
 
 def good(asked: Asked) -> None:
-    """Answers as it should be."""
+    """Answers correctly."""
     asked.answer()
 
 
@@ -221,23 +221,22 @@ def silent(asked: Asked) -> None:
 
 
 class ScriptedDevice(ABC):
-    """A device that runs until `stop`, and again from the next `start`. One thread does it all, so
-    that no connection is left when it has ended.
+    """A device that runs from `start` to `stop`, any number of times. One thread serves all
+    connections, so none is left after `stop`.
 
-    The first request is given to the first of `script`, and so on; all further ones to the last
-    one's successor, `then`.
+    Each request is handled by the next entry of `script`, and by `then` after its end.
     """
 
     url: str
     is_modelled = True
-    """Whether there is a good reply to every request, as a model of a device has it."""
+    """Whether a model of a device computes the correct reply to every request."""
 
     def __init__(self, *script: Behaviour, then: Behaviour = good) -> None:
         self.script = list(script)
         self.then = then
         self.oracle = good_unit()
         self.requests: list[Asked] = []
-        """All requests that came, in their order."""
+        """All received requests, in order."""
         self.connections = 0
         self._end = 0
         self._thread: threading.Thread | None = None
@@ -261,7 +260,7 @@ class ScriptedDevice(ABC):
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends all connections and listens no more."""
+        """Closes all connections and stops listening."""
         if self._thread is not None:
             os.close(self._end)
             self._thread.join()
@@ -269,24 +268,24 @@ class ScriptedDevice(ABC):
             self.release()
 
     def await_requests(self, count: int) -> None:
-        """Waits until exactly so many requests have come."""
+        """Waits until exactly `count` requests have arrived."""
         wire.until(lambda: len(self.requests) >= count, f"{count} requests have come")
         assert len(self.requests) == count
 
-    def open(self) -> None:  # noqa: B027 - most take all that they need when they are made
-        """Takes what `release` has given back."""
+    def open(self) -> None:  # noqa: B027 - most acquire them in the constructor
+        """Acquires the resources that `release` has released."""
 
     @abstractmethod
     def sources(self) -> list[Any]:
-        """What can be read."""
+        """Returns what can be read."""
 
     @abstractmethod
     def read(self, source: Any) -> Peer | None:
-        """Reads; who has sent something."""
+        """Reads, and returns the senders of new bytes."""
 
     @abstractmethod
     def release(self) -> None:
-        """Gives everything back."""
+        """Releases all resources."""
 
     def _serve(self, ended: int) -> None:
         with os.fdopen(ended, "rb", buffering=0):
@@ -315,9 +314,10 @@ class ScriptedDevice(ABC):
 
 
 class Stream(ScriptedDevice):
-    """Behind TCP: MBAP or RTU frames. `greet` is done with each connection first; whoever is `deaf`
-    reads nothing; whoever serves them `in_turn` accepts the next when the one before has ended.
-    With a `port` of its own it listens only when it is started, otherwise from its beginning.
+    """Over TCP, with MBAP or RTU frames.
+
+    Calls `greet` with each connection first. With `deaf`, reads nothing. With `in_turn`, accepts a
+    connection when the previous one has ended. With `port`, listens only from `start` on.
     """
 
     def __init__(
@@ -380,7 +380,7 @@ class Stream(ScriptedDevice):
 
 
 class FakeDevice(Stream):
-    """Modbus TCP, one connection after the other: a PDU is answered by a function, `answer`."""
+    """Answers requests with a function of their PDUs, one connection after the other."""
 
     is_modelled = False
 
@@ -419,7 +419,7 @@ class Udp(ScriptedDevice):
 
 
 class Serial(ScriptedDevice):
-    """On a line."""
+    """On a serial line."""
 
     def __init__(
         self,
@@ -439,7 +439,7 @@ class Serial(ScriptedDevice):
         return [self.terminal.end]
 
     def read(self, source: Any) -> Peer:  # noqa: ARG002
-        # Nobody may be there.
+        # There may be no reader.
         with contextlib.suppress(OSError):
             self._peer.received += os.read(self.terminal.end, 65536)
         return self._peer

@@ -1,6 +1,6 @@
-"""MQTT in tests: a client to talk to a broker, a way to it that can be cut, and adapters that run.
+"""MQTT in tests: a client, a proxy to a broker, and running adapters.
 
-Nothing here leaves the loopback interface, and a `Rig` stops all that it started.
+Everything stays on the loopback interface, and a `Rig` stops everything that it started.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class Proxy:
-    """A way to a broker that can be cut, while the broker itself stays as it is."""
+    """A proxy to a broker. It can cut connections while the broker keeps running."""
 
     def __init__(self, port: int) -> None:
         self._to = port
@@ -75,7 +75,7 @@ class Proxy:
                 end.shutdown(socket.SHUT_RDWR)
 
     def cut(self) -> None:
-        """Ends every connection."""
+        """Closes every connection."""
         with self._lock:
             ends = list(self._open)
         for end in ends:
@@ -101,7 +101,7 @@ class Message(NamedTuple):
 
 
 class Probe:
-    """A client beside the adapter: publishes, and gets what is published."""
+    """A client beside the adapter that publishes and subscribes."""
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         self.messages: queue.Queue[Message] = queue.Queue()
@@ -143,7 +143,7 @@ class Probe:
         retain: bool = False,
         **properties: Any,
     ) -> None:
-        """Returns when the broker has it."""
+        """Publishes a message and waits until the broker has it."""
         packed = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         for name, value in properties.items():
             setattr(packed, name, value)
@@ -156,26 +156,26 @@ class Probe:
 
 
 def subscription(topic: str = "plant/ingest", qos: int = 1, **more: Any) -> dict[str, Any]:
-    """One entry of `subscriptions`."""
+    """Builds an entry of `subscriptions`."""
     areas = ["holding_registers", "coils"]
     return {"topic": topic, "qos": qos, "memories": ["plant"], "areas": areas} | more
 
 
 def settings(url: str, *subscriptions: dict[str, Any], **more: Any) -> MqttConfig:
-    """The configuration of an adapter; with one subscription when none is given."""
+    """Builds the configuration of an adapter; by default with one subscription."""
     entries = list(subscriptions) or [subscription()]
     fields = {"url": url, "client_id": "holdfast-test", "subscriptions": entries} | more
     return MqttConfig.model_validate(fields)
 
 
 def command(values: list[Any], address: int = 0, **more: Any) -> dict[str, Any]:
-    """A command for holding registers of `plant`, unless `more` says something else."""
+    """Builds a command for holding registers of `plant`; `more` overrides fields."""
     plain = {"memory": "plant", "area": "holding_registers", "address": address, "values": values}
     return plain | more
 
 
 def text(*commands: dict[str, Any]) -> str:
-    """One command as JSON, or several as a batch."""
+    """Encodes one command as JSON, or several as a batch."""
     return json.dumps(commands[0] if len(commands) == 1 else commands)
 
 
@@ -204,7 +204,7 @@ class Running:
         self._stop.set()
 
     def stop(self, seconds: float = wire.DEADLINE) -> None:
-        """Stops it, which must not take longer than that; it must not have failed."""
+        """Stops the adapter within `seconds`. It must not have failed."""
         self._stop.set()
         self._thread.join(seconds)
         assert not self._thread.is_alive(), f"does not end within {seconds} s"
@@ -215,7 +215,7 @@ class Running:
         return self._thread.is_alive()
 
     def wait_until_connected(self) -> None:
-        """Until it is connected and each subscription is answered."""
+        """Waits until it is connected and each subscription is acknowledged."""
         wire.until(self._ready, "connected")
 
     def _ready(self) -> bool:
@@ -225,18 +225,18 @@ class Running:
         )
 
     def wait_until_received(self, count: int) -> None:
-        """Until so many messages were carried out or refused."""
+        """Waits until `count` messages were accepted or refused."""
         wire.until(lambda: handled(self.memory_access) >= count, f"{count} messages")
 
 
 def handled(memory_access: MemoryAccess) -> int:
-    """How many messages were accepted or refused."""
+    """Returns the number of messages that were accepted or refused."""
     counts: Any = memory_access.counts()
     return int(counts["accepted"] + sum(counts["refused"].values()))
 
 
 class Rig:
-    """Two memories with a door to them, and all that a test starts."""
+    """Two memories with memory access, and everything that a test starts."""
 
     def __init__(self, folder: Path) -> None:
         self.memory = _memory()
@@ -257,25 +257,25 @@ class Rig:
         self._running.close()
 
     def broker(self, *options: str, host: str = "127.0.0.1") -> Mosquitto:
-        """Mosquitto with these lines of configuration; without any, it lets everyone in."""
+        """Starts Mosquitto with these configuration lines; default: allows anonymous clients."""
         started = Mosquitto(self._folder, *options, host=host)
         self._running.callback(started.kill)
         return started
 
     def run(self, config: MqttConfig, memory_access: MemoryAccess | None = None) -> Running:
-        """An adapter, that may not be connected yet."""
+        """Starts an adapter without waiting for its connection."""
         running = Running(config, memory_access or self.memory_access)
         self._running.callback(running.stop)
         return running
 
     def connected(self, broker: Mosquitto, *subscriptions: dict[str, Any], **more: Any) -> Running:
-        """An adapter that is connected."""
+        """Starts an adapter and waits until it is connected."""
         running = self.run(settings(broker.url, *subscriptions, **more))
         running.wait_until_connected()
         return running
 
     def proxy(self, broker: Mosquitto) -> Proxy:
-        """A way to the broker that can be cut."""
+        """Starts a proxy to the broker."""
         proxy = Proxy(broker.port)
         self._running.callback(proxy.close)
         return proxy
@@ -284,11 +284,11 @@ class Rig:
         return self._running.enter_context(Probe(broker.port, broker.host))
 
     def registers(self, address: int, count: int) -> list[int]:
-        """Holding registers of `plant`."""
+        """Reads holding registers of `plant`."""
         return self.memory.read("holding_registers", address, count)
 
     def all_content(self) -> list[dict[Area, list[int]]]:
-        """Everything in both memories."""
+        """Returns the content of both memories."""
         return [content(self.memory), content(self.other)]
 
 

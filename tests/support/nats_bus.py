@@ -1,4 +1,4 @@
-"""NATS in tests: a caller to talk to it, and scanners that run.
+"""A NATS client and scanners, for tests.
 
 Everything stays on the loopback interface, and everything that was started is stopped.
 """

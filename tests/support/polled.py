@@ -40,7 +40,7 @@ def reply(request: wire.Frame, pdu: bytes) -> bytes:
 
 
 def asked(request: wire.Frame | Asked) -> tuple[int, int]:
-    """The address and count of a read."""
+    """Parses the address and the count of a read request."""
     address, count = struct.unpack(">HH", request.pdu[1:5])
     return address, count
 
@@ -59,7 +59,7 @@ def exception(request: wire.Frame, code: int) -> bytes:
 
 
 class Fake(Stream):
-    """Answers frames of any number of connections by a function; it can go and come back."""
+    """Answers requests with a function, on any number of connections. Can stop and restart."""
 
     is_modelled = False
 
@@ -74,7 +74,7 @@ class Fake(Stream):
 
 
 class Datagrams(Udp):
-    """Answers frames over UDP by a function."""
+    """Answers requests over UDP with a function, one by one."""
 
     is_modelled = False
 

@@ -182,7 +182,7 @@ class Relay:
                     raise
                 for end in (near, far):
                     end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                # What ends a connection from another thread must not meet the TLS of this one.
+                # Closing a connection from another thread must not interfere with its TLS state.
                 ends = {near.dup(), far.dup()}
                 with self._lock:
                     self._open |= ends
