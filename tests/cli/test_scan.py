@@ -244,7 +244,7 @@ def test_a_server_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch)
     ("options", "error"),
     [
         (["--nats", "http://localhost"], "found neither nats:// nor tls://, allowed: nats://host"),
-        (["--nats", "nats://host:port"], "found a host or port that can't be"),
+        (["--nats", "nats://host:port"], "found an invalid host or port"),
         (["--nats", "nats://me:secret@"], "found no host"),
         (["--allow", "10.0.0.1/8"], "found '10.0.0.1/8', which has host bits set: the network is"),
         (["--allow", "example"], "found 'example', allowed: a network or an address"),

@@ -44,7 +44,7 @@ RECEIVER = "raw://host:port, as in raw://10.0.2.9:9000 or raw://[fd00::9]:9000"
 READS = "  reads: a list"
 WORD = "an integer from 0 to 65535"
 SERIAL = "a unit id from 1 to 247; 0 is the broadcast, 248 to 255 are reserved"
-OWN = "allowed: addresses of its own"
+OWN = "allowed: addresses without overlap"
 
 
 @pytest.fixture
@@ -117,24 +117,24 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    reads", "    max_bits: 0\n    reads",
          "8: max_bits: found 0, allowed: an integer from 1 to 2000"),
         ("    reads", "    max_gap: 1\n    cost: {per_request: 1, per_register: 1}\n    reads",
-         "9: cost: found beside max_gap, allowed: one of both"),
+         "9: cost: found together with max_gap, allowed: only one of them"),
         ("    reads", "    cost: {per_request: 1}\n    reads",
          "8: cost.per_register: missing, allowed: a number from 0 to 3600000"),
         ("    reads", "    cost: {per_request: -1, per_register: 1}\n    reads",
          "8: cost.per_request: found -1, allowed: a number from 0 to 3600000"),
         ("    reads", "    forbidden: [{area: coils, start: 1}]\n    reads",
-         "8: forbidden[0]: found neither end nor count, allowed: one of both"),
+         "8: forbidden[0]: found neither end nor count, allowed: one of them"),
         ("    reads", "    forbidden: [{area: coils, start: 1, end: 1, count: 1}]\n    reads",
-         "8: forbidden[0].count: found beside end, allowed: one of both"),
+         "8: forbidden[0].count: found together with end, allowed: only one of them"),
         ("    reads", "    readable: [{area: coils, start: 2, end: 1}]\n    reads",
          "8: readable[0].end: found 1, allowed: the last address, 2 or more"),
         ("    reads", "    readable: [{area: coils, start: 65535, count: 2}]\n    reads",
          "8: readable[0].count: found start 65535 and count 2, allowed: a sum up to 65536"),
         ("    reads", "    forbidden: [{area: input_registers, start: 29, count: 1}]\n    reads",
-         "10: reads[0]: found 10 to 29, which meets 29 to 29 of forbidden[0] in line 8, "
+         "10: reads[0]: found 10 to 29, which overlaps 29 to 29 of forbidden[0] in line 8, "
          "allowed: other addresses"),
         ("    reads", "    forbidden: [{area: input_registers, start: 0, end: 10}]\n    reads",
-         "10: reads[0]: found 10 to 29, which meets 0 to 10 of forbidden[0] in line 8, "
+         "10: reads[0]: found 10 to 29, which overlaps 0 to 10 of forbidden[0] in line 8, "
          "allowed: other addresses"),
         ("area: input_registers\n", "area: registers\n", "9: reads[0].area: found 'registers', "
          "allowed: coils, discrete_inputs, holding_registers or input_registers"),
@@ -150,13 +150,15 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          "12: reads[0].into.memory: found 'plan', allowed: plant; did you mean 'plant'?"),
         ("area: input_registers, address", "area: coils, address", "12: reads[0].into.area: found "
          "'coils', allowed for input_registers: holding_registers or input_registers"),
-        ("address: 100}", "address: 181}", "12: reads[0].into.address: found 20 registers from 181 "
-         "on, allowed in input_registers of plant: 100 to 199"),
-        ("address: 100}", "address: 99}", "12: reads[0].into.address: found 20 registers from 99 "
-         "on, allowed in input_registers of plant: 100 to 199"),
-        ("slot: 4", "slot: 3", "13: status.slot: found 3, which is addresses 90 to 119, allowed in "
+        ("address: 100}", "address: 181}", "12: reads[0].into.address: found 20 registers from "
+         "181, "
+         "allowed in input_registers of plant: 100 to 199"),
+        ("address: 100}", "address: 99}", "12: reads[0].into.address: found 20 registers from 99, "
+         "allowed in input_registers of plant: 100 to 199"),
+        ("slot: 4", "slot: 3", "13: status.slot: found 3, which covers addresses 90 to 119, "
+         "allowed in "
          "input_registers of plant: 100 to 199"),
-        ("slot: 4", "slot: 6", "13: status.slot: found 6, which is addresses 180 to 209, "
+        ("slot: 4", "slot: 6", "13: status.slot: found 6, which covers addresses 180 to 209, "
          "allowed in input_registers of plant: 100 to 199"),
         ("slot: 4", "slot: 2184",
          "13: status.slot: found 2184, allowed: an integer from 0 to 2183"),
@@ -175,13 +177,13 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    status", "    forward: [{url: 'raw://a:0', unit: 1}]\n    status",
          f"13: forward[0].url: found 'raw://a:0', allowed: {RECEIVER}"),
         ("    status", "    forward: [{url: 'raw://a:1'}]\n    status",
-         f"13: forward[0].unit: missing beside format v1, allowed: {WORD}"),
+         f"13: forward[0].unit: missing with format v1, allowed: {WORD}"),
         ("    status", "    forward: [{url: 'raw://a:1', format: crc}]\n    status",
-         f"13: forward[0].memory_id: missing beside format crc, allowed: {WORD}"),
+         f"13: forward[0].memory_id: missing with format crc, allowed: {WORD}"),
         ("    status", "    forward: [{url: 'raw://a:1', unit: 1, memory_id: 1}]\n    status",
-         "13: forward[0].memory_id: found beside format v1, allowed: unit"),
+         "13: forward[0].memory_id: found with format v1, allowed: unit"),
         ("    status", "    forward: [{url: 'raw://a:1', unit: 1, crc: none}]\n    status",
-         "13: forward[0].crc: found beside format v1, allowed: beside format crc only"),
+         "13: forward[0].crc: found with format v1, allowed: only with format crc"),
     ],
 )  # fmt: skip
 def test_a_device_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
@@ -201,8 +203,8 @@ def test_a_read_of_a_whole_area_is_not_forwarded(folder: Folder) -> None:
     forward = "forward: [{url: 'raw://a:1', unit: 1}]"
     text = f"devices: {{a: {{url: tcp://a, unit: 1, interval: 1, reads: [{read}], {forward}}}}}\n"
     assert folder.problems(HEAD + text) == [
-        "p.yaml:3: devices.a.reads[0].count: found 65536, allowed beside forward: up to 65535, "
-        "which one packet holds"
+        "p.yaml:3: devices.a.reads[0].count: found 65536, allowed with forward: up to 65535, "
+        "the limit of one packet"
     ]
 
 
@@ -250,8 +252,9 @@ def test_a_serial_line_is_driven_in_one_way(folder: Folder) -> None:
     one, other = "'rtu:///dev/ttyX?baud=9600'", "'rtu:///dev/../dev/ttyX'"
     text = changed("tcp://10.0.0.9", one) + ANOTHER.replace("tcp://10.0.0.9", other)
     assert folder.problems(text) == [
-        "p.yaml:15: devices.other.url: found other settings of the line than devices.meter in "
-        "line 4 has, allowed: the same"
+        "p.yaml:15: devices.other.url: found line settings that differ from those of "
+        "devices.meter in "
+        "line 4, allowed: the same settings"
     ]
 
 
@@ -263,15 +266,15 @@ def test_a_serial_line_is_not_served_and_polled(folder: Folder) -> None:
     text = changed("tcp://10.0.0.9", "ascii:///dev/ttyX") + listener
     assert told(folder, text) == [
         "5: url: found '/dev/ttyX', which is the device of listeners.line in line 14, "
-        "allowed: another"
+        "allowed: a different one"
     ]
 
 
 def test_a_read_that_goes_nowhere_is_a_warning(folder: Folder) -> None:
     text = changed("        into: {memory: plant, area: input_registers, address: 100}\n", "")
     assert folder.warnings(text) == [
-        "p.yaml:9: devices.meter.reads[0]: it has no effect: neither into nor forward says where "
-        "it goes"
+        "p.yaml:9: devices.meter.reads[0]: has no effect: the read has no into "
+        "and the device has no forward"
     ]
     forward = "    forward: [{url: 'raw://a:1', unit: 1}]\n"
     assert folder.warnings(text + forward) == []
@@ -291,7 +294,6 @@ def test_readable_ranges_without_holes_are_a_warning(
 ) -> None:
     text = HEAD + METER + "    readable: [{area: coils, start: 0, end: 1}]\n" + more
     message = (
-        "p.yaml:14: devices.meter.readable: it has no effect: without max_gap or cost no holes "
-        "are read"
+        "p.yaml:14: devices.meter.readable: has no effect: gaps are read only with max_gap or cost"
     )
     assert folder.warnings(text) == ([message] if warned else [])

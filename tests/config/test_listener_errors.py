@@ -179,14 +179,14 @@ def test_an_ascii_line_is_checked(folder: Folder, serial: str, problem: str) -> 
         ("{1: plant}", "{1: plan}",
          "units.1: found 'plan', allowed: plant, other; did you mean 'plant'?"),
         ("{units", "{sources: [10.0.0.0/8], units",
-         "sources: a serial line has no addresses, allowed: units, access, functions, deny"),
+         "sources: not allowed on a serial line, allowed: units, access, functions, deny"),
         ("{units", "{sources: 5, units",
-         "sources: a serial line has no addresses, allowed: units, access, functions, deny"),
+         "sources: not allowed on a serial line, allowed: units, access, functions, deny"),
         ("read-only", "read-only, areas: []",
          "areas: unknown key, allowed: units, access, functions, deny"),
         ("read-only", "read-only, functions: [3, 3]", "functions[1]: found 3 again, allowed: once"),
         ("read-only", "read-only, functions: [3], deny: [4]",
-         "deny: found beside functions, allowed: one of both"),
+         "deny: found together with functions, allowed: only one of them"),
     ],
 )  # fmt: skip
 def test_a_rule_of_a_serial_line_is_checked(
@@ -200,8 +200,8 @@ def test_a_rule_of_a_serial_line_is_checked(
 def test_a_second_rule_of_a_serial_line_is_a_warning(folder: Folder) -> None:
     text = MEMORIES + RTU + "      - {units: {2: other}, access: read-write}\n"
     assert folder.warnings(text) == [
-        "p.yaml:10: listeners.rtu.rules[1]: never matches: the whole serial line belongs to "
-        "rules[0] in line 9"
+        "p.yaml:10: listeners.rtu.rules[1]: never matches: rules[0] in line 9 "
+        "matches the whole serial line"
     ]
 
 
@@ -209,7 +209,7 @@ def test_a_second_rule_of_a_serial_line_is_a_warning(folder: Folder) -> None:
 def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> None:
     assert folder.problems(MEMORIES + RTU + ASCII.replace("/dev/ttyUSB0", device)) == [
         f"p.yaml:12: listeners.ascii.serial.device: found '{device}', which is the device of "
-        "listeners.rtu in line 5, allowed: another"
+        "listeners.rtu in line 5, allowed: a different one"
     ]
 
 
@@ -218,13 +218,13 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
     [
         ("    bind", "    format: v2\n    bind", "7: format: found 'v2', allowed: v1 or crc"),
         ("    bind", "    crc: none\n    bind",
-         "7: crc: found beside format v1, allowed: beside format crc only"),
+         "7: crc: found with format v1, allowed: only with format crc"),
         ("    bind", "    when_full: evict\n    bind", "7: when_full: unknown key, allowed: type, "
          "format, crc, bind, max_connections, max_connections_per_source, request_timeout, rules"),
         ("    bind", "    max_connections: 0\n    bind",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
         ("units: {1: plant}, ", "",
-         "9: rules[0].units: missing beside format v1, allowed: a mapping with at least one entry"),
+         "9: rules[0].units: missing with format v1, allowed: a mapping with at least one entry"),
         ("units: {1: plant}", "units: {}",
          "9: rules[0].units: found an empty mapping, allowed: a mapping with at least one entry"),
         ("{1: plant}", "{65536: plant}",
@@ -232,7 +232,7 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
         ("{1: plant}", "{1: plan}", "9: rules[0].units.1: found 'plan', allowed: plant, other; "
          "did you mean 'plant'?"),
         ("{1: plant}", "{1: plant}, memories: [plant]",
-         "9: rules[0].memories: found beside format v1, allowed: units"),
+         "9: rules[0].memories: found with format v1, allowed: units"),
         (", areas: [coils]", "", f"9: rules[0].areas: missing, allowed: {SOME}"),
         ("[coils]", "[]", f"9: rules[0].areas: found an empty list, allowed: {SOME}"),
         ("[coils]", "coils", f"9: rules[0].areas: found 'coils', allowed: {SOME}"),
@@ -258,7 +258,7 @@ def test_raw_ingest_of_format_v1_is_checked(
          "8: crc: found 'maybe', allowed: required or none"),
         ("    bind", "    crc: \n    bind", "8: crc: found nothing, allowed: required or none"),
         ("memories: [plant], ", "",
-         f"10: rules[0].memories: missing beside format crc, allowed: {SOME}"),
+         f"10: rules[0].memories: missing with format crc, allowed: {SOME}"),
         ("[plant]", "[]", f"10: rules[0].memories: found an empty list, allowed: {SOME}"),
         ("[plant]", "[plan]", "10: rules[0].memories[0]: found 'plan', allowed: plant, other; "
          "did you mean 'plant'?"),
@@ -269,7 +269,7 @@ def test_raw_ingest_of_format_v1_is_checked(
         ("[plant]", "[7]",
          f"10: rules[0].memories[0]: found 7, allowed: {NAME}; write '7' to make it text"),
         ("[plant]", "[plant], units: {1: plant}",
-         "10: rules[0].units: found beside format crc, allowed: memories"),
+         "10: rules[0].units: found with format crc, allowed: memories"),
     ],
 )  # fmt: skip
 def test_raw_ingest_of_format_crc_is_checked(
@@ -296,7 +296,7 @@ def test_all_problems_of_a_raw_ingest_rule_are_told_at_once(folder: Folder) -> N
 def test_a_raw_ingest_rule_that_an_earlier_one_covers_is_a_warning(folder: Folder) -> None:
     rule = "      - {sources: [10.1.0.0/16], units: {1: plant}, areas: [coils]}\n"
     assert folder.warnings(MEMORIES + V1 + rule) == [
-        "p.yaml:10: listeners.raw.rules[1]: never matches: all its sources belong to "
+        "p.yaml:10: listeners.raw.rules[1]: never matches: all its sources are covered by "
         "rules[0] in line 9"
     ]
 
@@ -332,7 +332,7 @@ def test_sockets_of_one_protocol_do_not_overlap(folder: Folder, one: str, other:
         )
     assert folder.problems(MEMORIES + first + second) == [
         "p.yaml:12: listeners.raw.bind: found '0.0.0.0:5020', which overlaps 127.0.0.1:5020 of "
-        "listeners.udp in line 7, allowed: an address and port of its own"
+        "listeners.udp in line 7, allowed: an unused address and port"
     ]
 
 
@@ -382,7 +382,7 @@ def test_roles_are_for_tls_only(folder: Folder) -> None:
 @pytest.mark.parametrize(
     ("roles", "never"),
     [
-        ("roles: [engineer], ", "its sources and roles belong to rules[0] in line 10"),
+        ("roles: [engineer], ", "its sources and roles are covered by rules[0] in line 10"),
         ("roles: [engineer, operator], ", None),
         ("roles: [''], ", None),
         ("", None),
@@ -407,6 +407,6 @@ def test_a_rule_for_any_role_covers_those_for_one(folder: Folder) -> None:
         "access: read-only}\n"
     )
     assert folder.warnings(MEMORIES + TLS + rules) == [
-        "p.yaml:12: listeners.tls.rules[2]: never matches: its sources and roles belong to "
+        "p.yaml:12: listeners.tls.rules[2]: never matches: its sources and roles are covered by "
         "rules[0] in line 10 and rules[1] in line 11"
     ]

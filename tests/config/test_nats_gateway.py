@@ -49,12 +49,12 @@ POLLABLE = (
     "/dev/ttyUSB0 or COM3"
 )
 EGRESS = (
-    "NETWORK[:PORTS] as 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
-    "[fd00::]/8:502; without ports it is 502, and 802 with TLS"
+    "NETWORK[:PORTS], as in 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
+    "[fd00::]/8:502; default ports: 502, with TLS also 802"
 )
-ONE = "one of username, token_file or credentials_file"
+ONE = "only one of username, token_file, credentials_file"
 NO_FILE = "which can't be read: No such file or directory"
-FORM = "the first part of subjects: letters, digits, '_' and '-', with dots between"
+FORM = "letters, digits, '_' and '-', separated by dots"
 
 
 @pytest.fixture
@@ -198,8 +198,8 @@ def test_everything_else_needs_memories(
     folder: Folder, memories: str, found: str, more: str
 ) -> None:
     assert folder.problems(memories + (more or "workers: 1\n"))[0] == (
-        f"p.yaml:1: memories: {found}, allowed: a mapping with at least one entry, "
-        "or none beside nothing but nats and gateway"
+        f"p.yaml:1: memories: {found}, allowed: a mapping with at least one entry "
+        "(optional when only nats and gateway are configured)"
     )
 
 
@@ -228,24 +228,24 @@ def test_everything_else_needs_memories(
         ("  devices", "  username: ''\n  devices",
          "3: username: found text of 0 bytes, allowed: text of 1 to 65535 bytes"),
         ("  devices", "  password_file: p.yaml\n  devices",
-         "3: password_file: found without username, allowed: both or none"),
+         "3: password_file: found without username, allowed: both or neither"),
         ("  devices", "  username: a\n  password_file: none\n  devices",
          f"4: password_file: found 'none', {NO_FILE}"),
         ("  devices", "  token_file: none\n  devices", f"3: token_file: found 'none', {NO_FILE}"),
         ("  devices", "  credentials_file: /\n  devices",
          "3: credentials_file: found '/', which can't be read: Is a directory"),
         ("  devices", "  username: a\n  token_file: p.yaml\n  devices",
-         f"4: token_file: found beside username, allowed: {ONE}"),
+         f"4: token_file: found together with username, allowed: {ONE}"),
         ("  devices", "  credentials_file: p.yaml\n  token_file: p.yaml\n  devices",
-         f"3: credentials_file: found beside token_file, allowed: {ONE}"),
+         f"3: credentials_file: found together with token_file, allowed: {ONE}"),
         ("  devices", "  tls: {ca_file: none}\n  devices",
          f"3: tls.ca_file: found 'none', {NO_FILE}"),
         ("  devices", "  tls: {key_file: p.yaml}\n  devices",
-         "3: tls.key_file: found without cert_file, allowed: both or none"),
+         "3: tls.key_file: found without cert_file, allowed: both or neither"),
         ("  devices", "  device_tls: {ca_file: none}\n  devices",
          f"3: device_tls.ca_file: found 'none', {NO_FILE}"),
         ("  devices", "  device_tls: {cert_file: p.yaml}\n  devices",
-         "3: device_tls.cert_file: found without key_file, allowed: both or none"),
+         "3: device_tls.cert_file: found without key_file, allowed: both or neither"),
         ("  devices", "  prefix: a b\n  devices", f"3: prefix: found 'a b', allowed: {FORM}"),
         ("  devices", "  prefix: a.>\n  devices", f"3: prefix: found 'a.>', allowed: {FORM}"),
         ("  devices", "  prefix: \n  devices", f"3: prefix: found nothing, allowed: {FORM}"),
@@ -291,8 +291,7 @@ def test_a_secret_in_a_url_is_refused_and_not_repeated(folder: Folder, url: str)
 def test_certificates_need_a_server_with_tls(folder: Folder) -> None:
     tls = "  tls: {ca_file: p.yaml}\n"
     assert folder.problems(NATS.replace("tls://", "nats://") + tls) == [
-        "p.yaml:4: nats.tls: found beside servers that begin with nats://, "
-        "allowed: beside tls:// only"
+        "p.yaml:4: nats.tls: found with servers that begin with nats://, allowed: only with tls://"
     ]
     both = changed(NATS, "[tls://nats.example]", "[nats://a, tls://b]")
     assert assembly.scanner(nats_of(folder, both + tls)).servers.secure
@@ -307,9 +306,9 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
     nats = changed(NATS, "[10.0.0.0/8]", "[/dev/ttyUSB0, /dev/ttyUSB1, /dev/ttyUSB2]")
     assert folder.problems(memories + LISTENER + device + nats) == [
         "p.yaml:11: nats.devices[0]: found '/dev/ttyUSB0', which is the device of listeners.line "
-        "in line 3, allowed: another",
+        "in line 3, allowed: a different one",
         "p.yaml:11: nats.devices[1]: found '/dev/ttyUSB1', which is the device of devices.meter "
-        "in line 8, allowed: another",
+        "in line 8, allowed: a different one",
     ]
 
 
@@ -335,7 +334,7 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
         ("allow: [10.0.0.0/8]", "allow: ['10.0.0.1/8:*']", "4: allow[0]: found '10.0.0.1/8', "
          "which has host bits set: the network is 10.0.0.0/8"),
         ("allow: [10.0.0.0/8]", "allow: ['10.0.0.1:9-8']",
-         "4: allow[0]: found '10.0.0.1:9-8', allowed are ports 1 to 65535, lower ones first"),
+         "4: allow[0]: found '10.0.0.1:9-8', allowed: ports 1 to 65535, the lower port first"),
         ("read-only", "writes", "5: access: found 'writes', allowed: read-only or read-write"),
         ("  access", "  in_flight: 65\n  access",
          "5: in_flight: found 65, allowed: an integer from 1 to 64"),
@@ -383,21 +382,21 @@ def test_tokens_of_the_gateway_differ_in_name_and_hash(folder: Folder) -> None:
     token = GATEWAY[GATEWAY.index("    - name") :].replace(HASH, HASH.upper())
     assert folder.problems(GATEWAY + token) == [
         "p.yaml:9: gateway.tokens[1].name: found 'panel', which is the name of gateway.tokens[0] "
-        "in line 7, allowed: another",
+        "in line 7, allowed: a different one",
         "p.yaml:10: gateway.tokens[1].sha256: found a hash, which is the sha256 of "
-        "gateway.tokens[0] in line 7, allowed: another",
+        "gateway.tokens[0] in line 7, allowed: a different one",
     ]
 
 
 def test_without_tokens_the_gateway_is_for_this_machine_only(folder: Folder) -> None:
     text = changed(WITHOUT, "127.0.0.1:8090", "0.0.0.0:8090") + "  tokens: none\n"
     more = changed(text, "sources: [10.0.0.0/8]", "sources: [127.0.0.0/8, '::/0', 10.0.0.0/8]")
-    allowed = "allowed beside tokens none: loopback addresses, as in 127.0.0.0/8"
+    allowed = "allowed with tokens none: loopback addresses, as in 127.0.0.0/8"
     assert folder.problems(more) == [
         f"p.yaml:3: gateway.sources[1]: found '::/0', {allowed}",
         f"p.yaml:3: gateway.sources[2]: found '10.0.0.0/8', {allowed}",
-        "p.yaml:6: gateway.tokens: found 'none' beside bind 0.0.0.0:8090, allowed: none on a "
-        "loopback address only",
+        "p.yaml:6: gateway.tokens: found 'none' with bind 0.0.0.0:8090, allowed: none only on "
+        "a loopback address",
     ]
 
 
@@ -405,5 +404,5 @@ def test_the_gateway_needs_a_socket_of_its_own(folder: Folder) -> None:
     metrics = "metrics: {bind: '0.0.0.0:8090'}\n"
     assert folder.problems(GATEWAY + metrics) == [
         "p.yaml:9: metrics.bind: found '0.0.0.0:8090', which overlaps 127.0.0.1:8090 of gateway "
-        "in line 2, allowed: an address and port of its own"
+        "in line 2, allowed: an unused address and port"
     ]

@@ -66,8 +66,8 @@ def changed(text: str, old: str, new: str) -> str:
 def test_an_appliance_serves_something(folder: Folder, text: str, found: str) -> None:
     (problem,) = folder.problems(MEMORIES + text)
     assert problem.partition(": ")[2] == (
-        f"listeners: {found}, allowed: a mapping with at least one entry, "
-        "or none beside rest, mqtt, nats, gateway or devices"
+        f"listeners: {found}, allowed: a mapping with at least one entry "
+        "(optional with rest, mqtt, nats, gateway or devices)"
     )
 
 
@@ -173,8 +173,8 @@ def test_tokens_are_said(folder: Folder) -> None:
 def test_rest_without_tokens_stays_on_loopback(folder: Folder, bind: str) -> None:
     rest = f"rest:\n  bind: '{bind}'\n  sources: [127.0.0.1]\n  tokens: none\n"
     assert folder.problems(MEMORIES + rest) == [
-        f"p.yaml:7: rest.tokens: found 'none' beside bind {bind}, "
-        "allowed: none on a loopback address only"
+        f"p.yaml:7: rest.tokens: found 'none' with bind {bind}, "
+        "allowed: none only on a loopback address"
     ]
 
 
@@ -190,9 +190,9 @@ def test_tokens_differ_in_name_and_hash(folder: Folder) -> None:
     token = REST[REST.index("    - name") :].replace(HASH, HASH.upper())
     assert folder.problems(MEMORIES + REST + token) == [
         "p.yaml:13: rest.tokens[1].name: found 'edge', which is the name of rest.tokens[0] "
-        "in line 8, allowed: another",
+        "in line 8, allowed: a different one",
         "p.yaml:14: rest.tokens[1].sha256: found a hash, which is the sha256 of rest.tokens[0] "
-        "in line 8, allowed: another",
+        "in line 8, allowed: a different one",
     ]
 
 
@@ -207,16 +207,16 @@ def test_tokens_differ_in_name_and_hash(folder: Folder) -> None:
         ("mqtt://broker/", f"found more than host and port, allowed: {URL}"),
         ("mqtt://broker?password=secret", f"found more than host and port, allowed: {URL}"),
         ("mqtt://broker#secret", f"found more than host and port, allowed: {URL}"),
-        ("mqtt://broker:0", f"found a host or port that can't be, allowed: {HOST}"),
-        ("mqtt://broker:65536", f"found a host or port that can't be, allowed: {HOST}"),
-        ("mqtt://user:secret", f"found a host or port that can't be, allowed: {HOST}"),
-        ("mqtt://bro ker", f"found a host or port that can't be, allowed: {HOST}"),
-        ("mqtt://[fd00::g]", f"found a host or port that can't be, allowed: {HOST}"),
-        ("mqtt://fd00::1", f"found a host or port that can't be, allowed: {HOST}"),
-        ("mqtt://user:secret@broker", f"found a user in it, allowed: {URL}; the user is username, "
-         "the password is in the file that password_file names"),
-        ("mqtt://user:se/cr#et@broker", f"found a user in it, allowed: {URL}; the user is "
-         "username, the password is in the file that password_file names"),
+        ("mqtt://broker:0", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://broker:65536", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://user:secret", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://bro ker", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://[fd00::g]", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://fd00::1", f"found an invalid host or port, allowed: {HOST}"),
+        ("mqtt://user:secret@broker", f"found a user in the URL, allowed: {URL}; set username "
+         "and password_file instead"),
+        ("mqtt://user:se/cr#et@broker", f"found a user in the URL, allowed: {URL}; "
+         "set username and password_file instead"),
     ],
 )  # fmt: skip
 def test_the_url_of_a_broker_is_checked_and_not_repeated(
@@ -233,7 +233,7 @@ def test_the_url_of_a_broker_is_checked_and_not_repeated(
         ("''", "found text of 0 bytes, allowed: a topic filter of 1 to 65535 bytes"),
         ("7", "found 7, allowed: a topic filter of 1 to 65535 bytes"),
         ("ü" * 32768, "found text of 65536 bytes, allowed: a topic filter of 1 to 65535 bytes"),
-        ('"a\\0"', "found 'a\\x00', allowed: a topic filter without NUL and surrogates"),
+        ('"a\\0"', "found 'a\\x00', allowed: a topic filter without NUL or surrogates"),
         ("'a/#/b'", "found 'a/#/b', allowed: '#' only alone in the last level"),
         ("'a#'", "found 'a#', allowed: '#' only alone in the last level"),
         ("'##'", "found '##', allowed: '#' only alone in the last level"),
@@ -270,7 +270,7 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("  client", "  username: ''\n  client",
          "6: username: found text of 0 bytes, allowed: text of 1 to 65535 bytes"),
         ("  client", "  password_file: p.yaml\n  client",
-         "6: password_file: found without username, allowed: both or none"),
+         "6: password_file: found without username, allowed: both or neither"),
         ("  client", "  username: a\n  password_file: none.txt\n  client",
          "7: password_file: found 'none.txt', which can't be read: No such file or directory"),
         ("  client", "  username: a\n  password_file: /\n  client",
@@ -280,11 +280,11 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("  client", "  tls: {ca_file: none.pem}\n  client",
          "6: tls.ca_file: found 'none.pem', which can't be read: No such file or directory"),
         ("  client", "  tls: {cert_file: p.yaml}\n  client",
-         "6: tls.cert_file: found without key_file, allowed: both or none"),
+         "6: tls.cert_file: found without key_file, allowed: both or neither"),
         ("  client", "  tls: {key_file: p.yaml}\n  client",
-         "6: tls.key_file: found without cert_file, allowed: both or none"),
+         "6: tls.key_file: found without cert_file, allowed: both or neither"),
         ("  client", "  tls: {}\n  client",
-         "6: tls: found beside a url that begins with mqtt://, allowed: beside mqtts:// only"),
+         "6: tls: found with a url that begins with mqtt://, allowed: only with mqtts://"),
         ("topic:", "qos: 3, topic:", "8: subscriptions[0].qos: found 3, allowed: 0, 1 or 2"),
         ("topic:", "qos: true, topic:", "8: subscriptions[0].qos: found true, allowed: 0, 1 or 2"),
         ("[plant]", "[plnt]", "8: subscriptions[0].memories[0]: found 'plnt', "
@@ -311,7 +311,7 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
     again = MQTT[MQTT.index("    - {topic") :].replace("[plant]", "[other]")
     assert folder.problems(MEMORIES + MQTT + again) == [
         "p.yaml:9: mqtt.subscriptions[1].topic: found 'plant/+/in/#', which is the topic of "
-        "mqtt.subscriptions[0] in line 8, allowed: another"
+        "mqtt.subscriptions[0] in line 8, allowed: a different one"
     ]
 
 
@@ -341,7 +341,7 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
          f"6: metrics.sources: found an empty list, allowed: {SOME}"),
         ("file: audit.log", "keep: 1", "7: audit.file: missing, allowed: text"),
         ("audit.log", "none/audit.log", "7: audit.file: found 'none/audit.log', "
-         "allowed: a file in a folder that is there"),
+         "allowed: a file in an existing folder"),
         ("audit.log", ".", "7: audit.file: found '.', which is a folder, allowed: a file"),
         ("audit.log", "audit.log, max_bytes: 65535",
          "7: audit.max_bytes: found 65535, allowed: an integer of at least 65536"),
@@ -361,7 +361,7 @@ def test_rest_and_metrics_need_sockets_of_their_own(folder: Folder) -> None:
         "      - {sources: [10.0.0.7], units: {1: plant}, areas: [coils]}\n"
     )
     metrics = "metrics: {bind: '[::]:8080'}\n"
-    own = "allowed: an address and port of its own"
+    own = "allowed: an unused address and port"
     assert folder.problems(MEMORIES + listener + metrics + REST) == [
         f"p.yaml:10: metrics.bind: found '[::]:8080', which overlaps 0.0.0.0:8080 of "
         f"listeners.raw in line 7, {own}",
@@ -442,7 +442,7 @@ devices:
 )
 def test_a_seal_that_nothing_can_open_is_a_warning(folder: Folder, text: str) -> None:
     assert folder.warnings(SEALED + text) == [
-        "p.yaml:2: memories.plant.seal: it can never be opened: no raw-ingest rule, token, "
+        "p.yaml:2: memories.plant.seal: can never be opened: no raw-ingest rule, token, "
         "subscription, adapter or device may write coils of plant"
     ]
 

@@ -388,7 +388,7 @@ def test_a_configuration_has_them_too(
     [
         ("ca_file: none.pem", "tls.ca_file: found 'none.pem', which can't be read: No such file or "
          "directory"),
-        ("cert_file: panel.pem", "tls.cert_file: found without key_file, allowed: both or none"),
+        ("cert_file: panel.pem", "tls.cert_file: found without key_file, allowed: both or neither"),
         ("name: plc", "tls.name: unknown key, allowed: ca_file, cert_file, key_file"),
         ("ca_file: text.pem", "tls: {folder}/text.pem: found no certificate, allowed: a "
          "certificate in PEM"),

@@ -1,8 +1,8 @@
 """The configuration of an appliance: one YAML file, checked as a whole before anything starts.
 
-`load` is the way in. It returns a `Config` that is right in every respect, or raises a
-`ConfigError` that holds every problem of the file at once. This room must never start anything or
-open a socket; of the native core it knows the constants.
+Call `load`. It returns a valid `Config`, or raises a `ConfigError` with every problem of the file.
+This package never starts anything and never opens a socket. It uses only the constants of the
+native core.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""IP addresses as a configuration writes them: where to listen, and whom to admit.
+"""IP addresses in a configuration: addresses to listen on, and sources to admit.
 
-Only numbers, never host names: what is admitted must not depend on a name server. An IPv4 address
-mapped into IPv6 is refused everywhere, because its IPv4 form is what is matched.
+Host names are not allowed, because admission must not depend on a name server. IPv4-mapped IPv6
+addresses are refused, because peers are matched by their IPv4 form.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Bind:
         return joined(self.host, self.port)
 
     def overlaps(self, other: Bind) -> bool:
-        """Whether both can't be open at once: `[::]` takes IPv4 connections too."""
+        """Whether both can't be open at once: `[::]` also accepts IPv4 connections."""
         if self.port != other.port or self.port == 0:
             return False
         return self.address == other.address or self._takes(other) or other._takes(self)
@@ -47,7 +47,7 @@ class Bind:
 
 
 def parse_bind(text: object) -> Bind:
-    """Raises `ValueError` for anything but an IP address and a port."""
+    """Parses `address:port`. Raises `ValueError` for anything else."""
     if isinstance(text, Bind):
         return text
     match = _BIND.fullmatch(text) if isinstance(text, str) else None
@@ -65,12 +65,12 @@ def parse_bind(text: object) -> Bind:
             form = joined(str(four), int(match["port"]))
             raise ValueError(f"found {show(text)}, write its IPv4 form {form}")
         if address.scope_id is not None and not re.fullmatch("[0-9]{1,9}", address.scope_id):
-            raise ValueError(f"found {show(text)}, allowed behind '%': the number of an interface")
+            raise ValueError(f"found {show(text)}, allowed after '%': an interface number")
     return Bind(address, int(match["port"]))
 
 
 def parse_source(text: object) -> Network:
-    """Raises `ValueError` for anything but a network or a single address."""
+    """Parses a network or a single address. Raises `ValueError` for anything else."""
     if isinstance(text, IPv4Network | IPv6Network):
         return text
     if not isinstance(text, str) or not re.fullmatch(r"[0-9a-fA-F.:]+(/[0-9]{1,3})?", text):

@@ -1,6 +1,6 @@
-"""What is allowed at a place of the configuration, in words.
+"""Describes the values that a key of the configuration allows.
 
-It is read from the JSON Schema, so that messages and editors say the same.
+The descriptions come from the JSON Schema, so messages and editors agree.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ Node: TypeAlias = dict[str, Any]
 
 
 def allowed(path: KeyPath, data: object) -> str:
-    """What the value at `path` of `data` can be."""
+    """Describes the values that are allowed at `path` of `data`."""
     nodes = _at(path, data)
     return choice([_words(node) for node in nodes]) if nodes else "nothing"
 
 
 def known_keys(path: KeyPath, data: object) -> list[str]:
-    """The keys that the mapping at `path` of `data` can have."""
+    """The keys that are allowed in the mapping at `path` of `data`."""
     return [
         key
         for node in _at(path, data)
@@ -63,7 +63,7 @@ def _children(node: Node, part: Key, value: object) -> Iterator[Node]:
 
 
 def _kinds(node: Node, value: object) -> list[Node]:
-    """What a node is one of; only the kind that the value names, where it names one."""
+    """The alternatives of a node; only the one that the value's discriminator selects, if any."""
     kinds: list[Node] = [*node.get("anyOf", ()), *node.get("oneOf", ())]
     if "discriminator" in node:
         named = mapping(value).get(node["discriminator"]["propertyName"])

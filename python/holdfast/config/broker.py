@@ -1,4 +1,4 @@
-"""MQTT's own forms: the URL of a broker, and topic filters."""
+"""Parses MQTT settings: the URL of a broker, and topic filters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
 class Broker(NamedTuple):
-    """Where a broker is, and whether TLS is spoken to it."""
+    """The host and port of a broker, and whether the connection uses TLS."""
 
     host: str
     port: int
@@ -23,13 +23,13 @@ class Broker(NamedTuple):
 
 
 def parse_broker(text: object) -> Broker:
-    """Raises `ValueError` for anything but a scheme, a host and perhaps a port."""
+    """Parses `scheme://host[:port]`. Raises `ValueError` for anything else."""
     remote = parse_remote(text, _PORTS, URL_FORM)
     return Broker(remote.host, remote.port, remote.scheme == "mqtts")
 
 
 def parse_topic_filter(text: object) -> str:
-    """Raises `ValueError` for what MQTT 5, 4.7, does not allow."""
+    """Checks a topic filter. Raises `ValueError` if MQTT 5, section 4.7, does not allow it."""
     allowed = f"allowed: a topic filter of 1 to {MAX_TEXT} bytes"
     if not isinstance(text, str):
         raise ValueError(f"found {show(text)}, {allowed}")
@@ -37,7 +37,7 @@ def parse_topic_filter(text: object) -> str:
     if not 1 <= size <= MAX_TEXT:
         raise ValueError(f"found text of {size} bytes, {allowed}")
     if re.search("[\0\ud800-\udfff]", text):
-        raise ValueError(f"found {show(text)}, allowed: a topic filter without NUL and surrogates")
+        raise ValueError(f"found {show(text)}, allowed: a topic filter without NUL or surrogates")
     *inner, last = text.split("/")
     if "#" in "".join(inner) or ("#" in last and last != "#"):
         raise ValueError(f"found {show(text)}, allowed: '#' only alone in the last level")

@@ -1,5 +1,6 @@
-"""What the keys of devices must keep together: destinations, ranges, forwards and serial lines;
-and that a line polled for subscribers is nobody else's.
+"""Checks rules between keys of devices: destinations, ranges, forwards and serial lines.
+
+A serial line that is polled for NATS subscribers can't have another user.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
 
 MAX_OF_A_PACKET = MAX_WORD
-"""The most values of one raw ingest packet."""
+"""The maximum number of values in one raw ingest packet."""
 
 _NAMING = {"v1": "unit", "crc": "memory_id"}
-"""The key of what a packet names, by its format."""
+"""The key for the target of a packet, by format."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """Addresses of a memory that something is written to; `path` is its place in the file."""
+    """Addresses of a memory that a read or status block writes; `path` is its place in the file."""
 
     path: KeyPath
     memory: str
@@ -58,7 +59,7 @@ class DeviceChecks:
     report: Report
     grants: GrantChecks
     memories: dict[Any, Any]
-    """The memories as they are written."""
+    """The memories, as in the file and not validated."""
 
     def __post_init__(self) -> None:
         self._claims: list[Claim] = []
@@ -82,10 +83,10 @@ class DeviceChecks:
                 where, shown = (*path, "url"), f"{key}={show(file)}"
                 check_readable(where, file, self.folder, self.report, shown=shown)
         if "max_gap" in device and "cost" in device:
-            message = "found beside max_gap, allowed: one of both"
+            message = "found together with max_gap, allowed: only one of them"
             self.report.add((*path, "cost"), message, of_key=True)
         if device.get("readable") and not device.get("max_gap") and "cost" not in device:
-            message = "it has no effect: without max_gap or cost no holes are read"
+            message = "has no effect: gaps are read only with max_gap or cost"
             self.report.doubt((*path, "readable"), message)
         self._ranges((*path, "readable"), device.get("readable"))
         forbidden = self._ranges((*path, "forbidden"), device.get("forbidden"))
@@ -101,7 +102,7 @@ class DeviceChecks:
     def _line(
         self, path: KeyPath, target: SerialTarget, unit: object, taken: dict[str, KeyPath]
     ) -> None:
-        """A serial line: it belongs to devices that drive it alike, and to no listener."""
+        """Devices share a serial line only with equal settings, and never with a listener."""
         number = integer(unit, 0, MAX_UNIT)
         if number is not None and not 1 <= number <= MAX_SERIAL_UNIT:
             allowed = (
@@ -113,11 +114,11 @@ class DeviceChecks:
             self._taken((*path, "url"), target.device, taken[port])
         first, other = self._lines.setdefault(port, (path, target))
         if replace(target, device=other.device) != other:
-            message = f"found other settings of the line than {self._named(first)} has"
-            self.report.add((*path, "url"), f"{message}, allowed: the same")
+            message = f"found line settings that differ from those of {self._named(first)}"
+            self.report.add((*path, "url"), f"{message}, allowed: the same settings")
 
     def _subscribed(self, devices: list[Any], taken: dict[str, KeyPath]) -> None:
-        """The serial lines among those that subscribers may have polled."""
+        """Reports serial lines of the scanner that a device or a listener uses."""
         lines = {port: path for port, (path, _) in self._lines.items()} | taken
         for index, device in enumerate(devices):
             entry = parsed(parse_pollable, device)
@@ -127,21 +128,21 @@ class DeviceChecks:
 
     def _taken(self, path: KeyPath, device: str, owner: KeyPath) -> None:
         of = self._named(owner)
-        message = f"found {show(device)}, which is the device of {of}, allowed: another"
+        message = f"found {show(device)}, which is the device of {of}, allowed: a different one"
         self.report.add(path, message)
 
     def _ranges(self, path: KeyPath, ranges: object) -> list[tuple[KeyPath, object, range]]:
-        """The ranges that can be told, each with its place and its area."""
+        """The valid ranges, each with its path and its area."""
         found = []
         for index, each in enumerate(entries(ranges)):
             if not isinstance(each, dict):
                 continue
             here = (*path, index)
             if "end" in each and "count" in each:
-                message = "found beside end, allowed: one of both"
+                message = "found together with end, allowed: only one of them"
                 self.report.add((*here, "count"), message, of_key=True)
             elif not each.keys() & {"end", "count"}:
-                message = "found neither end nor count, allowed: one of both"
+                message = "found neither end nor count, allowed: one of them"
                 self.report.add(here, message, of_key=True)
             else:
                 span = self._range(here, each)
@@ -163,7 +164,7 @@ class DeviceChecks:
         return range(start, end + 1)
 
     def _sum(self, path: KeyPath, first: int | None, count: object, key: str) -> range | None:
-        """So many addresses from the first on, if there are that many."""
+        """The `count` addresses from `first` on, `None` if they are not valid."""
         number = integer(count, 1, ADDRESSES)
         if first is None or number is None:
             return None
@@ -176,16 +177,16 @@ class DeviceChecks:
     def _forward(self, path: KeyPath, forward: dict[Any, Any]) -> None:
         form = forward.get("format", "v1")
         if "crc" in forward and form == "v1":
-            message = "found beside format v1, allowed: beside format crc only"
+            message = "found with format v1, allowed: only with format crc"
             self.report.add((*path, "crc"), message, of_key=True)
         if form not in ("v1", "crc") or not forward:
             return
         needed, other = _NAMING[form], _NAMING["v1" if form == "crc" else "crc"]
         if needed not in forward:
-            message = f"missing beside format {form}, allowed: an integer from 0 to {MAX_WORD}"
+            message = f"missing with format {form}, allowed: an integer from 0 to {MAX_WORD}"
             self.report.add((*path, needed), message, of_key=True)
         if other in forward:
-            message = f"found beside format {form}, allowed: {needed}"
+            message = f"found with format {form}, allowed: {needed}"
             self.report.add((*path, other), message, of_key=True)
 
     def _read(
@@ -202,17 +203,17 @@ class DeviceChecks:
         count = integer(read.get("count"), 1, ADDRESSES)
         for where, of, span in forbidden:
             if asked is not None and of == area and _meet(asked, span):
-                message = f"found {extent(asked)}, which meets {extent(span)} of {_last(where)}"
+                message = f"found {extent(asked)}, which overlaps {extent(span)} of {_last(where)}"
                 line = f"in line {self.report.line(where)}"
                 self.report.add(path, f"{message} {line}, allowed: other addresses", of_key=True)
         if forwarded and count == ADDRESSES:
-            allowed = f"allowed beside forward: up to {MAX_OF_A_PACKET}, which one packet holds"
+            allowed = f"allowed with forward: up to {MAX_OF_A_PACKET}, the limit of one packet"
             self.report.add((*path, "count"), f"found {count}, {allowed}")
         if isinstance(read.get("into"), dict):
             into = (*path, "into")
             self._destination(into, read["into"], area, count)
         elif "into" not in read and not forwarded:
-            message = "it has no effect: neither into nor forward says where it goes"
+            message = "has no effect: the read has no into and the device has no forward"
             self.report.doubt(path, message)
 
     def _destination(
@@ -231,7 +232,7 @@ class DeviceChecks:
             return
         if address not in there or address + count - 1 not in there:
             noun = "bits" if area in BIT_AREAS else "registers"
-            found = f"found {count} {noun} from {address} on"
+            found = f"found {count} {noun} from {address}"
             allowed = f"allowed in {area} of {into['memory']}: {extent(there)}"
             self.report.add((*path, "address"), f"{found}, {allowed}")
             return
@@ -247,27 +248,27 @@ class DeviceChecks:
             return
         block = range(slot * STATUS_BLOCK, (slot + 1) * STATUS_BLOCK)
         if block[0] not in there or block[-1] not in there:
-            found = f"found {slot}, which is addresses {extent(block)}"
+            found = f"found {slot}, which covers addresses {extent(block)}"
             allowed = f"allowed in {area} of {status['memory']}: {extent(there)}"
             self.report.add((*path, "slot"), f"{found}, {allowed}")
             return
         self._claims.append(Claim(path, status["memory"], area, block))
 
     def _there(self, path: KeyPath, name: object, area: Any) -> range | None:
-        """The addresses of a memory's area, if they can be told."""
+        """The addresses of an area of a memory, `None` if the memory or area is not valid."""
         memory = self.memories.get(name) if isinstance(name, str) else None
         if not isinstance(memory, dict):
             return None
         if area not in memory:
             areas = [each for each in AREAS if each in memory]
-            allowed = f"allowed: {listing(areas)}" if areas else "which needs one"
+            allowed = f"allowed: {listing(areas)}" if areas else "and it has no other area"
             message = f"found {show(area)}, an area that {name} does not have, {allowed}"
             self.report.add((*path, "area"), message)
             return None
         return addresses(memory[area])
 
     def _overlaps(self) -> None:
-        """No address is written by two reads or blocks: the later one in the file is reported."""
+        """Reports reads and blocks that write an address twice, at the later one in the file."""
         order = {claim.path: number for number, claim in enumerate(self._claims)}
         widest: dict[tuple[str, str], Claim] = {}
         for claim in sorted(self._claims, key=lambda claim: claim.addresses.start):
@@ -277,7 +278,7 @@ class DeviceChecks:
                 first, second = sorted((before, claim), key=lambda each: order[each.path])
                 overlapped = f"{extent(first.addresses)} of {self._named(first.path)}"
                 message = f"found {second}, which overlaps {overlapped}"
-                self.report.add(second.path, f"{message}, allowed: addresses of its own")
+                self.report.add(second.path, f"{message}, allowed: addresses without overlap")
             if claim.addresses.stop > before.addresses.stop:
                 widest[key] = claim
 
@@ -290,7 +291,7 @@ def _target(url: object) -> Target:
 
 
 def _serial_listeners(data: dict[Any, Any]) -> dict[str, KeyPath]:
-    """The serial ports that are served, each with its listener."""
+    """The serial ports of listeners, each with the path of its listener."""
     ports: dict[str, KeyPath] = {}
     for name, listener in mapping(data.get("listeners")).items():
         if mapping(listener).get("type") in SERIAL_TYPES:

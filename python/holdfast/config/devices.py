@@ -1,4 +1,4 @@
-"""Devices that are polled: what is read of them, in which requests, and where it goes."""
+"""Models of polled devices: their reads, request limits and destinations."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ from holdfast.types import Area, RegisterArea
 
 MIN_INTERVAL = 0.01
 STATUS_BLOCK = 30
-"""Registers of a status block."""
+"""Registers in a status block."""
 LAST_SLOT = ADDRESSES // STATUS_BLOCK - 1
 
 
 class DestinationConfig(Model):
-    """Where the bytes of a read go."""
+    """The destination of a read."""
 
     memory: Name
     """The memory."""
     area: Area
-    """The area: of bits for bits, of registers for registers."""
+    """The area: an area of bits for bits, an area of registers for registers."""
     address: Register
     """The first address."""
 
 
 class ReadConfig(Model):
-    """Something to read, which is written as one step."""
+    """A range to read; its values are written to memory in one step."""
 
     area: Area
     """The area of the device."""
     address: Register
-    """The first address, as in the protocol: from 0."""
+    """The first address, as in the protocol: counted from 0."""
     count: Size
-    """Bits or registers; what one request can't carry takes several."""
+    """How many bits or registers; a large count takes several requests."""
     into: Annotated[DestinationConfig | None, NotNull()] = None
-    """Where it goes in this appliance."""
+    """The destination in this appliance."""
 
 
 class RangeConfig(Model):
@@ -64,7 +64,7 @@ class RangeConfig(Model):
     end: Annotated[Register | None, NotNull()] = None
     """The last address."""
     count: Annotated[Size | None, NotNull()] = None
-    """How many addresses there are, in place of end."""
+    """How many addresses there are, instead of end."""
 
     @property
     def addresses(self) -> range:
@@ -75,14 +75,14 @@ class RangeConfig(Model):
 
 
 class CostConfig(Model):
-    """What reading costs: a hole is read where that is cheaper than one more request."""
+    """What reading costs: a gap is read if that is cheaper than another request."""
 
     per_request: Milliseconds
-    """Milliseconds that a request takes, whatever it reads."""
+    """Milliseconds per request, whatever it reads."""
     per_register: Milliseconds
-    """Milliseconds that each register takes, or each 16 bits."""
+    """Milliseconds per register, or per 16 bits."""
     measured: bool = False
-    """Whether the device's own answers take the place of both, after a hundred of them."""
+    """Whether measurements replace both costs after 100 answers of the device."""
 
 
 def _crc(data: dict[str, Any]) -> Literal["required"] | None:
@@ -90,20 +90,20 @@ def _crc(data: dict[str, Any]) -> Literal["required"] | None:
 
 
 class ForwardConfig(Model):
-    """A receiver of raw ingest packets that gets every read too."""
+    """A raw ingest receiver to which every read is forwarded."""
 
     url: ReceiverUrl
     """The receiver: raw://host:port."""
     format: Literal["v1", "crc"] = "v1"
-    """The layout of a packet: 10 bytes of header and a unit id, or 12, a memory id and a CRC."""
+    """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
     crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
-    """Whether packets of format crc end with their CRC; `required` when left out."""
+    """Format crc: whether packets end with a CRC. Default: required."""
     unit: Annotated[Register | None, NotNull()] = None
-    """Format v1: the unit id that packets name."""
+    """Format v1: the unit id of the packets."""
     memory_id: Annotated[Register | None, NotNull()] = None
-    """Format crc: the memory id that packets name."""
+    """Format crc: the memory id of the packets."""
     timeout: Duration = 5.0
-    """Seconds for a connection, a packet and its reply together."""
+    """Seconds for connection, packet and reply together."""
 
     @property
     def receiver(self) -> Receiver:
@@ -112,19 +112,19 @@ class ForwardConfig(Model):
 
     @property
     def target(self) -> int:
-        """What packets name, by either format."""
+        """The unit id or the memory id of the packets, depending on the format."""
         return (self.unit if self.format == "v1" else self.memory_id) or 0
 
 
 class StatusConfig(Model):
-    """30 registers that tell how a device does."""
+    """A block of 30 registers with the status of a device."""
 
     memory: Name
     """The memory."""
     area: RegisterArea
     """The area, of registers."""
     slot: Annotated[int, Field(ge=0, le=LAST_SLOT)]
-    """The block begins at address 30 × slot."""
+    """The slot; the block begins at address 30 × slot."""
 
     @property
     def addresses(self) -> range:
@@ -140,7 +140,7 @@ class DeviceConfig(Model):
     """A device that is polled."""
 
     url: DeviceUrl
-    """The device, or the gateway that it is behind, as clients name it."""
+    """The URL of the device, or of the gateway in front of it."""
     unit: UnitId
     """The unit id, 0 to 255; on a serial line 1 to 247."""
     enabled: bool = True
@@ -154,25 +154,25 @@ class DeviceConfig(Model):
     timeout: Duration = 1.0
     """Seconds for a request and its reply."""
     reads: Annotated[tuple[ReadConfig, ...], Strict(False), Field(min_length=1)]
-    """What is read."""
+    """The ranges to read."""
     cost: Annotated[CostConfig | None, NotNull()] = None
-    """Reads holes between reads where that is cheaper; in place of max_gap."""
+    """Reads gaps between reads if that is cheaper; instead of max_gap."""
     max_gap: Annotated[Annotated[int, Field(ge=0, le=LAST_ADDRESS)] | None, NotNull()] = Field(
         default_factory=_max_gap
     )
-    """Reads holes between reads of up to so many bits or registers; 0 when left out."""
+    """The largest gap, in bits or registers, that is read to join two reads. Default: 0."""
     max_registers: Annotated[int, Field(ge=1, le=READ_REGISTERS)] = READ_REGISTERS
-    """The most registers of one request."""
+    """Maximum number of registers in one request."""
     max_bits: Annotated[int, Field(ge=1, le=READ_BITS)] = READ_BITS
-    """The most bits of one request."""
+    """Maximum number of bits in one request."""
     readable: Annotated[tuple[RangeConfig, ...], Strict(False)] = ()
-    """Holes are read only inside these, in the areas that have some."""
+    """Gaps are read only inside these ranges, in areas that have one."""
     forbidden: Annotated[tuple[RangeConfig, ...], Strict(False)] = ()
     """Addresses that are never read."""
     forward: Annotated[tuple[ForwardConfig, ...], Strict(False)] = ()
-    """Who gets every read too."""
+    """Raw ingest receivers to which every read is forwarded."""
     status: Annotated[StatusConfig | None, NotNull()] = None
-    """Where it is told how the device does."""
+    """The status block of the device."""
 
     @property
     def target(self) -> Target:

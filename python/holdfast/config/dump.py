@@ -1,6 +1,6 @@
-"""The effective configuration as YAML that people read and `load` accepts.
+"""Writes the effective configuration as readable YAML that `load` accepts.
 
-It writes plain data and knows no models.
+The functions take plain data, not models.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 from holdfast.config.source import scalar
 
 NULL_IS_SAID = frozenset({"max_connections_per_source"})
-"""Keys whose absence is written as null; the others are left out."""
+"""Keys whose `None` is written as null; other keys without a value are omitted."""
 
 AS_WRITTEN = frozenset({"options"})
-"""Keys whose values are not the models' own: a null in them is data."""
+"""Keys whose values belong to someone else, such as an adapter: a null in them is data."""
 
 PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", re.ASCII)
-"""Text that means itself anywhere in YAML; whatever else is quoted."""
+"""Text that is safe without quotes anywhere in YAML; all other text is quoted."""
 
 
 def effective(model: dict[Any, Any]) -> dict[Any, Any]:
-    """The data of a model as YAML and JSON have it, without keys that hold nothing."""
+    """The data of a model for YAML and JSON, without keys that have no value."""
     return {
         key: value if key in AS_WRITTEN else _plain(value)
         for key, value in model.items()
@@ -47,7 +47,7 @@ def _plain(value: object) -> object:
 
 
 def to_yaml(data: dict[str, Any]) -> str:
-    """The text of a mapping; what is small and deep inside is on one line."""
+    """The YAML text of a mapping; small, deeply nested values are on one line."""
     yaml = YAML()
     yaml.Representer = _Representer
     yaml.width = 100

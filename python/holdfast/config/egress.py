@@ -1,4 +1,4 @@
-"""Whom the gateway may connect to, as text: a network and ports."""
+"""Parses entries of the gateway's allow list: a network and ports."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from holdfast.net.addresses import LAST_PORT
 from holdfast.net.allow_list import ALL_PORTS, AllowedNetwork
 
 FORM = (
-    "NETWORK[:PORTS] as 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
-    "[fd00::]/8:502; without ports it is 502, and 802 with TLS"
+    "NETWORK[:PORTS], as in 10.0.0.0/8, 10.0.0.5:502, 10.0.0.0/24:502-510, 10.0.0.5:* or "
+    "[fd00::]/8:502; default ports: 502, with TLS also 802"
 )
 
 _ENTRY = re.compile(
@@ -22,7 +22,7 @@ _ENTRY = re.compile(
 
 
 def parse_allowed(text: object) -> AllowedNetwork:
-    """An entry of the list. Raises `ValueError`, which says what is allowed."""
+    """Parses an entry. Raises `ValueError` that says what is allowed."""
     if isinstance(text, AllowedNetwork):
         return text
     match = _ENTRY.fullmatch(text) if isinstance(text, str) else None
@@ -31,13 +31,13 @@ def parse_allowed(text: object) -> AllowedNetwork:
     host = match["four"] or f"{match['six']}{match['prefix'] or ''}"
     network = parse_source(host)
     if match["six"] is not None and network.version != 6:
-        raise ValueError(f"found {show(text)}, brackets are for IPv6")
+        raise ValueError(f"found {show(text)}, allowed in brackets: an IPv6 network")
     if match["ports"] is None:
         return AllowedNetwork(network)
     first, last = _ports(match["ports"])
     if not 1 <= first <= last <= LAST_PORT:
         raise ValueError(
-            f"found {show(text)}, allowed are ports 1 to {LAST_PORT}, lower ones first"
+            f"found {show(text)}, allowed: ports 1 to {LAST_PORT}, the lower port first"
         )
     return AllowedNetwork(network, (first, last))
 

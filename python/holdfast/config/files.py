@@ -1,4 +1,4 @@
-"""Files that a configuration names."""
+"""Checks that the files of a configuration are readable."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def unreadable(path: Path) -> str:
-    """Why a file can't be read, nothing when it can; it is not opened, as it may hold a secret."""
+    """Why a file can't be read, or "" if it can. Does not open it: it may contain a secret."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
@@ -30,9 +30,9 @@ def unreadable(path: Path) -> str:
 def check_readable(
     path: KeyPath, file: object, folder: Path, report: Report, *, shown: str | None = None
 ) -> None:
-    """Reports a file, relative to `folder`, that can't be read; what names no file is passed over.
+    """Reports a file, relative to `folder`, that can't be read. Ignores values that name no file.
 
-    `shown` is what was found, where that is more than the name of the file.
+    `shown` replaces the name of the file in the message.
     """
     if isinstance(file, str) and file and "\0" not in file:
         reason = unreadable(folder / file)

@@ -1,4 +1,4 @@
-"""Who may write where beside Modbus: that what is named exists, and what a grant comes to."""
+"""Checks grants to writers other than Modbus: their names exist, and they have an effect."""
 
 from __future__ import annotations
 
@@ -22,41 +22,41 @@ if TYPE_CHECKING:
 
 @dataclass
 class GrantChecks:
-    """Checks what names memories and areas, on the data as it was written."""
+    """Checks names of memories and areas, on data that is not validated."""
 
     report: Report
     names: Sequence[str]
-    """Names of the memories, none when they can't be told."""
+    """Names of the memories, empty if they are not known."""
 
     def grant(self, path: KeyPath, grant: dict[Any, Any]) -> None:
-        """The `memories` and `areas` of a grant."""
+        """Checks the `memories` and `areas` of a grant."""
         self.memories((*path, "memories"), grant.get("memories"))
         self.areas((*path, "areas"), grant.get("areas"))
 
     def units(self, path: KeyPath, units: object) -> None:
-        """A mapping of unit ids to memories."""
+        """Checks a mapping of unit ids to memories."""
         for unit, name in mapping(units).items():
             self.memory((*path, unit), name)
 
     def memories(self, path: KeyPath, names: object) -> None:
-        """A list of memories."""
+        """Checks a list of memories."""
         for index, name in enumerate(entries(names)):
             self.memory((*path, index), name)
         refuse_repeats(path, entries(names), self.report)
 
     def areas(self, path: KeyPath, areas: object) -> None:
-        """A list of areas."""
+        """Checks a list of areas."""
         refuse_repeats(path, entries(areas), self.report)
 
     def memory(self, path: KeyPath, name: object) -> None:
-        """The name of one memory."""
+        """Checks the name of one memory."""
         if self.names and is_name(name) and name not in self.names:
             allowed = f"allowed: {listing(self.names)}{guess(name, self.names)}"
             self.report.add(path, f"found {show(name)}, {allowed}")
 
 
 class WriterGrant(NamedTuple):
-    """Where one writer may go; `path` is its place in the file."""
+    """What one writer may access; `path` is its place in the file."""
 
     path: KeyPath
     memories: Sequence[str]
@@ -65,7 +65,7 @@ class WriterGrant(NamedTuple):
 
 
 def grants(config: Config) -> Iterator[WriterGrant]:
-    """All grants to others than Modbus clients."""
+    """All grants except those of Modbus clients."""
     for name, listener in config.listeners.items():
         if listener.type != "raw-ingest":
             continue
@@ -88,7 +88,7 @@ def grants(config: Config) -> Iterator[WriterGrant]:
 
 
 def doubt_grants(config: Config, report: Report) -> None:
-    """Warns of areas that no memory of a grant has, and of seals that nothing can open."""
+    """Warns about areas that no memory of a grant has, and about seals that nothing can open."""
     for grant in grants(config):
         there = {area for name in grant.memories for area in config.memories[name].areas()}
         for index, area in enumerate(grant.areas):
@@ -96,7 +96,7 @@ def doubt_grants(config: Config, report: Report) -> None:
                 message = f"{area} has no effect: {_have(grant.memories)} no such area"
                 report.doubt((*grant.path, "areas", index), message)
     if config.rest is not None and config.rest.tokens == "none":
-        return  # Everyone may write everything, the gate bits too.
+        return  # Every REST client may write everything, including the gate bits.
     for name, memory in config.memories.items():
         seal = memory.seal
         if seal is not None and not (
@@ -107,12 +107,12 @@ def doubt_grants(config: Config, report: Report) -> None:
             )
         ):
             writers = "raw-ingest rule, token, subscription, adapter or device"
-            message = f"it can never be opened: no {writers} may write {seal.area} of {name}"
+            message = f"can never be opened: no {writers} may write {seal.area} of {name}"
             report.doubt(("memories", name, "seal"), message)
 
 
 def _reads_into(config: Config, memory: str, gate: Seal) -> bool:
-    """Whether what is read of a device may set the gate bit of a memory."""
+    """Whether a read of a device can set the gate bit of a memory."""
     return any(
         read.into is not None
         and (read.into.memory, read.into.area) == (memory, gate.area)

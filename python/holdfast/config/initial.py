@@ -1,7 +1,7 @@
-"""Initial values of a memory: a file beside the configuration, checked like any write.
+"""Reads initial values of a memory from a file, and checks them like any write.
 
-CSV has a line `area,address,value` for each value; YAML has `area: {address: value}`, where a list
-of values fills the addresses from there on. Large sets belong in CSV, which is read much faster.
+CSV has one line `area,address,value` per value. YAML has `area: {address: value}`, where a list of
+values starts at that address. Use CSV for large sets: it loads much faster.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Cell: TypeAlias = tuple[str, int]
 
 
 class InitialRun(NamedTuple):
-    """Neighbouring values of one area, from `address` on."""
+    """Consecutive values of one area, from `address` on."""
 
     area: Area
     address: int
@@ -36,7 +36,7 @@ class InitialRun(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """One value as a file gives it, not yet judged; `key` says where a YAML file has it."""
+    """One value of a file, not yet checked; `key` is its path in a YAML file."""
 
     line: int
     column: int
@@ -49,10 +49,10 @@ class _Given(NamedTuple):
 def parse(
     text: str, file: str, areas: Mapping[Area, range | None], gate: Cell | None
 ) -> tuple[tuple[InitialRun, ...], list[Problem]]:
-    """The values of a file in runs, and what is wrong with it.
+    """Returns the values of a file as runs, and the problems of the file.
 
-    `areas` are those of the memory; where the addresses are `None`, any is taken. `gate` is the
-    bit that must stay 0.
+    `areas` are the areas of the memory; addresses of `None` allow any address. `gate` is the gate
+    bit of the seal, which must stay 0.
     """
     judge = _Judge(file, areas, gate)
     try:
@@ -66,13 +66,13 @@ def parse(
 
 
 def extent(addresses: range) -> str:
-    """Addresses in words."""
+    """A range of addresses as text."""
     return f"{addresses.start} to {addresses.stop - 1}"
 
 
 @dataclass
 class _Judge:
-    """Checks values one by one and keeps those that are right."""
+    """Checks values one by one and keeps the valid ones."""
 
     file: str
     areas: Mapping[Area, range | None]
@@ -81,11 +81,11 @@ class _Judge:
     kept: dict[Area, dict[int, tuple[int, int]]] = field(default_factory=dict)
 
     def refuse(self, line: int, column: int | None, key: str, message: str) -> None:
-        """Notes a problem of this file."""
+        """Adds a problem of this file."""
         self.problems.append(Problem(self.file, line, column, key, message))
 
     def take(self, given: _Given) -> None:
-        """Keeps a value and its line, or says why not."""
+        """Keeps a value and its line, or adds a problem."""
         try:
             area, address, value = self._judged(given)
         except ValueError as error:
@@ -107,7 +107,7 @@ class _Judge:
         value = self._value(area, address, given.value)
         if address in self.kept.get(area, {}):
             line = self.kept[area][address][1]
-            raise ValueError(f"{area} {address} comes twice, first in line {line}")
+            raise ValueError(f"duplicate {area} {address}, first in line {line}")
         return area, address, value
 
     def _value(self, area: Area, address: int, value: object) -> int:
@@ -119,7 +119,7 @@ class _Judge:
         return value
 
     def runs(self) -> Iterator[InitialRun]:
-        """What was kept, neighbours together, in the order of the addresses."""
+        """The kept values as runs, in the order of their addresses."""
         for area, cells in self.kept.items():
             first, values = 0, list[int]()
             for address in sorted(cells):

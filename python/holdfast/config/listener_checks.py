@@ -1,4 +1,4 @@
-"""What the keys of the listeners must keep together: limits, rules and memories."""
+"""Checks rules between keys of listeners: limits, rules and memories."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 _DEFAULT_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default
 _OTHER = {"v1": "crc", "crc": "v1"}
 _NAMING = {"v1": "units", "crc": "memories"}
-"""How a raw ingest rule names memories, by the format of the packets."""
+"""The key with which a raw ingest rule names memories, by packet format."""
 
 
 @dataclass
 class _Holder:
-    """A rule: whom it holds."""
+    """The peers that a rule matches."""
 
     path: KeyPath
     networks: list[Network]
@@ -39,7 +39,7 @@ class _Holder:
     """`None` for any role."""
 
     def overlaps(self, other: _Holder) -> bool:
-        """Whether some source is of both."""
+        """Whether both rules have a source in common."""
         mine, theirs = self.networks, other.networks
         return any(covers(mine, network) for network in theirs) or any(
             covers(theirs, network) for network in mine
@@ -54,7 +54,7 @@ class ListenerChecks:
     report: Report
     grants: GrantChecks
     ids: dict[Any, Any]
-    """The memories as they are written, for their ids."""
+    """The memories, as in the file and not validated, for their ids."""
 
     def check(self, listeners: object) -> None:
         """Reports what is wrong."""
@@ -99,11 +99,11 @@ class ListenerChecks:
         for rule_path, rule in self._rules(path, listener):
             if "sources" in rule:
                 known = "allowed: units, access, functions, deny"
-                message = f"a serial line has no addresses, {known}"
+                message = f"not allowed on a serial line, {known}"
                 self.report.settle((*rule_path, "sources"), message, of_key=True)
             if rule_path[-1] != 0:
                 first = f"rules[0] in line {self.report.line((*path, 'rules', 0))}"
-                message = f"never matches: the whole serial line belongs to {first}"
+                message = f"never matches: {first} matches the whole serial line"
                 self.report.doubt(rule_path, message)
 
     def _shadows(self, path: KeyPath, listener: dict[Any, Any]) -> None:
@@ -127,12 +127,12 @@ class ListenerChecks:
                 return
             taking |= {each.path: None for each in before if each.overlaps(rule)}
         names = [f"rules[{path[-1]}] in line {self.report.line(path)}" for path in taking]
-        what = "all its sources belong" if rule.roles is None else "its sources and roles belong"
-        self.report.doubt(rule.path, f"never matches: {what} to {' and '.join(names)}")
+        what = "all its sources" if rule.roles is None else "its sources and roles"
+        self.report.doubt(rule.path, f"never matches: {what} are covered by {' and '.join(names)}")
 
     def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         if "crc" in listener and listener.get("format", "v1") == "v1":
-            message = "found beside format v1, allowed: beside format crc only"
+            message = "found with format v1, allowed: only with format crc"
             self.report.add((*path, "crc"), message, of_key=True)
 
     def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
@@ -143,10 +143,10 @@ class ListenerChecks:
         needed, other = _NAMING[form], _NAMING[_OTHER[form]]
         if needed not in rule:
             words = allowed((*path, needed), self.report.document.data)
-            message = f"missing beside format {form}, allowed: {words}"
+            message = f"missing with format {form}, allowed: {words}"
             self.report.add((*path, needed), message, of_key=True)
         if other in rule:
-            message = f"found beside format {form}, allowed: {needed}"
+            message = f"found with format {form}, allowed: {needed}"
             self.report.add((*path, other), message, of_key=True)
         if form == "crc":
             self._have_ids((*path, "memories"), entries(rule.get("memories")))
@@ -161,7 +161,7 @@ class ListenerChecks:
 
 @dataclass
 class RuleCheck:
-    """Checks one rule for Modbus clients."""
+    """Checks one rule of a Modbus listener."""
 
     path: KeyPath
     rule: dict[Any, Any]
@@ -174,7 +174,7 @@ class RuleCheck:
         for key in ("functions", "deny", "roles"):
             refuse_repeats((*self.path, key), entries(self.rule.get(key)), self.report)
         if "functions" in self.rule and "deny" in self.rule:
-            message = "found beside functions, allowed: one of both"
+            message = "found together with functions, allowed: only one of them"
             self.report.add((*self.path, "deny"), message, of_key=True)
         if self.rule.get("access") == "read-only":
             self._writes()
@@ -182,5 +182,5 @@ class RuleCheck:
     def _writes(self) -> None:
         for index, code in enumerate(entries(self.rule.get("functions"))):
             if integer(code, 0, 255) in WRITING_CODES:
-                message = f"{code} has no effect: it writes, and access is read-only"
+                message = f"function {code} has no effect: it writes, and access is read-only"
                 self.report.doubt((*self.path, "functions", index), message)

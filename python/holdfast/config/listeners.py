@@ -1,7 +1,6 @@
-"""Listeners: who may come in where, over which protocol, and what for.
+"""Models of listeners: protocol, address, and what each peer may do.
 
-`type` tells the kinds apart. Each has its own model, so that a key that means nothing to a kind is
-an unknown key there.
+`type` selects the model. Each type has its own model, so a key of another type is an unknown key.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ DenyList: TypeAlias = Annotated[Codes | None, NotNull()]
 
 
 class RuleConfig(Model):
-    """What some peers may do."""
+    """What the peers of these sources may do."""
 
     sources: Sources
     """Networks and addresses of the peers, IPv4 or IPv6."""
@@ -51,18 +50,18 @@ class RuleConfig(Model):
     access: Access
     """Whether these peers may write."""
     functions: FunctionList = None
-    """The only function codes that are allowed."""
+    """The allowed function codes. Default: all."""
     deny: DenyList = None
-    """Function codes that are not allowed, the others are."""
+    """Function codes that are not allowed; all others are."""
 
 
 class TlsRuleConfig(RuleConfig):
-    """What some peers may do, by where they are and what their certificates say."""
+    """What the peers of these sources may do, if their certificates have one of these roles."""
 
     roles: Annotated[
         Annotated[tuple[Role, ...], Strict(False), Field(min_length=1)] | None, NotNull()
     ] = None
-    """The roles that a certificate may name, "" for one that names none; any when left out."""
+    """Roles of client certificates; "" is a certificate without a role. Default: any role."""
 
 
 class SerialRuleConfig(Model):
@@ -73,13 +72,13 @@ class SerialRuleConfig(Model):
     access: Access
     """Whether the client may write."""
     functions: FunctionList = None
-    """The only function codes that are allowed."""
+    """The allowed function codes. Default: all."""
     deny: DenyList = None
-    """Function codes that are not allowed, the others are."""
+    """Function codes that are not allowed; all others are."""
 
 
 class RawRuleConfig(Model):
-    """What some senders of raw ingest packets may write."""
+    """What the senders of these sources may write."""
 
     sources: Sources
     """Networks and addresses of the senders, IPv4 or IPv6."""
@@ -88,30 +87,30 @@ class RawRuleConfig(Model):
     )
     """Format v1: the memory behind each unit id, 0 to 65535."""
     memories: MemoryNames = Field(default=(), exclude_if=lambda v: not v)
-    """Format crc: the memories that packets may name, by their ids."""
+    """Format crc: the memories that packets may write; each needs an id."""
     areas: Areas
     """The areas that may be written."""
 
 
 class _ConnectionListener(Model):
-    """What all servers of Modbus over TCP connections have."""
+    """Settings of all Modbus servers over TCP connections."""
 
     type: str
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256
-    """Connections that are open at once."""
+    """Maximum number of open connections."""
     max_connections_per_source: Connections | None = None
-    """Connections that are open at once from one address; null for no limit of its own."""
+    """Maximum number of open connections from one address; null: unlimited."""
     when_full: Literal["refuse", "evict"] = "refuse"
-    """What becomes of a connection too many: it is refused, or takes the place of the idlest."""
+    """At the limit: refuse closes the new connection, evict the connection idle longest."""
     idle_timeout: DurationOrZero = 300.0
-    """Seconds without a request after which a connection is closed; 0 keeps it for ever."""
+    """Seconds without a request after which a connection is closed; 0: unlimited."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources hold the peer settles what it may do."""
+    """The first rule whose sources contain the peer applies."""
 
 
 class ModbusTcpListener(_ConnectionListener):
@@ -122,29 +121,29 @@ class ModbusTcpListener(_ConnectionListener):
 
 
 class ServerTlsConfig(Model):
-    """Certificates and keys of a server, in PEM; they are read at the start."""
+    """PEM files of a TLS server; they are read at the start."""
 
     cert_file: FilePath
-    """The certificate that clients are shown, and those between it and its authority."""
+    """The server's certificate, followed by its intermediate certificates."""
     key_file: FilePath
     """The key of that certificate, without a passphrase."""
     ca_file: FilePath
-    """The authorities that vouch for clients, and self-signed certificates of clients."""
+    """Authorities of client certificates, and self-signed certificates of clients."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
-    """What the authorities have revoked: a list of each authority above a client."""
+    """Certificate revocation lists: one of each authority in the chain of a client."""
 
 
 class ModbusTlsListener(_ConnectionListener):
-    """A Modbus TCP server inside TLS, for clients with a certificate (Modbus/TCP Security)."""
+    """A Modbus TCP server over TLS, for clients with a certificate (Modbus/TCP Security)."""
 
     type: Literal["modbus-tls"]
     """The protocol."""
     tls: ServerTlsConfig
-    """Who the server is, and which clients it trusts."""
+    """The server's certificate, and the clients it trusts."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last, and for the handshake."""
     rules: Annotated[tuple[TlsRuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources and roles hold the peer settles what it may do."""
+    """The first rule whose sources and roles match the peer applies."""
 
 
 class ModbusRtuOverTcpListener(_ConnectionListener):
@@ -155,14 +154,14 @@ class ModbusRtuOverTcpListener(_ConnectionListener):
 
 
 class ModbusUdpListener(Model):
-    """A Modbus UDP server: one datagram, one request."""
+    """A Modbus UDP server: one request per datagram."""
 
     type: Literal["modbus-udp"]
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources hold the sender settles what it may do."""
+    """The first rule whose sources contain the sender applies."""
 
 
 def _stop_bits(data: dict[str, Any]) -> Literal[1, 2]:
@@ -170,48 +169,48 @@ def _stop_bits(data: dict[str, Any]) -> Literal[1, 2]:
 
 
 class SerialConfig(Model):
-    """A serial port and how its line is driven."""
+    """A serial port and its line settings."""
 
     device: DeviceName
     """The serial port, as in /dev/ttyUSB0 or COM3."""
     baud: Annotated[int, Field(ge=50, le=4_000_000)] = 19200
-    """Bits a second."""
+    """Bits per second."""
     parity: Literal["none", "even", "odd"] = "even"
     """The parity bit."""
     stop_bits: StopBits = Field(default_factory=_stop_bits)
-    """Stop bits; when left out, 1 with a parity bit and 2 without."""
+    """Stop bits. Default: 1 with a parity bit, 2 without."""
     data_bits: DataBits = 8
-    """Data bits of a character."""
+    """Data bits per character."""
 
 
 class RtuSerialConfig(SerialConfig):
     """A serial port for Modbus RTU."""
 
     data_bits: EightBits = 8
-    """Data bits of a character."""
+    """Data bits per character."""
     silence: Annotated[
         Annotated[float, Field(ge=0.0001, le=10, allow_inf_nan=False)] | None, NotNull()
     ] = None
-    """Seconds of silence that end a frame; when left out, the time of 3.5 characters, and 1.75 ms
-    above 19200 baud."""
+    """Seconds of silence that end a frame. Default: the time of 3.5 characters; above 19200 baud
+    1.75 ms."""
 
 
 class AsciiSerialConfig(SerialConfig):
     """A serial port for Modbus ASCII."""
 
     data_bits: DataBits = 7
-    """Data bits of a character."""
+    """Data bits per character."""
 
 
 class _SerialListener(Model):
-    """What all servers on a serial line have."""
+    """Settings of all servers on a serial line."""
 
     type: str
     """The protocol."""
     serial: SerialConfig
     """The serial port."""
     rules: Annotated[tuple[SerialRuleConfig, ...], Strict(False), Field(min_length=1)]
-    """What the client may do; the first rule holds, as a serial line has no addresses."""
+    """What the client may do. Only the first rule applies: a serial line has no addresses."""
 
 
 class ModbusRtuListener(_SerialListener):
@@ -237,24 +236,24 @@ def _crc(data: dict[str, Any]) -> Literal["required"] | None:
 
 
 class RawIngestListener(Model):
-    """A server of raw ingest packets, which write and never read."""
+    """A server for raw ingest packets, which only write."""
 
     type: Literal["raw-ingest"]
     """The protocol."""
     format: Literal["v1", "crc"] = "v1"
-    """The layout of a packet: 10 bytes of header and a unit id, or 12, a memory id and a CRC."""
+    """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
     crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
-    """Whether packets of format crc end with their CRC; `required` when left out."""
+    """Format crc: whether packets end with a CRC. Default: required."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256
-    """Connections that are open at once."""
+    """Maximum number of open connections."""
     max_connections_per_source: Connections | None = None
-    """Connections that are open at once from one address; null for no limit of its own."""
+    """Maximum number of open connections from one address; null: unlimited."""
     request_timeout: Duration = 10.0
     """Seconds from the start of a connection to the last byte of its packet."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources hold the sender settles what it may write."""
+    """The first rule whose sources contain the sender applies."""
 
 
 Listener: TypeAlias = (
@@ -271,4 +270,4 @@ CONNECTION_TYPES = ("modbus-tcp", "modbus-tls", "modbus-rtu-over-tcp", "raw-inge
 DATAGRAM_TYPES = ("modbus-udp",)
 SERIAL_TYPES = ("modbus-rtu", "modbus-ascii")
 LISTENER_TYPES = (*CONNECTION_TYPES, *DATAGRAM_TYPES, *SERIAL_TYPES)
-"""The values of `type`, by what a listener needs: a TCP, UDP or serial port; and all of them."""
+"""All values of `type`; the tuples above group them by TCP, UDP and serial port."""

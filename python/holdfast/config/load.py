@@ -1,7 +1,7 @@
-"""From a file to a `Config`, or to all that is wrong with it.
+"""Loads a file into a `Config`, or reports every problem of the file.
 
-The shape of the data and the rules between its parts are judged side by side, each on the data as
-it was written: a mistake of one kind hides none of the other.
+The models check each value, and the checks test rules between values. Both run on the data of the
+file, so an error in one does not hide an error in the other.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from holdfast.config.words import show
 
 
 def load(path: Path | str) -> Config:
-    """Reads a configuration; raises `ConfigError` with every problem that it has.
+    """Reads a configuration. Raises `ConfigError` with every problem.
 
-    What is right but has no effect is in `Config.warnings`.
+    Valid settings without effect are in `Config.warnings`.
     """
     file = str(path)
     document, problems = source.parse(source.read_text(Path(path), file), file)

@@ -1,4 +1,4 @@
-"""Memories: areas of bits and registers, the seal, and the initial values."""
+"""Models of memories: areas of bits and registers, the seal, and the initial values."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ Extent = Annotated[
 
 
 class Seal(Model):
-    """The gate of a sealed memory: Modbus is answered with exception 06 while it is sealed."""
+    """The seal of a memory: Modbus clients receive exception 06 while it is sealed."""
 
     area: BitArea
     """The area of the gate bit."""
     address: Register
     """The address of the gate bit, inside its area."""
     mode: Literal["once", "level"] = "once"
-    """`once`: the bit opens the memory for good. `level`: it is sealed whenever the bit is 0."""
+    """once: stays open until a restart. level: sealed whenever the gate bit is 0."""
 
 
 class MemoryConfig(Model):
-    """Four areas of bits and registers. An area that is left out does not exist."""
+    """Four areas of bits and registers. An omitted area does not exist."""
 
     id: Annotated[Register | None, NotNull()] = None
-    """The MemoryID of the raw ingest format with CRC; no two memories share one."""
+    """The memory id of raw ingest packets of format crc; unique."""
     coils: Extent = None
     """Coils, read and written by Modbus: a size, or start and size."""
     discrete_inputs: Extent = None
@@ -65,20 +65,20 @@ class MemoryConfig(Model):
     input_registers: Extent = None
     """Input registers, read by Modbus: a size, or start and size."""
     seal: Annotated[Seal | None, NotNull()] = None
-    """Starts the memory sealed, until its gate bit is 1."""
+    """Seals the memory at the start, until its gate bit is 1."""
     initial: Annotated[FilePath | None, NotNull()] = None
-    """Initial values: a .csv file of area,address,value lines or a .yaml file, beside this one."""
+    """A .csv file with lines of area,address,value, or a .yaml file, with initial values."""
 
     _initial_values: tuple[InitialRun, ...] = PrivateAttr(default=())
 
     def model_post_init(self, context: object, /) -> None:
-        """Takes the initial values that were read for this memory's file."""
+        """Takes the initial values of this memory's file from the validation context."""
         if self.initial is not None and isinstance(context, Mapping):
             self._initial_values = context["initial_values"].get(self.initial, ())
 
     @property
     def initial_values(self) -> tuple[InitialRun, ...]:
-        """What the memory holds at first where it is not 0, as runs of neighbours."""
+        """The initial values as runs; all other bits and registers start at 0."""
         return self._initial_values
 
     def areas(self) -> dict[Area, Span]:

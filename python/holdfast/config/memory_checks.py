@@ -1,4 +1,4 @@
-"""What the keys of the memories must keep together: areas, seals, ids and initial values."""
+"""Checks rules between keys of memories: areas, seals, ids and initial values."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 _EXTENT: TypeAdapter[Span | None] = TypeAdapter(Extent)
 
 Layout: TypeAlias = dict[Area, range | None]
-"""The addresses of the areas that are there; `None` where they are not known for a mistake."""
+"""The addresses of the existing areas; `None` if an error makes them unknown."""
 
 
 def addresses(extent: object) -> range | None:
-    """The addresses of an area as it is written; `None` when they can't be told."""
+    """The addresses of an area from the data of the file; `None` if they are not valid."""
     span = fitting(_EXTENT, extent)
     return None if span is None or span.start + span.size > ADDRESSES else span.addresses
 
@@ -46,7 +46,7 @@ class MemoryChecks:
         self.problems_elsewhere: list[Problem] = []
 
     def check(self, memories: object) -> None:
-        """Reports what is wrong; afterwards `values` holds the initial values by file."""
+        """Reports problems. Afterwards `values` has the initial values by file."""
         for name, memory in mapping(memories).items():
             if isinstance(memory, dict):
                 self._memory(("memories", name), memory)
@@ -79,7 +79,7 @@ class MemoryChecks:
             return None
         if area not in layout:
             there = [area for area in BIT_AREAS if area in layout]
-            allowed = f"allowed: {listing(there)}" if there else "which needs one"
+            allowed = f"allowed: {listing(there)}" if there else "and it has no area of bits"
             message = f"found {show(area)}, an area that this memory does not have, {allowed}"
             self.report.add((*path, "area"), message)
             return None
@@ -95,7 +95,7 @@ class MemoryChecks:
     def _initial(self, path: KeyPath, file: str, layout: Layout, gate: initial.Cell | None) -> None:
         if Path(file).suffix.lower() not in initial.KINDS:
             allowed = listing(initial.KINDS)
-            self.report.add(path, f"found {show(file)}, allowed: a file of the kinds {allowed}")
+            self.report.add(path, f"found {show(file)}, allowed: a file with one of {allowed}")
             return
         shown = str(Path(self.report.document.file).parent / file)
         try:

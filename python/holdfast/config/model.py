@@ -1,8 +1,8 @@
-"""What a configuration holds, as frozen models: each checks its own values, strictly.
+"""The model of a whole configuration: frozen, and strict about its own values.
 
-This is the whole and its small parts; memories, listeners and services have files of their own. A
-rule that two places of the file must keep together is in no model but in the checks, so that one
-mistake never hides another. The descriptions are what editors show, by way of the JSON Schema.
+Memories, listeners, devices and services have their own files. Rules between two places of the file
+are in the checks, not in the models, so one error never hides another. Editors show the docstrings
+of the keys, by way of the JSON Schema.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 def installed_version() -> str:
-    """The version of this package, `0` when it is not installed."""
+    """The version of this package, `0` if it is not installed."""
     try:
         return importlib.metadata.version("holdfast")
     except importlib.metadata.PackageNotFoundError:
@@ -54,14 +54,14 @@ def installed_version() -> str:
 
 
 class IdentityConfig(Model):
-    """What functions 17 and 43/14 answer."""
+    """The answers to functions 17 and 43/14."""
 
     vendor_name: Text = "Holdfast"
     """Object 0, VendorName."""
     product_code: Text = "HF"
     """Object 1, ProductCode."""
     revision: Text = Field(default_factory=installed_version)
-    """Object 2, MajorMinorRevision; the version of Holdfast when it is left out."""
+    """Object 2, MajorMinorRevision. Default: the version of Holdfast."""
     vendor_url: Annotated[Text | None, NotNull()] = None
     """Object 3, VendorUrl."""
     product_name: Annotated[Text | None, NotNull()] = None
@@ -77,43 +77,43 @@ class IdentityConfig(Model):
 
 
 class LogConfig(Model):
-    """What is logged, and how."""
+    """Log level and log format."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
-    """The least important messages that are logged."""
+    """The lowest level that is logged."""
     format: Literal["text", "json"] = "text"
-    """Lines for people, or JSON objects for programs."""
+    """text: lines for people. json: one JSON object per line, for programs."""
 
 
 class Config(Model):
     """The configuration of a Holdfast appliance."""
 
     memories: dict[Name, MemoryConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
-    """The memories, by name; at least one, unless nothing but nats and gateway is served."""
+    """The memories, by name; optional when only nats and gateway are configured."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
-    """What the appliance says of itself."""
+    """The identification of the appliance."""
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(
         default={}, json_schema_extra=NAME_KEYS
     )
-    """The servers, by name; at least one, unless there is rest, mqtt, nats, gateway or a device."""
+    """The servers, by name; optional with rest, mqtt, nats, gateway or a device."""
     devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
-    """Devices that are polled, by name."""
+    """Devices to poll, by name."""
     rest: Annotated[RestConfig | None, NotNull()] = None
     """The REST interface."""
     mqtt: Annotated[MqttConfig | None, NotNull()] = None
     """The MQTT client."""
     nats: Annotated[NatsConfig | None, NotNull()] = None
-    """The scanner, which polls devices for subscribers over NATS."""
+    """The scanner, which polls devices for NATS subscribers."""
     gateway: Annotated[GatewayConfig | None, NotNull()] = None
-    """The gateway, which serves devices over HTTP, with a console."""
+    """The gateway, which gives access to devices over HTTP and has a web console."""
     adapters: dict[AdapterName, AdapterConfig] = Field(default={}, json_schema_extra=ADAPTER_KEYS)
     """Third-party adapters, by name."""
     metrics: Annotated[MetricsConfig | None, NotNull()] = None
-    """Counters and gauges for Prometheus."""
+    """Metrics for Prometheus."""
     audit: Annotated[AuditConfig | None, NotNull()] = None
-    """The record of all changes."""
+    """The log of every write."""
     log: LogConfig = Field(default_factory=LogConfig)
-    """What is told to those who run it."""
+    """The log of the program."""
     workers: Annotated[int, Field(ge=1, le=64)] = 1
     """Threads that serve connections."""
 
@@ -121,7 +121,7 @@ class Config(Model):
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
-        """What is right but has no effect, such as a rule that never matches."""
+        """Valid settings without effect, such as a rule that never matches."""
         return self._warnings
 
     def with_warnings(self, warnings: Iterable[Problem]) -> Self:
@@ -130,13 +130,13 @@ class Config(Model):
         return self
 
     def __eq__(self, other: object) -> bool:
-        """Whether both say the same; the places that their warnings name are no part of it."""
+        """Whether all settings are equal; warnings are not compared."""
         return isinstance(other, Config) and dict(self) == dict(other)
 
     def dump(self) -> str:
-        """The effective configuration as YAML, all defaults filled in; it loads as an equal one."""
+        """The effective configuration as YAML, with all defaults. `load` reads an equal one."""
         return dump.to_yaml(self.effective())
 
     def effective(self) -> dict[str, Any]:
-        """The effective configuration as plain data, as `dump` and JSON show it."""
+        """The effective configuration as plain data, for YAML and JSON."""
         return dump.effective(self.model_dump())

@@ -1,4 +1,4 @@
-"""What is wrong with a configuration: one `Problem` a mistake, all of them in one `ConfigError`."""
+"""Errors of a configuration: one `Problem` per error, all of them in one `ConfigError`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One mistake: where (line and column from 1, or `None` for all of a file) and what.
+    """One error. `line` and `column` count from 1; they are `None` for a whole file.
 
-    `key` is the path of the key, as in `listeners.scada.rules[0].access`; empty at the top.
+    `key` is the path of the key, as in `listeners.scada.rules[0].access`; "" at the top level.
     """
 
     file: str
@@ -28,8 +28,8 @@ class Problem:
 
 
 class ConfigError(Exception):
-    """A configuration that can't be used, with all its `problems`: first those of the file itself
-    in the order of its lines, then those of the files it names.
+    """The configuration is not valid. `problems` has every error: first those of the file itself,
+    by line, then those of the files that it names.
     """
 
     def __init__(self, file: str, problems: Iterable[Problem]) -> None:

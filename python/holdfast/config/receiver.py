@@ -11,14 +11,14 @@ RECEIVER_FORM = "raw://host:port, as in raw://10.0.2.9:9000 or raw://[fd00::9]:9
 
 
 class Receiver(NamedTuple):
-    """Where packets are sent."""
+    """The host and port of a receiver."""
 
     host: str
     port: int
 
 
 def parse_receiver(text: object) -> Receiver:
-    """Raises `ValueError` for anything but the scheme raw, a host and a port."""
+    """Parses `raw://host:port`. Raises `ValueError` for anything else."""
     wrong = ValueError(f"found {show(text)}, allowed: {RECEIVER_FORM}")
     if not isinstance(text, str):
         raise wrong

@@ -1,6 +1,6 @@
-"""The URL of a server that others run: a scheme, a host and perhaps a port.
+"""Parses the URL of a remote server: a scheme, a host and an optional port.
 
-No message repeats a URL: someone may have written a password into it.
+No message repeats a URL, because a URL may contain a password.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _HOST = re.compile(
 
 
 class Remote(NamedTuple):
-    """Where a server is; the host is a name or an address without brackets."""
+    """Scheme, host and port of a server; the host is a name or an address without brackets."""
 
     scheme: str
     host: str
@@ -35,9 +35,9 @@ class Remote(NamedTuple):
 def parse_remote(
     text: object, ports: Mapping[str, int], form: str, *, least_port: int = 1
 ) -> Remote:
-    """The parts of a URL; `ports` has the schemes, each with the port that is left out.
+    """Parses `scheme://host[:port]`; `ports` has the allowed schemes and their default ports.
 
-    Raises `ValueError` for anything but a scheme, a host and perhaps a port.
+    Raises `ValueError` for anything else.
     """
     if not isinstance(text, str):
         raise ValueError(f"found {shape(text)}, allowed: {form}")
@@ -47,8 +47,8 @@ def parse_remote(
         found = "no host" if scheme in ports else neither
         raise ValueError(f"found {found}, allowed: {form}")
     if "@" in rest:
-        where = "the user is username, the password is in the file that password_file names"
-        raise ValueError(f"found a user in it, allowed: {form}; {where}")
+        where = "set username and password_file instead"
+        raise ValueError(f"found a user in the URL, allowed: {form}; {where}")
     if re.search("[/?#]", rest):
         raise ValueError(f"found more than host and port, allowed: {form}")
     match = _HOST.fullmatch(rest)
@@ -56,7 +56,7 @@ def parse_remote(
     if match is None or not _is_host(match) or not least_port <= port <= LAST_PORT:
         port_form = f"a port from {least_port} to {LAST_PORT}"
         allowed = f"allowed: a host name or an address, IPv6 in brackets, and {port_form}"
-        raise ValueError(f"found a host or port that can't be, {allowed}")
+        raise ValueError(f"found an invalid host or port, {allowed}")
     return Remote(scheme, match["name"] or match["six"], port)
 
 

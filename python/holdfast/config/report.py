@@ -1,4 +1,4 @@
-"""Collects the problems of one file, each with its place. Nothing here judges a value."""
+"""Collects the problems of one file, each with its place. It does not check values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Report:
-    """The problems found so far in one document, each once, and what is right but has no effect."""
+    """The problems found so far in one document, each once, and the warnings (`doubts`)."""
 
     document: Document
     found: dict[Problem, None] = field(default_factory=dict)
@@ -22,26 +22,26 @@ class Report:
 
     @property
     def problems(self) -> list[Problem]:
-        """In the order they were found."""
+        """The problems, in the order they were found."""
         return list(self.found)
 
     def add(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
-        """Adds a problem of the value at `path`, or of the key itself."""
+        """Adds a problem with the value at `path`, or with the key itself."""
         self.found[self._at(path, message, of_key)] = None
 
     def settle(
         self, path: KeyPath, message: str, part: KeyPath = (), *, of_key: bool = False
     ) -> None:
-        """Adds the one problem of `path`, at a part of it; what is there is not looked at again."""
+        """Adds the only problem of `path`, at a part of it; other problems there are ignored."""
         self.add((*path, *part), message, of_key=of_key)
         self.settled.append(path)
 
     def is_settled(self, path: KeyPath) -> bool:
-        """Whether all that is to be said of `path` was said."""
+        """Whether `settle` already reported the only problem of `path`."""
         return any(path[: len(settled)] == settled for settled in self.settled)
 
     def doubt(self, path: KeyPath, message: str) -> None:
-        """Adds what is allowed at `path` but can't be what was meant."""
+        """Adds a warning: a valid setting at `path` that has no effect."""
         self.doubts.append(self._at(path, message, of_key=False))
 
     def _at(self, path: KeyPath, message: str, of_key: bool) -> Problem:

@@ -1,7 +1,7 @@
-"""The kinds of single values that a configuration holds, each with what is allowed.
+"""The types of single values in a configuration.
 
-Every kind is strict: text is not a number, a boolean is not an integer. A kind whose rule a JSON
-Schema can't say in full raises `ValueError` with a message of its own.
+Every type is strict: text is not a number, a boolean is not an integer. If a JSON Schema can't
+express a rule in full, the type raises `ValueError` with its own message.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ _SERIAL = r"([1-9]|[1-9][0-9]|1[0-9][0-9]|2[0-3][0-9]|24[0-7])"
 _WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5]))))"
 
 RESERVED = ("rest", "mqtt", "nats", "gateway", "metrics")
-"""Names that adapters can't have, because the appliance's own parts have them."""
+"""Names that adapters can't have, because built-in services use them."""
 
 
 def is_name(value: object) -> TypeGuard[str]:
-    """Whether it can be the name of a memory."""
+    """Whether the value is a valid name."""
     return isinstance(value, str) and re.fullmatch(_NAME, value) is not None
 
 
@@ -78,7 +78,7 @@ def _name(value: object) -> str:
 
 
 def _id_of(what: str, least: int, most: int, note: str = "") -> Callable[[object], int]:
-    """Takes integers of that range."""
+    """A validator for integers from `least` to `most`."""
 
     def number(value: object) -> int:
         if type(value) is int and least <= value <= most:
@@ -101,7 +101,7 @@ def _option_name(value: object) -> str:
 
 
 def parse_sha256(value: object) -> str:
-    """Raises `ValueError` without the value: it could be the token itself."""
+    """Checks a SHA-256. The `ValueError` omits the value, which could be the token itself."""
     if isinstance(value, str) and re.fullmatch("[0-9a-fA-F]{64}", value):
         return value.lower()
     quote = "" if isinstance(value, str) else ", as text"
@@ -120,7 +120,7 @@ def _nats_url(value: object) -> str:
 
 
 def parse_url(value: object) -> str:
-    """Raises `ValueError` for anything but the URL of a device."""
+    """Checks the URL of a device. Raises `ValueError` for anything else."""
     if not isinstance(value, str):
         raise ValueError(f"found {show(value)}, allowed: {FORMS}")
     if "\0" in unquote(value):
@@ -139,9 +139,9 @@ def _receiver_url(value: object) -> str:
 
 
 def _integral(value: object) -> object:
-    """Keeps `true` and `1.0` from being taken for 1."""
+    """Refuses `true` and `1.0`, which pydantic's literals accept as 1."""
     if type(value) is not int:
-        raise PydanticCustomError("integral", "no integer")
+        raise PydanticCustomError("integral", "not an integer")
     return value
 
 
@@ -150,7 +150,7 @@ def _version(value: object) -> object:
 
 
 def _folder(info: ValidationInfo) -> Path:
-    """What the files of a configuration are relative to."""
+    """The folder of the configuration; file paths are relative to it."""
     folder: Path = (info.context or {}).get("folder", Path())
     return folder
 
@@ -170,7 +170,7 @@ def _function(value: object) -> int:
 
 
 def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
-    """Takes text of so many bytes."""
+    """A validator for text of `least` to `most` bytes."""
     allowed = f"allowed: text of {least} to {most} bytes"
 
     def text(value: object) -> str:
@@ -205,7 +205,7 @@ def _whole(value: float) -> int | float:
 
 
 class NotNull:
-    """For a key that can be left out, but not be empty: `None` is its default and nothing else."""
+    """Marks a key that is optional but not nullable: omitted is `None`, an empty value fails."""
 
     def __get_pydantic_core_schema__(
         self, source: object, handler: GetCoreSchemaHandler
@@ -384,4 +384,4 @@ OBJECT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_HIGH_BYTE}$"}}
 ADAPTER_KEYS: JsonDict = {
     "propertyNames": {"pattern": f"^{_NAME}$", "not": {"enum": list(RESERVED)}}
 }
-"""What a schema says of the keys of a mapping, which are text to it."""
+"""JSON Schema patterns for the keys of mappings, which JSON Schema treats as text."""

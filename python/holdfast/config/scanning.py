@@ -1,4 +1,4 @@
-"""What the scanner is told, as text: NATS servers, the prefix of its subjects, and devices."""
+"""Parses settings of the scanner: NATS servers, the subject prefix, and devices."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 SERVER_FORM = "nats://host:port or tls://host:port"
 SERVER_PORT = 4222
 PREFIX = "modbus"
-PREFIX_FORM = "the first part of subjects: letters, digits, '_' and '-', with dots between"
+PREFIX_FORM = "letters, digits, '_' and '-', separated by dots"
 POLLABLE_FORM = f"{SOURCE_FORM}, or a serial device, as in /dev/ttyUSB0 or COM3"
 
 MAX_DEVICES = 5000
 MAX_TAGS = 500_000
-"""What subscribers may ask for where nothing else is said; tags are those of all devices."""
+"""Default limits of the scanner; `MAX_TAGS` counts the tags of all devices."""
 
 _PORTS = {"nats": SERVER_PORT, "tls": SERVER_PORT}
 _PREFIX = re.compile(r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})*", re.ASCII)
@@ -32,19 +32,19 @@ _SERIAL = re.compile(r"/[^\0]+|COM[0-9]+|\\\\\.\\[^\0]+", re.ASCII)
 
 
 def parse_server(text: object, *, least_port: int = 1) -> Remote:
-    """The parts of a server's URL. Raises `ValueError`, which does not repeat it."""
+    """Parses a server's URL. Raises `ValueError`, without the URL in the message."""
     return parse_remote(text, _PORTS, SERVER_FORM, least_port=least_port)
 
 
 def parse_prefix(text: object) -> str:
-    """Raises `ValueError` for what can't begin a subject."""
+    """Checks a subject prefix. Raises `ValueError` for anything else."""
     if isinstance(text, str) and _PREFIX.fullmatch(text):
         return text
     raise ValueError(f"found {show(text)}, allowed: {PREFIX_FORM}")
 
 
 def parse_pollable(text: object) -> AllowEntry:
-    """An entry of the list: a network or an address with all its ports, or a serial device.
+    """Parses an entry: a network or an address, with all ports, or a serial device.
 
     Raises `ValueError` for anything else.
     """
@@ -59,5 +59,5 @@ def parse_pollable(text: object) -> AllowEntry:
 
 
 def written_pollable(entry: AllowEntry) -> str:
-    """An entry as `parse_pollable` takes it: of a network always all ports are meant."""
+    """The text that `parse_pollable` accepts; networks have no ports, as all are allowed."""
     return str(entry.network) if isinstance(entry, AllowedNetwork) else entry.path

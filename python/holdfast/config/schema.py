@@ -1,4 +1,4 @@
-"""The JSON Schema of a configuration, for editors; and for messages, which say what it allows."""
+"""The JSON Schema of a configuration, for editors and for error messages."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ DIALECT = GenerateJsonSchema.schema_dialect
 
 
 def json_schema() -> dict[str, Any]:
-    """A JSON Schema, draft 2020-12. It accepts both forms of an area."""
+    """The JSON Schema, draft 2020-12. It accepts both forms of an area."""
     schema = Config.model_json_schema(mode="validation")
     return {"$schema": DIALECT, **_tidy(schema), "title": "Holdfast configuration"}
 
 
 @functools.cache
 def cached() -> dict[str, Any]:
-    """The same, made once; not to be changed."""
+    """The JSON Schema, built once. Callers must not change it."""
     return json_schema()
 
 
 def _tidy(node: dict[str, Any]) -> dict[str, Any]:
-    """With a title for every property; `null` is no default but stands for a key left out."""
+    """Adds a title to every property, and drops `null` defaults: they mean an omitted key."""
     tidy = {key: _tidy(value) if isinstance(value, dict) else value for key, value in node.items()}
     if tidy.get("default", ...) is None:
         del tidy["default"]

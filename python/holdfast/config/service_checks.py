@@ -1,4 +1,4 @@
-"""What the keys of the sections beside listeners and devices must keep together."""
+"""Checks rules between keys of the services: REST, MQTT, scanner, gateway, adapters, audit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from holdfast.config.scanning import parse_server
 from holdfast.config.tls_checks import check_client_tls
 from holdfast.config.tolerance import entries, mapping, parsed
 from holdfast.config.unique import Owners
-from holdfast.config.words import choice, show
+from holdfast.config.words import choice, listing, show
 
 if TYPE_CHECKING:
     from holdfast.config.grant_checks import GrantChecks
@@ -25,12 +25,12 @@ _USERS_OF_MEMORIES = ("listeners", "devices", "rest", "mqtt", "adapters")
 _USERS_OF_NONE = {"nats", "gateway"}
 _INSTEAD_OF_LISTENERS = ("rest", "mqtt", "nats", "gateway", "devices")
 _IDENTITIES = ("username", "token_file", "credentials_file")
-"""Keys that say who the scanner is at the NATS server."""
+"""Keys that authenticate the scanner at the NATS server; only one of them is allowed."""
 
 
 @dataclass
 class ServiceChecks:
-    """Checks the sections beside the listeners; files are relative to `folder`."""
+    """Checks the services of one file; files are relative to `folder`."""
 
     folder: Path
     report: Report
@@ -48,16 +48,16 @@ class ServiceChecks:
         self._audit(mapping(data.get("audit")).get("file"))
 
     def _served(self, data: dict[Any, Any]) -> None:
-        """That there is something to serve, and memories where that needs them."""
+        """Reports a missing server, and missing memories if a section uses them."""
         used = any(data.get(key, {}) != {} for key in _USERS_OF_MEMORIES)
         if data.get("memories", {}) == {} and (used or not data.keys() & _USERS_OF_NONE):
-            self._empty("memories", data, "beside nothing but nats and gateway")
+            self._empty("memories", data, "when only nats and gateway are configured")
         if data.get("listeners", {}) == {} and not data.keys() & {*_INSTEAD_OF_LISTENERS}:
-            self._empty("listeners", data, f"beside {choice(_INSTEAD_OF_LISTENERS)}")
+            self._empty("listeners", data, f"with {choice(_INSTEAD_OF_LISTENERS)}")
 
     def _empty(self, key: str, data: dict[Any, Any], unless: str) -> None:
         found = "found an empty mapping" if key in data else "missing"
-        message = f"{found}, allowed: a mapping with at least one entry, or none {unless}"
+        message = f"{found}, allowed: a mapping with at least one entry (optional {unless})"
         self.report.add((key,), message, of_key=True)
 
     def _rest(self, rest: dict[Any, Any]) -> None:
@@ -73,14 +73,14 @@ class ServiceChecks:
         for index, source in enumerate(entries(gateway.get("sources"))):
             network = parsed(parse_source, source)
             if network is not None and not network.is_loopback:
-                allowed = "allowed beside tokens none: loopback addresses, as in 127.0.0.0/8"
+                allowed = "allowed with tokens none: loopback addresses, as in 127.0.0.0/8"
                 self.report.add(("gateway", "sources", index), f"found {show(source)}, {allowed}")
 
     def _tokens(self, section: str, settings: dict[Any, Any]) -> None:
-        """Tokens that are told apart; none on a loopback address only."""
+        """Tokens have unique names and hashes; `none` requires a loopback address."""
         bind, tokens = parsed(parse_bind, settings.get("bind")), settings.get("tokens")
         if tokens == "none" and bind is not None and not bind.address.is_loopback:
-            message = f"found 'none' beside bind {bind}, allowed: none on a loopback address only"
+            message = f"found 'none' with bind {bind}, allowed: none only on a loopback address"
             self.report.add((section, "tokens"), message)
         names, hashes = Owners(self.report, "name"), Owners(self.report, "sha256")
         for index, token in enumerate(entries(tokens)):
@@ -96,7 +96,7 @@ class ServiceChecks:
         self._password("mqtt", mqtt)
         broker = parsed(parse_broker, mqtt.get("url"))
         if "tls" in mqtt and broker is not None and not broker.secure:
-            message = "found beside a url that begins with mqtt://, allowed: beside mqtts:// only"
+            message = "found with a url that begins with mqtt://, allowed: only with mqtts://"
             self.report.add(("mqtt", "tls"), message, of_key=True)
         self._tls(("mqtt", "tls"), mqtt.get("tls"))
         topics = Owners(self.report, "topic")
@@ -113,18 +113,18 @@ class ServiceChecks:
             self._readable(("nats", key), nats.get(key))
         first, *others = [key for key in _IDENTITIES if key in nats] or [""]
         for key in others:
-            message = f"found beside {first}, allowed: one of {choice(_IDENTITIES)}"
+            message = f"found together with {first}, allowed: only one of {listing(_IDENTITIES)}"
             self.report.add(("nats", key), message, of_key=True)
         servers = [parsed(parse_server, url) for url in entries(nats.get("servers"))]
         if "tls" in nats and servers and all(each and each.scheme == "nats" for each in servers):
-            message = "found beside servers that begin with nats://, allowed: beside tls:// only"
+            message = "found with servers that begin with nats://, allowed: only with tls://"
             self.report.add(("nats", "tls"), message, of_key=True)
         self._tls(("nats", "tls"), nats.get("tls"))
         self._tls(("nats", "device_tls"), nats.get("device_tls"))
 
     def _password(self, section: str, settings: dict[Any, Any]) -> None:
         if "password_file" in settings and "username" not in settings:
-            message = "found without username, allowed: both or none"
+            message = "found without username, allowed: both or neither"
             self.report.add((section, "password_file"), message, of_key=True)
         self._readable((section, "password_file"), settings.get("password_file"))
 
@@ -142,5 +142,5 @@ class ServiceChecks:
             message = f"found {show(file)}, which is a folder, allowed: a file"
             self.report.add(("audit", "file"), message)
         elif not path.parent.is_dir():
-            message = f"found {show(file)}, allowed: a file in a folder that is there"
+            message = f"found {show(file)}, allowed: a file in an existing folder"
             self.report.add(("audit", "file"), message)

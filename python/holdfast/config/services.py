@@ -1,6 +1,4 @@
-"""What an appliance offers or uses beside its listeners: REST, MQTT, the scanner, the gateway,
-adapters, metrics, audit.
-"""
+"""Models of the services: REST, MQTT, the scanner, the gateway, adapters, metrics and audit."""
 
 from __future__ import annotations
 
@@ -39,21 +37,21 @@ from holdfast.types import Access
 
 
 class GatewayTokenConfig(Model):
-    """One who may use the gateway, by a secret token."""
+    """A secret token that gives access to the gateway."""
 
     name: Name
-    """What the logs call it; no two tokens share one."""
+    """The name of the token in logs; unique."""
     sha256: Sha256
     """The SHA-256 of the token, 64 hexadecimal digits; the token itself is not in the file."""
 
 
 class TokenConfig(GatewayTokenConfig):
-    """One who may use REST, by a secret token, and what for."""
+    """A secret token that gives access to REST, and what it can access."""
 
     memories: MemoryNames
-    """The memories it reaches."""
+    """The memories it can access."""
     areas: Areas
-    """The areas it reaches."""
+    """The areas it can access."""
     access: Access
     """Whether it may write."""
 
@@ -78,24 +76,24 @@ class RestConfig(Model):
     sources: Sources
     """Networks and addresses of the clients, IPv4 or IPv6."""
     tokens: Tokens[TokenConfig]
-    """Who may do what; `none` lets everyone do everything, on a loopback address only."""
+    """The tokens. none: everyone can do everything; only on a loopback address."""
     max_body: Annotated[int, Field(ge=1024, le=2**30)] = 8 * 2**20
-    """The most bytes of the body of a request."""
+    """Maximum number of bytes in the body of a request."""
     max_connections: Connections = 64
-    """Connections that are open at once."""
+    """Maximum number of open connections."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last."""
 
 
 class ClientTlsConfig(Model):
-    """Certificates for TLS with a broker or with devices; the system's authorities without any."""
+    """Certificates for TLS connections to servers or devices."""
 
     ca_file: Annotated[FilePath | None, NotNull()] = None
-    """The certificates that are trusted, in PEM: of authorities, or of devices themselves."""
+    """Trusted certificates, in PEM. Default: the system's authorities."""
     cert_file: Annotated[FilePath | None, NotNull()] = None
-    """The certificate that is shown to the other side, in PEM; together with key_file."""
+    """The client certificate, in PEM; requires key_file."""
     key_file: Annotated[FilePath | None, NotNull()] = None
-    """The key of that certificate, in PEM."""
+    """The key of the client certificate, in PEM."""
 
     @property
     def files(self) -> Tls:
@@ -104,12 +102,12 @@ class ClientTlsConfig(Model):
 
 
 class SubscriptionConfig(Model):
-    """Topics to listen to, and what their messages may write."""
+    """Topics to subscribe to, and what their messages may write."""
 
     topic: TopicFilter
-    """The topic filter; `+` stands for one level, a last `#` for all that follow."""
+    """The topic filter; `+` matches one level, a final `#` all following levels."""
     qos: QualityOfService = 0
-    """The quality of service that is asked for."""
+    """The requested quality of service."""
     memories: MemoryNames
     """The memories that messages may write."""
     areas: Areas
@@ -117,24 +115,24 @@ class SubscriptionConfig(Model):
 
 
 class MqttConfig(Model):
-    """The MQTT client: takes JSON commands from the topics of a broker."""
+    """The MQTT client: receives JSON commands from topics of a broker."""
 
     url: BrokerUrl
-    """The broker: mqtt://host:port, or mqtts:// for TLS; the port is 1883 or 8883 if left out."""
+    """The broker: mqtt://host:port, or mqtts:// for TLS. Default port: 1883 or 8883."""
     username: Annotated[MqttText | None, NotNull()] = None
-    """The user name that is told to the broker."""
+    """The user name for the broker."""
     password_file: Annotated[FilePath | None, NotNull()] = None
-    """A file that holds the password; beside username only."""
+    """A file that contains the password; requires username."""
     client_id: MqttText
-    """The name of this client, which no other client of the broker has."""
+    """The client identifier; unique among the clients of the broker."""
     version: MqttVersion = "5"
     """The version of MQTT."""
     keep_alive: Annotated[int, Field(ge=1, le=65535)] = 60
-    """Seconds without a message after which the connection is tested."""
+    """Seconds without a message after which the client sends a ping."""
     tls: Annotated[ClientTlsConfig | None, NotNull()] = None
-    """Certificates; beside mqtts:// only."""
+    """Certificates; requires mqtts://."""
     subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
-    """The topics to listen to."""
+    """The topics to subscribe to."""
 
     @property
     def broker(self) -> Broker:
@@ -153,93 +151,93 @@ class MqttConfig(Model):
 
     @property
     def secure(self) -> bool:
-        """Whether TLS is spoken."""
+        """Whether the connection uses TLS."""
         return self.broker.secure
 
 
 class NatsLimitsConfig(Model):
-    """What subscribers of the scanner may ask for at most."""
+    """Limits on what subscribers of the scanner can request."""
 
     devices: Annotated[int, Field(ge=1)] = MAX_DEVICES
-    """Devices that are polled at once."""
+    """Maximum number of devices polled at once."""
     tags: Annotated[int, Field(ge=1)] = MAX_TAGS
-    """Tags of all devices."""
+    """Maximum number of tags of all devices."""
 
 
 class NatsConfig(Model):
-    """The scanner: polls devices for whoever subscribes over NATS."""
+    """The scanner: polls devices for NATS subscribers."""
 
     servers: Annotated[tuple[NatsUrl, ...], Strict(False), Field(min_length=1)]
-    """The NATS servers: nats://host:port, or tls://host:port; the port is 4222 if left out."""
+    """The NATS servers: nats://host:port or tls://host:port. Default port: 4222."""
     devices: Annotated[tuple[PollableEntry, ...], Strict(False), Field(min_length=1)]
-    """Whom subscribers may have polled and written to: networks, addresses, serial devices."""
+    """Devices that subscribers may poll and write to: networks, addresses, serial devices."""
     username: Annotated[MqttText | None, NotNull()] = None
-    """The user name that is told to the server."""
+    """The user name for the server."""
     password_file: Annotated[FilePath | None, NotNull()] = None
-    """A file that holds the password; beside username only."""
+    """A file that contains the password; requires username."""
     token_file: Annotated[FilePath | None, NotNull()] = None
-    """A file that holds a token, in the place of a user."""
+    """A file that contains a token, instead of a user name."""
     credentials_file: Annotated[FilePath | None, NotNull()] = None
-    """A file with a JWT and the seed of its key, in the place of a user."""
+    """A file that contains a JWT and the seed of its key, instead of a user name."""
     tls: Annotated[ClientTlsConfig | None, NotNull()] = None
-    """Certificates; beside tls:// only."""
+    """Certificates for the NATS servers; requires tls://."""
     device_tls: Annotated[ClientTlsConfig | None, NotNull()] = None
-    """Certificates for devices that are subscribed to with TLS."""
+    """Certificates for TLS connections to devices."""
     prefix: SubjectPrefix = PREFIX
     """The first part of all subjects."""
     limits: NatsLimitsConfig = Field(default_factory=NatsLimitsConfig)
-    """What subscribers may ask for at most."""
+    """Limits on what subscribers can request."""
 
 
 class GatewayConfig(Model):
-    """The gateway: Modbus devices over HTTP, and a console for a browser."""
+    """The gateway: access to devices over HTTP, with a web console."""
 
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     sources: Sources
     """Networks and addresses of the clients, IPv4 or IPv6."""
     allow: Annotated[tuple[EgressEntry, ...], Strict(False), Field(min_length=1)]
-    """Whom it may connect to: networks, addresses and ports; without, 502, and 802 with TLS."""
+    """Devices that it may connect to: NETWORK[:PORTS]. Default ports: 502, with TLS also 802."""
     access: Access
     """Whether it may write to devices."""
     tokens: Tokens[GatewayTokenConfig]
-    """Who may use it; `none` lets everyone, from this machine only."""
+    """The tokens. none: everyone has access; only on loopback addresses."""
     tls: Annotated[ClientTlsConfig | None, NotNull()] = None
-    """Certificates for devices that are talked to with TLS."""
+    """Certificates for TLS connections to devices."""
     in_flight: Annotated[int, Field(ge=1, le=64)] = 1
-    """Requests on their way to one device at once."""
+    """Maximum number of requests in flight to one device."""
 
 
 class AdapterConfig(Model):
-    """A third-party adapter, and what it may reach."""
+    """A third-party adapter, and what it can access."""
 
     type: Name
     """The entry point of the adapter, in the group holdfast.adapters."""
     memories: MemoryNames
-    """The memories it reaches."""
+    """The memories it can access."""
     areas: Areas
-    """The areas it reaches."""
+    """The areas it can access."""
     access: Access
     """Whether it may write."""
     options: dict[OptionName, Any] = Field(default={})
-    """What the adapter itself wants to know, as it is written."""
+    """The adapter's own settings."""
 
 
 class MetricsConfig(Model):
-    """Counters and gauges, as Prometheus text."""
+    """Metrics in the Prometheus text format."""
 
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     sources: Sources = LOOPBACK
-    """Networks and addresses of the readers, IPv4 or IPv6."""
+    """Networks and addresses of the clients, IPv4 or IPv6."""
 
 
 class AuditConfig(Model):
-    """A file that records every change, line by line."""
+    """A file that records every write, one line each."""
 
     file: FilePath
-    """The file, in a folder that is there."""
+    """The file, in an existing folder."""
     max_bytes: Annotated[int, Field(ge=65536)] = 100 * 2**20
-    """Bytes after which the file is put aside and a new one begun."""
+    """The size in bytes at which the file is rotated."""
     keep: Annotated[int, Field(ge=1, le=1000)] = 10
-    """Files put aside that are kept."""
+    """How many rotated files to keep."""

@@ -1,4 +1,4 @@
-"""That no two parts of an appliance ask for one socket or one serial port."""
+"""Checks that no two parts of an appliance use the same socket or serial port."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     _Server: TypeAlias = tuple[KeyPath, dict[Any, Any]]
 
 SERVICES = ("rest", "gateway", "metrics")
-"""Sections that are served over HTTP."""
+"""Sections with an HTTP server."""
 
 
 def check_sockets(data: object, report: Report) -> None:
-    """Reports what overlaps: TCP with TCP, UDP with UDP, a serial port with itself."""
+    """Reports TCP binds that overlap, UDP binds that overlap, and serial ports used twice."""
     services = [((name,), mapping(mapping(data).get(name))) for name in SERVICES]
     _overlaps([*_listeners(data, CONNECTION_TYPES), *services], report)
     _overlaps(_listeners(data, DATAGRAM_TYPES), report)
@@ -53,5 +53,5 @@ def _overlaps(servers: Iterable[_Server], report: Report) -> None:
                 line = report.line((*other_path, "bind"))
                 of = f"{other} of {report.document.spell(other_path)} in line {line}"
                 message = f"found {str(bind)!r}, which overlaps {of}"
-                report.add((*path, "bind"), f"{message}, allowed: an address and port of its own")
+                report.add((*path, "bind"), f"{message}, allowed: an unused address and port")
         earlier.append((path, bind))

@@ -1,8 +1,8 @@
-"""YAML 1.2 text to plain data, and the place of every key and value in it.
+"""Parses YAML 1.2 text into plain data, with the place of every key and value.
 
-Only the core schema's types exist here: null, booleans, integers, floats, text, lists and mappings,
-whatever a `%YAML` line says. Keys are text or integers, and no key comes twice. Nothing here knows
-what the keys mean.
+Values have the types of the core schema: null, booleans, integers, floats, text, lists and
+mappings, whatever a `%YAML` line says. Keys are text or integers, and are unique. This module does
+not know what the keys mean.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
 
 MAX_VALUES = 1_000_000
-"""Values of one file, counted as often as an alias repeats them."""
+"""Maximum number of values in one file, with aliases expanded."""
 
 _TAG = "tag:yaml.org,2002:"
 _WORDS: Final[dict[str, bool | None]] = {
@@ -51,7 +51,7 @@ class Place:
 
 @dataclass(slots=True)
 class _Spot:
-    """Where one value is, and what is inside it: by key, or by place in a list."""
+    """The place of one value, and of the values inside it, by key or by index."""
 
     place: Place
     children: dict[Key, tuple[Place, _Spot]] = field(default_factory=dict)
@@ -62,16 +62,16 @@ class _Spot:
 
 @dataclass(frozen=True)
 class Document:
-    """The data of one file; `root` says where each of its values is."""
+    """The data of one file; `root` has the place of each value."""
 
     file: str
     data: Any
     root: _Spot
 
     def place(self, path: KeyPath, *, of_key: bool = False) -> Place:
-        """Of a single value its own place, of a list or mapping that of its key.
+        """The place of a scalar value; for a list or mapping, the place of its key.
 
-        A path that leads out of the file ends at the last key that is there.
+        For a path that does not exist, the place of its last existing key.
         """
         spot, found = self.root, self.root.place
         for part in path:
@@ -91,7 +91,7 @@ class Document:
         return True
 
     def spell(self, path: KeyPath) -> str:
-        """A path as people write it: `rules[0].units.1`."""
+        """The path as text: `rules[0].units.1`."""
         text, spot = "", self.root
         for part in path:
             word = str(part) if re.fullmatch(r"[\w-]+", str(part)) else repr(part)
@@ -102,12 +102,12 @@ class Document:
 
 
 def read_text(path: Path, file: str) -> str:
-    """The text of a file; `file` is how messages name it. Raises `ConfigError`."""
+    """Reads a file; messages call it `file`. Raises `ConfigError`."""
     try:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        message = "this is not UTF-8, allowed: YAML or CSV in UTF-8"
+        message = "not UTF-8, allowed: YAML or CSV in UTF-8"
         raise ConfigError(file, [Problem(file, line, None, "", message)]) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
@@ -116,7 +116,7 @@ def read_text(path: Path, file: str) -> str:
 
 
 def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
-    """The document, and problems that left it readable; raises `ConfigError` where it is not."""
+    """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid."""
     try:
         reader = _Reader()
         data, spot = reader.value(_compose(text), ())
@@ -130,10 +130,10 @@ def parse(text: str, file: str) -> tuple[Document, list[Problem]]:
         message = f"not YAML: {error}"
         raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
     except RecursionError:
-        message = "not a configuration: values inside values without end"
+        message = "not a configuration: nested too deeply"
         raise ConfigError(file, [Problem(file, None, None, "", message)]) from None
     if spot.values > MAX_VALUES:
-        message = f"found {spot.values} values, aliases repeated, allowed: {MAX_VALUES}"
+        message = f"found {spot.values} values with aliases expanded, allowed: up to {MAX_VALUES}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
     document = Document(file, data, spot)
     return document, [
@@ -152,7 +152,7 @@ def _compose(text: str) -> Node | None:
 def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     mark = error.problem_mark or error.context_mark
     line, column = (mark.line + 1, mark.column + 1) if mark else (None, None)
-    reason = error.problem or error.context or "it can't be understood"
+    reason = error.problem or error.context or "invalid syntax"
     start = error.context_mark
     if error.context and reason.startswith("but "):
         reason = f"{error.context}, {reason}"
@@ -162,7 +162,7 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
 
 
 class _Reader:
-    """Turns nodes into data. A node that aliases name again is read once."""
+    """Converts nodes into data. A node that several aliases name is converted once."""
 
     def __init__(self) -> None:
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
@@ -173,7 +173,7 @@ class _Reader:
         if node is None:
             return None, _Spot(Place(1, 1), is_scalar=True)
         if id(node) in self._open:
-            self._add(node, path, "an alias inside the value that it repeats")
+            self._add(node, path, "an alias inside its own anchor is not allowed")
             return None, _Spot(_place(node), is_scalar=True)
         if id(node) not in self._done:
             self._open.add(id(node))
@@ -217,7 +217,7 @@ class _Reader:
             if key in data:
                 first = spot.children[key][0].line
                 name = str(key) if isinstance(key, int) else show(key)
-                self._add(key_node, path, f"the key {name} comes twice, first in line {first}")
+                self._add(key_node, path, f"duplicate key {name}, first in line {first}")
                 continue
             data[key], child = self.value(value_node, (*path, key))
             spot.children[key] = (_place(key_node), child)
@@ -229,7 +229,7 @@ class _Reader:
         if isinstance(key, str) or type(key) is int:
             return key
         found = (
-            f"the key {node.value}" if isinstance(node, ScalarNode) else "a key of several parts"
+            f"the key {node.value}" if isinstance(node, ScalarNode) else "a list or mapping as key"
         )
         self._add(
             node, path, f"found {found}, allowed: text or an integer; quote it to make it text"
@@ -241,9 +241,9 @@ class _Reader:
 
 
 def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
-    """The value of a scalar, by the core schema; `kind` is `str` for what is text in any case.
+    """The value of a scalar, by the core schema; with `kind` `str` it is always text.
 
-    Raises `ValueError` for a kind that does not exist here.
+    Raises `ValueError` for a tag that is not allowed.
     """
     if kind == "str":
         return text
@@ -261,7 +261,7 @@ def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
 
 
 def _is_empty(node: Node) -> bool:
-    """Whether nothing is written: the place of that is anywhere behind the key."""
+    """Whether the value is empty. The parser puts an empty value anywhere after its key."""
     return isinstance(node, ScalarNode) and node.style is None and node.value == ""
 
 

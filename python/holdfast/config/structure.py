@@ -1,6 +1,6 @@
-"""Plain data to models, and pydantic's errors to our own words.
+"""Builds the models from plain data, and translates pydantic's errors.
 
-One message a mistake, in one form: what was found, and what is allowed there.
+Each error becomes one message: what was found, and what is allowed.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _NO_KIND = ("union_tag_invalid", "union_tag_not_found")
 _TOKENS = (("rest", "tokens"), ("gateway", "tokens"))
 _SERVERS = ("nats", "servers")
 _TOLD = ("default_factory_not_called",)
-"""Errors that only follow from others."""
+"""Errors that are only consequences of other errors."""
 
 
 def build(data: object, context: Mapping[str, Any], report: Report) -> Config | None:
-    """The models of `data`, or `None` and what is wrong; what is settled is not looked at."""
+    """Builds a `Config`, or returns `None` and reports problems, except at settled paths."""
     try:
         return Config.model_validate(data, context=dict(context))
     except ValidationError as errors:
@@ -43,7 +43,7 @@ def build(data: object, context: Mapping[str, Any], report: Report) -> Config | 
 
 
 def _untagged(path: KeyPath) -> KeyPath:
-    """The path without the name of a kind, which pydantic puts in where there are several."""
+    """The path without the tag that pydantic inserts for a discriminated union."""
     of_listener = path[:1] == ("listeners",) and path[2:] != (_KEY,)
     return path[:2] + path[3:] if of_listener or path[:2] in _TOKENS else path
 
@@ -53,7 +53,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
     of_key = bool(path) and path[-1] == _KEY
     path = path[:-1] if of_key else path
     if kind in _TOLD or (kind == "too_short" and error["input"]):
-        return  # What is inside is wrong, and reported.
+        return  # The error inside the value has its own report.
     if kind in _NO_KIND:
         _add_kind((*path, "type"), error["input"], report)
     elif kind == "missing":
@@ -78,7 +78,7 @@ def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
 
 
 def _shown(path: KeyPath, value: object) -> str:
-    """The value in words; where it could be a secret, or have one in it, only its shape."""
+    """The value as text, or only its shape if it could contain a secret."""
     of_token = path[:2] in _TOKENS and len(path) <= 3
     return shape(value) if of_token or path == _SERVERS else show(value)
 

@@ -1,4 +1,4 @@
-"""What the files of TLS must keep together, wherever a section names some."""
+"""Checks the TLS files of any section."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ SERVER_FILES = ("cert_file", "key_file", "ca_file", "crl_file")
 
 
 def check_client_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:
-    """Reports what is wrong with the files for those that are connected to."""
+    """Reports problems with the files of a TLS client."""
     lonely = alone(cert="cert_file" in tls, key="key_file" in tls)
     if lonely is not None:
         given, missing = (f"{word}_file" for word in lonely)
-        message = f"found without {missing}, allowed: both or none"
+        message = f"found without {missing}, allowed: both or neither"
         report.add((*path, given), message, of_key=True)
     for key in CLIENT_FILES:
         check_readable((*path, key), tls.get(key), folder, report)
 
 
 def check_server_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:
-    """Reports which files of a server can't be read; that it needs them is the model's to say."""
+    """Reports files of a TLS server that can't be read. The model reports missing keys."""
     for key in SERVER_FILES:
         check_readable((*path, key), tls.get(key), folder, report)

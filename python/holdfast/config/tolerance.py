@@ -1,6 +1,6 @@
-"""Looking at data whose shape is not known to be right: what does not fit is as if it were absent.
+"""Reads data that is not validated: a value of the wrong type counts as absent.
 
-The checks use it, so that they see what they can whatever else is wrong.
+The checks use it to find as many problems as possible in an invalid file.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ T = TypeVar("T")
 
 
 def mapping(value: object) -> dict[Any, Any]:
-    """The value when it is a mapping, else an empty one."""
+    """The value if it is a mapping, else an empty mapping."""
     return value if isinstance(value, dict) else {}
 
 
 def entries(value: object) -> list[Any]:
-    """The value when it is a list, else an empty one."""
+    """The value if it is a list, else an empty list."""
     return value if isinstance(value, list) else []
 
 
 def fitting(kind: TypeAdapter[T], value: object) -> T | None:
-    """The value as the type it should have, `None` when it has not."""
+    """The value if it is valid for `kind`, else `None`."""
     try:
         return kind.validate_python(value, strict=True)
     except ValidationError:
@@ -34,7 +34,7 @@ def fitting(kind: TypeAdapter[T], value: object) -> T | None:
 
 
 def parsed(parse: Callable[[object], T], value: object) -> T | None:
-    """What `parse` makes of the value, `None` where it refuses."""
+    """The result of `parse`, `None` if it raises `ValueError`."""
     try:
         return parse(value)
     except ValueError:
@@ -42,5 +42,5 @@ def parsed(parse: Callable[[object], T], value: object) -> T | None:
 
 
 def integer(value: object, least: int, most: int) -> int | None:
-    """The value when it is an integer in that range."""
+    """The value if it is an integer from `least` to `most`, else `None`."""
     return value if type(value) is int and least <= value <= most else None

@@ -1,4 +1,4 @@
-"""Values that may come once only: in one list, or anywhere in a file."""
+"""Checks that values are unique in a list, or in a whole file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def refuse_repeats(path: KeyPath, values: Iterable[object], report: Report) -> None:
-    """Reports every text or integer of a list that came before in it."""
+    """Reports every text or integer that repeats an earlier entry of the list."""
     seen: set[str | int] = set()
     for index, value in enumerate(values):
         if not isinstance(value, str) and type(value) is not int:
@@ -27,18 +27,19 @@ def refuse_repeats(path: KeyPath, values: Iterable[object], report: Report) -> N
 
 @dataclass
 class Owners:
-    """Who has a value first, for values that no two may share."""
+    """The first owner of each value, for values that must be unique."""
 
     report: Report
     what: str
-    """What the value is to its owner."""
+    """What the value is, as messages call it."""
     first: dict[object, KeyPath] = field(default_factory=dict)
 
     def claim(self, path: KeyPath, value: object, shown: str, owner: KeyPath) -> None:
-        """Reports `value` at `path` when another owner has it; `shown` is how to name it."""
+        """Reports `value` at `path` if another owner has it; messages call it `shown`."""
         if value not in self.first:
             self.first[value] = owner
             return
         other = self.first[value]
         of = f"{self.report.document.spell(other)} in line {self.report.line(other)}"
-        self.report.add(path, f"found {shown}, which is the {self.what} of {of}, allowed: another")
+        message = f"found {shown}, which is the {self.what} of {of}, allowed: a different one"
+        self.report.add(path, message)

@@ -1,7 +1,4 @@
-"""How a message names values: what was found, and lists of what is allowed.
-
-Text only; nothing here knows what a configuration is.
-"""
+"""Formats values for error messages: found values, and lists of allowed values."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ MAX_SHOWN = 60
 
 
 def show(value: object) -> str:
-    """A value as a message prints it: text in quotes, the shape of what is larger than a value."""
+    """A value for a message: scalars as they are, text in quotes, a mapping or list by its kind."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -29,14 +26,14 @@ def show(value: object) -> str:
 
 
 def shape(value: object) -> str:
-    """What kind of value it is, for places where the value itself may be a secret."""
+    """The kind of a value that may be a secret."""
     if isinstance(value, str):
         return f"text of {len(value)} characters"
     return "a number" if type(value) in (int, float) else show(value)
 
 
 def choice(values: Iterable[object]) -> str:
-    """`a`, `a or b`, `a, b or c`; what comes again is left out."""
+    """`a`, `a or b`, `a, b or c`; without duplicates."""
     *most, last = dict.fromkeys(str(value) for value in values)
     return f"{', '.join(most)} or {last}" if most else last
 
@@ -47,6 +44,6 @@ def listing(values: Iterable[object]) -> str:
 
 
 def guess(word: object, known: Iterable[str]) -> str:
-    """`; did you mean 'x'?` when a known word is close, else nothing."""
+    """`; did you mean 'x'?` if a known word is close, else ""."""
     close = difflib.get_close_matches(str(word), list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
