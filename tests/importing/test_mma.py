@@ -175,7 +175,7 @@ def test_areas_take_the_short_form_where_they_start_at_0(imported: Import) -> No
 def test_an_area_of_no_size_is_left_out(imported: Import) -> None:
     found = imported(FIRST.replace("size: 8}", "size: 8}, input_registers: {start: 0, size: 0}"))
     assert found.data["memories"] == {"plant": {"coils": 8}}
-    assert noted(found, "input_registers: left out: has no addresses")
+    assert noted(found, "input_registers: left out: the area has no addresses")
 
 
 def test_a_default_memory_is_noted(imported: Import) -> None:
@@ -200,7 +200,7 @@ def test_a_name_that_is_not_allowed_is_changed_everywhere(imported: Import) -> N
     found = imported(memory + routing + PORT % "")
     assert list(found.data["memories"]) == ["a_b-2", "a_b", "__b"]
     assert rule(found)["units"] == {1: "a_b-2", 2: "a_b", 3: "__b"}
-    assert noted(found, "memory.memories.'a b': changed: is named a_b-2")
+    assert noted(found, "memory.memories.'a b': changed: renamed to a_b-2")
 
 
 SEAL = "state_sealing: {enable: true, gate: {area: discrete_inputs, address: 3}}"
@@ -223,13 +223,13 @@ def test_a_seal_of_its_own_stands_before_that_of_all(imported: Import) -> None:
     text = SEALED.replace("memory: {", f"memory: {{{SEAL}, ").replace("{discrete", off)
     found = imported(text)
     assert "seal" not in found.data["memories"]["plant"]
-    assert noted(found, "plant.state_sealing: left out: it is not enabled")
+    assert noted(found, "plant.state_sealing: left out: not enabled")
 
 
 def test_a_seal_that_nothing_can_open_is_noted(imported: Import) -> None:
     text = SEALED.replace("{discrete", f"{{{SEAL}, discrete")
-    assert noted(imported(text), "nothing here can open plant")
-    assert not noted(imported(text + MQTT % ("b", "")), "nothing here can open")
+    assert noted(imported(text), "nothing can open plant")
+    assert not noted(imported(text + MQTT % ("b", "")), "nothing can open")
 
 
 def test_a_port_serves_units_that_map_and_port_allow(imported: Import) -> None:
@@ -247,7 +247,7 @@ def test_a_port_that_serves_no_unit_is_left_out(imported: Import) -> None:
     other = "503: {unit_ids: [9], memories: all, access: read-only}"
     found = imported(FIRST.replace("ports: {", f"ports: {{{other}, "))
     assert list(found.data["listeners"]) == ["port-502"]
-    assert noted(found, "ports.503: left out: the port is left out: no unit id")
+    assert noted(found, "ports.503: left out: the port is left out: it allows no unit id")
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_a_port_that_serves_no_unit_is_left_out(imported: Import) -> None:
         ("':502'", "0.0.0.0:502", "listens on all IPv4 addresses"),
         ("'10.0.0.1:502'", "10.0.0.1:502", ""),
         ("'[::]:502'", "[::]:502", ""),
-        ("localhost:502", "127.0.0.1:502", "a bind has no host name"),
+        ("localhost:502", "127.0.0.1:502", "host names are not allowed"),
     ],
 )
 def test_a_port_is_a_number_or_an_address(imported: Import, key: str, bind: str, note: str) -> None:
@@ -297,20 +297,20 @@ def test_functions_that_write_are_not_listed_where_nothing_is_written(imported: 
     text = PORT.replace("read-write", "read-only") % ", function_codes: {allow: [3, 6]}"
     found = imported(MEMORY + ROUTING + text)
     assert rule(found)["functions"] == [3]
-    assert noted(found, "function_codes.allow: changed: not 6: writes")
+    assert noted(found, "function_codes.allow: changed: without 6: it writes")
 
 
 def test_an_unknown_function_code_is_noted(imported: Import) -> None:
     found = imported(MEMORY + ROUTING + PORT % ", function_codes: {deny: [7]}")
     assert "deny" not in rule(found)
-    assert noted(found, "function_codes.deny[0]: left out: function 7 does not exist here")
+    assert noted(found, "function_codes.deny[0]: left out: function 7 is not supported")
 
 
 def test_a_port_that_allows_no_function_is_left_out(
     refused: Callable[[str], list[str]],
 ) -> None:
     text = MEMORY + ROUTING + PORT % ", function_codes: {allow: [6], deny: [6]}"
-    assert refused(text) == ["1: nothing is left to serve, allowed: a listener, REST or MQTT"]
+    assert refused(text) == ["1: nothing to serve, allowed: at least one listener, REST or MQTT"]
 
 
 def test_denied_addresses_are_cut_out(imported: Import) -> None:
@@ -392,7 +392,7 @@ def test_what_a_policy_rule_allows(imported: Import, allowed: str, rights: dict[
 
 def test_write_only_is_noted(imported: Import) -> None:
     found = imported(SECOND % (RULE.replace("rw", "wo"), ""))
-    assert noted(found, "policy.rules[0].allow: changed: only the functions 5, 6, 15, 16")
+    assert noted(found, "policy.rules[0].allow: changed: only functions 5, 6, 15, 16")
 
 
 def test_a_sealing_coil_is_followed(imported: Import) -> None:
@@ -401,7 +401,7 @@ def test_a_sealing_coil_is_followed(imported: Import) -> None:
     expected = {"area": "coils", "address": 7, "mode": "level"}
     assert found.data["memories"]["main-1"]["seal"] == expected
     assert noted(found, "state_sealing.exception: left out", "0x06")
-    assert noted(found, "nothing here can open main-1")
+    assert noted(found, "nothing can open main-1")
 
 
 def test_a_seal_that_is_off_is_left_out(imported: Import) -> None:
@@ -447,7 +447,7 @@ def test_units_that_are_treated_otherwise_get_what_all_have(imported: Import) ->
         {"sources": ["10.1.0.0/16"], "units": both, "access": "read-only", "functions": [3]},
         {"sources": ["10.0.0.0/8"], "units": both, "access": "read-write"},
     ]
-    assert noted(found, "listeners[0]: changed: peers in 10.1.0.0/16", "so they get 3")
+    assert noted(found, "listeners[0]: changed: peers in 10.1.0.0/16", "for all its units: 3")
 
 
 def test_a_unit_with_nothing_in_common_is_not_served(imported: Import) -> None:
@@ -464,7 +464,7 @@ def test_same_names_in_two_listeners_are_two_memories(imported: Import) -> None:
     found = imported(first + second)
     assert list(found.data["memories"]) == ["a", "a-2"]
     assert rule(found, "lab")["units"] == {1: "a-2"}
-    assert noted(found, "listeners[1].memory[0].name: changed: is named a-2")
+    assert noted(found, "listeners[1].memory[0].name: changed: renamed to a-2")
 
 
 @pytest.mark.parametrize("key", ["debug", "rbe", "notify", "persistence", "access_events"])
@@ -475,7 +475,11 @@ def test_what_has_no_counterpart_is_noted_with_the_reason(imported: Import, key:
 
 
 def test_raw_ingest_on_the_same_port_is_noted(imported: Import) -> None:
-    assert noted(imported(SECOND % (RULE, "")), "listeners: check: Raw Ingest", "format: v1")
+    assert noted(
+        imported(SECOND % (RULE, "")),
+        "listeners: check: these ports also received Raw Ingest",
+        "format: v1",
+    )
 
 
 # REST, MQTT and Raw Ingest.
@@ -502,10 +506,10 @@ def test_rest_admits_those_of_the_filter(imported: Import) -> None:
     text = FIRST + REST % ("':8080'", "x" * 20)
     everybody = imported(text)
     assert everybody.data["rest"]["sources"] == ["0.0.0.0/0", "::/0"]
-    assert noted(everybody, "rest: check: sources are everybody")
+    assert noted(everybody, "rest: check: sources are all addresses")
     found = imported(text + "ip_filter: {allow: [10.0.0.0/8]}\n")
     assert found.data["rest"]["sources"] == ["10.0.0.0/8"]
-    assert noted(found, "rest: check: sources are those of ip_filter")
+    assert noted(found, "rest: check: sources are from ip_filter")
 
 
 def test_rest_without_tokens_stays_on_loopback(imported: Import) -> None:
@@ -519,7 +523,7 @@ def test_rest_without_tokens_stays_on_loopback(imported: Import) -> None:
 def test_rest_that_nobody_could_use_is_left_out(imported: Import) -> None:
     found = imported(FIRST + REST % ("127.0.0.1:8080", "''"))
     assert "rest" not in found.data
-    assert noted(found, "no token could get in")
+    assert noted(found, "it has no usable token")
 
 
 def test_a_short_or_repeated_token_is_noted(imported: Import) -> None:
@@ -527,7 +531,7 @@ def test_a_short_or_repeated_token_is_noted(imported: Import) -> None:
     found = imported(FIRST + text)
     assert [token["name"] for token in found.data["rest"]["tokens"]] == ["gate"]
     assert noted(found, "tokens[0].token: check", "fewer than 16 characters")
-    assert noted(found, "tokens[1]: left out: the token is the same")
+    assert noted(found, "tokens[1]: left out: the token repeats")
 
 
 @pytest.mark.parametrize(
@@ -553,7 +557,7 @@ def test_the_broker_becomes_a_url(imported: Import, broker: str, url: str) -> No
 def test_a_broker_by_websocket_leaves_mqtt_out(imported: Import) -> None:
     found = imported(FIRST + MQTT % ("wss://broker/mqtt", ""))
     assert "mqtt" not in found.data
-    assert noted(found, "mqtt.broker: left out: MQTT is left out: 'wss' is not served")
+    assert noted(found, "mqtt.broker: left out: MQTT is left out: 'wss' is not supported")
 
 
 def test_the_password_is_to_be_put_in_a_file(imported: Import) -> None:
@@ -585,7 +589,7 @@ def test_raw_ingest_becomes_a_listener_without_crc(imported: Import) -> None:
 def test_raw_ingest_never_reached_memories_whose_name_is_no_number(imported: Import) -> None:
     found = imported(FIRST + RAW)
     assert "raw-ingest" not in found.data["listeners"]
-    assert noted(found, "raw_ingest: check: never reached plant")
+    assert noted(found, "raw_ingest: check: could not write plant")
     assert noted(found, "raw_ingest: left out: Raw Ingest is left out")
 
 
@@ -593,7 +597,7 @@ def test_raw_ingest_never_reached_memories_whose_name_is_no_number(imported: Imp
 def test_what_is_not_enabled_is_left_out_with_a_note(imported: Import, section: str) -> None:
     found = imported(FIRST + f"{section}: {{enabled: false, broker: x, listen: 5}}\n")
     assert list(found.data) == ["memories", "listeners"]
-    assert noted(found, f"4: {section}: left out: it is not enabled")
+    assert noted(found, f"4: {section}: left out: not enabled")
 
 
 # What can't be imported.
@@ -604,7 +608,11 @@ def test_what_is_not_enabled_is_left_out_with_a_note(imported: Import, section: 
     [
         ("size: 8", "size: -1", "coils.size: found -1, allowed: an integer from 0 to 65536"),
         ("size: 8", "size: '8'", "coils.size: found '8', allowed: an integer from 0 to 65536"),
-        ("start: 0", "start: 65535", "coils: found 65535 and 8, allowed: a sum up to 65536"),
+        (
+            "start: 0",
+            "start: 65535",
+            "coils: found start 65535 and size 8, allowed: a sum up to 65536",
+        ),
         ("start: 0, size: 8", "start: 0", "coils.size: missing, allowed: an integer"),
         ("coils: {start: 0, size: 8}", "", "plant: found nothing, allowed: a mapping"),
         ("1: plant", "1: plan", "1: found 'plan', allowed: plant; did you mean 'plant'?"),
@@ -646,7 +654,7 @@ def test_an_impossible_value_is_refused(
         ("    listen: 127.0.0.1:502\n", "", "listeners[0].listen: missing"),
         ("unit_id: 1", "name: x", "unit_id: missing, allowed: a unit id from 0 to 255"),
         ("allow: rw", "allow: all", "allow: found 'all', allowed: ro, rw or wo"),
-        ("allow: rw", "allow: rw, allow_fc: [1]", "allow: found beside allow_fc"),
+        ("allow: rw", "allow: rw, allow_fc: [1]", "allow: found together with allow_fc"),
         ("source_ip: [10.0.0.0/8], ", "", "source_ip: missing, allowed: a list"),
         ("[10.0.0.0/8]", "10.0.0.0/8", "source_ip: found '10.0.0.0/8', allowed: a list"),
         (AREA_LINES, "", "memory[0]: no area, allowed: at least one of"),
@@ -663,7 +671,7 @@ def test_an_impossible_value_of_the_second_generation_is_refused(
 
 def test_two_memories_of_one_unit_are_refused(refused: Callable[[str], list[str]]) -> None:
     text = SECOND % (RULE, "") + "      - {unit_id: 1, coils: {start: 0, count: 1}}\n"
-    expected = "found 1, which is that of listeners[0].memory[0], allowed: one of its own"
+    expected = "found 1, which is the unit id of listeners[0].memory[0], allowed: a different one"
     assert refused(text) == [f"10: listeners[0].memory[1].unit_id: {expected}"]
 
 
@@ -676,7 +684,7 @@ def test_a_gate_outside_its_area_is_refused(refused: Callable[[str], list[str]])
 def test_two_servers_of_one_port_are_refused(refused: Callable[[str], list[str]]) -> None:
     text = FIRST + REST % ("':502'", "x" * 20)
     assert refused(text) == [
-        "6: rest.address: found ':502', where ports.502 listens, allowed: another port"
+        "6: rest.address: found ':502', which ports.502 uses, allowed: another port"
     ]
 
 
@@ -749,7 +757,7 @@ def test_a_file_is_replaced_only_by_force(tmp_path: Path) -> None:
     out.write_text("mine")
     result = run(MMA / "minimal.yaml", "--output", out)
     assert (result.exit_code, out.read_text()) == (1, "mine")
-    assert result.stderr == f"{out}: is there already; --force replaces it\n"
+    assert result.stderr == f"{out}: already exists; --force overwrites it\n"
     assert run(MMA / "minimal.yaml", "--output", out, "--force").exit_code == 0
     assert "memory1" in out.read_text()
 
@@ -779,7 +787,7 @@ def test_programs_get_json() -> None:
         "line": 2,
         "column": 1,
         "key": "debug",
-        "message": "what is logged is set by log.level",
+        "message": "log.level sets what is logged",
     }
 
 

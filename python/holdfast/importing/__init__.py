@@ -1,7 +1,7 @@
-"""Configurations of other programs, made into ours.
+"""Converts configurations of other programs to Holdfast configurations.
 
-`read_mma` is the way in. What can't be carried over is told in a `Note`, never left out in silence.
-This room must never start anything, and no secret that it reads may leave it but as a hash.
+Call `read_mma`. A `Note` reports every setting that can't be converted; nothing is dropped
+silently. This package never starts anything, and secrets leave it only as hashes.
 """
 
 from __future__ import annotations

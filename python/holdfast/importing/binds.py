@@ -1,4 +1,4 @@
-"""Where the source listens, as an address and a port of ours."""
+"""Converts listen addresses of the source."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ FORM = "a port, :port or address:port with an IP address"
 
 
 class Binds:
-    """Reads the places to listen on, and refuses two that can't be open at once."""
+    """Reads listen addresses, and refuses two that can't be open at once."""
 
     def __init__(self, desk: Desk) -> None:
         self._desk = desk
         self._taken: list[tuple[KeyPath, Bind]] = []
 
     def read(self, path: KeyPath, value: object, *, of_key: bool = False) -> Bind | None:
-        """The place that `value` names; `None`, and a problem, where it names none."""
+        """The address and port of `value`; `None`, and a problem, if it is not valid."""
         bind = self._parsed(path, value, of_key)
         if bind is None:
             return None
         for other_path, other in self._taken:
             if bind.overlaps(other):
                 spelled = self._desk.document.spell(other_path)
-                message = f"found {show(value)}, where {spelled} listens"
+                message = f"found {show(value)}, which {spelled} uses"
                 self._desk.problem(path, f"{message}, allowed: another port", of_key=of_key)
                 return None
         self._taken.append((path, bind))
@@ -47,8 +47,8 @@ class Binds:
             self._desk.problem(path, f"found {show(value)}, allowed: {FORM}", of_key=of_key)
             return None
         if host in ("", "*"):
-            other = f"for IPv6 too, write [::]:{port}, which takes both"
+            other = f"for IPv4 and IPv6, write [::]:{port}"
             self._desk.note("changed", path, f"listens on all IPv4 addresses, {bind}; {other}")
         elif host != numeric:
-            self._desk.note("changed", path, f"listens on {bind}: a bind has no host name")
+            self._desk.note("changed", path, f"listens on {bind}: host names are not allowed")
         return bind

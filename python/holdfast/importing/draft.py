@@ -1,4 +1,4 @@
-"""The configuration that an import is making, as plain data in the order it is written in."""
+"""The configuration that an import builds, as plain data in output order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from holdfast.types import AREAS
 
 @dataclass
 class Draft:
-    """The sections so far. `seals` says where the source seals a memory, by our name for it."""
+    """The sections so far. `seals` has the place of each seal in the source, by new memory name."""
 
     memories: dict[str, dict[str, Any]] = field(default_factory=dict)
     listeners: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -19,7 +19,7 @@ class Draft:
     seals: dict[str, tuple[str | int, ...]] = field(default_factory=dict)
 
     def data(self) -> dict[str, Any]:
-        """The configuration, without sections that hold nothing."""
+        """The configuration, without empty sections."""
         sections = {
             "memories": self.memories,
             "listeners": self.listeners,
@@ -29,10 +29,10 @@ class Draft:
         return {name: section for name, section in sections.items() if section}
 
     def grant(self, memories: list[str]) -> dict[str, Any]:
-        """All areas that some of these memories have, as a grant names them."""
+        """A grant for these memories and for all areas that at least one of them has."""
         there = {area for name in memories for area in self.memories[name]}
         return {"memories": memories, "areas": [area for area in AREAS if area in there]}
 
     def written_by_raw_ingest(self) -> list[str]:
-        """The memories that have an id, by which Raw Ingest with memory ids finds them."""
+        """The memories with an id, which Raw Ingest packets with memory ids can write."""
         return [name for name, memory in self.memories.items() if "id" in memory]

@@ -1,4 +1,4 @@
-"""The source's filters of addresses: who may connect."""
+"""Converts the address filters of the source."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ALL = Peers.of(EVERYBODY)
 
 
 def read_filter(parent: Section) -> Peers | None:
-    """Those whom `ip_filter` lets in, `None` when there is no filter. To be denied wins."""
+    """The peers that `ip_filter` admits, `None` without a filter. Denied networks win."""
     filters = parent.mapping("ip_filter")
     if filters is None:
         return None
@@ -26,11 +26,11 @@ def read_filter(parent: Section) -> Peers | None:
 
 
 def read_networks(section: Section, key: str, *, required: bool = False) -> list[Network]:
-    """The networks of a list; empty entries name nobody."""
+    """The networks of a list; empty entries are ignored, with a note."""
     networks = []
     for path, text in section.entries(key, required=required) or ():
         if text is None or text == "":
-            section.desk.note("left out", path, "an empty entry, which names nobody")
+            section.desk.note("left out", path, "the entry is empty")
             continue
         try:
             networks.append(parse_network(text))

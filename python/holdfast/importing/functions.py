@@ -1,4 +1,4 @@
-"""Function codes: from the source's lists to the keys of a rule of ours."""
+"""Converts lists of function codes to the keys of a rule."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
     from holdfast.importing.sections import Section
 
 SOURCE = frozenset({1, 2, 3, 4, 5, 6, 15, 16})
-"""What the source serves; the others it always refused."""
+"""Functions that the source supports; it refuses all others."""
 
 ALL = frozenset(CODES)
 WRITING = frozenset(WRITING_CODES)
 READING = ALL - WRITING
 WRITING_ONLY = SOURCE & WRITING
-"""Functions that write and read nothing: without 23, and without 22, whose result tells bits."""
+"""Functions that only write: without 23, and without 22, whose result reveals bits."""
 
 OTHERS = frozenset(each.code for each in FUNCTIONS if each.area is None)
-"""Functions that read or write no area."""
+"""Functions that access no area."""
 
 _CLOSE = {22: {6, 16}, 23: {3, 6, 16}}
-"""Functions that do what others do: who is denied those must not get these."""
+"""Functions with the effect of others: a peer that is denied those must not have these."""
 
 
 def read_codes(section: Section, key: str) -> list[int] | None:
-    """The codes of a list that we know, each once; `None` when there is no list."""
+    """The supported codes of a list, without duplicates; `None` without a list."""
     entries = section.entries(key)
     if entries is None:
         return None
@@ -39,7 +39,7 @@ def read_codes(section: Section, key: str) -> list[int] | None:
             message = f"found {show(code)}, allowed: a function code from 0 to 255"
             section.desk.problem(path, message)
         elif code not in ALL:
-            message = f"function {code} does not exist here, and is refused in any case"
+            message = f"function {code} is not supported, so it is always refused"
             section.desk.note("left out", path, message)
         else:
             codes[code] = None
@@ -53,13 +53,13 @@ def touching(areas: Iterable[str]) -> frozenset[int]:
 
 
 def beside(denied: Iterable[int]) -> list[int]:
-    """Functions that have to be denied too, as they do what a denied one does."""
+    """Functions that must be denied too, because they have the effect of a denied function."""
     codes = set(denied)
     return [code for code, like in _CLOSE.items() if like & codes and code not in codes]
 
 
 def rights(allowed: frozenset[int]) -> dict[str, Any]:
-    """`access` and, where it takes them, `functions` of a rule that allows exactly these."""
+    """`access`, and `functions` if necessary, of a rule that allows exactly these functions."""
     access = "read-write" if allowed & WRITING else "read-only"
     if allowed in (ALL, READING):
         return {"access": access}
@@ -67,5 +67,5 @@ def rights(allowed: frozenset[int]) -> dict[str, Any]:
 
 
 def spelled(codes: Iterable[int]) -> str:
-    """Codes as a message names them."""
+    """Codes as text for a message."""
     return listing(sorted(codes)) or "none"

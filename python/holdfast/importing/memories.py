@@ -1,4 +1,4 @@
-"""The memories of the source: their areas and seals, which both generations write nearly alike."""
+"""Converts areas and seals of memories, which are similar in both generations."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 def read_id(name: str) -> dict[str, int]:
-    """The id of a memory that is named by a number: as such a name Raw Ingest looks it up."""
+    """The id of a memory whose name is a number: Raw Ingest finds the memory by that number."""
     number = int(name) if re.fullmatch("0|[1-9][0-9]{0,4}", name) else ADDRESSES
     return {"id": number} if number < ADDRESSES else {}
 
 
 def read_areas(memory: Section, size_key: str) -> dict[str, Any]:
-    """The areas by name, as a configuration of ours has them."""
+    """The areas by name, as in a Holdfast configuration."""
     areas: dict[str, Any] = {}
     wrong = len(memory.desk.report.problems)
     for area in AREAS:
@@ -50,17 +50,17 @@ def _long_form(memory: Section, area: str, size_key: str) -> dict[str, int] | in
 
 def _extent(memory: Section, area: str, start: int, size: int) -> dict[str, int] | int | None:
     if size == 0:
-        memory.desk.note("left out", memory.at(area), "has no addresses, so there is no such area")
+        memory.desk.note("left out", memory.at(area), "the area has no addresses")
         return None
     if start + size > ADDRESSES:
-        message = f"found {start} and {size}, allowed: a sum up to {ADDRESSES}"
+        message = f"found start {start} and size {size}, allowed: a sum up to {ADDRESSES}"
         memory.desk.problem(memory.at(area), message)
         return None
     return {"start": start, "size": size} if start else size
 
 
 def addresses(extent: Any) -> range:
-    """The addresses of an area as `read_areas` gives it."""
+    """The addresses of an area that `read_areas` returned."""
     if isinstance(extent, int):
         return range(extent)
     return range(extent["start"], extent["start"] + extent["size"])
@@ -69,10 +69,10 @@ def addresses(extent: Any) -> range:
 def check_gate(
     desk: Desk, path: KeyPath, memory: str, areas: dict[str, Any], area: str, address: int
 ) -> bool:
-    """Whether the gate bit is inside its area; if not, that is a problem."""
+    """Whether the gate bit is inside its area; adds a problem if not."""
     if area not in areas:
         message = f"the gate is in {area}, which {memory} does not have"
-        desk.problem(path, f"{message}, allowed: a memory that has it, or no seal of that memory")
+        desk.problem(path, f"{message}, allowed: a memory with that area, or no seal")
         return False
     there = addresses(areas[area])
     if address in there:

@@ -1,4 +1,4 @@
-"""Configurations of the Modbus Memory Appliance, of both its generations.
+"""Imports configurations of the Modbus Memory Appliance, of both generations.
 
 The first has `memory`, `routing` and `ports`, the second nests memories in `listeners`.
 """
@@ -38,7 +38,7 @@ _SECOND = "listeners"
 
 @dataclass(frozen=True)
 class Imported:
-    """A configuration of ours, and what is to be known about it."""
+    """A Holdfast configuration, with notes on the conversion."""
 
     file: str
     generation: Generation
@@ -53,14 +53,14 @@ class Imported:
         ]
         lines.append(f"{name} generation: {self.file}")
         if self.notes:
-            lines += ["What was left out, changed, or is to be checked:", *map(str, self.notes)]
+            lines += ["Left out, changed or to be checked:", *map(str, self.notes)]
         comments = "".join(f"# {' '.join(line.splitlines())}\n" for line in lines)
         body = "".join(f"{line.rstrip()}\n" for line in to_yaml(self.data).splitlines())
         return f"{comments}\n{body}"
 
 
 class NotImportable(ConfigError):
-    """A source that can't be imported, with what was noted until then."""
+    """The source can't be imported; `notes` has the notes until then."""
 
     def __init__(self, file: str, problems: Iterable[Problem], notes: tuple[Note, ...]) -> None:
         super().__init__(file, problems)
@@ -68,9 +68,9 @@ class NotImportable(ConfigError):
 
 
 def read_mma(path: Path | str) -> Imported:
-    """Reads a configuration of either generation.
+    """Converts a configuration of either generation.
 
-    Raises `ConfigError` with everything that makes it impossible to import.
+    Raises `ConfigError` with every problem that prevents the import.
     """
     file = str(path)
     text = source.read_text(Path(path), file)
@@ -85,7 +85,7 @@ def read_mma(path: Path | str) -> Imported:
     if generation is not None:
         _read(desk, draft, generation)
         if not (draft.listeners or draft.rest or draft.mqtt or desk.report.problems):
-            desk.problem((), "nothing is left to serve, allowed: a listener, REST or MQTT")
+            desk.problem((), "nothing to serve, allowed: at least one listener, REST or MQTT")
     problems += desk.report.problems
     if problems or generation is None:
         raise NotImportable(file, problems, desk.notes)
@@ -93,9 +93,9 @@ def read_mma(path: Path | str) -> Imported:
 
 
 def _without_secrets(text: str, problems: Iterable[Problem]) -> list[Problem]:
-    """The problems; one that YAML finds in a line with a secret does not say what it found."""
+    """Hides what a YAML error quotes from a line that may contain a secret."""
     lines = text.splitlines()
-    hidden = "not YAML (not shown: there may be a secret in this line), allowed: text in quotes"
+    hidden = "not YAML (line hidden, as it may contain a secret), allowed: text in quotes"
     return [
         replace(problem, message=hidden)
         if problem.line and _SECRET.search(" ".join(lines[problem.line - 1 : problem.line]))
@@ -115,7 +115,7 @@ def _generation(desk: Desk) -> Generation | None:
     if any(key in data for key in _FIRST):
         return 1
     allowed = "memory, routing and ports (first generation) or listeners (second)"
-    desk.problem((), f"found none of the keys that tell what this is, allowed: {allowed}")
+    desk.problem((), f"found none of the keys of a generation, allowed: {allowed}")
     return None
 
 

@@ -1,4 +1,4 @@
-"""What writes into the source's memories beside Modbus: REST, MQTT and Raw Ingest."""
+"""Converts the writers other than Modbus: REST, MQTT and Raw Ingest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from holdfast.importing.sections import Section
 
 SHORT = 16
-"""Characters below which a secret can be guessed."""
+"""Secrets with fewer characters can be guessed."""
 
 PASSWORD_FILE = "mqtt.password"
 CLIENT_ID = "holdfast"
@@ -34,12 +34,12 @@ _SCHEMES = {"tcp": "mqtt", "mqtt": "mqtt", "ssl": "mqtts", "tls": "mqtts", "mqtt
 _BROKER = re.compile(
     r"((?P<scheme>[A-Za-z]{1,8})://)?(?P<user>.*@)?(?P<host>[^/?#@]+)(?P<more>([/?#].*)?)"
 )
-_AREAS_TOLD = "may write all areas of all memories; name those that it needs"
+_AREAS_TOLD = "may write all areas of all memories; list only those that it needs"
 
 
 @dataclass
 class Adapters:
-    """Reads `rest`, `mqtt` and `raw_ingest` into a draft that has its memories."""
+    """Reads `rest`, `mqtt` and `raw_ingest` into a draft that already has the memories."""
 
     desk: Desk
     draft: Draft
@@ -47,7 +47,7 @@ class Adapters:
     admitted: Peers | None
 
     def read(self, root: Section) -> None:
-        """Reads those that are there and on."""
+        """Reads the sections that exist and are enabled."""
         rest, mqtt = self._enabled(root, "rest"), self._enabled(root, "mqtt")
         raw = self._enabled(root, "raw_ingest")
         if raw is not None:
@@ -63,15 +63,15 @@ class Adapters:
         found = root.mapping(key)
         if found is None or found.flag("enabled"):
             return found
-        self.desk.note("left out", found.path, "it is not enabled")
+        self.desk.note("left out", found.path, "not enabled")
         return None
 
     def _tell_who_opens(self, name: str, path: KeyPath) -> None:
         by_raw = "raw-ingest" in (one["type"] for one in self.draft.listeners.values())
         if self.draft.rest or self.draft.mqtt or (by_raw and "id" in self.draft.memories[name]):
             return
-        message = f"nothing here can open {name}: only REST, MQTT and Raw Ingest write its gate"
-        self.desk.note("check", path, f"{message}, and none of them reaches it")
+        message = f"nothing can open {name}: REST, MQTT and Raw Ingest write gate bits"
+        self.desk.note("check", path, f"{message}, and none of them can access it")
 
     def _rest(self, rest: Section) -> None:
         address = rest.get("address")
@@ -84,8 +84,8 @@ class Adapters:
             return
         sources = self._rest_sources(rest, bind)
         if not tokens and not bind.address.is_loopback:
-            message = "REST is left out: without auth it is served on loopback only; bind it to"
-            told = f"{message} 127.0.0.1 with tokens: none, or make tokens with `holdfast token`"
+            message = "REST is left out: without auth it requires a loopback address; bind it to"
+            told = f"{message} 127.0.0.1 with tokens: none, or create tokens with `holdfast token`"
             self.desk.note("left out", rest.path, told)
         elif sources:
             found = {"bind": str(bind), "sources": sources, "tokens": tokens or "none"}
@@ -97,21 +97,21 @@ class Adapters:
         return self._sources(rest, "REST")
 
     def _sources(self, parent: Section, what: str) -> list[str]:
-        """Whom the filter of the whole file admits, though it did not hold for these before."""
+        """The sources that the file's filter admits, although it did not apply here before."""
         if self.admitted is None:
-            message = "sources are everybody; name the networks that need it"
+            message = "sources are all addresses; list only the networks that need it"
             self.desk.note("check", parent.path, message)
             return ALL.written()
         if not self.admitted:
-            message = f"{what} is left out: ip_filter lets nobody in"
+            message = f"{what} is left out: ip_filter admits nobody"
             self.desk.note("left out", parent.path, message)
             return []
-        message = "sources are those of ip_filter, which did not hold here; is nobody missing?"
+        message = "sources are from ip_filter, which did not apply here before"
         self.desk.note("check", parent.path, message)
         return self.admitted.written()
 
     def _tokens(self, rest: Section) -> list[dict[str, Any]] | None:
-        """The tokens; empty without authentication, `None` where no client could get in."""
+        """The tokens; empty without authentication, `None` if no client could have access."""
         auth = rest.mapping("auth")
         if auth is None:
             return []
@@ -123,11 +123,11 @@ class Adapters:
             bearer.close()
         auth.close()
         if not enabled:
-            self.desk.note("left out", auth.path, "it is not enabled")
+            self.desk.note("left out", auth.path, "not enabled")
             return []
         tokens = self._token_list(entries)
         if not tokens:
-            self.desk.note("left out", rest.path, "REST is left out: no token could get in")
+            self.desk.note("left out", rest.path, "REST is left out: it has no usable token")
             return None
         self.desk.note("check", auth.path, f"each token {_AREAS_TOLD}")
         return tokens
@@ -142,15 +142,16 @@ class Adapters:
             token.close()
             digest = hashlib.sha256(secret.encode()).hexdigest()
             if not secret:
-                self.desk.note("left out", path, "an empty token, which nobody could use")
+                self.desk.note("left out", path, "the token is empty")
             elif digest in found:
-                message = "the token is the same as one before it"
+                message = "the token repeats an earlier one"
                 self.desk.note("left out", path, message)
             else:
                 found[digest] = (token.at("name"), name or f"token-{len(found) + 1}")
                 if len(secret) < SHORT:
-                    message = f"the token has fewer than {SHORT} characters; `holdfast token` makes"
-                    self.desk.note("check", token.at("token"), f"{message} a better one")
+                    message = f"the token has fewer than {SHORT} characters and can be guessed"
+                    told = f"{message}; create one with `holdfast token`"
+                    self.desk.note("check", token.at("token"), told)
         names = unique_names(self.desk, list(found.values()))
         grant = {**self.draft.grant(list(self.draft.memories)), "access": "read-write"}
         return [
@@ -174,7 +175,7 @@ class Adapters:
         if password is not None:
             found |= self._password(mqtt, username)
         if client_id is None:
-            message = f"no client_id; it is {CLIENT_ID} now, which no other client may have"
+            message = f"no client_id: set to {CLIENT_ID}, which must be unique at the broker"
             self.desk.note("changed", mqtt.path, message)
         found["client_id"] = client_id or CLIENT_ID
         grant = self.draft.grant(list(self.draft.memories))
@@ -193,15 +194,15 @@ class Adapters:
     def _password(self, mqtt: Section, username: str | None) -> dict[str, Any]:
         path = mqtt.at("password")
         if username is None:
-            message = "without a username the source did not send it"
+            message = "no username: the source did not send the password"
             self.desk.note("left out", path, message)
             return {}
-        message = f"write the password into the file {PASSWORD_FILE} beside the configuration"
-        self.desk.note("check", path, f"{message}, readable to nobody else")
+        message = f"write the password into the file {PASSWORD_FILE} next to the configuration"
+        self.desk.note("check", path, f"{message}, and let nobody else read it")
         return {"password_file": PASSWORD_FILE}
 
     def _broker(self, mqtt: Section) -> str | None:
-        """The URL of the broker; what a message shows of it has no user and no password."""
+        """The URL of the broker; messages never show a user or password."""
         path, text = mqtt.at("broker"), mqtt.text("broker")
         if text is None:
             self.desk.note("left out", mqtt.path, "MQTT is left out: it has no broker")
@@ -209,20 +210,20 @@ class Adapters:
         match = _BROKER.fullmatch(text)
         scheme = (match["scheme"] or "tcp").lower() if match else ""
         if match and scheme not in _SCHEMES:
-            message = f"MQTT is left out: {show(scheme)} is not served, only {listing(_SCHEMES)}"
+            message = f"MQTT is left out: {show(scheme)} is not supported, only {listing(_SCHEMES)}"
             self.desk.note("left out", path, message)
             return None
         url = f"{_SCHEMES[scheme]}://{match['host']}" if match else ""
         try:
             parse_broker(url)
         except ValueError:
-            self.desk.problem(path, "found no broker (not shown here), allowed: tcp://host:port")
+            self.desk.problem(path, "not a broker URL (value hidden), allowed: tcp://host:port")
             return None
         if match and match["user"]:
-            message = "the user and the password in it: write username and password_file"
+            message = "user and password in the URL: set username and password_file"
             self.desk.note("left out", path, message)
         if match and match["more"].strip("/"):
-            self.desk.note("left out", path, "what is behind the host and the port")
+            self.desk.note("left out", path, "everything after host and port")
         return url
 
     def _raw_ingest(self, raw: Section) -> None:
@@ -236,10 +237,10 @@ class Adapters:
         memories = self.draft.written_by_raw_ingest()
         for name in self.draft.memories:
             if name not in memories:
-                message = f"never reached {name}, whose name is no MemoryID"
-                self.desk.note("check", raw.path, f"{message}; give it an id if it should")
+                message = f"could not write {name}, whose name is not a memory id"
+                self.desk.note("check", raw.path, f"{message}; give it an id to allow that")
         if not memories:
-            message = f"Raw Ingest is left out: no memory is named by a number from 0 to {MAX_WORD}"
+            message = f"Raw Ingest is left out: no memory has a number from 0 to {MAX_WORD} as name"
             self.desk.note("left out", raw.path, message)
             return
         sources = self._sources(raw, "Raw Ingest")

@@ -1,4 +1,4 @@
-"""The first generation: memories with names, one map of unit ids, and a policy for each port."""
+"""Imports the first generation: named memories, one map of unit ids, a policy for each port."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class FirstGeneration:
     draft: Draft
     binds: Binds
     admitted: Peers | None
-    """Those whom the filter of the whole file lets in, `None` when it has none."""
+    """The peers that the filter of the whole file admits, `None` without a filter."""
 
     def read(self, root: Section) -> None:
-        """Reads all of it."""
+        """Reads all sections."""
         self.names: dict[str, str] = {}
         self.units: dict[int, str] = {}
         self.served: set[int] = set()
@@ -62,7 +62,7 @@ class FirstGeneration:
         wanted = [(memories.at(key), str(key)) for key in memories.data]
         for index, (path, text) in enumerate(wanted):
             if text in (earlier for _, earlier in wanted[:index]):
-                message = f"found the name {text} twice, as text and as a number, allowed: once"
+                message = f"duplicate name {text}, as text and as a number"
                 self.desk.problem(path, message, of_key=True)
         self.names = {
             text: name
@@ -83,7 +83,7 @@ class FirstGeneration:
         found: dict[str, Any] = {**read_id(text), **areas}
         for area in areas:
             if isinstance(areas[area], dict):
-                message = "addresses begin at start; releases that ignored it began at 0"
+                message = "addresses start at `start`; releases that ignored it started at 0"
                 self.desk.note("check", one.at(area, "start"), message)
         gate = self._gate(one) if "state_sealing" in one.data else for_all
         if gate is not None:
@@ -91,11 +91,11 @@ class FirstGeneration:
             if check_gate(self.desk, path, name, areas, "discrete_inputs", address):
                 found["seal"] = {"area": "discrete_inputs", "address": address, "mode": "once"}
                 self.draft.seals[name] = path
-        one.close({"default": "there is no default memory: a unit id that is not mapped has none"})
+        one.close({"default": "there is no default memory: an unmapped unit id has no memory"})
         self.draft.memories[name] = found
 
     def _gate(self, parent: Section) -> tuple[KeyPath, int] | None:
-        """Where the gate bit of a `state_sealing` is, if that is there and on."""
+        """The path and address of the gate bit, if `state_sealing` exists and is enabled."""
         sealing = parent.mapping("state_sealing")
         if sealing is None:
             return None
@@ -103,7 +103,7 @@ class FirstGeneration:
         gate = sealing.mapping("gate", required=bool(enabled))
         sealing.close()
         if not enabled:
-            self.desk.note("left out", sealing.path, "it is not enabled")
+            self.desk.note("left out", sealing.path, "not enabled")
         if gate is None:
             return None
         gate.word("area", ["discrete_inputs"], required=bool(enabled))
@@ -124,7 +124,7 @@ class FirstGeneration:
                 self.units[unit] = name
 
     def _known(self, path: KeyPath, value: object) -> str | None:
-        """Our name for a memory that the source names."""
+        """The new name of a memory of the source."""
         text = str(value) if type(value) is int else value
         if isinstance(text, str) and text in self.names:
             return self.names[text]
@@ -135,8 +135,8 @@ class FirstGeneration:
 
     def _ports(self, ports: Section) -> None:
         if ports.data:
-            message = "a function that is not allowed is answered 0x01, and a unit id that is not"
-            self.desk.note("check", ports.path, f"{message} mapped 0x0B; it was 0x02 for both")
+            message = "a function that is not allowed now returns 0x01, an unmapped unit id 0x0B"
+            self.desk.note("check", ports.path, f"{message}; both returned 0x02 before")
         for key in ports.data:
             bind = self.binds.read(ports.at(key), key, of_key=True)
             policy = section(self.desk, ports.at(key), ports.get(key))
@@ -145,7 +145,7 @@ class FirstGeneration:
                 self.draft.listeners[self._free_name(bind)] = listener
 
     def _free_name(self, bind: Bind) -> str:
-        """`port-502`; where two addresses have the same port, the address is in the name."""
+        """`port-502`; with the address in the name if two addresses have the same port."""
         name = f"port-{bind.port}"
         if name not in self.draft.listeners:
             return name
@@ -165,11 +165,11 @@ class FirstGeneration:
     def _sources(self, policy: Section) -> list[str] | None:
         own = read_filter(policy)
         if own is None and self.admitted is None:
-            message = "no ip_filter: sources are everybody; name the networks that need it"
+            message = "no ip_filter: sources are all addresses; list only networks that need it"
             self.desk.note("check", policy.path, message)
         peers = (ALL if own is None else own) & (ALL if self.admitted is None else self.admitted)
         if not peers:
-            message = "the port is left out: its ip_filter lets nobody in"
+            message = "the port is left out: its ip_filter admits nobody"
             self.desk.note("left out", policy.path, message)
             return None
         return peers.written()
@@ -183,7 +183,7 @@ class FirstGeneration:
             unit: name for unit, name in self.units.items() if unit in allowed and name in memories
         }
         if not units:
-            message = "the port is left out: no unit id is mapped to a memory that it allows"
+            message = "the port is left out: it allows no unit id with a memory that it allows"
             self.desk.note("left out", policy.path, message)
         self.served |= units.keys()
         return units
@@ -200,7 +200,7 @@ class FirstGeneration:
                 message = f"found {show(unit)}, allowed: a unit id from 0 to 255"
                 self.desk.problem(path, message)
             elif unit not in self.units:
-                message = f"unit id {unit} is not in routing.unit_id_map, so it was never served"
+                message = f"unit id {unit} is not in routing.unit_id_map, so it was not served"
                 self.desk.note("left out", path, message)
             else:
                 found.add(unit)
@@ -232,15 +232,15 @@ class FirstGeneration:
     def _only(
         self, codes: Section, access: str | None, allow: list[int], deny: list[int]
     ) -> dict[str, Any] | None:
-        """The rights where there is a list of what is allowed."""
+        """The rights with a list of allowed functions."""
         path = codes.at("allow")
         if both := [code for code in allow if code in deny]:
-            message = f"not {functions.spelled(both)}: denied too, and that wins"
+            message = f"without {functions.spelled(both)}: also denied, and denied wins"
             self.desk.note("changed", path, message)
         left = [code for code in allow if code not in deny]
         writing = [code for code in left if code in WRITING_CODES]
         if access == "read-only" and writing:
-            message = f"not {functions.spelled(writing)}: writes, and access is read-only"
+            message = f"without {functions.spelled(writing)}: it writes, and access is read-only"
             self.desk.note("changed", path, message)
             left = [code for code in left if code not in writing]
         if not left:
@@ -250,13 +250,13 @@ class FirstGeneration:
         return None if access is None else {"access": access, "functions": left}
 
     def _denied(self, codes: Section | None, access: str, deny: list[int]) -> dict[str, Any]:
-        """The rights where only some functions are denied."""
+        """The rights with only a list of denied functions."""
         if codes is None or not deny:
             return {}
         more = functions.beside(deny) if access == "read-write" else []
         if more:
-            message = f"denies {functions.spelled(more)} too, which do what is denied"
-            self.desk.note("changed", codes.at("deny"), f"{message}; nobody had them before")
+            message = f"also denies {functions.spelled(more)}, with the same effect as denied ones"
+            self.desk.note("changed", codes.at("deny"), f"{message}; the source had none of them")
         return {"deny": [*deny, *more]}
 
     def _max_connections(self, policy: Section) -> int:
@@ -266,13 +266,13 @@ class FirstGeneration:
         allowed = DEFAULT_CONNECTIONS if most < 1 else min(most, MAX_CONNECTIONS)
         if allowed != most:
             integer = f"an integer from 1 to {MAX_CONNECTIONS}"
-            message = f"is {allowed}, found {most}, allowed: {integer}"
+            message = f"set to {allowed}, found {most}, allowed: {integer}"
             self.desk.note("changed", policy.at("max_connections"), message)
         return allowed
 
 
 def _list_or_all(policy: Section, key: str, what: str) -> list[tuple[KeyPath, Any]] | None:
-    """The entries of a list that `all` could stand for; without any it is a problem."""
+    """The entries of a list that is an alternative to `all`; a problem if it is empty."""
     value = policy.get(key)
     if isinstance(value, list) and value:
         return policy.entries(key)

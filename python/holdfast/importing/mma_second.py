@@ -1,4 +1,4 @@
-"""The second generation: listeners that hold their memories, each with a policy of its own."""
+"""Imports the second generation: listeners contain memories, each with its own policy."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Network
 
 TOP_REASONS = {
-    "debug": "what is logged is set by log.level",
-    "device_identity": "write what it says under identity",
-    "notify": "there are no notifications; programs read by Modbus or REST",
-    "rbe": "there is no report by exception; programs read by Modbus or REST",
-    "access_events": "refused peers are in the log",
+    "debug": "log.level sets what is logged",
+    "device_identity": "set the values under identity",
+    "notify": "no notifications; programs read with Modbus or REST",
+    "rbe": "no report by exception; programs read with Modbus or REST",
+    "access_events": "the log has refused peers",
     "persistence": "memory is not kept; initial values come from a file, see initial",
-    "memory": "a listener has its memories of its own in this generation",
+    "memory": "in this generation, each listener has its own memories",
 }
 _MEMORY_REASONS = {
-    "fc43": "write what it says under identity, which is that of the whole appliance",
-    "port": "a memory is reached by the listener that it stands in",
+    "fc43": "set the values under identity, which applies to the whole appliance",
+    "port": "a memory belongs to the listener that contains it",
     "notify": TOP_REASONS["notify"],
     "rbe": TOP_REASONS["rbe"],
     "persistence": TOP_REASONS["persistence"],
@@ -43,7 +43,7 @@ BUSY = 6
 
 @dataclass
 class _Memory:
-    """One memory of a listener, as far as it can be read."""
+    """One memory of a listener; `unit` is `None` if it is not valid."""
 
     section: Section
     unit: int | None
@@ -58,10 +58,10 @@ class SecondGeneration:
     draft: Draft
     binds: Binds
     admitted: Peers | None
-    """Those whom the filter of the whole file lets in, `None` when it has none."""
+    """The peers that the filter of the whole file admits, `None` without a filter."""
 
     def read(self, root: Section) -> None:
-        """Reads all of it."""
+        """Reads all sections."""
         self.rules_have_ids = False
         entries = root.entries("listeners", required=True) or []
         found = [section(self.desk, path, value) for path, value in entries]
@@ -79,13 +79,13 @@ class SecondGeneration:
             self._tell_all(root.at("listeners"))
 
     def _tell_all(self, path: KeyPath) -> None:
-        message = "Raw Ingest came in at these ports too; for it, add a listener with type:"
-        self.desk.note("check", path, f"{message} raw-ingest, format: v1 and a port of its own")
-        message = "a function that is not allowed is answered 0x01, and a unit id that is not"
-        closed = "a peer without any rule is closed at once"
-        self.desk.note("check", path, f"{message} mapped 0x0B; {closed}")
+        message = "these ports also received Raw Ingest; for it, add a listener with type:"
+        self.desk.note("check", path, f"{message} raw-ingest, format: v1 and a separate port")
+        message = "a function that is not allowed returns 0x01, an unmapped unit id 0x0B"
+        closed = "a peer that no rule matches is disconnected at once"
+        self.desk.note("check", path, f"{message}; {closed}")
         if self.rules_have_ids:
-            self.desk.note("left out", path, "the ids of policy rules: our rules have no names")
+            self.desk.note("left out", path, "the ids of policy rules: rules have no names")
 
     def _memories(self, listener: Section) -> list[_Memory]:
         read = []
@@ -97,7 +97,7 @@ class SecondGeneration:
             unit = memory.integer("unit_id", 0, 255, required=True, what="a unit id")
             if unit is not None and unit in first:
                 other = self.desk.document.spell(first[unit])
-                message = f"found {unit}, which is that of {other}, allowed: one of its own"
+                message = f"found {unit}, which is the unit id of {other}, allowed: a different one"
                 self.desk.problem(memory.at("unit_id"), message)
             elif unit is not None:
                 first[unit] = path
@@ -105,7 +105,7 @@ class SecondGeneration:
         return read
 
     def _name(self, listeners: list[tuple[str, list[_Memory]]]) -> None:
-        """Gives all memories their names; without one, it is that of the listener and the unit."""
+        """Names all memories. Default: the listener's name and the unit id."""
         every = [(listener, memory) for listener, own in listeners for memory in own]
         wanted = []
         for listener, memory in every:
@@ -127,11 +127,11 @@ class SecondGeneration:
             ALL if self.admitted is None else self.admitted
         )
         if not rules:
-            message = "the listener is left out: no policy allows what the areas of its memory have"
+            message = "the listener is left out: no policy allows a function for its areas"
             self.desk.note("left out", listener.path, message)
             return
         for policy in unserved(known, rules):
-            message = f"no rule serves unit {policy.unit}, as it allows nothing that its areas have"
+            message = f"no rule serves unit {policy.unit}: it allows no function for its areas"
             self.desk.note("check", listener.path, message)
         self.draft.listeners[name] = {"type": "modbus-tcp", "bind": str(bind), "rules": rules}
 
@@ -160,15 +160,15 @@ class SecondGeneration:
         exception = sealing.integer("exception", 1, 255)
         sealing.close()
         if not enabled:
-            self.desk.note("left out", sealing.path, "it is not enabled")
+            self.desk.note("left out", sealing.path, "not enabled")
             return None
         if exception not in (None, BUSY):
-            message = f"a sealed memory always answers 0x{BUSY:02X}"
+            message = f"a sealed memory always returns 0x{BUSY:02X}"
             self.desk.note("left out", sealing.at("exception"), message)
         path = sealing.at("address")
         if address is None or not check_gate(self.desk, path, name, areas, "coils", address):
             return None
-        message = "sealed whenever the coil is 0, and Modbus can't write that coil (0x02)"
+        message = "sealed whenever the coil is 0; Modbus can't write that coil (0x02)"
         self.desk.note("check", sealing.path, message)
         return {"area": "coils", "address": address, "mode": "level"}
 
@@ -178,7 +178,7 @@ class SecondGeneration:
         if policy is not None:
             policy.close()
         if not entries:
-            message = "no policy, which refuses everybody; add its unit id to a rule to serve it"
+            message = "no policy, so all peers are refused; add its unit id to a rule to serve it"
             self.desk.note("check", one.path, message)
             return None
         found = [section(self.desk, path, value) for path, value in entries]
@@ -197,7 +197,7 @@ class SecondGeneration:
         codes = functions.read_codes(rule, "allow_fc")
         word = rule.word("allow", list(_ALLOW))
         if codes is not None and word is not None:
-            message = "found beside allow_fc, allowed: one of both"
+            message = "found together with allow_fc, allowed: only one of them"
             self.desk.problem(rule.at("allow"), message, of_key=True)
         if codes is not None:
             return frozenset(codes)
@@ -207,7 +207,7 @@ class SecondGeneration:
                 self.desk.note("check", rule.path, message)
             return frozenset()
         if word == "wo":
-            message = f"only the functions {functions.spelled(_ALLOW[word])}, which write; 22 and"
-            told = f"{message} 23 read too. A rule has no other way to forbid reading"
+            message = f"only functions {functions.spelled(_ALLOW[word])}, which write; 22 and 23"
+            told = f"{message} also read. A rule has no other way to forbid reading"
             self.desk.note("changed", rule.at("allow"), told)
         return _ALLOW[word]

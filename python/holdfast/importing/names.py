@@ -1,4 +1,4 @@
-"""Names that a configuration of ours allows, for things that the source names more freely."""
+"""Converts names of the source to unique names that a configuration allows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_LENGTH = 64
 
 
 def unique_names(desk: Desk, wanted: Sequence[tuple[KeyPath, str]]) -> list[str]:
-    """An allowed name for each wanted one, no two alike; those that can stay as they are do."""
+    """A unique, allowed name for each wanted name; keeps wanted names where possible."""
     texts = [text for _, text in wanted]
     taken = {text for text in texts if _allowed(text) == text}
     given: list[str] = []
@@ -26,8 +26,8 @@ def unique_names(desk: Desk, wanted: Sequence[tuple[KeyPath, str]]) -> list[str]
         if text not in taken or text in texts[:index]:
             name = free_name(_allowed(text), taken)
             taken.add(name)
-            reason = "the name is taken" if text in texts[:index] else f"a name is {NAME_FORM}"
-            desk.note("changed", path, f"is named {name}: {reason}")
+            reason = "the name is in use" if text in texts[:index] else f"a name has {NAME_FORM}"
+            desk.note("changed", path, f"renamed to {name}: {reason}")
         given.append(name)
     return given
 
@@ -37,7 +37,7 @@ def _allowed(text: str) -> str:
 
 
 def free_name(name: str, taken: set[str]) -> str:
-    """The name, with a number behind it when it is taken."""
+    """The name, followed by a number if it is taken."""
     number, free = 1, name
     while free in taken:
         number += 1

@@ -1,6 +1,6 @@
-"""What an import has to tell: a `Note` for whoever takes over the result, or a problem.
+"""The results of an import that people must read: notes, and problems.
 
-Messages name what was found, but never the value of a secret.
+Messages show found values, but never a secret.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from holdfast.config.source import Document, KeyPath
 
 Kind: TypeAlias = Literal["left out", "changed", "check"]
-"""`left out` is not in the result, `changed` is there in another way, `check` is for people."""
+"""`left out`: not in the result; `changed`: converted differently; `check`: a person must check."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """What became of one place of the source; the places are those of a `Problem`."""
+    """What the import did with one place of the source; places are as in a `Problem`."""
 
     kind: Kind
     file: str
@@ -49,11 +49,11 @@ class Desk:
         return tuple(sorted(self.noted, key=lambda note: (note.line, note.column)))
 
     def note(self, kind: Kind, path: KeyPath, message: str) -> None:
-        """Notes something about the key at `path`."""
+        """Adds a note about the key at `path`."""
         place = self.document.place(path, of_key=True)
         key = self.document.spell(path)
         self.noted[Note(kind, self.document.file, place.line, place.column, key, message)] = None
 
     def problem(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
-        """Adds what makes the import impossible."""
+        """Adds a problem, which makes the import impossible."""
         self.report.add(path, message, of_key=of_key)

@@ -1,7 +1,7 @@
-"""Sets of addresses, exactly: what is allowed, less what is denied, as networks.
+"""Exact sets of addresses: allowed networks without denied networks.
 
-Both families are one line of numbers, IPv4 far behind IPv6, and a set is a list of stretches of it.
-An IPv4 address mapped into IPv6 is that IPv4 address: no other peer ever has it.
+Both families share one number line, with IPv4 after IPv6. A set is a list of intervals on it. An
+IPv4-mapped IPv6 address counts as its IPv4 address: no other peer ever has it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ EVERYBODY = (IPv4Network("0.0.0.0/0"), IPv6Network("::/0"))
 
 @dataclass(frozen=True)
 class Peers:
-    """A set of IPv4 and IPv6 addresses; its stretches are in order and never touch."""
+    """A set of IPv4 and IPv6 addresses; its stretches are sorted and never adjacent."""
 
     stretches: tuple[Stretch, ...]
 
@@ -65,7 +65,7 @@ class Peers:
         return Peers(tuple(left))
 
     def networks(self) -> list[Network]:
-        """The fewest networks that are this set, IPv4 first."""
+        """The smallest list of networks that equals this set, IPv4 first."""
         four: list[Network] = []
         six: list[Network] = []
         for first, last in self.stretches:
@@ -78,18 +78,18 @@ class Peers:
         return [*four, *six]
 
     def written(self) -> list[str]:
-        """The networks as a configuration writes them."""
+        """The networks as text for a configuration."""
         return [written(network) for network in self.networks()]
 
 
 def written(network: Network) -> str:
-    """A network, or an address where it is a single one."""
+    """A network as text; a single address without its prefix length."""
     single = network.prefixlen == network.max_prefixlen
     return str(network.network_address) if single else str(network)
 
 
 def parse_network(text: object) -> Network:
-    """A network or an address as the source reads it: host bits are ignored, a mapped one is IPv4.
+    """Parses a network or an address as the source does: ignores host bits, unmaps IPv4.
 
     Raises `ValueError` for anything else.
     """

@@ -1,8 +1,8 @@
-"""Policies of single units, made into rules that hold for all units of a listener.
+"""Converts policies of single units to rules for all units of a listener.
 
-The source judges each unit by a list of its own; with us the first rule that matches a peer settles
-what it may do with every unit. Networks lie inside each other or apart, so each of them, less those
-inside it, is a set of peers that are all treated alike. Whatever is inside comes first.
+The source has a list of rules for each unit. In Holdfast, the first rule that matches a peer
+applies to every unit. Two networks are nested or disjoint, so each network without its nested
+networks is a set of peers with equal rights. Nested networks come first.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ MAX_SHOWN = 4
 
 @dataclass(frozen=True)
 class Policy:
-    """The rules of one unit: the first with a network that holds the peer says what it may do."""
+    """The rules of one unit: the first rule whose networks contain the peer applies."""
 
     unit: int
     memory: str
     touching: frozenset[int]
-    """The functions that read or write an area of the memory; others do nothing to it."""
+    """The functions that access an area of the memory; others have no effect on it."""
     rules: tuple[tuple[tuple[Network, ...], frozenset[int]], ...]
 
     def functions(self, network: Network) -> frozenset[int]:
-        """What those of a network may do who are in no narrower network of any rule."""
+        """The functions of peers in a network, but not in a narrower network of any rule."""
         for networks, allowed in self.rules:
             if any(_inside(network, other) for other in networks):
                 return allowed
@@ -43,12 +43,12 @@ class Policy:
 
 
 Profile: TypeAlias = tuple[tuple[Policy, frozenset[int]], ...]
-"""What peers may do with each unit; only units that they may do something with."""
+"""The functions of a group of peers by unit; only units with at least one effective function."""
 
 
 @dataclass(frozen=True)
 class RuleGrant:
-    """What a rule of ours says of those it matches."""
+    """What a rule allows to the peers that it matches."""
 
     units: tuple[int, ...]
     functions: frozenset[int]
@@ -56,7 +56,7 @@ class RuleGrant:
 
 @dataclass
 class Merger:
-    """Makes the rules of one listener."""
+    """Builds the rules of one listener."""
 
     desk: Desk
     path: KeyPath
@@ -64,7 +64,7 @@ class Merger:
     _conflicts: dict[Profile, list[Network]] = field(default_factory=dict, init=False)
 
     def rules(self, admitted: Peers) -> list[dict[str, Any]]:
-        """The rules in order, for those peers that are admitted at all."""
+        """The rules in order, only for admitted peers."""
         grants = self._pruned(self._grants())
         for profile, networks in self._conflicts.items():
             self._tell(profile, networks)
@@ -86,7 +86,7 @@ class Merger:
         return rules
 
     def _grants(self) -> dict[Network, RuleGrant]:
-        """The grant of each network that some peer is in without being in a narrower one."""
+        """The grant of each network that is not fully covered by narrower networks."""
         networks = dict.fromkeys(
             network for policy in self.policies for rule in policy.rules for network in rule[0]
         )
@@ -112,7 +112,7 @@ class Merger:
         return grant
 
     def _pruned(self, grants: dict[Network, RuleGrant]) -> dict[Network, RuleGrant]:
-        """Without networks that are granted what the next wider one is granted."""
+        """Drops networks with the same grant as the next wider network."""
         nothing = RuleGrant((), frozenset())
         kept: dict[Network, RuleGrant] = {}
         for network in sorted(grants, key=lambda network: network.prefixlen):
@@ -136,17 +136,16 @@ class Merger:
         left = [str(policy.unit) for policy, _ in profile if policy.unit not in grant.units]
         gone = f", and unit {listing(left)} is not served to them" if left else ""
         message = (
-            f"peers in {listing(shown)} had different functions ({had}); a rule has the same for"
-            f" all its units, so they get {got}{gone}; units that"
-            " need others need a listener of their own"
+            f"peers in {listing(shown)} had different functions ({had}); a rule allows the same"
+            f" functions for all its units: {got}{gone}; to allow others, use a separate listener"
         )
         self.desk.note("changed", self.path, message)
 
 
 def _common(profile: Profile) -> RuleGrant:
-    """One set of functions for all units: it gives no unit a function that it did not have.
+    """One set of functions for all units. It gives no unit a function that it did not have.
 
-    A unit that could do nothing then, or leave nothing to those before it, is left out.
+    Omits a unit that would have no function left, or would leave none to the units before it.
     """
     served: Profile = ()
     for entry in profile:
@@ -160,16 +159,16 @@ def _common(profile: Profile) -> RuleGrant:
 
 
 def _shared(profile: Profile) -> frozenset[int]:
-    """The functions that every unit had, or to whose memory they do nothing."""
+    """The functions that every unit had, or that have no effect on its memory."""
     refused = ((policy.touching | functions.OTHERS) - allowed for policy, allowed in profile)
     return functions.ALL.difference(*refused)
 
 
 def _next(waiting: dict[Network, RuleGrant]) -> tuple[RuleGrant, list[Network]]:
-    """The grant whose rule can come next, with networks that wait for no narrower one.
+    """The grant for the next rule, with its networks that no narrower network must precede.
 
-    Best is a grant of which nothing is left for a later rule. If there is none, only those
-    networks come now that a wider one waits for.
+    Prefers a grant whose networks are all ready. Otherwise, takes only networks that a wider
+    network waits for.
     """
 
     def ready(network: Network) -> bool:

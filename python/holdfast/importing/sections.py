@@ -1,7 +1,6 @@
-"""Reading a mapping key by key, so that every key is either asked for or told as left out.
+"""Reads a mapping key by key, so that every unread key gets a note.
 
-A value of the wrong kind is a problem, and reads as if it were not there: so no mistake hides
-another.
+A value of the wrong type is a problem and counts as absent, so no error hides another.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _FALSE = ("no", "No", "NO", "off", "Off", "OFF")
 
 @dataclass
 class Section:
-    """The mapping at `path`. An empty value is the same as none, as it was to the source."""
+    """The mapping at `path`. An empty value counts as absent, as in the source."""
 
     desk: Desk
     path: KeyPath
@@ -31,16 +30,16 @@ class Section:
     _asked: set[Any] = field(default_factory=set, init=False)
 
     def at(self, *parts: str | int) -> KeyPath:
-        """The path of a key in here."""
+        """The path of a key in this mapping."""
         return (*self.path, *parts)
 
     def get(self, key: str | int) -> Any:
-        """The value as it is written, `None` when there is none."""
+        """The value as in the file, `None` if it is absent."""
         self._asked.add(key)
         return self.data.get(key)
 
     def mapping(self, key: str | int, *, required: bool = False) -> Section | None:
-        """The mapping of that key."""
+        """The mapping at a key."""
         value = self._present(key, "a mapping", required)
         if isinstance(value, dict):
             return Section(self.desk, self.at(key), value)
@@ -48,7 +47,7 @@ class Section:
         return None
 
     def entries(self, key: str, *, required: bool = False) -> list[tuple[KeyPath, Any]] | None:
-        """The entries of the list of that key, each with its path."""
+        """The entries of the list at a key, each with its path."""
         value = self._present(key, "a list", required)
         if isinstance(value, list):
             return [(self.at(key, index), entry) for index, entry in enumerate(value)]
@@ -58,7 +57,7 @@ class Section:
     def integer(
         self, key: str, least: int, most: int, *, required: bool = False, what: str = "an integer"
     ) -> int | None:
-        """The integer of that key."""
+        """The integer at a key."""
         allowed = f"{what} from {least} to {most}"
         value = self._present(key, allowed, required)
         if type(value) is int and least <= value <= most:
@@ -67,7 +66,7 @@ class Section:
         return None
 
     def flag(self, key: str) -> bool | None:
-        """The boolean of that key; the source took `yes` and `on` for booleans too."""
+        """The boolean at a key; the source also accepted `yes` and `on`."""
         value = self.get(key)
         if isinstance(value, bool):
             return value
@@ -77,7 +76,7 @@ class Section:
         return None
 
     def text(self, key: str, *, required: bool = False) -> str | None:
-        """The text of that key without spaces around it; `None` when it is empty."""
+        """The text at a key, stripped; `None` if it is empty."""
         value = self._present(key, "text", required)
         if isinstance(value, str):
             return value.strip() or None
@@ -85,20 +84,20 @@ class Section:
         return None
 
     def name(self, key: str, *, required: bool = False) -> str | None:
-        """The text of that key, where a number is a name too."""
+        """The name at a key, which can be a number."""
         value = self.get(key)
         return str(value) if type(value) is int else self.text(key, required=required)
 
     def secret(self, key: str) -> str | None:
-        """The text of that key; no message shows it."""
+        """The text at a key, which no message shows."""
         value = self.get(key)
         if value is None or isinstance(value, str):
             return value or None
-        self.desk.problem(self.at(key), "found no text (not shown here), allowed: text in quotes")
+        self.desk.problem(self.at(key), "not text (value hidden), allowed: text in quotes")
         return None
 
     def word(self, key: str, allowed: Sequence[str], *, required: bool = False) -> str | None:
-        """One of the words that the key can have."""
+        """The word at a key, one of those allowed."""
         value = self._present(key, choice(allowed), required)
         if isinstance(value, str) and value in allowed:
             return value
@@ -106,7 +105,7 @@ class Section:
         return None
 
     def close(self, reasons: Mapping[str, str] | None = None) -> None:
-        """Notes every key that nobody asked for, with the reason where one is known."""
+        """Adds a note for every unread key, with the reason if it is known."""
         known = [key for key in self._asked if isinstance(key, str)]
         for key in self.data:
             if key in self._asked:
@@ -130,7 +129,7 @@ class Section:
 
 
 def section(desk: Desk, path: KeyPath, value: object) -> Section | None:
-    """The mapping at `path`; anything else is a problem."""
+    """The mapping at `path`; adds a problem for any other value."""
     if isinstance(value, dict):
         return Section(desk, path, value)
     desk.problem(path, f"found {show(value)}, allowed: a mapping")
