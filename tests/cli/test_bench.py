@@ -113,8 +113,8 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
             "only tcp and tls have more than one request in flight.",
         ),
         (("rtu:///dev/ttyX", "--connections", "2"), "a serial line has one connection."),
-        (("tcp://127.0.0.1", "--area", "x"), "'x' is no area"),
-        (("tcp://127.0.0.1", "--seconds", "inf"), "'inf' is no number of seconds"),
+        (("tcp://127.0.0.1", "--area", "x"), "'x' is not an area"),
+        (("tcp://127.0.0.1", "--seconds", "inf"), "'inf' is not a number of seconds"),
     ],
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
@@ -122,7 +122,7 @@ def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
 
 
 def test_the_help_warns() -> None:
-    assert "THIS LOADS THE DEVICE" in "\n".join(done("bench", "--help"))
+    assert "THIS IS A LOAD TEST" in "\n".join(done("bench", "--help"))
 
 
 def test_it_can_be_ended_earlier_with_what_was_measured(server: holdfast.Server) -> None:

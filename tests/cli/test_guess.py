@@ -58,7 +58,7 @@ def test_a_known_value_is_looked_for(server: holdfast.Server, memory: holdfast.M
         for line in best
     )
     assert done("guess", cli.url(server), "hr", "41", "--like", "99", *AT_ONCE)[-1] == (
-        "Nothing there is like that."
+        "No type matches that value."
     )
 
 
@@ -86,7 +86,7 @@ def test_fewer_registers_are_looked_at_where_there_are_no_more(
 
 def test_nothing_is_guessed_from_zeros(server: holdfast.Server) -> None:
     assert done("guess", cli.url(server), "hr", "0", *AT_ONCE)[-1] == (
-        "All registers are 0, of which every type makes 0."
+        "All registers are 0: every type decodes to 0."
     )
 
 
@@ -102,10 +102,10 @@ def test_errors_are_told(server: holdfast.Server) -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("co", "0"), "coils hold bits, there is nothing to guess."),
+        (("co", "0"), "coils contain bits; guess requires registers."),
         (("hr", "0", "4"), "Got unexpected extra argument (4)."),
         (("hr", "65535", "--count", "2"), "the last address is 65535"),
-        (("hr", "0", "--like", "nan"), "--like is to be a number."),
+        (("hr", "0", "--like", "nan"), "--like requires a finite number."),
         (("hr", "0", "--count", "126"), "126 is not in the range 1<=x<=125."),
     ],
 )

@@ -100,10 +100,10 @@ def test_failures_are_told_apart() -> None:
         areas = answer("map", device.url, "--exact", "--range", "0-15")["areas"]
     assert "holding registers  █████!███·······" in lines
     assert lines[-4:] == [
-        "coils: exception 01 (Illegal Function); not looked at further",
-        "discrete_inputs: exception 01 (Illegal Function); not looked at further",
+        "coils: exception 01 (Illegal Function); area skipped",
+        "discrete_inputs: exception 01 (Illegal Function); area skipped",
         "holding_registers: exception 04 (Server Device Failure) at 5",
-        "input_registers: exception 01 (Illegal Function); not looked at further",
+        "input_registers: exception 01 (Illegal Function); area skipped",
     ]
     assert areas["coils"]["given_up"]["code"] == 1
     [failed] = areas["holding_registers"]["failures"]
@@ -132,8 +132,8 @@ def test_only_ascii_is_shown_where_there_is_no_more(url: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--areas", "hr,x"), "'x' is no area"),
-        (("--range", "5-4"), "'5-4' is not FIRST-LAST, as 0-999, up to 65535."),
+        (("--areas", "hr,x"), "'x' is not an area"),
+        (("--range", "5-4"), "'5-4' is not FIRST-LAST, as in 0-999, up to 65535."),
         (("--range", "0-65536"), "'0-65536' is not FIRST-LAST"),
         (("--range", "-4"), "'-4' is not FIRST-LAST"),
         (("--max-quantity", "0"), "0 is not in the range x>=1."),

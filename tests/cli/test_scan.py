@@ -80,7 +80,7 @@ def test_it_says_what_it_does_and_a_signal_ends_it(
 ) -> None:
     process = start("--prefix", "plant", NATS_SERVERS=f"127.0.0.1:{nats.port}")
     said = greeting(process)
-    assert f"Scanning for whoever subscribes at nats://127.0.0.1:{nats.port}." in said
+    assert f"Scanning for subscribers at nats://127.0.0.1:{nats.port}." in said
     assert "plant.subscribe, plant.unsubscribe, plant.browse" in said
     connected(process)
     process.send_signal(number)
@@ -248,18 +248,21 @@ def test_a_server_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch)
         (["--nats", "nats://me:secret@"], "found no host"),
         (["--allow", "10.0.0.1/8"], "found '10.0.0.1/8', which has host bits set: the network is"),
         (["--allow", "example"], "found 'example', allowed: a network or an address"),
-        (["--prefix", "a b"], "found 'a b', allowed: the first part of subjects"),
-        (["--prefix", "a.>"], "found 'a.>', allowed: the first part of subjects"),
-        (["--password-file", __file__], "--password-file goes with --user."),
-        (["--tls-cert", __file__], "--tls-cert goes with --tls-key."),
-        (["--device-key", __file__], "--device-key goes with --device-cert."),
+        (["--prefix", "a b"], "found 'a b', allowed: letters, digits"),
+        (["--prefix", "a.>"], "found 'a.>', allowed: letters, digits"),
+        (["--password-file", __file__], "--password-file requires --user."),
+        (["--tls-cert", __file__], "--tls-cert requires --tls-key."),
+        (["--device-key", __file__], "--device-key requires --device-cert."),
         (["--device-ca", "missing"], "'missing' does not exist."),
-        (["--user", "a", "--token-file", __file__], "--user and --token-file exclude each other."),
-        (["--user", "a", "--creds", __file__], "--user and --creds exclude each other."),
+        (
+            ["--user", "a", "--token-file", __file__],
+            "--user and --token-file can't be used together.",
+        ),
+        (["--user", "a", "--creds", __file__], "--user and --creds can't be used together."),
         (["--creds", "missing"], "'missing' does not exist."),
-        (["--store", "x"], "--store goes with --embedded."),
-        (["--embedded", "--nats", "nats://10.0.0.1"], "--embedded serves at 127.0.0.1 only"),
-        (["--embedded", "--user", "a"], "--embedded serves at 127.0.0.1 only"),
+        (["--store", "x"], "--store requires --embedded."),
+        (["--embedded", "--nats", "nats://10.0.0.1"], "--embedded only serves at 127.0.0.1"),
+        (["--embedded", "--user", "a"], "--embedded only serves at 127.0.0.1"),
         (["--max-tags", "0"], "0 is not in the range x>=1."),
     ],
 )

@@ -103,7 +103,7 @@ def test_a_short_secret_is_warned_of() -> None:
     assert run("--stdin", stdin="x" * 16).stderr == ""
     result = run("--stdin", stdin="x" * 15)
     assert result.exit_code == 0
-    assert result.stderr == "warning: the secret has fewer than 16 characters, and can be guessed\n"
+    assert result.stderr == "warning: the secret has fewer than 16 characters and can be guessed\n"
 
 
 def test_a_secret_that_a_header_cannot_carry_is_warned_of() -> None:
@@ -134,7 +134,7 @@ def test_the_entry_of_the_gateway_fits_into_a_configuration(tmp_path: Path) -> N
     path = tmp_path / "plant.yaml"
     path.write_text(head + text)
     gateway = load(path).gateway
-    assert told == "Under gateway.tokens in the configuration"
+    assert told == "Add under gateway.tokens in the configuration"
     assert gateway is not None
     assert gateway.model_dump()["tokens"] == ({"name": "panel", "sha256": digest(SECRET)},)
 
@@ -143,4 +143,4 @@ def test_the_entry_of_the_gateway_fits_into_a_configuration(tmp_path: Path) -> N
 def test_there_is_one_form_at_a_time(options: tuple[str, ...]) -> None:
     result = run(*options)
     assert result.exit_code == 2
-    assert "don't go together" in result.stderr
+    assert "can't be used together" in result.stderr

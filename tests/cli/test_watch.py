@@ -136,7 +136,7 @@ def test_all_that_a_device_has_is_watched_if_nothing_is_named(
     memory = holdfast.Memory(discrete_inputs=10, input_registers=(1000, 10))
     server = serve({1: memory})
     watching = watch(cli.url(server))
-    assert "finding out which addresses there are" in watching.greeting
+    assert "searching for addresses" in watching.greeting
     assert watching.process.stderr is not None
     assert watching.process.stderr.readline() == f"watching {cli.url(server)}, unit 1\n"
     reads = server.counters()["requests"][4]
@@ -192,9 +192,9 @@ def test_a_token_opens_what_it_may_read(
     _, file = plant(MEMORIES, REST, tokens=json.dumps([granted]))
     result = invoke("watch", file, "--times", "1")
     assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr == f"{file}: rest asks for a token; give it in HOLDFAST_TOKEN\n"
+    assert result.stderr == f"{file}: rest requires a token: set HOLDFAST_TOKEN\n"
     monkeypatch.setenv("HOLDFAST_TOKEN", "other")
-    assert "rest knows no token like that" in invoke("watch", file, "--times", "1").stderr
+    assert "rest does not accept the token" in invoke("watch", file, "--times", "1").stderr
     monkeypatch.setenv("HOLDFAST_TOKEN", "s3cret")
     result = invoke("watch", file, "--times", "2", *OFTEN)
     assert (result.exit_code, result.stdout) == (0, "")
@@ -222,28 +222,36 @@ def test_an_appliance_without_rest_is_watched_over_modbus(
 @pytest.mark.parametrize(
     ("parts", "arguments", "told"),
     [
-        ((MEMORIES, LISTENER), ("--memory", "fans"), "has no memory 'fans', it has boiler, pumps."),
-        ((MEMORIES, LISTENER), ("--memory", "pumps", "hr", "0"), "nothing of that can be read"),
-        ((MEMORIES, LISTENER), ("co", "0", "8"), "nothing of that can be read"),
+        (
+            (MEMORIES, LISTENER),
+            ("--memory", "fans"),
+            "has no memory 'fans', allowed: boiler, pumps.",
+        ),
+        (
+            (MEMORIES, LISTENER),
+            ("--memory", "pumps", "hr", "0"),
+            "none of the requested addresses can be read",
+        ),
+        ((MEMORIES, LISTENER), ("co", "0", "8"), "none of the requested addresses can be read"),
         (
             (MEMORIES, LISTENER.replace("127.0.0.0/8", "127.0.0.2")),
             (),
-            "no rule of listener scada lets 127.0.0.1 in",
+            "no rule of listener scada admits 127.0.0.1",
         ),
         (
             (MEMORIES, LISTENER.replace("SCADA", "0")),
             (),
-            "listener scada is bound to port 0, so that its port is not known",
+            "the port of listener scada is 0, so the port in use is not known",
         ),
         (
             (MEMORIES, LISTENER, REST.replace("REST", "0")),
             (),
-            "rest is bound to port 0, so that its port is not known",
+            "the port of rest is 0, so the port in use is not known",
         ),
         (
             (MEMORIES, LISTENER.replace("modbus-tcp", "modbus-rtu-over-tcp")),
             (),
-            "there is neither rest nor a listener of type modbus-tcp",
+            "found neither rest nor a listener of type modbus-tcp",
         ),
         (("memories: {}\n",), (), "problem"),
     ],
@@ -283,10 +291,10 @@ def test_a_device_without_addresses_can_not_be_watched() -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("tcp://127.0.0.1", "--memory", "x"), "--memory goes with FILE."),
+        (("tcp://127.0.0.1", "--memory", "x"), "--memory requires FILE."),
         (("foo://127.0.0.1",), "is no URL of a device"),
         (("tcp://127.0.0.1", "hr"), "Missing argument 'ADDRESS'."),
-        (("tcp://127.0.0.1", "hr", "65535", "2"), "the last address is 65535."),
+        (("tcp://127.0.0.1", "hr", "65535", "2"), "exceed the last address, 65535."),
     ],
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:

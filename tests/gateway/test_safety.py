@@ -777,7 +777,7 @@ def test_the_greeting_has_an_example_that_may_be(allow: str, example: str) -> No
 )
 def test_the_greeting_names_an_address_that_can_be_opened(address: str, url: str) -> None:
     lines = _greeting(address, Settings((parse_allowed("10.0.0.0/8"),))).splitlines()
-    assert lines[0] == f"The console is at {url}/, the API is described at {url}/docs"
+    assert lines[0] == f"Console: {url}/, API documentation: {url}/docs"
 
 
 def test_it_needs_an_egress_list() -> None:

@@ -394,17 +394,17 @@ def test_the_plan_of_a_configuration(file: str) -> None:
     assert done("plan", file) == [
         "meter: tcp://10.0.0.9 unit 7, every 0.5 s",
         "",
-        "area             address  count  reads  holes  why it ends",
+        "area             address  count  reads  gaps   why it ends",
         "input_registers        0     16  0, 1   10-13  gap: 14, max_gap is 4",
         "input_registers       30      1  2             nothing more to read",
         "",
-        "2 requests, 4 read that nothing wants",
+        "2 requests, 4 extra addresses read",
         "",
         "other: udp://10.0.0.10 unit 1, not polled",
         "",
-        "area   address  count  reads  holes  why it ends",
-        "coils        0   2000  0             limit: 2001 with the next, the most is 2000",
-        "coils     2000      1  0             nothing more to read",
+        "area   address  count  reads  gaps  why it ends",
+        "coils        0   2000  0            limit: 2001 with the next, the most is 2000",
+        "coils     2000      1  0            nothing more to read",
         "",
         "2 requests",
     ]
@@ -443,10 +443,10 @@ def test_the_plan_of_a_configuration_for_programs(file: str) -> None:
 
 def test_options_take_the_place_of_what_a_configuration_says(file: str) -> None:
     assert done("plan", file, "--device", "meter", "--max-gap", "14")[-1] == (
-        "1 request, 18 read that nothing wants"
+        "1 request, 18 extra addresses read"
     )
     priced = done("plan", file, "--device", "meter", "--cost", "5:.5")
-    assert priced[-1] == "2 requests, 4 read that nothing wants, 18.5 ms"
+    assert priced[-1] == "2 requests, 4 extra addresses read, 18.5 ms"
     assert "  ms  why it ends" in priced[2]
 
 
@@ -456,7 +456,7 @@ READS = ("--read", "hr:0:10", "--read", "holding:12:4", "--read", "coils:0x3")
 def test_the_plan_of_reads() -> None:
     lines = done("plan", "tcp://plc", *READS, "--max-gap", "2", "--preset", "none")
     assert lines[0] == "tcp://plc"
-    assert lines[-2:] == ["2 requests, 2 read that nothing wants", "none: 3 requests"]
+    assert lines[-2:] == ["2 requests, 2 extra addresses read", "none: 3 requests"]
     forbidden = done("plan", "tcp://plc", *READS, "--max-gap", "9", "--forbidden", "hr:10-10")
     assert "forbidden: 10" in forbidden[4]
     plans = answer("plan", "tcp://plc", *READS, "--readable", "hr:0-10", "--max-gap", "9")["plans"]
@@ -467,14 +467,14 @@ def test_the_plan_of_reads() -> None:
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (("tcp://plc",), "A URL needs --read, once or more."),
-        (("tcp://plc", *READS, "--device", "a"), "--device goes with FILE."),
-        (("tcp://plc", *READS, "--fill", "1"), "--fill goes with --preset max_insert."),
-        (("tcp://plc", *READS, "--preset", "none", "--fill", "1"), "--fill goes with"),
-        (("tcp://plc", *READS, "--max-gap", "1", "--cost", "1:1"), "exclude each other"),
+        (("tcp://plc",), "URL requires at least one --read."),
+        (("tcp://plc", *READS, "--device", "a"), "--device requires FILE."),
+        (("tcp://plc", *READS, "--fill", "1"), "--fill requires --preset max_insert."),
+        (("tcp://plc", *READS, "--preset", "none", "--fill", "1"), "--fill requires"),
+        (("tcp://plc", *READS, "--max-gap", "1", "--cost", "1:1"), "can't be used together"),
         (("tcp://plc", "--read", "hr:0:0"), "'hr:0:0' is not AREA:ADDRESS:COUNT"),
         (("tcp://plc", "--read", "hr:65535:2"), "is not AREA:ADDRESS:COUNT"),
-        (("tcp://plc", "--read", "xx:0:1"), "'xx' is no area"),
+        (("tcp://plc", "--read", "xx:0:1"), "'xx' is not an area"),
         (("tcp://plc", *READS, "--cost", "1"), "'1' is not REQUEST:REGISTER"),
         (("tcp://plc", *READS, "--forbidden", "hr:3-1"), "'hr:3-1' is not AREA:FIRST-LAST"),
         (("tcp://plc", *READS, "--forbidden", "hr:9"), "holding_registers 0 to 9 meets what is"),
@@ -486,10 +486,10 @@ def test_wrong_usage_of_plan_is_told(words: tuple[str, ...], error: str) -> None
 
 
 def test_wrong_usage_of_plan_with_a_file_is_told(file: str, tmp_path: Path) -> None:
-    assert "has no device 'metr', allowed are meter, other" in usage_error(
+    assert "has no device 'metr', allowed: meter, other" in usage_error(
         "plan", file, "--device", "metr"
     )
-    assert "--read goes with URL" in usage_error("plan", file, *READS)
+    assert "--read requires URL" in usage_error("plan", file, *READS)
     empty = tmp_path / "empty.yaml"
     rest = {"bind": "127.0.0.1:1", "sources": ["127.0.0.1"], "tokens": "none"}
     empty.write_text(json.dumps({"memories": {"a": {"coils": 1}}, "rest": rest}))

@@ -1,7 +1,7 @@
 """The command line: `holdfast COMMAND`, one command a file.
 
-A command is imported when it is used, so that none waits for what another needs. Commands must hold
-no logic that another caller would need.
+Each command is imported only when it is used, so no command waits for the imports of another.
+Commands contain no logic that another caller could need.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ COMMANDS = {
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command when it is asked for."""
+    """A group that imports each command on first use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The names of all commands."""
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        """The command of that name, if there is one."""
+        """The command with that name, or `None`."""
         if cmd_name not in COMMANDS:
             return None
         module, _, name = COMMANDS[cmd_name].partition(":")
@@ -56,4 +56,4 @@ class LazyGroup(click.Group):
 )
 @click.version_option(__version__, prog_name="holdfast", message="%(prog)s %(version)s")
 def main() -> None:
-    """A Modbus memory that many writers fill and many readers read."""
+    """Modbus software: an appliance with shared memories, and tools for Modbus devices."""

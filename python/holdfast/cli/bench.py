@@ -1,4 +1,4 @@
-"""`holdfast bench`: how much a Modbus server answers, and how fast."""
+"""`holdfast bench`: measures the throughput and latency of a Modbus server."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _area(text: str) -> Area:
     default=1,
     show_default=True,
     metavar="N",
-    help="At the same time.",
+    help="Number of concurrent connections.",
 )
 @click.option(
     "--in-flight",
@@ -46,7 +46,7 @@ def _area(text: str) -> Area:
     default=1,
     show_default=True,
     metavar="N",
-    help="Requests on their way at once, on each connection.",
+    help="Requests in flight on each connection.",
 )
 @click.option(
     "--seconds",
@@ -54,7 +54,7 @@ def _area(text: str) -> Area:
     default="5",
     show_default=True,
     metavar="SECONDS",
-    help="How long.",
+    help="Duration of the test.",
 )
 @click.option(
     "--area",
@@ -62,7 +62,7 @@ def _area(text: str) -> Area:
     default="holding_registers",
     show_default=True,
     metavar="AREA",
-    help="What is read.",
+    help="Area to read.",
 )
 @click.option(
     "--address",
@@ -70,7 +70,7 @@ def _area(text: str) -> Area:
     default=0,
     show_default=True,
     metavar="N",
-    help="The first address.",
+    help="First address to read.",
 )
 @click.option(
     "--count",
@@ -78,7 +78,7 @@ def _area(text: str) -> Area:
     default=10,
     show_default=True,
     metavar="N",
-    help="Bits or registers of a request.",
+    help="Bits or registers per request.",
 )
 @device.device_options
 @device.json_option
@@ -94,16 +94,17 @@ def bench(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Load the Modbus server at URL with reads, and measure its answers.
+    """Measure how many reads per second the Modbus server at URL answers, and how fast.
 
-    THIS LOADS THE DEVICE: it is asked for as much as it can answer, and may neglect its work, drop
-    its other clients or stop. Never do it to a device that controls something.
+    WARNING: THIS IS A LOAD TEST. It sends as many requests as the device can answer. The device may
+    neglect its other work, drop other clients or stop. Never run it against a device that controls
+    a process.
 
-    Every connection reads the same range again and again. The client is one thread: from some tens
-    of thousands of requests a second on, it is what is measured.
+    Every connection reads the same range repeatedly. The client is a single thread and reaches its
+    own limit at some tens of thousands of requests per second.
 
-    Ctrl-C ends it earlier, with what was measured until then. Exit codes: 0 done, 1 no answer,
-    2 wrong usage.
+    Ctrl-C ends the test early and prints the results so far. Exit codes: 0 done, 1 no answer, 2
+    wrong usage.
     """
     with device.usable():
         load = Load(
@@ -147,7 +148,7 @@ def bench(
 
 
 def _lines(load: Load) -> list[str]:
-    """What was measured, for people."""
+    """The results as text."""
     times = load.latencies
     rows = [("requests", f"{times.count}"), ("rate", f"{load.rate:.0f} /s")]
     if times.count:
@@ -185,7 +186,7 @@ def _time(seconds: float) -> str:
 
 
 def _told(load: Load) -> dict[str, object]:
-    """What was measured, for programs."""
+    """The results for JSON."""
     times = load.latencies
     latency = {name: times.quantile(share) for name, share in QUANTILES.items()}
     latency |= {"mean": times.mean, "min": times.least if times.count else 0.0, "max": times.most}

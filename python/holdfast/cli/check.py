@@ -1,4 +1,4 @@
-"""`holdfast check`: is a configuration right, and what does it come to with all defaults?"""
+"""`holdfast check`: validates a configuration, and prints it with all defaults."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 @click.command(epilog="Example: holdfast check plant.yaml")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
 def check(file: Path, as_json: bool) -> None:
-    """Check the configuration FILE without starting anything.
+    """Validate the configuration FILE without starting anything.
 
-    Prints the effective configuration, every default filled in. When something is wrong, prints
-    every problem with its line and exits with 2.
+    Prints the effective configuration, with all defaults. If FILE is not valid, prints every
+    problem with its line and exits with 2.
     """
     if not as_json:
         click.echo(load_or_exit(file).dump(), nl=False)

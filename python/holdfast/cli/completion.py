@@ -1,4 +1,4 @@
-"""`holdfast completion`: commands and options completed by the shell."""
+"""`holdfast completion`: prints completion scripts for shells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROGRAM = "holdfast"
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 @click.pass_context
 def completion(ctx: click.Context, shell: str) -> None:
-    """Print the script that lets SHELL complete commands and options.
+    """Print the script with which SHELL completes commands and options.
 
     \b
     bash   holdfast completion bash > ~/.local/share/bash-completion/completions/holdfast

@@ -1,4 +1,4 @@
-"""Loading a configuration for a command: as it should be, or not at all."""
+"""Loads a configuration for a command, including certificates and keys."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
 
 WRONG = 2
-"""The exit code for wrong usage or a wrong configuration."""
+"""The exit code for wrong usage or an invalid configuration."""
 
 
 def load_whole(path: Path | str) -> Config:
-    """The configuration, when what is in its certificates and keys is right too.
+    """Loads a configuration and checks the contents of its certificates and keys.
 
     Raises `ConfigError` with every problem.
     """
@@ -61,9 +61,9 @@ def load_whole(path: Path | str) -> Config:
 
 
 def load_or_exit(path: Path | str) -> Config:
-    """The configuration; when it is wrong, prints every problem and exits with 2.
+    """Loads a configuration. If it is not valid, prints every problem and exits with 2.
 
-    What is right but has no effect is told on standard error, as a warning.
+    Prints warnings on standard error.
     """
     try:
         config = load_whole(path)
@@ -76,7 +76,7 @@ def load_or_exit(path: Path | str) -> Config:
 
 
 def show_problems(error: ConfigError) -> None:
-    """Prints every problem on a line of standard error, and how many there are."""
+    """Prints each problem as a line on standard error, and their number."""
     for problem in error.problems:
         click.echo(str(problem), err=True)
     count = len(error.problems)

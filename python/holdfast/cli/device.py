@@ -1,4 +1,4 @@
-"""What the commands that talk to a device share: its URL, their options, how an error is told."""
+"""Shared parts of the commands that talk to a device: its URL, options and error output."""
 
 from __future__ import annotations
 
@@ -40,23 +40,23 @@ REASONS: tuple[tuple[type[ModbusError], str], ...] = (
 
 
 def seconds(text: str) -> float:
-    """A time in seconds, as an option has it."""
+    """Parses the seconds of an option."""
     try:
         number = float(text)
     except ValueError:
         number = math.nan
     if not 0 < number <= MAX_TIMEOUT:
-        raise click.BadParameter(f"{text!r} is no number of seconds, more than 0 to 86400.")
+        raise click.BadParameter(f"{text!r} is not a number of seconds, more than 0, up to 86400.")
     return number
 
 
 def is_url(text: str) -> bool:
-    """Whether this is meant for a URL."""
+    """Whether an argument is a URL, not a file."""
     return "://" in text
 
 
 def checked_url(text: str) -> str:
-    """The URL of a device."""
+    """Checks the URL of a device. Raises `click.BadParameter`."""
     try:
         parse(text)
     except ValueError as error:
@@ -65,7 +65,7 @@ def checked_url(text: str) -> str:
 
 
 url_argument = click.argument("url", type=checked_url, metavar="URL")
-json_option = click.option("--json", "as_json", is_flag=True, help="JSON for programs.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")
 
 
 def device_options(command: Command) -> Command:
@@ -84,20 +84,20 @@ def device_options(command: Command) -> Command:
         default="1",
         show_default=True,
         metavar="SECONDS",
-        help="For a connection, a request and its reply together.",
+        help="Time limit for connection, request and reply together.",
     )
     return unit(timeout(command))
 
 
 def connect(url: str, unit: int, timeout: float) -> SyncClient:
-    """A client, which connects when it is used."""
+    """A client. It connects on its first request."""
     with usable():
         return SyncClient(url, unit=unit, timeout=timeout)
 
 
 @contextlib.contextmanager
 def usable() -> Iterator[None]:
-    """Wrong usage is what a client refuses: a value, or a file of its URL."""
+    """Turns errors of a client's arguments, or of files in its URL, into usage errors."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -107,14 +107,14 @@ def usable() -> Iterator[None]:
 def read_raw(
     client: SyncClient, area: Area, address: int, count: int, unit: int | None = None
 ) -> list[int]:
-    """Bits or registers, in as many requests as that takes."""
+    """Reads bits or registers, in several requests if necessary."""
     kind = "bool" if area in BIT_AREAS else "uint16"
     raw: list[int] = client.read(area, address, f"{kind}[{count}]", unit=unit)
     return raw
 
 
 def problem(error: ModbusError) -> dict[str, object]:
-    """An error as programs get it."""
+    """An error for JSON."""
     reason = next(word for kind, word in REASONS if isinstance(error, kind))
     code = {"code": error.code} if isinstance(error, ModbusException) else {}
     return {"reason": reason, **code, "detail": str(error)}
@@ -123,7 +123,7 @@ def problem(error: ModbusError) -> dict[str, object]:
 def fail(
     error: ModbusError, url: str, answer: Mapping[str, object] | None, hint: str | None = None
 ) -> NoReturn:
-    """Tells an error and ends with 1; for programs (`answer`) on standard output."""
+    """Prints an error and exits with 1; with `answer`, as JSON on standard output."""
     if answer is not None:
         click.echo(json.dumps({"ok": False, **answer, **problem(error)}))
     else:

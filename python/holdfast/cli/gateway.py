@@ -1,4 +1,4 @@
-"""`holdfast gateway`: Modbus devices over HTTP, and a console, until a signal ends it."""
+"""`holdfast gateway`: serves Modbus devices over HTTP, with a web console, until a signal."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Parsed = TypeVar("Parsed")
 
 
 def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
-    """The type of an option: what `parse` makes of its text."""
+    """The type of an option, from a function that parses its text."""
 
     def parsed(text: str) -> Parsed:
         try:
@@ -59,7 +59,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     default="127.0.0.1:8090",
     show_default=True,
     metavar="ADDRESS:PORT",
-    help="Where to listen.",
+    help="Address and port to listen on.",
 )
 @click.option(
     "--allow",
@@ -67,15 +67,15 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     multiple=True,
     required=True,
     metavar="NETWORK[:PORTS]",
-    help="Whom it may connect to; again for more. Without ports it is 502, and 802 with TLS; `*` "
-    "is all.",
+    help="Devices that the gateway may connect to; repeatable. Default ports: 502, with TLS also "
+    "802; `*`: all ports.",
 )
-@click.option("--writes", is_flag=True, help="Let requests change devices.")
+@click.option("--writes", is_flag=True, help="Allow requests to write to devices.")
 @click.option(
     "--token-file",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Lines `NAME SHA256`, as `holdfast token --line` prints them: every request needs one.",
+    help="Require a token from this file: lines `NAME SHA256`, as from `holdfast token --line`.",
 )
 @click.option(
     "--sources",
@@ -84,7 +84,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     default=[str(each) for each in LOOPBACK],
     show_default="this machine",
     metavar="NETWORK",
-    help="Who may connect to it; again for more.",
+    help="Clients that may connect to the gateway; repeatable.",
 )
 @tls_options("tls", DEVICES, " for devices")
 @click.option(
@@ -93,9 +93,9 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
     default=1,
     show_default=True,
     metavar="N",
-    help="Requests on their way to one device at once.",
+    help="Requests in flight to one device.",
 )
-@click.option("--json-log", is_flag=True, help="Log JSON, an object a line.")
+@click.option("--json-log", is_flag=True, help="Log one JSON object per line.")
 def gateway(
     bind: Bind,
     allow: tuple[AllowedNetwork, ...],
@@ -108,18 +108,18 @@ def gateway(
     in_flight: int,
     json_log: bool,
 ) -> None:
-    """Serve Modbus devices over HTTP, with a console for a browser.
+    """Serve Modbus devices over HTTP, with a web console.
 
-    Only devices in the networks of --allow are connected to, and only on their ports:
-    10.0.0.0/8, 10.0.0.5:5020, 10.0.0.0/24:502-510, 10.0.0.5:*, [fd00::]/8:502. Names are resolved,
-    and their addresses must be in there. Without --writes it only reads.
+    The gateway only connects to networks and ports in --allow: 10.0.0.0/8, 10.0.0.5:5020,
+    10.0.0.0/24:502-510, 10.0.0.5:*, [fd00::]/8:502. The addresses of a host name must be in the
+    list. Without --writes, the gateway only reads.
 
-    Who may connect, --sources says: this machine, if nothing else. Anyone else needs a token.
+    By default, only clients on this machine may connect. Other --sources require --token-file.
 
-    With TLS a device's certificate is checked against --tls-ca, and a device that asks for one is
-    shown --tls-cert.
+    With TLS, certificates of devices are verified with --tls-ca. Devices that require a client
+    certificate receive --tls-cert.
 
-    Exit codes: 0 stopped by a signal, 1 it could not listen, 2 wrong usage.
+    Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage.
     """
     settings = Settings(
         allow=allow,
@@ -130,7 +130,7 @@ def gateway(
         tls=_tls(tls_ca, tls_cert, tls_key),
     )
     if not settings.tokens and any(not each.is_loopback for each in sources):
-        raise click.UsageError("--sources beyond this machine go with --token-file.")
+        raise click.UsageError("--sources beyond this machine require --token-file.")
     logs.configure("info", "json" if json_log else "text")
     signals = Signals()
     try:
@@ -143,7 +143,7 @@ def gateway(
 
 
 def _serve(settings: Settings, listener: socket.socket, signals: Signals) -> None:
-    """Serves in a thread, until a signal comes."""
+    """Serves in a thread until a signal arrives."""
     served = Gateway(settings, listener)
     stop = Stop()
     with ThreadPoolExecutor(1, "gateway") as threads:
@@ -167,13 +167,13 @@ def _tokens(file: Path) -> tuple[tokens.Token, ...]:
 
 
 def _tls(ca: str | None, cert: str | None, key: str | None) -> Tls:
-    """The files, which can be used."""
+    """The TLS files, checked."""
     tls = tls_of("tls", ca, cert, key)
     if tls != NO_FILES:
         try:
             check_files(tls)
         except (OSError, ValueError) as error:
-            raise click.UsageError(f"TLS of devices: {error}.") from error
+            raise click.UsageError(f"TLS for devices: {error}.") from error
     return tls
 
 
@@ -189,10 +189,10 @@ def _greeting(address: str, settings: Settings) -> str:
         header += ' -H "Authorization: Bearer $TOKEN"'
     return "\n".join(
         [
-            f"The console is at {url}/, the API is described at {url}/docs",
+            f"Console: {url}/, API documentation: {url}/docs",
             "",
             f"  {can} devices at {', '.join(map(str, settings.allow))}",
-            f"  asked from {', '.join(map(str, settings.sources))}; {who}",
+            f"  clients: {', '.join(map(str, settings.sources))}; {who}",
             "",
             "Try:",
             "",
@@ -204,7 +204,7 @@ def _greeting(address: str, settings: Settings) -> str:
 
 
 def _example(entry: AllowedNetwork) -> tuple[str, int]:
-    """A host and a port that an entry of the list allows."""
+    """A host and a port that the entry allows."""
     network, (first, last) = entry.network, entry.ports or (PORT, PORT)
     if network.prefixlen == 0:
         host = "plc.local"

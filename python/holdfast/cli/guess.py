@@ -1,4 +1,4 @@
-"""`holdfast guess`: which type and byte order registers have."""
+"""`holdfast guess`: guesses the type and byte order of registers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from holdfast.tools.inference import Guess
 
 REGISTERS = 4
-"""What is looked at: enough for the largest number."""
+"""Registers to read by default: enough for the largest number."""
 
 SHOWN = 10
 WIDEST = 12
@@ -37,19 +37,17 @@ WIDEST = 12
     "--count",
     type=click.IntRange(1, READ_REGISTERS),
     metavar="N",
-    help=f"Registers to look at.  [default: {REGISTERS}, or as many as there are]",
+    help=f"Registers to read.  [default: {REGISTERS}, fewer if they do not exist]",
 )
-@click.option(
-    "--anywhere", is_flag=True, help="Values may begin at any of them, not only at ADDRESS."
-)
-@click.option("--like", type=float, metavar="NUMBER", help="The value, as known from elsewhere.")
+@click.option("--anywhere", is_flag=True, help="Also try values that start at any later register.")
+@click.option("--like", type=float, metavar="NUMBER", help="Expected value.")
 @click.option(
     "--reads",
     type=click.IntRange(1, 1000),
     default=5,
     show_default=True,
     metavar="N",
-    help="How often to read, to see what changes.",
+    help="Number of reads, to observe changes.",
 )
 @click.option(
     "--every",
@@ -57,9 +55,11 @@ WIDEST = 12
     default="0.5",
     show_default=True,
     metavar="SECONDS",
-    help="From read to read.",
+    help="Interval between reads.",
 )
-@click.option("--all", "everything", is_flag=True, help=f"Show all guesses, not the best {SHOWN}.")
+@click.option(
+    "--all", "everything", is_flag=True, help=f"Show all guesses, not only the best {SHOWN}."
+)
 @click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as 40001 or 4x0001.")
 @device.device_options
 @device.json_option
@@ -79,22 +79,22 @@ def guess(
 ) -> None:
     """Guess the type and the byte order of the value at ADDRESS in AREA of the device at URL.
 
-    AREA is holding_registers or input_registers (hr, ir). Reads the registers there some times, and
-    ranks every type in every order: by how plausible its values are, and how smoothly they change.
-    The best guess is first; the values tell whether it is right.
+    AREA is holding_registers or input_registers (hr, ir). Reads the registers several times and
+    ranks every type in every order, by how plausible its values are and how smoothly they change.
+    The best guess is first. Compare the values with what you expect.
 
-    With --like 21.5, guesses are ranked by how close they come to that, and those more than 10 %
-    off are left out. Integers are multiplied by 0.1, 0.01, 0.001 and 10 too.
+    With --like 21.5, ranks guesses by their distance to that value and omits those that are more
+    than 10 % off. Integers are also scaled by 0.1, 0.01, 0.001 and 10.
 
-    Exit codes: 0 done, 1 the registers could not be read, 2 wrong usage.
+    Exit codes: 0 done, 1 can't read the registers, 2 wrong usage.
     """
     place, left = places.taken(words, modicon=modicon)
     if left:
         raise click.UsageError(f"Got unexpected extra argument ({' '.join(left)}).")
     if place.area in BIT_AREAS:
-        raise click.UsageError(f"{place.area} hold bits, there is nothing to guess.")
+        raise click.UsageError(f"{place.area} contain bits; guess requires registers.")
     if like is not None and not math.isfinite(like):
-        raise click.UsageError("--like is to be a number.")
+        raise click.UsageError("--like requires a finite number.")
     told: dict[str, object] = {
         "url": url,
         "unit": unit,
@@ -121,7 +121,7 @@ def guess(
 
 
 def _size(client: SyncClient, place: Place) -> int:
-    """As many registers as there are, up to what the largest number takes."""
+    """How many registers exist at a place, up to `REGISTERS`."""
     size = min(REGISTERS, LAST_ADDRESS + 1 - place.address)
     while True:
         try:
@@ -145,9 +145,9 @@ def _lines(place: Place, found: Sequence[Sequence[int]], guesses: Sequence[Guess
         "",
     ]
     if not any(map(any, found)):
-        return [*lines, "All registers are 0, of which every type makes 0."]
+        return [*lines, "All registers are 0: every type decodes to 0."]
     if not guesses:
-        return [*lines, "Nothing there is like that."]
+        return [*lines, "No type matches that value."]
     scaled = any(each.scale != 1 for each in guesses)
     head = ["score", "address", "type", "order", *(["times"] if scaled else []), "value", "why"]
     rows = [
@@ -166,7 +166,7 @@ def _lines(place: Place, found: Sequence[Sequence[int]], guesses: Sequence[Guess
 
 
 def _values(guess: Guess) -> str:
-    """The value of the last read, and where it came from if it changed."""
+    """The value of the last read, after the value of the first read if it changed."""
     first, last = (_scaled(guess, value) for value in (guess.values[0], guess.values[-1]))
     return last if len(set(guess.values)) == 1 else f"{first} … {last}"
 

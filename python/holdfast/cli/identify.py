@@ -1,4 +1,4 @@
-"""`holdfast identify`: what a device says of itself."""
+"""`holdfast identify`: prints the identification of a device."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ LEVELS = {1: "basic", 2: "regular", 3: "extended"}
 @device.device_options
 @device.json_option
 def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
-    """Show what the device at URL says of itself.
+    """Print the identification of the device at URL.
 
-    Asks for its identification (function 43/14) and its server id (function 17), which many devices
-    have neither or one of.
+    Requests the device identification (function 43/14) and the server id (function 17). Many
+    devices support only one of them, or neither.
 
-    Exit codes: 0 it said something, 1 it did not, 2 wrong usage.
+    Exit codes: 0 the device supports at least one, 1 neither, 2 wrong usage.
     """
     with device.connect(url, unit, timeout) as client:
         identification = _asked(client.identify)
@@ -66,7 +66,7 @@ def _asked(call: Callable[[], Answer]) -> Answer | ModbusError:
 def _told(
     answer: Answer | ModbusError, made: Callable[[Answer], dict[str, object]]
 ) -> dict[str, object]:
-    """An answer for programs, or why there is none."""
+    """An answer, or its error, for JSON."""
     if isinstance(answer, ModbusError):
         return {"ok": False, **device.problem(answer)}
     return {"ok": True, **made(answer)}
@@ -88,7 +88,7 @@ def _server_id(answer: ServerId) -> dict[str, object]:
 
 
 def _identified(answer: Identification | ModbusError) -> list[str]:
-    """The identification, for people."""
+    """The identification as text."""
     head = showing.styled("Device identification (function 43/14)", bold=True)
     if isinstance(answer, ModbusError):
         return [head, f"  {showing.styled(str(answer), fg='red')}"]
@@ -103,7 +103,7 @@ def _identified(answer: Identification | ModbusError) -> list[str]:
 
 
 def _served(answer: ServerId | ModbusError) -> list[str]:
-    """The server id, for people."""
+    """The server id as text."""
     head = showing.styled("Server id (function 17)", bold=True)
     if isinstance(answer, ModbusError):
         return [head, f"  {showing.styled(str(answer), fg='red')}"]

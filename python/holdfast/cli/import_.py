@@ -1,4 +1,4 @@
-"""`holdfast import`: a configuration of another program, made into one of ours."""
+"""`holdfast import`: converts the configuration of another program."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FAILED = 1
 
 @click.group("import", epilog="Example: holdfast import mma config.yaml --output plant.yaml")
 def import_() -> None:
-    """Turn the configuration of another program into one of Holdfast."""
+    """Convert the configuration of another program."""
 
 
 @import_.command(epilog="Example: holdfast import mma config.yaml --output plant.yaml")
@@ -33,17 +33,17 @@ def import_() -> None:
 @click.option(
     "--output", metavar="OUT", type=click.Path(path_type=Path), help="Write the YAML to this file."
 )
-@click.option("--force", is_flag=True, help="Replace OUT if it is there.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+@click.option("--force", is_flag=True, help="Overwrite OUT if it exists.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
 def mma(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
-    """Turn FILE, a configuration of the Modbus Memory Appliance, into one of Holdfast.
+    """Convert FILE, a configuration of the Modbus Memory Appliance, to a Holdfast configuration.
 
-    Prints the new configuration. What it could not carry over, what it changed and what is to be
-    checked is on standard error, a line each, and in the comments of the configuration. Exit codes:
-    0 done, 1 OUT could not be written, 2 FILE can't be imported.
+    Prints the new configuration. Notes on standard error, and comments in the configuration, say
+    what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
+    OUT, 2 can't import FILE.
     """
     if output is not None and _same(file, output):
-        raise click.UsageError("OUT is FILE itself.")
+        raise click.UsageError("OUT and FILE are the same file.")
     try:
         imported = read_mma(file)
     except ConfigError as error:
@@ -61,7 +61,7 @@ def mma(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
 
 
 def _refuse(error: ConfigError, as_json: bool) -> None:
-    """Prints why it is impossible, and ends with 2."""
+    """Prints why the import is impossible, and exits with 2."""
     notes = error.notes if isinstance(error, NotImportable) else ()
     if as_json:
         problems = {"ok": False, "problems": _plain(error.problems), "notes": _plain(notes)}
@@ -78,7 +78,7 @@ def _write(output: Path, text: str, force: bool) -> None:
         with output.open("w" if force else "x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        click.echo(f"{output}: is there already; --force replaces it", err=True)
+        click.echo(f"{output}: already exists; --force overwrites it", err=True)
         sys.exit(FAILED)
     except OSError as error:
         click.echo(f"{output}: can't be written: {error.strerror or error}", err=True)

@@ -1,4 +1,4 @@
-"""Single keys from the terminal, without waiting for the end of a line."""
+"""Reads single keys from the terminal, without waiting for Enter."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     Wait: TypeAlias = Callable[[float], str]
 
 END = "\x04"
-"""What comes when the terminal is gone."""
+"""The key that stands for a closed terminal."""
 
 
 @contextlib.contextmanager
 def keys() -> Iterator[Wait]:
-    """A function that waits some seconds for a key, and returns it, or nothing."""
+    """Yields a function that waits up to some seconds for a key; it returns "" at the timeout."""
     if not sys.stdin.isatty():
         yield _nothing
     elif sys.platform == "win32":

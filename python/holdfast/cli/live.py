@@ -1,4 +1,4 @@
-"""The live view of `holdfast watch`: all values, the changed ones highlighted, and their rates."""
+"""The live view of `holdfast watch`: all values, with changes highlighted, and their rates."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from holdfast.cli.sources import Source, WatchedRange
 
 SIZE_CHECK_INTERVAL = 0.2
-"""Seconds between two looks at the size of the terminal."""
+"""Seconds between checks of the size of the terminal."""
 
 FADE = 3
-"""Readings for which a change is to be seen."""
+"""Readings for which a change stays highlighted."""
 
 RATES = 8
-"""Lines for what changes."""
+"""Maximum number of lines for rates of change."""
 
 TURNS = {
     **dict.fromkeys(("n", " ", "\x1b[6~", "\x1b[B"), 1),
@@ -45,11 +45,11 @@ RECENT = "bold yellow"
 
 
 class Quit(Exception):
-    """The user wants to end it."""
+    """The user ends the view."""
 
 
 class View:
-    """The screen, drawn anew after every reading and when its size has changed."""
+    """The screen, redrawn after every reading and when its size changes."""
 
     def __init__(self, source: Source, every: float, note: str | None) -> None:
         self._source = source
@@ -65,7 +65,7 @@ class View:
         self._size = self._console.size
 
     def run(self, first: Sequence[Sequence[int]], times: int | None) -> None:
-        """Shows readings, the first of which was made already, until q or Ctrl-C."""
+        """Shows readings until q or Ctrl-C, starting with the reading `first`."""
         self._tracker.update(time.monotonic(), first)
         before = signal.signal(signal.SIGTERM, _quit)
         try:
@@ -89,7 +89,7 @@ class View:
             self._tracker.update(time.monotonic(), values)
 
     def _wait(self, wait: Wait, left: float) -> None:
-        """Waits a moment, for keys as well."""
+        """Waits for a key or a short time, and handles keys."""
         pressed = wait(min(left, SIZE_CHECK_INTERVAL))
         for key in [pressed] if pressed.startswith("\x1b") else pressed:
             if key in ("q", "Q", keys.END):
@@ -129,7 +129,7 @@ class View:
         return [head, second]
 
     def _body(self, width: int) -> list[Text]:
-        """All blocks, each with its name before it."""
+        """All blocks, each under its name."""
         lines: list[Text] = []
         for index, block in enumerate(self._tracker.blocks):
             if lines:
@@ -162,7 +162,7 @@ class View:
         return FRESH if age == 0 else RECENT
 
     def _rates(self) -> list[Text]:
-        """What changes: its value, how fast, how often."""
+        """The latest changes: value, rate and number of changes."""
         rows = []
         for block, address, value, history in self._tracker.latest(RATES):
             rate = history.rate(self._tracker.at)
@@ -175,7 +175,7 @@ class View:
 
 
 def _quit(_number: int, _frame: FrameType | None) -> None:
-    """Ends it so that the terminal is left as it was."""
+    """Ends the view by an exception, so that the terminal is restored."""
     raise Quit
 
 

@@ -1,4 +1,4 @@
-"""`holdfast map`: which addresses a device has."""
+"""`holdfast map`: finds the addresses of a device."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 BLOCKS = "▁▂▃▄▅▆▇█"
 NOTHING = "·"
 ASCII = ("-" * 7 + "#", ".")
-"""The same where only ASCII can be shown."""
+"""The same for an output that can only show ASCII."""
 
 WIDEST = 100
 
@@ -41,19 +41,21 @@ def _span(text: str) -> range:
     first, dash, last = text.partition("-")
     numbers = places.number(first), places.number(last if dash else first)
     if None in numbers or not 0 <= (numbers[0] or 0) <= (numbers[1] or 0) <= LAST_ADDRESS:
-        raise click.BadParameter(f"{text!r} is not FIRST-LAST, as 0-999, up to {LAST_ADDRESS}.")
+        raise click.BadParameter(f"{text!r} is not FIRST-LAST, as in 0-999, up to {LAST_ADDRESS}.")
     return range(numbers[0] or 0, (numbers[1] or 0) + 1)
 
 
 @click.command("map", epilog="Example: holdfast map tcp://192.168.0.10 --areas hr,ir")
 @device.url_argument
-@click.option("--areas", type=_areas, metavar="AREA,...", help="Only these.  [default: all four]")
-@click.option("--exact", is_flag=True, help="Read every address, not samples.")
+@click.option(
+    "--areas", type=_areas, metavar="AREA,...", help="Areas to search.  [default: all four]"
+)
+@click.option("--exact", is_flag=True, help="Read every address instead of samples.")
 @click.option(
     "--max-quantity",
     type=click.IntRange(1),
     metavar="N",
-    help="Read at most N bits or registers at once.",
+    help="Read at most N bits or registers per request.",
 )
 @click.option(
     "--step",
@@ -61,7 +63,7 @@ def _span(text: str) -> range:
     default=discovery.STEP,
     show_default=True,
     metavar="N",
-    help="Addresses from sample to sample.",
+    help="Distance between samples.",
 )
 @click.option(
     "--range",
@@ -70,7 +72,7 @@ def _span(text: str) -> range:
     default=f"0-{LAST_ADDRESS}",
     show_default=True,
     metavar="FIRST-LAST",
-    help="Only these addresses.",
+    help="Addresses to search.",
 )
 @device.device_options
 @device.json_option
@@ -85,22 +87,22 @@ def map_(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Find out which addresses the device at URL has, by reading; nothing is written.
+    """Find the addresses of the device at URL by reading; nothing is written.
 
-    An address that is answered with exception 02 is outside. Other exceptions, silence and replies
-    that are none are told apart.
+    An address does not exist if reading it returns exception 02. Other exceptions, timeouts and
+    invalid replies are listed separately.
 
-    Without --exact, it reads samples: every 256th address (--step) and some where devices like to
-    begin, and follows the range around each that is there to both ends. All addresses that are
-    shown have been read, and holes in them are found. Missed is a range that lies between two
-    samples. This takes some hundred requests an area, more for large ranges.
+    Without --exact, reads samples: every 256th address (--step) and common start addresses, then
+    the whole range around each existing sample. All reported addresses were read, and gaps between
+    them are found. A range that lies between two samples is missed. This takes some hundred
+    requests per area, more for large ranges.
 
-    With --exact, it reads every address: in blocks where there are any, halved where a block fails,
-    and one by one where there are none. Nothing is missed, but each address that the device does
-    not have takes a request, up to 65536 an area: minutes over TCP, hours on a serial line. --range
-    and --areas make it shorter.
+    With --exact, reads every address: in blocks where addresses exist, in halves where a block
+    fails, and one by one elsewhere. Nothing is missed, but each missing address takes a request, up
+    to 65536 per area: minutes over TCP, hours on a serial line. --range and --areas limit the
+    search.
 
-    Exit codes: 0 done, 1 the device did not answer or it was interrupted, 2 wrong usage.
+    Exit codes: 0 done, 1 the device did not answer or the search was interrupted, 2 wrong usage.
     """
     survey = Survey(areas or AREAS, exact=exact, max_quantity=max_quantity, step=step, span=span)
     began = time.monotonic()
@@ -136,7 +138,7 @@ def _requests(survey: Survey) -> str:
 
 
 def _picture(survey: Survey) -> list[str]:
-    """The areas one below the other, each scaled to a line."""
+    """One line per area, and a scale."""
     labels = [showing.words(found.area) for found in survey.areas]
     margin = max(map(len, labels)) + 2
     columns = min(shutil.get_terminal_size().columns, WIDEST)
@@ -155,7 +157,7 @@ def _picture(survey: Survey) -> list[str]:
 
 
 def _line(found: AreaMap, span: range, cells: int) -> str:
-    """An area: the more of a cell's addresses are there, the higher its block."""
+    """One area: the height of a block shows the share of existing addresses in a cell."""
     blocks, nothing = (BLOCKS, NOTHING) if showing.fits(BLOCKS + NOTHING) else ASCII
     there = _counts(found.ranges, span, cells)
     failed = _counts((each for some in found.failures.values() for each in some), span, cells)
@@ -172,7 +174,7 @@ def _line(found: AreaMap, span: range, cells: int) -> str:
 
 
 def _counts(ranges: Iterable[range], span: range, cells: int) -> list[int]:
-    """How many addresses of ranges are in each cell."""
+    """The number of addresses in each cell."""
     counts = [0] * cells
     for each in ranges:
         cell = (each.start - span.start) * cells // len(span)
@@ -186,7 +188,7 @@ def _counts(ranges: Iterable[range], span: range, cells: int) -> list[int]:
 
 
 def _bounds(span: range, cells: int, cell: int) -> tuple[int, int]:
-    """The first address of a cell, and that behind its last."""
+    """The first address of a cell, and the address after its last."""
     size = len(span)
     return span.start + -(-cell * size // cells), span.start + -(-(cell + 1) * size // cells)
 
@@ -203,11 +205,11 @@ def _ranges(survey: Survey) -> list[str]:
 
 
 def _others(survey: Survey) -> list[str]:
-    """What was neither there nor outside, a line each."""
+    """The failures other than exception 02, one line each."""
     lines = []
     for found in survey.areas:
         if found.given_up is not None:
-            lines.append(f"{found.area}: {_words(survey, found.given_up)}; not looked at further")
+            lines.append(f"{found.area}: {_words(survey, found.given_up)}; area skipped")
             continue
         for failure, ranges in found.failures.items():
             where = ", ".join(
@@ -225,7 +227,7 @@ def _words(survey: Survey, failure: Failure) -> str:
 
 
 def _told(survey: Survey, seconds: float, why: str | None) -> dict[str, object]:
-    """The survey for programs."""
+    """The survey for JSON."""
     return {
         **({} if why is None else {"detail": why}),
         "exact": survey.exact,

@@ -1,4 +1,4 @@
-"""Open files: each connection is one, and the system says how many a process may have."""
+"""The limit on open files, as every connection is an open file."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import logging
 from holdfast import logs
 
 OTHER_FILES = 128
-"""Open files beside the connections: listeners, readers of metrics, the interpreter's own."""
+"""Open files that are not connections: listeners, metrics requests, the interpreter's files."""
 
 
 def allow_open_files(connections: int) -> None:
-    """Lets this process hold so many connections; logs where the system does not let it."""
+    """Raises the limit on open files for `connections`; logs if the system does not allow it."""
     try:
         import resource
     except ImportError:  # Windows has no such limit.
@@ -23,7 +23,7 @@ def allow_open_files(connections: int) -> None:
     allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-    except (ValueError, OSError):  # The system has another limit, which it does not tell.
+    except (ValueError, OSError):  # The system has a lower limit that it does not report.
         allowed = soft
     if allowed < needed:
         logs.write(logging.WARNING, "too_few_open_files", needed=needed, allowed=allowed)

@@ -1,4 +1,4 @@
-"""Doing something again and again, at times that do not drift."""
+"""A schedule for repeated work that does not drift."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 def ticks(
     every: float, times: int | None = None, wait: Callable[[float], object] = time.sleep
 ) -> Iterator[int]:
-    """Comes back now and after every multiple of `every` seconds from now; `times`, or for ever.
+    """Yields now and at every multiple of `every` seconds from now, `times` times or forever.
 
-    What was missed because the caller took longer is left out. `wait` lets a time pass.
+    Skips ticks that pass while the caller is busy. `wait` waits for some seconds.
     """
     start = time.monotonic()
     tick = done = 0

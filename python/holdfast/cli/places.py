@@ -1,4 +1,4 @@
-"""Where a command reads or writes: an area and an address, or a Modicon number that is both."""
+"""Parses the target of a command: an area and an address, or a Modicon number."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ _MODICON = re.compile(r"([0134])(?:[xX]([0-9]{1,5})|([0-9]{4,5}))")
 
 @dataclass(frozen=True)
 class Place:
-    """An area and an address in it."""
+    """An area, and an address in that area."""
 
     area: Area
     address: int
 
 
 def number(text: str) -> int | None:
-    """An integer from 0, decimal or 0x, if it is one."""
+    """Parses a non-negative integer, decimal or 0x. Returns `None` for other text."""
     if re.fullmatch("0[xX][0-9a-fA-F]{1,20}", text):
         return int(text, 16)
     return int(text) if re.fullmatch("[0-9]{1,20}", text) else None
 
 
 def area_of(text: str) -> Area:
-    """The area of a name, or of a part that is enough."""
+    """Parses the name of an area, a short form or an unambiguous prefix."""
     name = text.lower().replace("-", "_")
     if name in SHORT:
         return SHORT[name]
@@ -51,18 +51,18 @@ def area_of(text: str) -> Area:
         return found[0]
     hint = f"; did you mean {text} --modicon?" if _MODICON.fullmatch(text) else ""
     raise click.UsageError(
-        f"{text!r} is no area, allowed are {', '.join(AREAS)} and co, di, hr, ir{hint or '.'}"
+        f"{text!r} is not an area, allowed: {', '.join(AREAS)}, co, di, hr, ir{hint or '.'}"
     )
 
 
 def areas_of(text: str) -> tuple[Area, ...]:
-    """The areas of a list with commas, in the order of the standard."""
+    """Parses a comma-separated list of areas, and returns them in the order of the standard."""
     chosen = {area_of(name.strip()) for name in text.split(",")}
     return tuple(area for area in AREAS if area in chosen)
 
 
 def taken(words: Sequence[str], *, modicon: bool) -> tuple[Place, list[str]]:
-    """The place at the beginning of the words of a command line, and the words behind it."""
+    """Parses a place at the start of the arguments. Returns it and the remaining arguments."""
     left = list(words)
     area = None
     if not modicon or (left and left[0][:1].isalpha()):
@@ -82,19 +82,19 @@ def taken(words: Sequence[str], *, modicon: bool) -> tuple[Place, list[str]]:
 
 
 def counted(words: Sequence[str]) -> int:
-    """The COUNT that is left on a command line behind a place, 1 if none is."""
+    """Parses the optional COUNT after a place. Default: 1."""
     if not words:
         return 1
     if len(words) > 1:
         raise click.UsageError(f"Got unexpected extra argument ({' '.join(words[1:])}).")
     count = number(words[0])
     if count is None or not 1 <= count <= ADDRESSES:
-        raise click.UsageError(f"COUNT is {words[0]!r}, allowed are 1 to {ADDRESSES}.")
+        raise click.UsageError(f"COUNT is {words[0]!r}, allowed: 1 to {ADDRESSES}.")
     return count
 
 
 def modicon_hint(place: Place) -> str | None:
-    """What may be meant by an address that the device does not have."""
+    """A hint for an address that does not exist but looks like a Modicon number."""
     match = _MODICON.fullmatch(str(place.address))
     if match is None or MODICON[match[1]] != place.area:
         return None
@@ -105,7 +105,7 @@ def modicon_hint(place: Place) -> str | None:
 
 
 def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The areas, for a shell."""
+    """Completes areas in a shell."""
     return [CompletionItem(area) for area in AREAS if area.startswith(incomplete)]
 
 
@@ -114,7 +114,7 @@ def _address(text: str) -> int:
     if address is None or address > LAST_ADDRESS:
         hint = f"; did you mean {text} --modicon?" if _MODICON.fullmatch(text) else "."
         raise click.UsageError(
-            f"address {text!r} is not allowed, allowed are 0 to {LAST_ADDRESS}, decimal or 0x{hint}"
+            f"ADDRESS is {text!r}, allowed: 0 to {LAST_ADDRESS}, decimal or 0x{hint}"
         )
     return address
 
@@ -123,5 +123,5 @@ def _modicon(text: str) -> Place:
     match = _MODICON.fullmatch(text)
     count = int(match[2] or match[3]) if match else 0
     if match is None or not 1 <= count <= ADDRESSES:
-        raise click.UsageError(f"{text!r} is no Modicon number, as in {FORMS}.")
+        raise click.UsageError(f"{text!r} is not a Modicon number, as in {FORMS}.")
     return Place(MODICON[match[1]], count - 1)

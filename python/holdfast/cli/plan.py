@@ -1,4 +1,4 @@
-"""`holdfast plan`: the requests that read a device, and why each ends where it does."""
+"""`holdfast plan`: prints the requests that read a device."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 FILL = 50
-"""The holes that max_insert reads unless it is told otherwise."""
+"""The default of `--fill`."""
 
 
 def _read(text: str) -> Field:
@@ -33,7 +33,7 @@ def _read(text: str) -> Field:
     first, size = places.number(address), places.number(count or "1")
     if first is None or size is None or not 1 <= size <= ADDRESSES - first:
         raise click.BadParameter(
-            f"{text!r} is not AREA:ADDRESS:COUNT, as hr:100:20, up to {LAST_ADDRESS}."
+            f"{text!r} is not AREA:ADDRESS:COUNT, as in hr:100:20, up to {LAST_ADDRESS}."
         )
     return places.area_of(area), first, size
 
@@ -44,7 +44,7 @@ def _stretch(text: str) -> tuple[Area, int, int]:
     start, end = places.number(first), places.number(last if dash else first)
     if start is None or end is None or not start <= end <= LAST_ADDRESS:
         raise click.BadParameter(
-            f"{text!r} is not AREA:FIRST-LAST, as hr:100-119, up to {LAST_ADDRESS}."
+            f"{text!r} is not AREA:FIRST-LAST, as in hr:100-119, up to {LAST_ADDRESS}."
         )
     return places.area_of(area), start, end + 1
 
@@ -53,54 +53,69 @@ def _cost(text: str) -> tuple[float, float]:
     match = re.fullmatch(r"([0-9]*\.?[0-9]+):([0-9]*\.?[0-9]+)", text)
     prices = (float(match[1]), float(match[2])) if match else (math.inf, math.inf)
     if not math.isfinite(sum(prices)):
-        raise click.BadParameter(f"{text!r} is not REQUEST:REGISTER in milliseconds, as 12:0.1.")
+        raise click.BadParameter(f"{text!r} is not REQUEST:REGISTER in milliseconds, as in 12:0.1.")
     return prices
 
 
 @click.command(epilog="Example: holdfast plan plant.yaml --preset max_insert --fill 10")
 @click.argument("target", metavar="FILE|URL")
-@click.option("--device", "names", multiple=True, metavar="NAME", help="With FILE: only this one.")
+@click.option(
+    "--device",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="With FILE: only this device; repeatable.",
+)
 @click.option(
     "--read",
     "reads",
     multiple=True,
     type=_read,
     metavar="AREA:ADDRESS:COUNT",
-    help="With URL: what is to be read.",
+    help="With URL: a range to read; repeatable.",
 )
 @click.option(
-    "--max-gap", type=click.IntRange(0, LAST_ADDRESS), metavar="N", help="Read holes of up to N."
+    "--max-gap", type=click.IntRange(0, LAST_ADDRESS), metavar="N", help="Read gaps of up to N."
 )
 @click.option(
     "--cost",
     type=_cost,
     metavar="REQUEST:REGISTER",
-    help="Read holes where that is cheaper, at these prices in milliseconds.",
+    help="Read gaps if that is cheaper, with these costs in milliseconds.",
 )
 @click.option(
-    "--max-registers", type=click.IntRange(1, READ_REGISTERS), metavar="N", help="In a request."
+    "--max-registers",
+    type=click.IntRange(1, READ_REGISTERS),
+    metavar="N",
+    help="Limit of one request.",
 )
-@click.option("--max-bits", type=click.IntRange(1, READ_BITS), metavar="N", help="In a request.")
+@click.option(
+    "--max-bits", type=click.IntRange(1, READ_BITS), metavar="N", help="Limit of one request."
+)
 @click.option(
     "--readable",
     multiple=True,
     type=_stretch,
     metavar="AREA:FIRST-LAST",
-    help="Read holes only in these.",
+    help="Read gaps only inside these ranges.",
 )
 @click.option(
-    "--forbidden", multiple=True, type=_stretch, metavar="AREA:FIRST-LAST", help="Never read these."
+    "--forbidden",
+    multiple=True,
+    type=_stretch,
+    metavar="AREA:FIRST-LAST",
+    help="Never read these ranges.",
 )
 @click.option(
     "--preset",
     type=click.Choice(get_args(Preset)),
-    help="Compare with the requests of this rule.",
+    help="Also count the requests of this rule.",
 )
 @click.option(
     "--fill",
     type=click.IntRange(0),
     metavar="N",
-    help=f"The holes that max_insert reads.  [default: {FILL}]",
+    help=f"Largest gap that max_insert reads.  [default: {FILL}]",
 )
 @device.json_option
 def plan(
@@ -112,17 +127,17 @@ def plan(
     as_json: bool,
     **rules: Any,
 ) -> None:
-    """Print the requests that one poll takes, and why each ends where it does; nothing is sent.
+    """Print the requests of one poll, and why each request ends; nothing is sent.
 
-    For a configuration FILE these are the requests of its devices; options take the place of what
-    it says. For the URL of a device they are those of the reads that --read gives.
+    With a configuration FILE, prints the requests of its devices; options override the file. With
+    the URL of a device, prints the requests for the ranges of --read.
 
-    Exit codes: 0 done, 2 wrong usage or a wrong configuration.
+    Exit codes: 0 done, 2 wrong usage or an invalid configuration.
     """
     if rules["max_gap"] is not None and rules["cost"] is not None:
-        raise click.UsageError("--max-gap and --cost exclude each other.")
+        raise click.UsageError("--max-gap and --cost can't be used together.")
     if fill is not None and preset != "max_insert":
-        raise click.UsageError("--fill goes with --preset max_insert.")
+        raise click.UsageError("--fill requires --preset max_insert.")
     given = {key: value for key, value in rules.items() if value not in (None, ())}
     try:
         if device.is_url(target):
@@ -143,7 +158,7 @@ def plan(
 
 
 class _Shown:
-    """A plan, and whose it is."""
+    """A plan and its device."""
 
     def __init__(
         self, plan: Plan, rules: Rules, url: str, name: str | None, of: DeviceConfig | None
@@ -167,9 +182,9 @@ def _of_url(
 ) -> _Shown:
     device.checked_url(url)
     if names:
-        raise click.UsageError("--device goes with FILE.")
+        raise click.UsageError("--device requires FILE.")
     if not reads:
-        raise click.UsageError("A URL needs --read, once or more.")
+        raise click.UsageError("URL requires at least one --read.")
     rules: Rules = {**given}  # type: ignore[typeddict-item]
     return _Shown(planning.plan(reads, rules), rules, url, None, None)
 
@@ -178,14 +193,14 @@ def _of_file(
     file: Path, names: Sequence[str], reads: Sequence[Field], given: dict[str, Any]
 ) -> Iterator[_Shown]:
     if reads:
-        raise click.UsageError("--read goes with URL: FILE says what is read.")
+        raise click.UsageError("--read requires URL: FILE has its own reads.")
     devices = load_or_exit(file).devices
     if not devices:
         raise click.UsageError(f"{file} has no devices.")
     for name in names or devices:
         if name not in devices:
             known = ", ".join(devices)
-            raise click.UsageError(f"{file} has no device {name!r}, allowed are {known}.")
+            raise click.UsageError(f"{file} has no device {name!r}, allowed: {known}.")
         settings = devices[name]
         rules = planning.rules(settings)
         if given.keys() & {"max_gap", "cost"}:
@@ -196,7 +211,7 @@ def _of_file(
 
 
 def _compared(preset: Preset | None, fill: int | None, shown: _Shown) -> dict[str, Any] | None:
-    """What another rule would ask for."""
+    """The number of requests by another rule."""
     if preset is None:
         return None
     holes = {"fill": FILL if fill is None else fill} if preset == "max_insert" else {}
@@ -205,7 +220,7 @@ def _compared(preset: Preset | None, fill: int | None, shown: _Shown) -> dict[st
 
 
 def _told(shown: _Shown, compared: dict[str, Any] | None) -> dict[str, Any]:
-    """A plan for programs."""
+    """A plan for JSON."""
     plan = shown.plan
     whose: dict[str, Any] = {"url": shown.url}
     if shown.of is not None:
@@ -237,9 +252,9 @@ def _place(area: Area, address: int, count: int) -> dict[str, Any]:
 
 
 def _lines(shown: _Shown, compared: dict[str, Any] | None) -> list[str]:
-    """A plan for people."""
+    """A plan as text."""
     plan = shown.plan
-    head = ["area", "address", "count", "reads", "holes"]
+    head = ["area", "address", "count", "reads", "gaps"]
     priced = plan.cost is not None
     rows = [
         [*_cells(block), *([f"{block.cost:g}"] if priced else []), block.ends]
@@ -280,7 +295,7 @@ def _span(at: int, count: int) -> str:
 def _summary(plan: Plan) -> str:
     parts = [showing.counted(len(plan.blocks), "request")]
     if plan.unwanted:
-        parts.append(f"{plan.unwanted} read that nothing wants")
+        parts.append(f"{showing.counted(plan.unwanted, 'extra address')} read")
     if plan.cost is not None:
         parts.append(f"{plan.cost:g} ms")
     return ", ".join(parts)

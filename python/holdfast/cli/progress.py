@@ -1,4 +1,4 @@
-"""How far something is that takes long: a bar on standard error, if that is a terminal."""
+"""A progress bar on standard error, if that is a terminal."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     Advance: TypeAlias = Callable[[int], None]
 
 BETWEEN = 0.1
-"""Seconds between two looks of the bar."""
+"""Seconds between updates of the bar."""
 
 
 @contextlib.contextmanager
 def bar(label: str, length: int, note: Callable[[], str]) -> Iterator[Advance | None]:
-    """A function to be told how far it is, of `length`; `None` where nobody would see it."""
+    """Yields a function that sets the progress, from 0 to `length`; `None` without a terminal."""
     if not sys.stderr.isatty():
         yield None
         return

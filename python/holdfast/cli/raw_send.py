@@ -1,4 +1,4 @@
-"""`holdfast raw-send`: one Raw Ingest packet."""
+"""`holdfast raw-send`: sends one Raw Ingest packet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from holdfast.cli.places import number
 from holdfast.protocol import MAX_WORD
 from holdfast.types import AREAS, Area
 
-# Everything that may stand between two values of a file.
+# Separators between values in a file.
 SEPARATORS = re.compile(r"[\s,;]+")
 
 
@@ -33,12 +33,12 @@ def _word(text: str) -> int:
 
 
 def _receiver(text: str) -> tuple[str, int]:
-    """Host and port; an IPv6 address without its brackets."""
+    """Parses HOST:PORT; returns an IPv6 address without brackets."""
     host, _, digits = text.rpartition(":")
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]
     elif ":" in host:
-        raise click.BadParameter(f"{text!r}: an IPv6 address goes in brackets, as in [::1]:9000.")
+        raise click.BadParameter(f"{text!r}: an IPv6 address requires brackets, as in [::1]:9000.")
     port = number(digits)
     if not host or port is None:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
@@ -54,26 +54,30 @@ def _receiver(text: str) -> tuple[str, int]:
 @click.argument("area", type=click.Choice(AREAS), metavar="AREA")
 @click.argument("address", type=_word)
 @click.argument("values", metavar="[VALUE]...", nargs=-1, type=_integer)
-@click.option("--unit", type=_word, metavar="N", help="Unit id: the packet is of format v1.")
+@click.option("--unit", type=_word, metavar="N", help="Unit id; selects format v1.")
+@click.option("--memory-id", type=_word, metavar="N", help="Memory id; selects format crc.")
 @click.option(
-    "--memory-id", type=_word, metavar="N", help="Memory id: the packet is of format crc."
+    "--no-crc",
+    is_flag=True,
+    help="With --memory-id: omit the CRC, for a listener with `crc: none`.",
 )
-@click.option("--no-crc", is_flag=True, help="Format crc, for a listener with `crc: none`.")
 @click.option(
-    "--file", type=click.File(encoding="utf-8"), help="Take the values from a file, or from - ."
+    "--file",
+    type=click.File(encoding="utf-8"),
+    help="Read the values from a file; -: standard input.",
 )
-@click.option("--hex", "payload", metavar="BYTES", help="Take the payload as it is on the wire.")
-@click.option("--count", type=_word, metavar="N", help="How many bits --hex has.")
+@click.option("--hex", "payload", metavar="BYTES", help="Payload as on the wire, in hex.")
+@click.option("--count", type=_word, metavar="N", help="Number of bits in --hex.")
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
     default=raw_ingest.TIMEOUT,
     show_default=True,
     metavar="SECONDS",
-    help="For connection, packet and reply together.",
+    help="Time limit for connection, packet and reply together.",
 )
 @click.option("--dry-run", is_flag=True, help="Print the packet in hex and send nothing.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
 def raw_send(
     receiver: tuple[str, int],
     area: Area,
@@ -89,21 +93,21 @@ def raw_send(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Write VALUEs to AREA from ADDRESS on, all in one step, with one Raw Ingest packet.
+    """Write VALUEs to AREA, starting at ADDRESS, in one step with one Raw Ingest packet.
 
     AREA is coils, discrete_inputs, holding_registers or input_registers. Numbers are decimal or 0x.
-    A file has the values on lines, or separated by commas, semicolons or spaces.
+    Values in a file are separated by line ends, spaces, commas or semicolons.
 
-    Exit codes: 0 written, 1 refused or not known to be written, 2 wrong usage.
+    Exit codes: 0 written, 1 refused or possibly not written, 2 wrong usage.
     """
     if (unit is None) == (memory_id is None):
-        raise click.UsageError("Give --unit (format v1) or --memory-id (format crc).")
+        raise click.UsageError("Give either --unit (format v1) or --memory-id (format crc).")
     if no_crc and memory_id is None:
-        raise click.UsageError("--no-crc goes with --memory-id.")
+        raise click.UsageError("--no-crc requires --memory-id.")
     if bool(values) + (file is not None) + (payload is not None) != 1:
-        raise click.UsageError("Give VALUEs, --file or --hex, one of them.")
+        raise click.UsageError("Give exactly one of VALUEs, --file and --hex.")
     if count is not None and payload is None:
-        raise click.UsageError("--count goes with --hex.")
+        raise click.UsageError("--count requires --hex.")
     try:
         packet = raw_ingest.encode(
             area,
@@ -147,7 +151,7 @@ def _reason(error: raw_ingest.RawError) -> str:
 
 
 def _values(file: IO[str]) -> list[int]:
-    """The values of a file; raises `ValueError` with the line of the first that is none."""
+    """Reads values from a file. Raises `ValueError` with the line of the first invalid value."""
     values: list[int] = []
     try:
         for line, text in enumerate(file, 1):
@@ -162,7 +166,7 @@ def _values(file: IO[str]) -> list[int]:
             if len(values) > MAX_WORD:
                 raise ValueError(f"{file.name} has more than {MAX_WORD} values")
     except UnicodeDecodeError:
-        raise ValueError(f"{file.name} is not text in UTF-8") from None
+        raise ValueError(f"{file.name} is not UTF-8 text") from None
     return values
 
 
@@ -170,4 +174,4 @@ def _bytes(payload: str) -> bytes:
     try:
         return bytes.fromhex(payload)
     except ValueError:
-        raise ValueError(f"--hex is {payload[:40]!r}, allowed are pairs of hex digits") from None
+        raise ValueError(f"--hex is {payload[:40]!r}, allowed: pairs of hex digits") from None

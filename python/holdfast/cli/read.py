@@ -1,4 +1,4 @@
-"""`holdfast read`: values of a device, once or again and again."""
+"""`holdfast read`: reads values of a device, once or repeatedly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 BITS_A_LINE = 16
 WIDEST = 14
-"""The width of a column of typed values, where lines follow each other."""
+"""The minimum width of a column of typed values with `--every`."""
 
 
 @click.command(
@@ -40,14 +40,14 @@ WIDEST = 14
     shell_complete=places.complete,
 )
 @typed_options
-@click.option("--count", type=click.IntRange(1, ADDRESSES), metavar="N", help="The same as COUNT.")
+@click.option("--count", type=click.IntRange(1, ADDRESSES), metavar="N", help="Same as COUNT.")
 @click.option(
-    "--every", type=device.seconds, metavar="SECONDS", help="Read again and again, until Ctrl-C."
+    "--every", type=device.seconds, metavar="SECONDS", help="Repeat the read until Ctrl-C."
 )
 @click.option(
-    "--times", type=click.IntRange(1), metavar="N", help="With --every: so many times, then end."
+    "--times", type=click.IntRange(1), metavar="N", help="With --every: stop after N reads."
 )
-@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as 40001 or 4x0001.")
+@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as in 40001 or 4x0001.")
 @device.device_options
 @device.json_option
 def read(
@@ -64,20 +64,19 @@ def read(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Read COUNT values, 1 if not given, from ADDRESS on in AREA of the device at URL.
+    """Read COUNT values (default: 1) from AREA of the device at URL, starting at ADDRESS.
 
-    AREA is coils, discrete_inputs, holding_registers or input_registers; co, di, hr, ir or any
-    beginning that only one of them has will do. ADDRESS counts from 0, decimal or 0x. With
-    --modicon it is 40001, 400001 or 4x0001, which counts from 1 and names the area (0, 1, 3, 4), so
-    that AREA can be left out.
+    AREA is coils, discrete_inputs, holding_registers or input_registers; co, di, hr, ir, or any
+    unambiguous prefix. ADDRESS counts from 0, decimal or 0x. With --modicon, it is 40001, 400001 or
+    4x0001, which counts from 1 and includes the area (0, 1, 3, 4), so AREA is optional.
 
     URL is tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502,
     rtu:///dev/ttyUSB0?baud=19200 or ascii:///dev/ttyUSB0.
 
-    Exit codes: 0 read, 1 not all could be read, 2 wrong usage.
+    Exit codes: 0 all values read, 1 some values not read, 2 wrong usage.
     """
     if times is not None and every is None:
-        raise click.UsageError("--times goes with --every.")
+        raise click.UsageError("--times requires --every.")
     place, left = places.taken(words, modicon=modicon)
     query = _query(place, _count(left, count), kind, order, encoding)
     told = {"url": url, "unit": unit, **query.told()}
@@ -97,11 +96,11 @@ def read(
 
 
 def _count(words: Sequence[str], count: int | None) -> int:
-    """The number of values that is asked for."""
+    """The number of requested values."""
     if count is None or len(words) > 1:
         return places.counted(words)
     if words:
-        raise click.UsageError("COUNT and --count are the same, give one of them.")
+        raise click.UsageError("COUNT and --count are the same: give only one.")
     return count
 
 
@@ -111,14 +110,14 @@ def _query(place: Place, count: int, kind: str | None, order: str, encoding: str
     if place.address + query.size > ADDRESSES:
         items = showing.counted(query.size, query.noun)
         raise click.UsageError(
-            f"{items} from {place.address} on: the last address is {LAST_ADDRESS}."
+            f"{items} from address {place.address} exceed the last address, {LAST_ADDRESS}."
         )
     return query
 
 
 @dataclass(frozen=True)
 class _Query:
-    """What is read, and how it is shown."""
+    """What to read, and how to print it."""
 
     place: Place
     size: int
@@ -137,7 +136,7 @@ class _Query:
         return device.read_raw(client, self.place.area, self.place.address, self.size)
 
     def told(self) -> dict[str, object]:
-        """What is asked for, for programs."""
+        """The query for JSON."""
         told: dict[str, object] = {
             "area": self.place.area,
             "address": self.place.address,
@@ -148,7 +147,7 @@ class _Query:
         return told
 
     def found(self, raw: Sequence[int]) -> dict[str, object]:
-        """What came, for programs."""
+        """The values for JSON."""
         items: dict[str, object] = {f"{self.noun}s": list(raw)}
         if self.typed is not None:
             found = self.typed.decode(raw)
@@ -166,13 +165,13 @@ class _Query:
         return items
 
     def undecodable(self, raw: Sequence[int]) -> bool:
-        """Whether there is something that is no value of the type."""
+        """Whether some registers are not a valid value of the type."""
         if self.typed is None:
             return False
         return any(isinstance(each, ConversionError) for each in self.typed.decode(raw))
 
     def lines(self, raw: Sequence[int]) -> list[str]:
-        """What came, as a table."""
+        """The values as a table."""
         if self.typed is not None:
             return self._values(raw)
         return self._bits(raw) if self.of_bits else self._registers(raw)
@@ -216,12 +215,12 @@ class _Query:
         return str(first) if width == 1 else f"{first}-{first + width - 1}"
 
     def columns(self) -> list[str]:
-        """The heads of the columns, where every reading is a line."""
+        """The column headings, for one line per reading."""
         step = 1 if self.typed is None else self.typed.width
         return [str(self.place.address + at) for at in range(0, self.size, step)]
 
     def cells(self, raw: Sequence[int]) -> list[str]:
-        """The columns of a reading."""
+        """The cells of a reading, for one line per reading."""
         if self.typed is None:
             return [str(int(each)) for each in raw]
         return [
@@ -237,7 +236,7 @@ def _again(
     every: float,
     times: int | None,
 ) -> int:
-    """Reads at every tick; the exit code. Errors are shown, and it goes on."""
+    """Reads at every tick and returns the exit code. Prints errors and continues."""
     code = 0
     lines = _Lines(query)
     try:
@@ -263,7 +262,7 @@ def _again(
 
 
 class _Lines:
-    """Every reading a line, what has changed highlighted."""
+    """Prints one line per reading, with changes highlighted."""
 
     def __init__(self, query: _Query) -> None:
         self._query = query
@@ -271,7 +270,7 @@ class _Lines:
         self._widths: list[int] = []
 
     def reading(self, raw: Sequence[int]) -> None:
-        """The line of a reading; before the first, the heads."""
+        """Prints a reading; the column headings come before the first one."""
         cells = self._query.cells(raw)
         if not self._widths:
             self._begin(cells)
@@ -284,7 +283,7 @@ class _Lines:
         click.echo("  ".join([showing.clock(), *columns]).rstrip())
 
     def wrong(self, error: ModbusError) -> None:
-        """The line of a reading that failed."""
+        """Prints a failed reading."""
         click.echo(f"{showing.clock()}  {showing.styled(str(error), fg='red')}")
 
     def _begin(self, cells: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""`holdfast run`: the appliance, until a signal ends it."""
+"""`holdfast run`: runs an appliance until a signal."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
         SerialRuleConfig,
     )
 
-# How long a signal may wait until it is noticed, in seconds.
+# Maximum delay of the reaction to a signal, in seconds.
 JOIN_TIMEOUT = 0.2
 
-# Devices that the greeting names.
+# Maximum number of devices in the greeting.
 MAX_DEVICES = 10
 
-# The number that mbpoll gives each area, registers first: they show more.
+# mbpoll's number for each area. Registers come first, as they are the better example.
 MBPOLL_TYPES = {
     area: number
     for preferred in (REGISTER_AREAS, BIT_AREAS)
@@ -57,10 +57,10 @@ MBPOLL_TYPES = {
 @click.command(epilog="Example: holdfast run examples/plant.yaml")
 @click.argument("file", type=click.Path(path_type=Path))
 def run(file: Path) -> None:
-    """Run the appliance that FILE describes.
+    """Run the appliance with the configuration FILE.
 
-    Prints what listens where and what is polled, then serves until Ctrl-C or SIGTERM. Exit codes:
-    0 stopped by a signal, 1 a listener could not be bound, 2 the configuration has errors.
+    Prints listeners and polled devices, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped
+    by a signal, 1 can't bind a listener, 2 the configuration has errors.
     """
     config = load_or_exit(file)
     logs.configure(config.log.level, config.log.format)
@@ -85,7 +85,7 @@ def run(file: Path) -> None:
 
 
 def _connections(config: Config) -> int:
-    """The most connections that it may have at once."""
+    """The maximum number of open connections of a configuration."""
     served = [*config.listeners.values(), config.rest]
     most = sum(getattr(each, "max_connections", 0) for each in served)
     most += sum(1 + len(device.forward) for device in config.devices.values())
@@ -97,7 +97,7 @@ def _connections(config: Config) -> int:
 
 
 class Signals:
-    """Notes that SIGINT or SIGTERM came; a second one ends the process at once."""
+    """Records SIGINT and SIGTERM. The second signal ends the process at once."""
 
     def __init__(self) -> None:
         self.received = False
@@ -112,7 +112,7 @@ class Signals:
 def _explained(error: OSError) -> str:
     text = error.strerror or str(error)
     if error.errno == errno.EACCES:
-        text += " (ports below 1024 need a privilege, on Linux CAP_NET_BIND_SERVICE)"
+        text += " (ports below 1024 require a privilege, on Linux CAP_NET_BIND_SERVICE)"
     return text
 
 
@@ -149,14 +149,14 @@ def _address(endpoint: ListenAddress) -> str:
 
 
 def _polled(device: DeviceConfig) -> str:
-    """What becomes of a device, in a line."""
+    """The polling of a device, in one line."""
     if not device.enabled:
         return f"{device.url} unit {device.unit}, not polled"
     return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
 
 
 def _reached(gateway: GatewayConfig) -> str:
-    """What the gateway lets whom do, in a line."""
+    """The access that the gateway gives, in one line."""
     can = "reads and writes" if gateway.access == "read-write" else "reads"
     sources = ", ".join(map(str, gateway.sources))
     tokens = "no tokens" if gateway.tokens == "none" else "a token each"
@@ -164,13 +164,13 @@ def _reached(gateway: GatewayConfig) -> str:
 
 
 def _scanned(nats: NatsConfig) -> str:
-    """What the scanner does for whom, in a line."""
+    """The devices and subject of the scanner, in one line."""
     devices = ", ".join(map(written_pollable, nats.devices))
     return f"polls and writes {devices} for subscribers at {nats.prefix}.subscribe"
 
 
 def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
-    """What a rule lets whom do, in a line."""
+    """The access that a rule gives, in one line."""
     units = ", ".join(f"{unit} = {memory}" for unit, memory in rule.units.items())
     to = f"units {units}" if units else f"memories {', '.join(getattr(rule, 'memories', ()))}"
     rights = getattr(rule, "access", None) or f"writes {', '.join(getattr(rule, 'areas', ()))}"
@@ -181,7 +181,7 @@ def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
 
 
 def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Path) -> list[str]:
-    """Commands that work on this appliance: a read, a write where one is allowed, the check."""
+    """Example commands for this appliance: a read, a write if one is allowed, the check."""
     check = f"{_program()} check {shlex.quote(str(file))}"
     for endpoint in endpoints:
         if not isinstance(endpoint.settings, ModbusTcpListener):
@@ -206,7 +206,7 @@ def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Pat
 
 
 def _program() -> str:
-    """How this program was called, or its path where a shell would not find it."""
+    """The name with which this program was called, or its path if a shell can't find it."""
     name = click.get_current_context().find_root().info_name or "holdfast"
     if name == "holdfast" and shutil.which(name) is None:
         return shlex.quote(os.path.relpath(sys.argv[0]))

@@ -1,4 +1,4 @@
-"""`holdfast scan`: the scanner, until a signal or a message ends it."""
+"""`holdfast scan`: runs the scanner until a signal or a shutdown message."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ DEFAULT_URL = f"nats://127.0.0.1:{SERVER_PORT}"
 FAILED = 1
 
 WATCHED = 1.0
-"""Seconds between looks whether an embedded server still runs."""
+"""Seconds between checks that the embedded server is running."""
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
 def _servers(text: str) -> list[str]:
-    """The URLs of servers in a text with commas; without a scheme they are nats://."""
+    """Parses a comma-separated list of server URLs. Default scheme: nats://."""
     urls = []
     for part in filter(None, map(str.strip, text.split(","))):
         url = part if "://" in part else f"nats://{part}"
@@ -62,7 +62,7 @@ def _servers(text: str) -> list[str]:
 
 
 def _server(url: str) -> Remote:
-    """Where a server is. A user and a password may stand before the host, and port 0 is any."""
+    """Parses a server URL. A user and password before the host, and port 0, are allowed."""
     scheme, mark, rest = url.removesuffix("/").partition("://")
     return parse_server(f"{scheme}{mark}{rest.rpartition('@')[2]}", least_port=0)
 
@@ -87,23 +87,23 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     multiple=True,
     type=_servers,
     metavar="URL",
-    help=f"NATS server; can be repeated. [env: NATS_SERVERS, with commas; default: {DEFAULT_URL}]",
+    help=f"NATS server; repeatable. [env: NATS_SERVERS, comma-separated; default: {DEFAULT_URL}]",
 )
 @click.option(
-    "--embedded", is_flag=True, help="Start a NATS server too, on the loopback interface."
+    "--embedded", is_flag=True, help="Also start a NATS server, on the loopback interface."
 )
 @click.option(
     "--store",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="FOLDER",
-    help="With --embedded: where JetStream keeps its data; a temporary folder if not given.",
+    help="With --embedded: folder for JetStream data.  [default: a temporary folder]",
 )
 @click.option(
     "--allow",
     multiple=True,
     metavar="NETWORK",
-    help="Devices that may be subscribed to: a network, an address or a serial device; can be "
-    "repeated. Without a network, private and loopback addresses.",
+    help="Devices that subscribers may poll: a network, an address or a serial device; "
+    "repeatable. Without a network: private and loopback addresses.",
 )
 @click.option(
     "--prefix",
@@ -113,11 +113,13 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     metavar="SUBJECT",
     help="First part of all subjects.",
 )
-@click.option("--user", metavar="NAME", help="User at the NATS server.")
-@click.option("--password-file", type=FILE, metavar="FILE", help="Holds the user's password.")
-@click.option("--token-file", type=FILE, metavar="FILE", help="Holds a token for the NATS server.")
-@click.option("--creds", type=FILE, metavar="FILE", help="Holds a user's JWT and seed.")
-@tls_options("tls", "Authorities that sign the server.")
+@click.option("--user", metavar="NAME", help="User name for the NATS server.")
+@click.option("--password-file", type=FILE, metavar="FILE", help="File with the user's password.")
+@click.option(
+    "--token-file", type=FILE, metavar="FILE", help="File with a token for the NATS server."
+)
+@click.option("--creds", type=FILE, metavar="FILE", help="File with a user's JWT and seed.")
+@tls_options("tls", "Trusted authorities for the NATS server.")
 @tls_options("device", DEVICES, " for devices")
 @click.option(
     "--max-devices",
@@ -132,7 +134,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     default=ScannerLimits.tags,
     show_default=True,
     metavar="N",
-    help="Of all devices.",
+    help="Tags of all devices.",
 )
 @click.option(
     "--log-level",
@@ -149,21 +151,21 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     is_eager=True,
     expose_value=False,
     callback=_print_schema,
-    help="Print the JSON Schema of all messages and end.",
+    help="Print the JSON Schema of all messages and exit.",
 )
 def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **options: Any) -> None:
-    """Poll Modbus devices for whoever subscribes over NATS.
+    """Poll Modbus devices for NATS subscribers.
 
-    Devices are connected to when somebody subscribes to their tags, and let go with the last
-    subscriber. Serves until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. Exit codes: 0 ended,
-    1 failed, 2 wrong usage.
+    Connects to a device when a client subscribes to its tags, and disconnects after the last
+    subscriber leaves. Runs until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. Exit codes: 0
+    stopped, 1 failed, 2 wrong usage.
     """
     urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
     trust = _tls("device", options)
     allow = _allowed(options["allow"])
     if store is not None and not embedded:
-        raise click.UsageError("--store goes with --embedded.")
+        raise click.UsageError("--store requires --embedded.")
     logs.configure(options["log_level"], options["log_format"])
     limits = ScannerLimits(devices=options["max_devices"], tags=options["max_tags"])
     allow_open_files(limits.connections)
@@ -183,7 +185,7 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
 
 
 def _allowed(entries: tuple[str, ...]) -> tuple[AllowEntry, ...]:
-    """Whom subscribers may have polled: without a network, private and loopback addresses too."""
+    """The devices that subscribers may poll. Without a network, adds private addresses."""
     try:
         listed = tuple(map(parse_pollable, entries))
     except ValueError as error:
@@ -193,13 +195,13 @@ def _allowed(entries: tuple[str, ...]) -> tuple[AllowEntry, ...]:
 
 
 def _identity(urls: tuple[str, ...], options: dict[str, Any]) -> Servers:
-    """The servers, and who we are there; a usage error for what does not go together."""
+    """The servers and credentials. Raises a usage error for conflicting options."""
     if options["password_file"] is not None and options["user"] is None:
-        raise click.UsageError("--password-file goes with --user.")
+        raise click.UsageError("--password-file requires --user.")
     ways = [key for key in ("user", "token_file", "creds") if options[key] is not None]
     if len(ways) > 1:
         given = " and ".join(f"--{key.replace('_', '-')}" for key in ways)
-        raise click.UsageError(f"{given} exclude each other.")
+        raise click.UsageError(f"{given} can't be used together.")
     return Servers(
         urls,
         options["user"],
@@ -215,12 +217,12 @@ def _tls(prefix: str, options: dict[str, Any]) -> Tls:
 
 
 def _embedded_port(servers: Servers) -> int:
-    """The port that an embedded server is to have."""
+    """The port for the embedded server."""
     parts = urlsplit(servers.urls[0])
     plain = servers == Servers(servers.urls) and parts.username is None and parts.scheme == "nats"
     if len(servers.urls) > 1 or parts.hostname not in (HOST, "localhost") or not plain:
-        allowed = f"--embedded serves at {HOST} only, to whoever is on this machine"
-        raise click.UsageError(f"{allowed}: --nats may name a port there, as in {DEFAULT_URL}.")
+        allowed = f"--embedded only serves at {HOST}, without credentials"
+        raise click.UsageError(f"{allowed}: --nats can only set its port, as in {DEFAULT_URL}.")
     return SERVER_PORT if parts.port is None else parts.port
 
 
@@ -229,7 +231,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
     loop = asyncio.get_running_loop()
 
     def end(number: int, _: object) -> None:
-        signal.signal(number, signal.SIG_DFL)  # A second one ends the process at once.
+        signal.signal(number, signal.SIG_DFL)  # The second signal ends the process at once.
         loop.call_soon_threadsafe(scanner.end)
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -251,7 +253,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
 def _greeting(settings: Settings) -> str:
     prefix = settings.prefix
     lines = [
-        f"Scanning for whoever subscribes at {', '.join(_without_secrets(settings.servers))}.",
+        f"Scanning for subscribers at {', '.join(_without_secrets(settings.servers))}.",
         "",
         f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse",
         f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",

@@ -1,4 +1,4 @@
-"""`holdfast schema`: the JSON Schema of a configuration, for editors."""
+"""`holdfast schema`: prints the JSON Schema of a configuration, for editors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from holdfast.config import json_schema
 def schema() -> None:
     """Print the JSON Schema of a configuration, for editors.
 
-    With the YAML language server, a configuration then begins with the line
+    For the YAML language server, start the configuration with the line
     `# yaml-language-server: $schema=holdfast.schema.json`.
     """
     click.echo(json.dumps(json_schema(), indent=2))

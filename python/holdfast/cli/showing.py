@@ -1,4 +1,4 @@
-"""What people see: aligned tables, colour where it is wanted, text that can do no harm."""
+"""Text output: aligned tables, colour, and text from outside without control characters."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def styled(text: str, **style: Any) -> str:
-    """Text with colour, unless NO_COLOR is set; off a terminal `click.echo` removes it."""
+    """Text with colour, unless NO_COLOR is set. Without a terminal, `click.echo` removes it."""
     return text if os.environ.get("NO_COLOR") else click.style(text, **style)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> list[str]:
-    """Lines with aligned columns, the head first; a letter of `align` each, `>` is to the right."""
+    """Lines with aligned columns, headings first. `align` has a `<` or `>` per column."""
     cells = [list(head), *map(list, rows)]
     widths = [max(len(click.unstyle(row[at])) for row in cells) for at in range(len(head))]
     sides = align.ljust(len(head), "<")
@@ -47,12 +47,12 @@ def counted(count: int, noun: str) -> str:
 
 
 def words(area: str) -> str:
-    """The name of an area, or of a key, for people."""
+    """The name of an area or key, with spaces."""
     return area.replace("_", " ")
 
 
 def plain(text: str) -> str:
-    """Text from outside, with nothing in it that a terminal acts upon."""
+    """Text from outside, with control characters escaped."""
     return "".join(letter if letter.isprintable() else _escaped(letter) for letter in text)
 
 
@@ -62,7 +62,7 @@ def _escaped(letter: str) -> str:
 
 
 def shown(value: Any, kind: str) -> str:
-    """A typed value for people."""
+    """A typed value as text."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -75,7 +75,7 @@ def shown(value: Any, kind: str) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """A typed value for programs: bytes in hex, and `None` for what JSON has no number for."""
+    """A typed value for JSON: bytes in hex, `None` for NaN and infinity."""
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, float) and not math.isfinite(value):
@@ -84,7 +84,7 @@ def jsonable(value: Any) -> Any:
 
 
 def fits(text: str) -> bool:
-    """Whether standard output can show these letters."""
+    """Whether standard output can encode the text."""
     try:
         text.encode(sys.stdout.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -93,10 +93,10 @@ def fits(text: str) -> bool:
 
 
 def clock() -> str:
-    """The time of day, for people."""
+    """The local time of day."""
     return datetime.datetime.now().strftime("%H:%M:%S.%f")[:-3]
 
 
 def timestamp() -> str:
-    """The time, for programs."""
+    """The time in UTC, for JSON."""
     return logs.timestamp(time.time())

@@ -1,4 +1,4 @@
-"""Where `holdfast watch` reads: a device, or the memories of an appliance that runs."""
+"""The sources of `holdfast watch`: a device, or the memories of a running appliance."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 MAX_ADDRESSES = 8192
-"""Addresses that are watched at most: more nobody can look at, and reading them takes long."""
+"""Maximum number of watched addresses: nobody can look at more, and reading them is slow."""
 
 
 @dataclass(frozen=True)
 class WatchedRange:
-    """A range of addresses that is watched."""
+    """A watched range of addresses."""
 
     memory: str | None
-    """Its memory; a device has none."""
+    """The memory; `None` for a device."""
     unit: int
-    """The unit id that a device, or a listener, knows it by."""
+    """The unit id of the device, or of the memory at the listener."""
     area: Area
     address: int
     count: int
 
 
 class Unreadable(Exception):
-    """The source answered that it would not, in words."""
+    """The source answered with an error."""
 
 
 class Unwatchable(Exception):
-    """A configuration whose appliance can't be watched, and why."""
+    """The appliance of a configuration can't be watched."""
 
 
 class Source(Protocol):
-    """What is watched. `read` raises `ModbusError`, `Unreadable` or `OSError`."""
+    """A source of values. `read` raises `ModbusError`, `Unreadable` or `OSError`."""
 
     where: str
     blocks: list[WatchedRange]
 
     def read(self) -> list[list[int]]:
-        """The values of each block."""
+        """Reads the values of each block."""
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Closes the connection."""
 
 
 class DeviceSource:
@@ -70,14 +70,14 @@ class DeviceSource:
         self._client = client
 
     def read(self) -> list[list[int]]:
-        """The values of each block."""
+        """Reads the values of each block."""
         return [
             read_raw(self._client, block.area, block.address, block.count, unit=block.unit)
             for block in self.blocks
         ]
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Closes the connection."""
         self._client.close()
 
 
@@ -95,14 +95,14 @@ class Rest:
         )
 
     def read(self) -> list[list[int]]:
-        """The values of each block."""
+        """Reads the values of each block."""
         try:
             return [self._values(block) for block in self.blocks]
         except (OSError, http.client.HTTPException, ValueError, KeyError) as error:
             self.close()
             if isinstance(error, OSError):
                 raise
-            raise Unreadable(f"not an answer of REST: {error!r}") from error
+            raise Unreadable(f"invalid REST reply: {error!r}") from error
 
     def _values(self, block: WatchedRange) -> list[int]:
         query = {
@@ -122,23 +122,23 @@ class Rest:
         return values
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Closes the connection."""
         self._connection.close()
 
 
 def by_rest(config: Config, token: str | None) -> list[WatchedRange]:
-    """The memories that a token lets one read. Raises `Unwatchable`."""
+    """The memories that the token may read. Raises `Unwatchable`."""
     rest = config.rest
     assert rest is not None
     _check_port("rest", rest.bind)
     memories, areas = set(config.memories), set(AREAS)
     if rest.tokens != "none":
         if token is None:
-            raise Unwatchable("rest asks for a token; give it in HOLDFAST_TOKEN")
+            raise Unwatchable("rest requires a token: set HOLDFAST_TOKEN")
         digest = hashlib.sha256(token.encode()).hexdigest()
         granted = [each for each in rest.tokens if each.sha256.lower() == digest]
         if not granted:
-            raise Unwatchable("rest knows no token like that in HOLDFAST_TOKEN")
+            raise Unwatchable("rest does not accept the token in HOLDFAST_TOKEN")
         memories, areas = set(granted[0].memories), set(granted[0].areas)
     return [
         block
@@ -150,20 +150,20 @@ def by_rest(config: Config, token: str | None) -> list[WatchedRange]:
 
 
 def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
-    """The first Modbus TCP listener, and the memories that it shows. Raises `Unwatchable`."""
+    """The first Modbus TCP listener, and its readable memories. Raises `Unwatchable`."""
     found = [
         (name, listener)
         for name, listener in config.listeners.items()
         if isinstance(listener, ModbusTcpListener)
     ]
     if not found:
-        raise Unwatchable("there is neither rest nor a listener of type modbus-tcp")
+        raise Unwatchable("found neither rest nor a listener of type modbus-tcp")
     name, listener = found[0]
     _check_port(f"listener {name}", listener.bind)
     host = parse_address(reachable(listener.bind.host))
     rules = [rule for rule in listener.rules if holds(rule.sources, host)]
     if not rules:
-        raise Unwatchable(f"no rule of listener {name} lets {host} in")
+        raise Unwatchable(f"no rule of listener {name} admits {host}")
     rule = rules[0]
     blocks: list[WatchedRange] = []
     seen: set[str] = set()
@@ -181,7 +181,7 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
 def within(
     blocks: Sequence[WatchedRange], area: Area, address: int, count: int
 ) -> list[WatchedRange]:
-    """What of blocks is in a range of an area."""
+    """The parts of blocks inside a range of an area."""
     found = []
     for block in blocks:
         first = max(block.address, address)
@@ -194,7 +194,7 @@ def within(
 def cut(
     blocks: Sequence[WatchedRange], most: int = MAX_ADDRESSES
 ) -> tuple[list[WatchedRange], int]:
-    """The first blocks that together have no more than `most` addresses; how many were cut off."""
+    """The first `most` addresses of the blocks, and how many addresses were cut off."""
     left, kept = most, []
     for block in blocks:
         count = min(block.count, left)
@@ -216,7 +216,7 @@ def _shown(bind: Bind) -> str:
 
 def _check_port(what: str, bind: Bind) -> None:
     if bind.port == 0:
-        raise Unwatchable(f"{what} is bound to port 0, so that its port is not known")
+        raise Unwatchable(f"the port of {what} is 0, so the port in use is not known")
 
 
 def _areas(config: Config, memory: str, unit: int) -> list[WatchedRange]:

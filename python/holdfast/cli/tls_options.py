@@ -1,4 +1,4 @@
-"""The options that name files of TLS, and what they come to."""
+"""The command-line options for TLS files."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound="Callable[..., Any]")
 
 DEVICES = (
-    "Who is trusted among devices with TLS: authorities, or devices themselves; without it the "
-    "system's authorities."
+    "Trusted certificates for devices: of authorities, or of devices themselves.  [default: the "
+    "system's authorities]"
 )
 FILE = click.Path(exists=True, dir_okay=False)
 
@@ -26,7 +26,7 @@ def tls_options(prefix: str, trusted: str, shown_to: str = "") -> Callable[[Comm
     def added(command: Command) -> Command:
         ca = click.option(f"--{prefix}-ca", type=FILE, metavar="FILE", help=trusted)
         cert = click.option(
-            f"--{prefix}-cert", type=FILE, metavar="FILE", help=f"Our certificate{shown_to}."
+            f"--{prefix}-cert", type=FILE, metavar="FILE", help=f"Client certificate{shown_to}."
         )
         key = click.option(f"--{prefix}-key", type=FILE, metavar="FILE", help="Its key.")
         return ca(cert(key(command)))
@@ -35,9 +35,9 @@ def tls_options(prefix: str, trusted: str, shown_to: str = "") -> Callable[[Comm
 
 
 def tls_of(prefix: str, ca: str | None, cert: str | None, key: str | None) -> Tls:
-    """The files that the options name. Raises `click.UsageError`."""
+    """The files of the options. Raises `click.UsageError`."""
     lonely = alone(cert=cert is not None, key=key is not None)
     if lonely is not None:
         given, missing = lonely
-        raise click.UsageError(f"--{prefix}-{given} goes with --{prefix}-{missing}.")
+        raise click.UsageError(f"--{prefix}-{given} requires --{prefix}-{missing}.")
     return Tls(ca, cert, key)

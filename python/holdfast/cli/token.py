@@ -1,4 +1,4 @@
-"""`holdfast token`: a secret for a client of REST or the gateway, and the entry that lets it in."""
+"""`holdfast token`: creates a secret for a client of REST or the gateway."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from holdfast.config.source import scalar
 
 BYTES = 32
 SHORT = 16
-"""Characters below which a secret can be guessed."""
+"""Secrets with fewer characters can be guessed."""
 
 _ENTRY = """\
     - name: {name}
@@ -33,21 +33,21 @@ _RIGHTS = """\
 
 
 @click.command(epilog="Example: holdfast token --name edge-gateway")
-@click.option("--name", default="edge-gateway", show_default=True, help="The name of the client.")
-@click.option("--stdin", is_flag=True, help="Take the secret from standard input.")
-@click.option("--gateway", is_flag=True, help="An entry for the gateway of a configuration.")
-@click.option("--line", is_flag=True, help="A line for a gateway's token file.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object for programs.")
+@click.option("--name", default="edge-gateway", show_default=True, help="Name of the client.")
+@click.option("--stdin", is_flag=True, help="Read the secret from standard input.")
+@click.option("--gateway", is_flag=True, help="Print an entry for gateway.tokens.")
+@click.option("--line", is_flag=True, help="Print a line for the token file of `holdfast gateway`.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
 def token(name: str, stdin: bool, gateway: bool, line: bool, as_json: bool) -> None:
-    """Make a secret for a client of REST, and the entry of the configuration that lets it in.
+    """Create a secret for a client of REST, and print its entry for the configuration.
 
-    The secret is shown once and kept nowhere: the configuration holds only its SHA-256. With
-    --stdin the secret is the one line of standard input, and is not shown again. With --gateway the
-    entry is one for the section `gateway`. With --line there is a line of a token file, for
-    `holdfast gateway`, and the secret goes to standard error.
+    The secret is printed once and not stored: the configuration contains only its SHA-256. With
+    --stdin, reads the secret as one line from standard input and does not print it. With --gateway,
+    prints an entry for the section `gateway`. With --line, prints a line for the token file of
+    `holdfast gateway`, and the secret on standard error.
     """
     if gateway + line + as_json > 1:
-        raise click.UsageError("--gateway, --line and --json don't go together.")
+        raise click.UsageError("--gateway, --line and --json can't be used together.")
     if not is_name(name):
         raise click.BadParameter(f"found {name!r}, allowed: {NAME_FORM}", param_hint="'--name'")
     secret = _read() if stdin else secrets.token_urlsafe(BYTES)
@@ -58,31 +58,31 @@ def token(name: str, stdin: bool, gateway: bool, line: bool, as_json: bool) -> N
         return
     if line:
         if not stdin:
-            click.echo(f"The secret, shown this once: {secret}", err=True)
+            click.echo(f"The secret, shown only once: {secret}", err=True)
         click.echo(f"{name} {digest}")
         return
     if not stdin:
-        click.echo(f"The secret, shown this once: {secret}\n")
-    click.echo(f"Under {'gateway' if gateway else 'rest'}.tokens in the configuration:\n")
+        click.echo(f"The secret, shown only once: {secret}\n")
+    click.echo(f"Add under {'gateway' if gateway else 'rest'}.tokens in the configuration:\n")
     entry = _ENTRY.format(name=_quoted(name), digest=digest)
     click.echo(entry if gateway else entry + _RIGHTS, nl=False)
 
 
 def _read() -> str:
-    """The secret from standard input, without the line's end; on a terminal it is not shown."""
+    """Reads the secret from standard input, without the line end; a terminal does not show it."""
     if sys.stdin.isatty():
         ask = functools.partial(click.prompt, "Secret", hide_input=True, err=True)
         secret = str(ask(default="", show_default=False))
     else:
         secret = _decoded(sys.stdin.buffer.read())
     if not secret:
-        _refuse("standard input holds no secret")
+        _refuse("standard input has no secret")
     if re.search(r"[\r\n]", secret):
-        _refuse("standard input holds more than one line, allowed: the secret alone")
+        _refuse("standard input has more than one line, allowed: only the secret")
     if not re.fullmatch(r"[!-~]+", secret):
-        _warn("the secret has other characters than visible ASCII, which many clients can't send")
+        _warn("the secret has characters other than visible ASCII; many clients can't send them")
     if len(secret) < SHORT:
-        _warn(f"the secret has fewer than {SHORT} characters, and can be guessed")
+        _warn(f"the secret has fewer than {SHORT} characters and can be guessed")
     return secret
 
 
@@ -103,5 +103,5 @@ def _warn(message: str) -> None:
 
 
 def _quoted(name: str) -> str:
-    """The name as YAML reads it as text."""
+    """The name, quoted if YAML would not read it as the same text."""
     return name if PLAIN.fullmatch(name) and scalar(name) == name else json.dumps(name)

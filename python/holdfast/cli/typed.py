@@ -1,4 +1,4 @@
-"""Typed values of the command line: what `--type`, `--order` and `--encoding` come to."""
+"""The options `--type`, `--order` and `--encoding`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound="Callable[..., Any]")
 
-TYPES = "int16, uint32, float32, bcd16, bit:N, string:N, bytes:N, bool, and arrays as float32[10]"
+TYPES = "int16, uint32, float32, bcd16, bit:N, string:N, bytes:N, bool, or arrays: float32[10]"
 ORDERS = "ABCD, CDAB, BADC, DCBA, or eight letters for eight bytes"
 
 
@@ -25,17 +25,17 @@ def typed_options(command: Command) -> Command:
     """Adds `--type`, `--order` and `--encoding`."""
     kind = click.option("--type", "kind", metavar="TYPE", help=f"{TYPES}.")
     order = click.option(
-        "--order", default="ABCD", show_default=True, metavar="ORDER", help=f"Of bytes: {ORDERS}."
+        "--order", default="ABCD", show_default=True, metavar="ORDER", help=f"Byte order: {ORDERS}."
     )
     encoding = click.option(
-        "--encoding", metavar="NAME", help="Of strings, such as utf-8.  [default: ascii]"
+        "--encoding", metavar="NAME", help="Encoding of strings, such as utf-8.  [default: ascii]"
     )
     return kind(order(encoding(command)))
 
 
 @dataclass(frozen=True)
 class Typed:
-    """A number of values of one type, one behind the other."""
+    """Consecutive values of one type."""
 
     element: str
     """The type of a value, without a count."""
@@ -43,20 +43,20 @@ class Typed:
     order: str
     encoding: str | None
     width: int
-    """The registers that a value takes."""
+    """Registers per value."""
 
     @property
     def name(self) -> str:
-        """The type of all of them, which is no array if it is one value."""
+        """The type of all values: an array type if there are several."""
         return self.element if self.count == 1 else f"{self.element}[{self.count}]"
 
     @property
     def registers(self) -> int:
-        """The registers that all of them take."""
+        """Registers of all values."""
         return self.width * self.count
 
     def decode(self, raw: Sequence[int]) -> list[Any]:
-        """The values; in place of one that can't be, the error."""
+        """The values, with the error instead of a value that can't be decoded."""
         return [self._value(raw[at : at + self.width]) for at in range(0, len(raw), self.width)]
 
     def _value(self, raw: Sequence[int]) -> Any:
@@ -69,15 +69,15 @@ class Typed:
 def typed(
     kind: str | None, order: str, encoding: str | None, area: Area, count: int
 ) -> Typed | None:
-    """What the options ask for, `count` times; `None` if they ask for no type."""
+    """The type of the options, `count` times; `None` without `--type`."""
     if kind is None:
         if order != "ABCD" or encoding is not None:
-            raise click.UsageError("--order and --encoding go with --type.")
+            raise click.UsageError("--order and --encoding require --type.")
         return None
     try:
         type = values.codec_for(area, kind, order, encoding).type
     except WrongArea as error:
-        raise click.UsageError(f"{area} hold bits, whose type is bool.") from error
+        raise click.UsageError(f"{area} contain bits; the only type is bool.") from error
     except ConversionError as error:
         raise click.UsageError(f"{error}.") from error
     size = 1 if type.count is None else type.count

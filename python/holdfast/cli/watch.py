@@ -41,10 +41,10 @@ TOKEN = "HOLDFAST_TOKEN"
     default="1",
     show_default=True,
     metavar="SECONDS",
-    help="From reading to reading.",
+    help="Interval between readings.",
 )
-@click.option("--times", type=click.IntRange(1), metavar="N", help="So many readings, then end.")
-@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as 40001 or 4x0001.")
+@click.option("--times", type=click.IntRange(1), metavar="N", help="Stop after N readings.")
+@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as in 40001 or 4x0001.")
 @device.device_options
 @device.json_option
 def watch(
@@ -58,23 +58,23 @@ def watch(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Watch a device, or the memories of an appliance that runs; nothing is written.
+    """Watch a device, or the memories of a running appliance; nothing is written.
 
-    With URL, reads COUNT addresses, 1 if not given, from ADDRESS on in AREA of that device; without
-    AREA, all that `holdfast map` finds.
+    With URL, reads COUNT addresses (default: 1) from AREA of the device, starting at ADDRESS.
+    Without AREA, reads all addresses that `holdfast map` finds.
 
-    With FILE, the configuration of an appliance that runs on this machine, reads its memories: over
-    its REST interface if it has one (the token, if it asks for one, is taken from the environment,
-    HOLDFAST_TOKEN), otherwise over its first listener of type modbus-tcp.
+    With FILE, the configuration of an appliance on this machine, reads its memories over its REST
+    interface (with the token in HOLDFAST_TOKEN), or else over its first listener of type
+    modbus-tcp.
 
-    On a terminal, shows all values; those that have changed are highlighted, with how fast they
-    change. q quits, n and p turn pages. Elsewhere, and with --json, prints a line for every change.
+    On a terminal, shows all values, with changes highlighted, and rates of change. q quits, n and p
+    turn pages. Without a terminal, or with --json, prints a line for every change.
 
     Exit codes: 0 ended by q or Ctrl-C, 1 the first reading failed, 2 wrong usage.
     """
     url = device.is_url(target)
     if url and memory is not None:
-        raise click.UsageError("--memory goes with FILE.")
+        raise click.UsageError("--memory requires FILE.")
     chosen = _chosen(words, modicon)
     if url:
         device.checked_url(target)
@@ -102,14 +102,14 @@ def watch(
 
 
 def _chosen(words: Sequence[str], modicon: bool) -> tuple[Place, int] | None:
-    """The place and the count that are asked for, if any are."""
+    """The requested place and count, or `None`."""
     if not words:
         return None
     place, left = places.taken(words, modicon=modicon)
     count = places.counted(left)
     if place.address + count > ADDRESSES:
         raise click.UsageError(
-            f"{count} from {place.address} on: the last address is {LAST_ADDRESS}."
+            f"{count} from address {place.address} exceed the last address, {LAST_ADDRESS}."
         )
     return place, count
 
@@ -117,7 +117,7 @@ def _chosen(words: Sequence[str], modicon: bool) -> tuple[Place, int] | None:
 def _device(
     url: str, chosen: tuple[Place, int] | None, unit: int, timeout: float, as_json: bool
 ) -> Source:
-    """The blocks of a device: the one that is asked for, or all that there are."""
+    """The blocks of a device: the requested block, or all that exist."""
     client = device.connect(url, unit, timeout)
     where = f"{url}, unit {unit}"
     if chosen is not None:
@@ -126,7 +126,7 @@ def _device(
             where, client, [WatchedRange(None, unit, place.area, place.address, count)]
         )
     survey = discovery.Survey()
-    click.echo(f"{where}: finding out which addresses there are", err=True)
+    click.echo(f"{where}: searching for addresses", err=True)
     try:
         with bar("Mapping", survey.total, lambda: f"{survey.requests} requests") as advance:
             discovery.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
@@ -147,12 +147,12 @@ def _device(
 def _appliance(
     file: Path, memory: str | None, chosen: tuple[Place, int] | None, timeout: float
 ) -> Source:
-    """The memories of an appliance, and how they are read."""
+    """The memories of an appliance, read over REST or Modbus TCP."""
     config = load_or_exit(file)
     token = os.environ.get(TOKEN)
     if memory is not None and memory not in config.memories:
         names = ", ".join(config.memories)
-        raise click.UsageError(f"{file} has no memory {memory!r}, it has {names}.")
+        raise click.UsageError(f"{file} has no memory {memory!r}, allowed: {names}.")
     try:
         if config.rest is not None:
             blocks = sources.by_rest(config, token)
@@ -167,7 +167,7 @@ def _appliance(
         place, count = chosen
         blocks = sources.within(blocks, place.area, place.address, count)
     if not blocks:
-        click.echo(f"{file}: nothing of that can be read", err=True)
+        click.echo(f"{file}: none of the requested addresses can be read", err=True)
         sys.exit(WRONG)
     if config.rest is not None:
         needed = None if config.rest.tokens == "none" else token
@@ -180,7 +180,7 @@ def _appliance(
 def _lines(
     source: Source, first: Sequence[Sequence[int]], every: float, times: int | None, as_json: bool
 ) -> None:
-    """Prints every change; errors are told, and it goes on."""
+    """Prints every change. Prints errors and continues."""
     tracker = Tracker(source.blocks)
     tracker.update(time.monotonic(), first)
     for tick in pace.ticks(every, times):

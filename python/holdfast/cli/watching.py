@@ -1,4 +1,4 @@
-"""What has changed from one reading to the next, when, and how fast."""
+"""Tracks changes between readings: when, how often and how fast."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from holdfast.cli.sources import WatchedRange
 
 WINDOW = 10.0
-"""Seconds that a rate is taken over."""
+"""Seconds over which a rate is computed."""
 
 MAX_CHANGES = 64
-"""Changes of an address that a rate is taken from."""
+"""Maximum number of changes of an address from which a rate is computed."""
 
 
 @dataclass
@@ -26,16 +26,16 @@ class History:
 
     changes: int = 0
     last: float = 0.0
-    """When it changed last."""
+    """The time of the last change."""
     reading: int = 0
-    """In which reading that was."""
+    """The number of the reading with the last change."""
     steps: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=MAX_CHANGES))
-    """When it changed, and by how much."""
+    """The time and size of the last changes."""
     since: float = 0.0
-    """When the first of these steps began."""
+    """The time of the reading before the first of these steps."""
 
     def rate(self, now: float) -> float:
-        """How much it changes in a second, over the last time; 0 when it has ceased to."""
+        """The change per second over the last `WINDOW` seconds; 0 without recent changes."""
         if now - self.last > WINDOW or now <= self.since:
             return 0.0
         return sum(step for _, step in self.steps) / (now - self.since)
@@ -43,7 +43,7 @@ class History:
 
 @dataclass(frozen=True)
 class Change:
-    """An address that has another value than before."""
+    """An address whose value changed."""
 
     block: WatchedRange
     address: int
@@ -60,12 +60,12 @@ class Tracker:
         """The last reading of each block."""
         self.readings = 0
         self.histories: dict[tuple[int, int], History] = {}
-        """By the index of the block and the address, of those that ever changed."""
+        """The addresses that ever changed, by index of the block and address."""
         self.at = 0.0
-        """When the last reading was."""
+        """The time of the last reading."""
 
     def update(self, moment: float, values: Sequence[Sequence[int]]) -> list[Change]:
-        """Takes a reading; what is not as it was in the last."""
+        """Adds a reading. Returns the changes since the reading before."""
         self.readings += 1
         changes = []
         for index, (block, now) in enumerate(zip(self.blocks, values, strict=True)):
@@ -86,7 +86,7 @@ class Tracker:
         return None if history is None else self.readings - history.reading
 
     def latest(self, most: int) -> list[tuple[WatchedRange, int, int, History]]:
-        """Range, address, value and history of what changed last, in order of addresses."""
+        """Range, address, value and history of the latest changes, in order of addresses."""
         places = sorted(self.histories, key=lambda place: -self.histories[place].reading)
         found = []
         for index, address in sorted(places[:most]):
@@ -111,7 +111,7 @@ class Tracker:
 
 
 def _step(block: WatchedRange, was: int, now: int) -> int:
-    """By how much a register changed, round the corner if that is nearer; 1 for a bit."""
+    """The change of a register, across the wrap at 65535 if that is smaller; 1 for a bit."""
     if block.area in BIT_AREAS:
         return 1
     return (now - was + 0x8000) % 0x10000 - 0x8000

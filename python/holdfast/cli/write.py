@@ -1,4 +1,4 @@
-"""`holdfast write`: values into coils and holding registers of a device."""
+"""`holdfast write`: writes coils and holding registers of a device."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NEGATIVE = re.compile(r"-(\.?[0-9]|inf|nan)", re.I)
 
 @click.command(
     epilog="Example: holdfast write tcp://192.168.0.10 hr 100 21.5 --type float32 --order CDAB",
-    # So that -5 is a value, and no option.
+    # Otherwise -5 would be an unknown option.
     context_settings={"ignore_unknown_options": True},
 )
 @device.url_argument
@@ -45,10 +45,10 @@ NEGATIVE = re.compile(r"-(\.?[0-9]|inf|nan)", re.I)
     shell_complete=places.complete,
 )
 @typed_options
-@click.option("--split", is_flag=True, help="Use several requests for what one can't hold.")
-@click.option("--verify", is_flag=True, help="Read back, and compare.")
+@click.option("--split", is_flag=True, help="Allow several requests if one is not enough.")
+@click.option("--verify", is_flag=True, help="Read the values back and compare.")
 @click.option("--dry-run", is_flag=True, help="Print the requests (PDU) in hex and send nothing.")
-@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as 40001 or 4x0001.")
+@click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as in 40001 or 4x0001.")
 @device.device_options
 @device.json_option
 def write(
@@ -65,19 +65,20 @@ def write(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Write VALUEs to AREA of the device at URL, from ADDRESS on.
+    """Write VALUEs to AREA of the device at URL, starting at ADDRESS.
 
-    AREA is coils or holding_registers; co, hr or any beginning will do. ADDRESS counts from 0,
-    decimal or 0x. With --modicon it is 40001, 400001 or 4x0001, which counts from 1 and names the
-    area, so that AREA can be left out.
+    AREA is coils or holding_registers; co, hr or any prefix. ADDRESS counts from 0, decimal or 0x.
+    With --modicon, it is 40001, 400001 or 4x0001, which counts from 1 and includes the area, so
+    AREA is optional.
 
-    Values of coils are true, false, on, off, 1, 0; those of registers 0 to 65535, decimal or 0x.
-    With --type they are what the type holds: text for a string, hex for bytes. One bit of a
-    register (bit:N) is written by function 22, which leaves the others as they are.
+    Coils take true, false, on, off, 1, 0; registers take 0 to 65535, decimal or 0x. With --type,
+    VALUEs are of that type: text for a string, hex for bytes. bit:N writes one bit of a register
+    with function 22, which keeps the other bits.
 
-    One coil or register is written by function 5 or 6, more by 15 or 16.
+    One coil or register is written with function 5 or 6, several with 15 or 16.
 
-    Exit codes: 0 written, 1 not written, not known to be or not read back alike, 2 wrong usage.
+    Exit codes: 0 written, 1 not written, possibly not written or read back different, 2 wrong
+    usage.
     """
     place, left = places.taken(words, modicon=modicon)
     for word in left:
@@ -125,7 +126,7 @@ def _job(
     encoding: str | None,
     split: bool,
 ) -> _Job:
-    """What is to be written, checked. Raises `click.UsageError`."""
+    """Checks what to write. Raises `click.UsageError`."""
     asked = typed(kind, order, encoding, place.area, 1)
     if asked is None:
         own = "bool" if place.area in BIT_AREAS else "uint16"
@@ -151,7 +152,7 @@ def _job(
 
 @dataclass(frozen=True)
 class _Job:
-    """What is written where, and the requests that do it."""
+    """Values to write, and the requests that write them."""
 
     place: Place
     typed: Typed
@@ -161,7 +162,7 @@ class _Job:
 
     @property
     def said(self) -> str:
-        """What was done, for people."""
+        """The result as text."""
         first, count = self.place.address, self.typed.registers
         where = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
         return (
@@ -169,7 +170,7 @@ class _Job:
         )
 
     def told(self) -> dict[str, object]:
-        """What was asked for, for programs."""
+        """The job for JSON."""
         return {
             "area": self.place.area,
             "address": self.place.address,
@@ -177,7 +178,7 @@ class _Job:
         }
 
     def write(self, client: SyncClient) -> None:
-        """Writes it."""
+        """Writes the values."""
         place, kind = self.place, self.typed
         client.write(
             place.area,
@@ -190,7 +191,7 @@ class _Job:
         )
 
     def differing(self, client: SyncClient) -> dict[int, tuple[int, int]]:
-        """What was written and what is there now, where that is not the same, by address."""
+        """Written and read-back values that differ, by address."""
         place, kind = self.place, self.typed
         now = device.read_raw(client, place.area, place.address, kind.registers)
         if kind.element.startswith("bit:"):
@@ -203,7 +204,7 @@ class _Job:
 
 
 def _value(text: str, kind: str) -> Any:
-    """A value of a type, as it is written on a command line."""
+    """Parses a value of a type from the command line."""
     base = kind.partition(":")[0].rstrip("0123456789")
     if base == "string":
         return text
@@ -215,13 +216,15 @@ def _value(text: str, kind: str) -> Any:
         try:
             return bytes.fromhex(text.removeprefix("0x"))
         except ValueError:
-            raise click.UsageError(f"{text!r} is not pairs of hex digits.") from None
+            raise click.UsageError(f"{text!r} is not hex, allowed: pairs of hex digits.") from None
     if base == "float":
         try:
             return float(text)
         except ValueError:
-            raise click.UsageError(f"{text!r} is no number.") from None
+            raise click.UsageError(f"{text!r} is not a number.") from None
     match = WHOLE.fullmatch(text)
     if match is None:
-        raise click.UsageError(f"{text!r} is no integer, decimal or 0x; others need --type.")
+        raise click.UsageError(
+            f"{text!r} is not an integer, decimal or 0x; other values require --type."
+        )
     return int(match[1] + match[2], 0 if match[2][:2] in ("0x", "0X") else 10)
