@@ -172,9 +172,9 @@ def test_fields_that_overlap_are_only_for_decoding(fields: list[Any]) -> None:
 @pytest.mark.parametrize(
     ("block", "text"),
     [
-        ([0xFA, 0, 0x4141], "digits: digits 0x00FA are no bcd16, allowed are 0 to 9"),
-        ([0, 0xFA, 0x4141], "more: values[0]: digits 0x00FA are no bcd16, allowed are 0 to 9"),
-        ([0, 0, 0x41FF], r"name: b'A\xff' is no string:2 in ascii"),
+        ([0xFA, 0, 0x4141], "digits: digits 0x00FA are not bcd16, allowed: 0 to 9"),
+        ([0, 0xFA, 0x4141], "more: values[0]: digits 0x00FA are not bcd16, allowed: 0 to 9"),
+        ([0, 0, 0x41FF], r"name: b'A\xff' is not a string:2 in ascii"),
     ],
 )
 def test_a_field_that_can_not_be_decoded_is_named(block: list[int], text: str) -> None:
@@ -191,7 +191,7 @@ def test_a_field_that_can_not_be_decoded_is_named(block: list[int], text: str) -
         ({"flow": 1e39}, values.DoesNotFit, "flow: 1e+39 is outside -3.4028234663852886e+38 to"),
         ({"limits": [1, -1]}, values.DoesNotFit, "limits: values[1]: -1 is outside 0 to 65535"),
         ({"limits": [1]}, values.WrongLength, "limits: uint16[2] takes 2 values, found 1"),
-        ({"on": 5}, values.DoesNotFit, "on: 5 is not False, True, 0 or 1, which bit:4 holds"),
+        ({"on": 5}, values.DoesNotFit, "on: 5 is not False, True, 0 or 1, which bit:4 requires"),
     ],
 )
 def test_a_value_that_does_not_fit_is_refused_with_its_field(
@@ -207,7 +207,7 @@ def test_the_length_of_a_block_is_that_of_its_layout() -> None:
     layout = Layout([("a", "uint16", 3)])
     with pytest.raises(values.WrongLength, match=r"^the layout takes 4 registers, found 5$"):
         layout.decode([0] * 5)
-    with pytest.raises(values.InvalidRegister, match=r"^registers\[1\]: True is no integer$"):
+    with pytest.raises(values.InvalidRegister, match=r"^registers\[1\]: True is not an integer$"):
         layout.decode([0, True, 0, 0])
 
 
@@ -222,18 +222,26 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
 @pytest.mark.parametrize(
     ("fields", "error", "text"),
     [
-        ([], values.InvalidLayout, "a layout has at least one field"),
+        ([], values.InvalidLayout, "a layout requires at least one field"),
         ([("a", "bool", 0)] * 2, values.InvalidLayout, "two fields have the name 'a'"),
-        ([("a", "bool")], values.InvalidLayout, "a field is a tuple, allowed is a Field, or"),
-        ([{"name": "a"}], values.InvalidLayout, "a field is a dict, allowed is a Field, or"),
-        ([("", "bool", 0)], values.InvalidLayout, "the name of a field is '', not a text"),
-        ([(5, "bool", 0)], values.InvalidLayout, "the name of a field is 5, not a text"),
-        ([("a", "bool", -1)], values.InvalidLayout, "a: offset -1, allowed are 0 to 65535"),
-        ([("a", "bool", True)], values.InvalidLayout, "a: offset True, allowed are 0 to 65535"),
+        ([("a", "bool")], values.InvalidLayout, "a field is a tuple, allowed: a Field, or"),
+        ([{"name": "a"}], values.InvalidLayout, "a field is a dict, allowed: a Field, or"),
+        (
+            [("", "bool", 0)],
+            values.InvalidLayout,
+            "the name of a field is '', allowed: non-empty text",
+        ),
+        (
+            [(5, "bool", 0)],
+            values.InvalidLayout,
+            "the name of a field is 5, allowed: non-empty text",
+        ),
+        ([("a", "bool", -1)], values.InvalidLayout, "a: offset -1, allowed: 0 to 65535"),
+        ([("a", "bool", True)], values.InvalidLayout, "a: offset True, allowed: 0 to 65535"),
         (
             [("a", "uint32", 65535)],
             values.InvalidLayout,
-            "a: ends after 65537 registers, allowed are 65536",
+            "a: ends after 65537 registers, allowed: up to 65536",
         ),
         ([("a", "uint24", 0)], values.UnknownType, "a: type 'uint24' is unknown"),
         ([("a", "int16", 0, "XY")], values.UnknownOrder, "a: order 'XY' is unknown"),
@@ -254,5 +262,5 @@ def test_fields_that_make_no_layout_are_refused(
 
 @pytest.mark.parametrize("size", [2, 65537, True, 3.0])
 def test_a_size_that_holds_not_all_fields_is_refused(size: Any) -> None:
-    with pytest.raises(values.InvalidLayout, match=r"^size .*, allowed are 3 to 65536$"):
+    with pytest.raises(values.InvalidLayout, match=r"^size .*, allowed: 3 to 65536$"):
         Layout([("a", "uint16", 2)], size=size)

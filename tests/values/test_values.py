@@ -270,7 +270,7 @@ def test_an_unknown_type_is_refused_with_all_that_are_allowed(name: Any) -> None
     ],
 )
 def test_a_type_without_registers_or_with_too_many_is_refused(name: str, registers: int) -> None:
-    text = f"type '{name}' would take {registers} registers, allowed are 1 to 65536"
+    text = f"type '{name}' would take {registers} registers, allowed: 1 to 65536"
     with pytest.raises(values.UnknownType, match=f"^{re.escape(text)}$"):
         register_count(name)
 
@@ -315,7 +315,7 @@ def test_an_order_is_that_of_the_whole_string() -> None:
     "order", ["ABDC", "abcd", "", "AB", "ABCDEF", "A B C D ", 5, None], ids=repr
 )
 def test_an_unknown_order_is_refused_with_those_that_are_allowed(order: Any) -> None:
-    allowed = "allowed are ABCD, DCBA, BADC, CDAB, and eight letters such as GHEFCDAB"
+    allowed = "allowed: ABCD, DCBA, BADC, CDAB, and eight letters such as GHEFCDAB"
     for convert in (decode, encode):
         with pytest.raises(values.UnknownOrder, match=rf"^order .* is unknown, {allowed}"):
             convert([1], "uint16", order)
@@ -324,14 +324,22 @@ def test_an_unknown_order_is_refused_with_those_that_are_allowed(order: Any) -> 
 @pytest.mark.parametrize(
     ("order", "name", "text"),
     [
-        ("ABCDEFGG", "uint64", "order ABCDEFGG is unknown, eight letters are A to H once each"),
-        ("abcdefgh", "uint64", "order abcdefgh is unknown, eight letters are A to H once each"),
+        (
+            "ABCDEFGG",
+            "uint64",
+            "order ABCDEFGG is unknown, allowed with eight letters: A to H once each",
+        ),
+        (
+            "abcdefgh",
+            "uint64",
+            "order abcdefgh is unknown, allowed with eight letters: A to H once each",
+        ),
         (
             "ACBDEFGH",
             "uint64",
-            "order ACBDEFGH splits a register, allowed is to keep AB, CD, EF and GH together",
+            "order ACBDEFGH splits a register, allowed: AB, CD, EF and GH together",
         ),
-        ("CDEFGHAB", "uint64", "order CDEFGHAB is not undone by applying it again"),
+        ("CDEFGHAB", "uint64", "order CDEFGHAB is not its own inverse"),
         ("GHEFCDAB", "uint32", "order GHEFCDAB is for 8 bytes, uint32 has 4"),
         ("GHEFCDAB", "string:5[2]", "order GHEFCDAB is for 8 bytes, string:5 has 6"),
         ("GHEFCDAB", "bool", "order GHEFCDAB is for 8 bytes, bool has 2"),
@@ -370,12 +378,12 @@ def test_a_wrong_length_is_refused(registers: Any, name: str, text: str) -> None
         (65536, "65536 is outside 0 to 65535"),
         (-1, "-1 is outside 0 to 65535"),
         (10**5000, "an integer of 16610 bits is outside 0 to 65535"),
-        (1.0, "1.0 is no integer"),
-        ("1", "'1' is no integer"),
-        ("x" * 50, f"'{'x' * 40}'… is no integer"),
-        (None, "None is no integer"),
-        ([1], "a list is no integer"),
-        (True, "True is no integer"),
+        (1.0, "1.0 is not an integer"),
+        ("1", "'1' is not an integer"),
+        ("x" * 50, f"'{'x' * 40}'… is not an integer"),
+        (None, "None is not an integer"),
+        ([1], "a list is not an integer"),
+        (True, "True is not an integer"),
     ],
     ids=lambda value: repr(value)[:20] if value != 10**5000 else "huge",
 )
@@ -401,7 +409,7 @@ def test_a_register_is_an_integer_of_16_bits(register: Any, text: str, form: Any
     ids=repr,
 )
 def test_what_is_no_sequence_of_registers_is_a_type_error(registers: Any, found: str) -> None:
-    allowed = "allowed are a sequence of integers, bytes, or a buffer of bytes or of unsigned 16"
+    allowed = "allowed: a sequence of integers, bytes, or a buffer of bytes or of unsigned 16"
     with pytest.raises(TypeError, match=f"^registers are {re.escape(found)}, {allowed}"):
         decode(registers, "uint32")
 
@@ -435,7 +443,9 @@ def test_a_bit_encodes_to_a_mask_that_changes_no_other(register: int, bit: int) 
 @pytest.mark.parametrize("value", [2, -1, 1.0, "true", None, 10**5000], ids=lambda _: "")
 def test_a_truth_value_is_a_bool_or_a_bit(name: str, value: Any) -> None:
     assert encode(1, name) == encode(True, name)
-    with pytest.raises(values.DoesNotFit, match=f"is not False, True, 0 or 1, which {name} holds$"):
+    with pytest.raises(
+        values.DoesNotFit, match=f"is not False, True, 0 or 1, which {name} requires$"
+    ):
         encode(value, name)
 
 
@@ -457,14 +467,14 @@ def test_an_integer_outside_its_type_is_refused(name: str, bounds: tuple[int, in
     "value", [True, False, 1.0, 1.5, math.nan, math.inf, "1", b"1", None, [1], 1j], ids=repr
 )
 def test_what_is_no_integer_is_refused(name: str, value: Any) -> None:
-    with pytest.raises(values.DoesNotFit, match=f" is no integer, which {name} holds$"):
+    with pytest.raises(values.DoesNotFit, match=f" is not an integer, which {name} requires$"):
         encode(value, name)
 
 
 @pytest.mark.parametrize("name", LARGEST)
 @pytest.mark.parametrize("value", [True, False, "1", b"1", None, [1.0], 1j], ids=repr)
 def test_what_is_no_number_is_refused(name: str, value: Any) -> None:
-    with pytest.raises(values.DoesNotFit, match=f" is no number, which {name} holds$"):
+    with pytest.raises(values.DoesNotFit, match=f" is not a number, which {name} requires$"):
         encode(value, name)
 
 
@@ -522,7 +532,7 @@ def test_a_digit_over_9_is_refused(nibble: int, digit: int) -> None:
     register = digit << 4 * nibble
 
     with pytest.raises(
-        values.Undecodable, match=f"^digits 0x{register:04X} are no bcd16, allowed are 0 to 9$"
+        values.Undecodable, match=f"^digits 0x{register:04X} are not bcd16, allowed: 0 to 9$"
     ):
         decode([register], "bcd16")
     with pytest.raises(values.Undecodable, match=r"^values\[1\]: digits 0x0000.... are no bcd32"):
@@ -565,9 +575,9 @@ def test_a_text_has_the_encoding_that_is_given(encoding: str, order: str) -> Non
         ("HELLO", None, "'HELLO' has 5 bytes in ascii, string:4 holds up to 4"),
         ("°°°", "utf-8", "'°°°' has 6 bytes in utf-8, string:4 holds up to 4"),
         ("°", None, "'°' can't be encoded in ascii"),
-        ("A\0", None, r"'A\x00' would come back as 'A'"),
-        (b"A", None, "b'A' is no text, which string:4 holds"),
-        (5, None, "5 is no text, which string:4 holds"),
+        ("A\0", None, r"'A\x00' would be read back as 'A'"),
+        (b"A", None, "b'A' is not text, which string:4 requires"),
+        (5, None, "5 is not text, which string:4 requires"),
     ],
     ids=repr,
 )
@@ -577,10 +587,10 @@ def test_a_text_that_does_not_fit_is_refused(value: Any, encoding: str | None, t
 
 
 def test_bytes_that_are_no_text_are_refused() -> None:
-    with pytest.raises(values.Undecodable, match=r"^b'A\\xff' is no string:2 in ascii$"):
+    with pytest.raises(values.Undecodable, match=r"^b'A\\xff' is not a string:2 in ascii$"):
         decode([0x41FF], "string:2")
     with pytest.raises(
-        values.Undecodable, match=r"^values\[1\]: b'A\\xff' is no string:2 in utf-8$"
+        values.Undecodable, match=r"^values\[1\]: b'A\\xff' is not a string:2 in utf-8$"
     ):
         decode([0x4141, 0x41FF], "string:2[2]", encoding="utf-8")
 
@@ -597,7 +607,7 @@ def test_bytes_that_are_no_text_are_refused() -> None:
             "utf-16-le",
             "encoding utf-16-le can't pad with NUL to the 5 bytes of string:5",
         ),
-        ("uint16[2]", "ascii", "encoding 'ascii' is for strings, uint16[2] is none"),
+        ("uint16[2]", "ascii", "encoding 'ascii' is for strings, not for uint16[2]"),
     ],
 )
 def test_an_encoding_that_can_not_be_is_refused(name: str, encoding: str, text: str) -> None:
@@ -608,10 +618,10 @@ def test_an_encoding_that_can_not_be_is_refused(name: str, encoding: str, text: 
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (b"AB", "2 bytes are not the 3 of bytes:3"),
-        (b"ABCD", "4 bytes are not the 3 of bytes:3"),
-        ("ABC", "'ABC' is no bytes, which bytes:3 holds"),
-        ([65, 66, 67], "a list is no bytes, which bytes:3 holds"),
+        (b"AB", "found 2 bytes, bytes:3 requires 3"),
+        (b"ABCD", "found 4 bytes, bytes:3 requires 3"),
+        ("ABC", "'ABC' is not bytes, which bytes:3 requires"),
+        ([65, 66, 67], "a list is not bytes, which bytes:3 requires"),
     ],
     ids=repr,
 )
@@ -634,13 +644,17 @@ def test_the_values_of_an_array_are_any_sequence(form: Any) -> None:
 
 def test_an_array_of_one_is_no_single_value() -> None:
     assert decode([5], "uint16[1]") == [5]
-    with pytest.raises(values.DoesNotFit, match=r"^5 is no sequence, which uint16\[1\] holds$"):
+    with pytest.raises(
+        values.DoesNotFit,
+        match=r"^5 is not a sequence, which uint16\[1\] "
+        "requires$",
+    ):
         encode(5, "uint16[1]")
 
 
 @pytest.mark.parametrize("value", ["ab", b"ab", bytearray(b"ab"), {1: 2, 2: 3}, None], ids=repr)
 def test_what_is_no_sequence_is_no_array(value: Any) -> None:
-    with pytest.raises(values.DoesNotFit, match=r" is no sequence, which uint16\[2\] holds$"):
+    with pytest.raises(values.DoesNotFit, match=r" is not a sequence, which uint16\[2\] requires$"):
         encode(value, "uint16[2]")
 
 
@@ -655,10 +669,10 @@ def test_an_array_has_all_its_values() -> None:
     ("name", "items", "text"),
     [
         ("uint16[3]", [1, 2, 65536], "values[2]: 65536 is outside 0 to 65535 of uint16"),
-        ("uint16[2]", [1, True], "values[1]: True is no integer, which uint16 holds"),
-        ("uint64[2]", [1.0, 1], "values[0]: 1.0 is no integer, which uint64 holds"),
-        ("float32[2]", [1.0, True], "values[1]: True is no number, which float32 holds"),
-        ("bool[2]", [True, 2], "values[1]: 2 is not False, True, 0 or 1, which bool holds"),
+        ("uint16[2]", [1, True], "values[1]: True is not an integer, which uint16 requires"),
+        ("uint64[2]", [1.0, 1], "values[0]: 1.0 is not an integer, which uint64 requires"),
+        ("float32[2]", [1.0, True], "values[1]: True is not a number, which float32 requires"),
+        ("bool[2]", [True, 2], "values[1]: 2 is not False, True, 0 or 1, which bool requires"),
         ("bcd16[2]", [1, 10000], "values[1]: 10000 is outside 0 to 9999 of bcd16"),
         (
             "string:1[2]",

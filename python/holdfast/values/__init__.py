@@ -1,11 +1,11 @@
-"""The byte interpreter: registers and bits to typed values, and back.
+"""Converts registers and bits to typed values, and back.
 
-A type says what a field holds (`float32`, `string:20`, `uint16[8]`), an order how its bytes are
-arranged on the wire. `decode` and `encode` convert one field, a `Layout` all fields of a block at
-once. Everything here is pure: no I/O, no device, no memory.
+A type is the content of a field (`float32`, `string:20`, `uint16[8]`); an order is the arrangement
+of its bytes on the wire. `decode` and `encode` convert one field, a `Layout` converts all fields of
+a block at once. This package does no I/O.
 
-Nothing is padded, cut, wrapped or clamped. What can't be converted raises a `ConversionError`,
-which is a `ValueError`; an argument that is no data at all raises `TypeError`.
+Values are never padded, truncated, wrapped or clamped. A value that can't be converted raises
+`ConversionError`, a `ValueError`. An argument that is not data at all raises `TypeError`.
 """
 
 from __future__ import annotations

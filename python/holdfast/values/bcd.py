@@ -1,4 +1,4 @@
-"""Decimal digits, four bits each."""
+"""BCD: decimal digits of four bits each."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ class Bcd(Bytewise):
     """`bcd16` and `bcd32`: four and eight digits, no sign."""
 
     def unpack_one(self, data: bytes) -> int:
-        """The number. Raises `Undecodable` for a digit over 9."""
+        """The number. Raises `Undecodable` for a digit above 9."""
         digits = self.arrange(data).hex()
         try:
             return int(digits)
         except ValueError:
             found = f"digits 0x{digits.upper()}"
-            raise Undecodable(f"{found} are no {self.name}, allowed are 0 to 9") from None
+            raise Undecodable(f"{found} are not {self.name}, allowed: 0 to 9") from None
 
     def pack_one(self, value: Any) -> bytes:
         """The digits of an integer. Raises `DoesNotFit`."""
         if not is_integer(value):
-            raise DoesNotFit(f"{shown(value)} is no integer, which {self.name} holds")
+            raise DoesNotFit(f"{shown(value)} is not an integer, which {self.name} requires")
         most = 10 ** (2 * self.width) - 1
         if not 0 <= value <= most:
             raise DoesNotFit(f"{shown(value)} is outside 0 to {most} of {self.name}")

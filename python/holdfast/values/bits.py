@@ -1,4 +1,4 @@
-"""Truth values: a register or bit of its own, or one bit of a register."""
+"""Boolean values: a whole register, a single bit, or one bit of a register."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FALSE = b"\0\0"
 
 
 class Bool(Kind):
-    """`bool`: a bit of a bit area, or a register that is not 0. Its order changes nothing."""
+    """`bool`: a bit of a bit area, or a register that is not 0. Its order has no effect."""
 
     item = "H"
     finish = bool
@@ -36,9 +36,9 @@ class Bool(Kind):
 
 
 class Bit(Kind):
-    """`bit:N`: bit N of a register, 0 the least significant.
+    """`bit:N`: bit N of a register; bit 0 is the least significant.
 
-    Packed alone a bit is a mask of its register: to be ORed when true, ANDed when false.
+    A packed bit is a mask for its register: OR it if the bit is true, AND it if false.
     """
 
     item = "H"
@@ -60,7 +60,7 @@ class Bit(Kind):
 
 
 def merge(data: bytearray, start: int, masks: bytes) -> None:
-    """Changes one bit of each register from a byte on, by masks as `Bit` packs them."""
+    """Applies masks from `Bit.pack_one` to consecutive registers, starting at a byte."""
     for place in range(0, len(masks), 2):
         mask = int.from_bytes(masks[place : place + 2])
         here = slice(start + place, start + place + 2)
@@ -72,4 +72,4 @@ def merge(data: bytearray, start: int, masks: bytes) -> None:
 def _truth(value: object, name: str) -> bool:
     if type(value) in (bool, int) and value in (0, 1):
         return value == 1
-    raise DoesNotFit(f"{shown(value)} is not False, True, 0 or 1, which {name} holds")
+    raise DoesNotFit(f"{shown(value)} is not False, True, 0 or 1, which {name} requires")

@@ -1,4 +1,4 @@
-"""One field: a type in an order, compiled once, then used for any registers."""
+"""Codecs: a type in a byte order, compiled once, then used for any registers."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ if TYPE_CHECKING:
 def decode(
     registers: Registers, type: str, order: str = "ABCD", *, encoding: str | None = None
 ) -> Any:
-    """The value that registers hold: a bool, int, float, str or bytes, a list of an array type.
+    """Converts registers to a bool, int, float, str or bytes; to a list for an array type.
 
-    `registers` are exactly those of the field, as integers 0 to 65535, as big-endian bytes, or as a
-    buffer of unsigned 16-bit integers; for `bool` bits will do. `encoding` is that of strings,
-    ASCII if not given.
+    `registers` are exactly the registers of the field: integers 0 to 65535, big-endian bytes, or a
+    buffer of unsigned 16-bit integers; for `bool`, also bits. `encoding` is the encoding of
+    strings. Default: ASCII.
 
-    Raises `ConversionError`; `TypeError` for registers that are no such sequence.
+    Raises `ConversionError`, or `TypeError` if `registers` is not such a sequence.
     """
     codec = codec_of(type, order, encoding)
     return codec.unpack(codec.to_bytes(registers))
 
 
 def encode(value: Any, type: str, order: str = "ABCD", *, encoding: str | None = None) -> list[int]:
-    """The registers, 0 to 65535, that hold a value, or a sequence of values for an array type.
+    """Converts a value, or a sequence of values for an array type, to registers, 0 to 65535.
 
-    A single `bit:N` becomes a mask for its register: only that bit is set for true, which is to be
-    ORed, and all but that bit for false, which is to be ANDed.
+    A single `bit:N` becomes a mask for its register: for true, only that bit is set, for OR; for
+    false, all other bits are set, for AND.
 
     Raises `ConversionError`.
     """
@@ -58,7 +58,7 @@ def encode(value: Any, type: str, order: str = "ABCD", *, encoding: str | None =
 
 
 def register_count(type: str) -> int:
-    """How many registers a field of this type takes; bits for `bool`. Raises `UnknownType`."""
+    """Registers per field of this type; for `bool`, bits. Raises `UnknownType`."""
     return parsed(type).registers
 
 
@@ -83,15 +83,15 @@ class Codec:
             type.registers, type.name, swapped=order.swapped, bits=type.base == "bool"
         )
         self.to_bytes = block.pack
-        """The bytes of registers in any form, those of each register swapped if `swapped`."""
+        """Converts registers in any form to bytes; swaps the bytes of each if `swapped`."""
         self._to_registers = block.unpack
         self.unpack = kind.unpack_one if type.count is None else kind.unpack_many
-        """The value of those bytes."""
+        """Converts those bytes to the value."""
         single = type.count is None
         self.item = kind.item if single else f"{2 * type.registers}s"
-        """The field as an item of `struct`, in the byte order `kind.mark`."""
+        """The format of the field for `struct`, in the byte order `kind.mark`."""
         self.finish = kind.finish if single else kind.unpack_many
-        """What makes that item the value, if it isn't already."""
+        """Converts the result of `struct` to the value; `None` if they are equal."""
 
     def encode(self, value: Any) -> list[int]:
         """The registers of a value."""
@@ -100,7 +100,7 @@ class Codec:
         return self._to_registers(self._pack_array(value))
 
     def pack(self, value: Any) -> bytes:
-        """The bytes of a value as they are on the wire."""
+        """The bytes of a value as on the wire."""
         data = self.kind.pack_one(value) if self.type.count is None else self._pack_array(value)
         return swap_registers(data) if self.swapped else data
 
@@ -108,7 +108,7 @@ class Codec:
         if hasattr(values, "tolist"):
             values = values.tolist()
         if not isinstance(values, Sequence) or isinstance(values, str | bytes | bytearray):
-            raise DoesNotFit(f"{shown(values)} is no sequence, which {self.type.name} holds")
+            raise DoesNotFit(f"{shown(values)} is not a sequence, which {self.type.name} requires")
         if len(values) != self.type.count:
             takes = counted(self.type.count or 0, "value")
             raise WrongLength(f"{self.type.name} takes {takes}, found {len(values)}")
@@ -121,7 +121,7 @@ def codec_of(name: str, order: str, encoding: str | None) -> Codec:
     type = parsed(name)
     bytes_order = order_of(order, type.element, type.width)
     if encoding is not None and type.base != "string":
-        raise UnknownEncoding(f"encoding {shown(encoding)} is for strings, {type.name} is none")
+        raise UnknownEncoding(f"encoding {shown(encoding)} is for strings, not for {type.name}")
     if type.base == "bool":
         bytes_order = FOUR["ABCD"]
     return Codec(
@@ -130,13 +130,13 @@ def codec_of(name: str, order: str, encoding: str | None) -> Codec:
 
 
 def codec_for(area: Area, name: str, order: str = "ABCD", encoding: str | None = None) -> Codec:
-    """The codec of a type in an area: whatever a typed value is asked for with, checked together.
+    """The codec of a type in an area, with all parameters of a typed value checked together.
 
-    Raises as `codec_of`, and `WrongArea`.
+    Raises the errors of `codec_of`, and `WrongArea`.
     """
     codec = codec_of(name, order, encoding)
     if area in BIT_AREAS and codec.type.base != "bool":
-        raise WrongArea(f"type is {name!r}, {area} hold only bool")
+        raise WrongArea(f"type is {name!r}, allowed in {area}: bool")
     return codec
 
 

@@ -1,6 +1,6 @@
-"""What is raised when something can't be converted.
+"""Errors of conversions.
 
-A text says what was found and what is allowed. Places stand before it, outer ones first:
+A message says what was found and what is allowed. The place comes first, from outer to inner:
 `flow: values[3]: 70000 is outside 0 to 65535 of uint16`.
 """
 
@@ -14,25 +14,25 @@ LARGEST_SHOWN = 1 << 128
 
 
 class ConversionError(ValueError):
-    """Nothing was converted. `field` is the name of a layout's field, if it was one's."""
+    """Nothing was converted. `field` is the name of the field, if a layout raised the error."""
 
     field: str | None = None
 
 
 class UnknownType(ConversionError):
-    """A type that does not exist."""
+    """The type does not exist."""
 
 
 class UnknownOrder(ConversionError):
-    """An order that does not exist, or not for fields of this size."""
+    """The order does not exist, or not for fields of this size."""
 
 
 class UnknownEncoding(ConversionError):
-    """A text encoding that does not exist, or not for this type."""
+    """The text encoding does not exist, or not for this type."""
 
 
 class WrongArea(ConversionError):
-    """A type that an area of bits does not hold, which is any but `bool`."""
+    """The type is not allowed in an area of bits, which allows only `bool`."""
 
 
 class WrongLength(ConversionError):
@@ -40,33 +40,33 @@ class WrongLength(ConversionError):
 
 
 class InvalidRegister(ConversionError):
-    """A register that is no integer of 0 to 65535."""
+    """A register is not an integer from 0 to 65535."""
 
 
 class Undecodable(ConversionError):
-    """Registers that hold no value of the type."""
+    """The registers are not a valid value of the type."""
 
 
 class DoesNotFit(ConversionError):
-    """A value that its type does not hold."""
+    """The value is outside the range of its type, or of the wrong kind."""
 
 
 class InvalidLayout(ConversionError):
-    """Fields that make no layout, or none that can be encoded."""
+    """The fields are not a valid layout, or can't be encoded."""
 
 
 Error = TypeVar("Error", bound=ConversionError)
 
 
 def at(place: str, error: Error, field: str | None = None) -> Error:
-    """The same error with a place before its text."""
+    """A copy of the error, with a place before its message."""
     placed = type(error)(f"{place}: {error}")
     placed.field = field
     return placed
 
 
 def shown(value: object) -> str:
-    """A value for a text, cut short: it comes from outside, and may be of any size."""
+    """A value for a message, shortened: values come from outside and can have any size."""
     if isinstance(value, int) and not -LARGEST_SHOWN < value < LARGEST_SHOWN:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, str | bytes):
@@ -78,7 +78,7 @@ def shown(value: object) -> str:
 
 
 def is_integer(value: object) -> bool:
-    """Whether a value is an integer, of any library, and no bool."""
+    """Whether a value is an integer of any library, but not a bool."""
     if isinstance(value, bool):
         return False
     try:

@@ -1,4 +1,4 @@
-"""What all kinds of types have in common: elements to bytes and back, one by one."""
+"""The base classes of all kinds of types, which convert elements one by one."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 class Kind(ABC):
-    """Elements of one type in one order. All bytes are those on the wire, but for `order.swapped`,
-    which was done, or will be, where registers are made bytes.
+    """Elements of one type in one order. All bytes are as on the wire, except for `order.swapped`,
+    which the conversion between registers and bytes handles.
     """
 
     item: str
-    """An element as an item of `struct`, in the byte order `mark`."""
+    """The format of an element for `struct`, in the byte order `mark`."""
     finish: Callable[[Any], Any] | None = None
-    """What makes that item the value, if it isn't already."""
+    """Converts the result of `struct` to the value; `None` if they are equal."""
 
     def __init__(self, type: Type, order: Order) -> None:
         self.name = type.element
@@ -60,14 +60,14 @@ class Kind(ABC):
         return b"".join(packed)
 
     def arrange(self, data: bytes) -> bytes:
-        """What the order does to one element, but for `order.swapped`; the same both ways."""
+        """Applies the order to one element, except for `order.swapped`; it is its own inverse."""
         if self.order.reversed:
             return data[::-1]
         return move(data, self.order.places) if self.order.places else data
 
 
 class Bytewise(Kind):
-    """Elements that `struct` hands over as bytes."""
+    """Elements that `struct` unpacks as bytes."""
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order)

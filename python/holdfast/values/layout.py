@@ -1,4 +1,4 @@
-"""Many named fields of one block of registers, compiled once and converted in one call."""
+"""Layouts: the named fields of a block of registers, compiled once, converted in one call."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A named value in a block, `offset` registers from its start. `encoding` is for strings."""
+    """A named value in a block, at `offset` registers. `encoding` is for strings."""
 
     name: str
     type: str
@@ -32,24 +32,24 @@ Fields: TypeAlias = Iterable[Field | tuple[Any, ...]]
 
 
 class Layout:
-    """The fields of a block of registers; they may overlap, and leave gaps.
+    """The fields of a block of registers. Fields may overlap and leave gaps.
 
-    Each is a `Field`, or a tuple of what makes one. The block ends with its last field, or has
-    `size` registers. If all fields are `bool`, it may be a block of bits.
+    Each field is a `Field`, or a tuple of its arguments. The block ends with its last field, or has
+    `size` registers. If all fields are `bool`, it can be a block of bits.
 
-    Raises `InvalidLayout`, and what `decode` raises for an unknown type, order or encoding.
+    Raises `InvalidLayout`, and the errors of `decode` for an unknown type, order or encoding.
     """
 
     def __init__(self, fields: Fields, *, size: int | None = None) -> None:
         self.fields = tuple(_field(entry) for entry in fields)
         self.names = tuple(entry.name for entry in self.fields)
-        """The names of the fields, in the order they were given."""
+        """The names of the fields, in the order of `fields`."""
         if len(set(self.names)) < len(self.names):
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise InvalidLayout(f"two fields have the name {shown(twice)}")
         self._codecs = [_codec(entry) for entry in self.fields]
         self.size = _size(self.fields, self._codecs, size)
-        """The registers of the block."""
+        """How many registers the block has."""
         bits = all(codec.type.base == "bool" for codec in self._codecs)
         self._block = RegisterBlock(self.size, "the layout", bits=bits)
         offsets = [entry.offset for entry in self.fields]
@@ -59,22 +59,22 @@ class Layout:
     def decode(self, registers: Registers) -> dict[str, Any]:
         """The values of all fields by name, in the order of `names`.
 
-        `registers` are exactly those of the block, in any form that `decode` takes. Raises
-        `ConversionError`, with the name of the field in its text and in `field`.
+        `registers` are exactly the registers of the block, in any form that `decode` accepts.
+        Raises `ConversionError`, with the name of the field in its message and in `field`.
         """
         return dict(zip(self.names, self._values(self._block.pack(registers)), strict=True))
 
     def decode_tuple(self, registers: Registers) -> tuple[Any, ...]:
-        """The values of all fields in the order of `names`; raises as `decode`."""
+        """The values of all fields in the order of `names`. Raises the errors of `decode`."""
         return tuple(self._values(self._block.pack(registers)))
 
     def encode(self, values: Mapping[str, Any], base: Registers | None = None) -> list[int]:
-        """The registers of the block, with a value for every field.
+        """Converts the values of all fields to the registers of the block.
 
-        What no field holds is as in `base`, a block of the same size, or 0 if there is none.
+        Bits outside all fields are copied from `base`, a block of the same size. Default: 0.
 
         Raises `InvalidLayout` if fields overlap, `DoesNotFit` if names are missing or unknown, and
-        what `encode` raises, with the name of the field in its text and in `field`.
+        the errors of `encode`, with the name of the field in the message and in `field`.
         """
         if self._overlap is not None:
             first, second = self._overlap
@@ -109,11 +109,11 @@ def _field(entry: Field | tuple[Any, ...]) -> Field:
         made = Field(*entry)
     if not isinstance(made, Field):
         allowed = "a Field, or a tuple of name, type, offset, order and encoding"
-        raise InvalidLayout(f"a field is {shown(entry)}, allowed is {allowed}")
+        raise InvalidLayout(f"a field is {shown(entry)}, allowed: {allowed}")
     if not isinstance(made.name, str) or not made.name:
-        raise InvalidLayout(f"the name of a field is {shown(made.name)}, not a text")
+        raise InvalidLayout(f"the name of a field is {shown(made.name)}, allowed: non-empty text")
     if type(made.offset) is not int or not 0 <= made.offset < MAX_REGISTERS:
-        allowed = f"allowed are 0 to {MAX_REGISTERS - 1}"
+        allowed = f"allowed: 0 to {MAX_REGISTERS - 1}"
         raise at(made.name, InvalidLayout(f"offset {shown(made.offset)}, {allowed}"), made.name)
     return made
 
@@ -127,24 +127,24 @@ def _codec(entry: Field) -> Codec:
 
 def _size(fields: tuple[Field, ...], codecs: list[Codec], size: int | None) -> int:
     if not fields:
-        raise InvalidLayout("a layout has at least one field")
+        raise InvalidLayout("a layout requires at least one field")
     ends = [
         entry.offset + codec.type.registers for entry, codec in zip(fields, codecs, strict=True)
     ]
     last = max(ends)
     if last > MAX_REGISTERS:
         name = fields[ends.index(last)].name
-        found = f"ends after {last} registers, allowed are {MAX_REGISTERS}"
+        found = f"ends after {last} registers, allowed: up to {MAX_REGISTERS}"
         raise at(name, InvalidLayout(found), name)
     if size is None:
         return last
     if type(size) is not int or not last <= size <= MAX_REGISTERS:
-        raise InvalidLayout(f"size {shown(size)}, allowed are {last} to {MAX_REGISTERS}")
+        raise InvalidLayout(f"size {shown(size)}, allowed: {last} to {MAX_REGISTERS}")
     return size
 
 
 def _overlap(fields: tuple[Field, ...], codecs: list[Codec]) -> tuple[str, str] | None:
-    """The names of two fields that share a bit, if there are such."""
+    """The names of two fields that share a bit, or `None`."""
     extents = sorted(
         (start, end, entry.name)
         for entry, codec in zip(fields, codecs, strict=True)
@@ -159,7 +159,7 @@ def _overlap(fields: tuple[Field, ...], codecs: list[Codec]) -> tuple[str, str] 
 
 
 def _extents(offset: int, codec: Codec) -> Iterator[tuple[int, int]]:
-    """The bits that a field takes in a block, as starts and ends."""
+    """The bits of a field in a block, as starts and ends."""
     registers = codec.type.registers
     if not isinstance(codec.kind, Bit):
         yield 16 * offset, 16 * (offset + registers)

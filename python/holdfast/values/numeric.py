@@ -1,4 +1,4 @@
-"""Integers and floats, which `struct` knows, also whole arrays of them in one call."""
+"""Integers and floats, which `struct` converts, including whole arrays in one call."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ LARGEST = {"float16": 65504.0, "float32": 3.4028234663852886e38, "float64": 1.79
 
 
 class Number(Kind):
-    """Elements that are an item of `struct` each."""
+    """Elements with a format of `struct`."""
 
     plain: frozenset[type]
-    """Types of Python whose values `struct` may be given unseen."""
+    """Python types whose values go to `struct` without a check."""
 
     def __init__(self, type: Type, order: Order, code: str) -> None:
         super().__init__(type, order)
@@ -68,14 +68,14 @@ class Number(Kind):
 
     @abstractmethod
     def _number(self, value: Any) -> Any:
-        """A value of another type as one that `struct` may be given. Raises `DoesNotFit`."""
+        """Converts a value of another type for `struct`. Raises `DoesNotFit`."""
 
     @abstractmethod
     def _too_large(self, value: Any) -> DoesNotFit:
-        """What is raised for a number that the type does not hold."""
+        """The error for a number outside the range of the type."""
 
     def _moved(self, data: bytes) -> bytes:
-        """What eight letters spell out; reversing is `struct`'s."""
+        """Applies an order of eight letters. `struct` handles reversed orders."""
         return move(data, self.order.places) if self.order.places else data
 
 
@@ -92,7 +92,7 @@ class Integer(Number):
 
     def _number(self, value: Any) -> int:
         if not is_integer(value):
-            raise DoesNotFit(f"{shown(value)} is no integer, which {self.name} holds")
+            raise DoesNotFit(f"{shown(value)} is not an integer, which {self.name} requires")
         return operator.index(value)
 
     def _too_large(self, value: Any) -> DoesNotFit:
@@ -101,7 +101,7 @@ class Integer(Number):
 
 
 class Float(Number):
-    """`float16` to `float64`. An integer, or a float of more digits, becomes the nearest one."""
+    """`float16` to `float64`. Integers and more precise floats are rounded to the nearest value."""
 
     plain = frozenset({float, int})
 
@@ -111,7 +111,7 @@ class Float(Number):
 
     def _number(self, value: Any) -> float | int:
         if isinstance(value, bool) or not isinstance(value, Real):
-            raise DoesNotFit(f"{shown(value)} is no number, which {self.name} holds")
+            raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
         return value if isinstance(value, int) else float(value)
 
     def _too_large(self, value: Any) -> DoesNotFit:

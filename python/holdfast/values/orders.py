@@ -1,13 +1,13 @@
-"""Byte orders: how the bytes of a field, A first, are arranged on the wire.
+"""Byte orders: the arrangement of the bytes of a field on the wire; A is the first byte.
 
-Four letters follow the field, whatever its size. They are two choices: the bytes of each register
-swapped (BADC), and the whole field reversed (DCBA); CDAB is both, which leaves the registers
-reversed. Eight letters spell a field of eight bytes out: the letter at a place of the wire names
-the byte of the value.
+Four letters apply to fields of any size. They combine two choices: the bytes of each register are
+swapped (BADC), and the whole field is reversed (DCBA). CDAB is both, so the registers are reversed.
+Eight letters describe a field of eight bytes: each letter is the byte of the value at that place on
+the wire.
 
-An order applied twice changes nothing. Hence eight letters that are not their own inverse are no
-order; with the others it does not matter whether they are read from the wire or from the value.
-Registers stay whole too: AB, CD, EF and GH are moved as pairs, and may be swapped inside.
+Every order is its own inverse, so the direction (wire or value) does not matter. Eight letters that
+are not their own inverse are refused. Registers stay whole: AB, CD, EF and GH move as pairs, and
+can be swapped inside.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ LETTERS = "ABCDEFGH"
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What an order does: to each register first, then to the field."""
+    """The effect of an order: on each register first, then on the field."""
 
     swapped: bool = False
-    """The two bytes of each register change places."""
+    """Whether the two bytes of each register are swapped."""
     reversed: bool = False
-    """All bytes of the field are reversed."""
+    """Whether all bytes of the field are reversed."""
     places: tuple[int, ...] = ()
-    """Where each byte comes from, if the other two can't say it."""
+    """The source of each byte, for orders that the other two can't express."""
 
 
 FOUR = {
@@ -54,7 +54,7 @@ def order_of(name: str, element: str, width: int) -> Order:
     if name in FOUR:
         return FOUR[name]
     if not isinstance(name, str) or len(name) != 8 or not name.isalpha():
-        raise UnknownOrder(f"order {shown(name)} is unknown, allowed are {ALLOWED}")
+        raise UnknownOrder(f"order {shown(name)} is unknown, allowed: {ALLOWED}")
     flaw = _flaw(name)
     if flaw is not None:
         raise UnknownOrder(f"order {name} {flaw}")
@@ -71,7 +71,7 @@ def swap_registers(data: bytes) -> bytes:
 
 
 def move(data: bytes, places: tuple[int, ...]) -> bytes:
-    """The bytes of each element moved; `places` say where each byte of an element comes from."""
+    """Moves the bytes of each element; `places` has the source of each byte of an element."""
     moved = bytearray(len(data))
     for place, source in enumerate(places):
         moved[place :: len(places)] = data[source :: len(places)]
@@ -84,10 +84,10 @@ def _places(name: str) -> tuple[int, ...]:
 
 def _flaw(name: str) -> str | None:
     if sorted(name) != list(LETTERS):
-        return "is unknown, eight letters are A to H once each"
+        return "is unknown, allowed with eight letters: A to H once each"
     places = _places(name)
     if any(places[at] // 2 != places[at + 1] // 2 for at in range(0, 8, 2)):
-        return "splits a register, allowed is to keep AB, CD, EF and GH together"
+        return "splits a register, allowed: AB, CD, EF and GH together"
     if any(places[source] != place for place, source in enumerate(places)):
-        return "is not undone by applying it again"
+        return "is not its own inverse"
     return None

@@ -1,8 +1,7 @@
-"""How the fields of a layout are read from the bytes of its block.
+"""Reads the fields of a layout from the bytes of its block.
 
-Fields of one order are read by one `struct` call, which steps over what lies between them; where
-fields overlap, it takes one more. What `struct` can't make is finished field by field: bits,
-strings, BCD, arrays.
+One `struct` call reads all fields of one order and skips the bytes between them; overlapping fields
+take another call. Bits, strings, BCD and arrays are then finished field by field.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Reading:
         ]
 
     def values(self, data: bytes) -> Sequence[Any]:
-        """The values in the order of the names. Raises `ConversionError` with a name."""
+        """The values in the order of the names. Raises `ConversionError` with the field's name."""
         found: tuple[Any, ...] = ()
         swapped = b""
         for is_swapped, unpack in self._calls:
@@ -71,11 +70,11 @@ class _Pass:
 
     @property
     def items(self) -> int:
-        """How many items the call makes."""
+        """How many items the call returns."""
         return len(self._places)
 
     def place(self, codec: Codec, start: int) -> int | None:
-        """The place among the items of a field from byte `start`, if this call can read it."""
+        """The index of a field at byte `start` in the result, `None` if this call can't read it."""
         if codec.swapped is not self.swapped or codec.kind.mark != self._mark:
             return None
         key = start, codec.item
@@ -86,12 +85,12 @@ class _Pass:
         return self._places.get(key)
 
     def compiled(self, size: int) -> Callable[[bytes], tuple[Any, ...]]:
-        """The call, for a block of `size` bytes."""
+        """The compiled call, for a block of `size` bytes."""
         return struct.Struct(f"{self._form}{size - self._end}x").unpack
 
 
 def _taken(passes: list[_Pass], codec: Codec, start: int) -> tuple[_Pass, int]:
-    """The first pass that can read a field, and the field's place in it."""
+    """The first pass that can read a field, and the index of the field in that pass."""
     for one in passes:
         place = one.place(codec, start)
         if place is not None:
@@ -101,7 +100,7 @@ def _taken(passes: list[_Pass], codec: Codec, start: int) -> tuple[_Pass, int]:
 
 
 def _sources(passes: list[_Pass], taken: list[tuple[_Pass, int]]) -> list[int]:
-    """Where the item of each field is among the items of all passes."""
+    """The index of each field among the items of all passes."""
     firsts, first = {}, 0
     for one in passes:
         firsts[one] = first

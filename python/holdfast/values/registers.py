@@ -1,4 +1,4 @@
-"""Registers of every form to bytes, and bytes to registers."""
+"""Converts registers in any form to bytes, and bytes to registers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 Registers: TypeAlias = "Sequence[int] | Buffer"
 """Integers 0 to 65535, big-endian bytes, or a buffer of unsigned 16-bit integers, such as a numpy
-array of `uint16`. For `bool` also bits: a sequence of 0, 1, `False`, `True`, or an array of `bool`.
+array of `uint16`. For `bool`, also bits: a sequence of 0, 1, `False`, `True`, or a `bool` array.
 """
 
 ALLOWED = "a sequence of integers, bytes, or a buffer of bytes or of unsigned 16-bit integers"
 
 
 class RegisterBlock:
-    """A number of registers as bytes: big-endian, or `swapped`. `bits` lets bools in."""
+    """A fixed number of registers as bytes: big-endian, or `swapped`. `bits` allows bools."""
 
     def __init__(self, count: int, name: str, *, swapped: bool = False, bits: bool = False) -> None:
         self.count = count
@@ -62,7 +62,7 @@ class RegisterBlock:
         for index, register in enumerate(registers):
             found = f"registers[{index}]: {shown(register)}"
             if not is_integer(register) and not (self._bits and isinstance(register, bool)):
-                return InvalidRegister(f"{found} is no integer")
+                return InvalidRegister(f"{found} is not an integer")
             if not 0 <= register <= MAX_WORD:
                 return InvalidRegister(f"{found} is outside 0 to {MAX_WORD}")
         raise AssertionError("registers without a flaw were refused")
@@ -73,14 +73,14 @@ class RegisterBlock:
 
 
 def _plain(registers: Registers) -> bytes | Sequence[int]:
-    """Big-endian bytes of a buffer, a tuple of a sequence."""
+    """Converts a buffer to big-endian bytes, and a sequence to a tuple."""
     try:
         view = memoryview(registers)  # type: ignore[arg-type]
     except TypeError:
         unordered = isinstance(registers, str | Mapping)
         if unordered or not hasattr(registers, "__len__") or not hasattr(registers, "__getitem__"):
             found = f"registers are {shown(registers)}"
-            raise TypeError(f"{found}, allowed are {ALLOWED}") from None
+            raise TypeError(f"{found}, allowed: {ALLOWED}") from None
         return tuple(cast("Sequence[int]", registers))
     mark, code = view.format[:-1], view.format[-1]
     if view.ndim == 1 and code in "Bc":
@@ -91,4 +91,4 @@ def _plain(registers: Registers) -> bytes | Sequence[int]:
     if view.ndim == 1 and code == "?":
         return tuple(map(bool, view.tobytes()))
     found = f"registers are a buffer of format {view.format!r}, dimensions {view.ndim}"
-    raise TypeError(f"{found}, allowed are {ALLOWED}")
+    raise TypeError(f"{found}, allowed: {ALLOWED}")

@@ -1,4 +1,4 @@
-"""Strings and bytes, two to a register."""
+"""Strings and bytes, two bytes per register."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Bytes(Bytewise):
-    """`bytes:N`: exactly N bytes. The odd byte after them is written as 0 and not read."""
+    """`bytes:N`: exactly N bytes. With odd N, the last byte is written as 0 and not read."""
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order)
@@ -24,12 +24,12 @@ class Bytes(Bytewise):
         return self.arrange(data)[: self.size]
 
     def pack_one(self, value: Any) -> bytes:
-        """The bytes, and the odd one. Raises `DoesNotFit`."""
+        """The bytes, with padding. Raises `DoesNotFit`."""
         if not isinstance(value, bytes | bytearray | memoryview):
-            raise DoesNotFit(f"{shown(value)} is no bytes, which {self.name} holds")
+            raise DoesNotFit(f"{shown(value)} is not bytes, which {self.name} requires")
         data = bytes(value)
         if len(data) != self.size:
-            raise DoesNotFit(f"{len(data)} bytes are not the {self.size} of {self.name}")
+            raise DoesNotFit(f"found {len(data)} bytes, {self.name} requires {self.size}")
         return self._padded(data)
 
     def _padded(self, data: bytes) -> bytes:
@@ -37,7 +37,7 @@ class Bytes(Bytewise):
 
 
 class Text(Bytes):
-    """`string:N`: up to N bytes of text, then NUL."""
+    """`string:N`: up to N bytes of text, padded with NUL."""
 
     def __init__(self, type: Type, order: Order, encoding: str) -> None:
         super().__init__(type, order)
@@ -53,26 +53,26 @@ class Text(Bytes):
             raise UnknownEncoding(f"{found} to the {self.size} bytes of {self.name}")
 
     def unpack_one(self, data: bytes) -> str:
-        """The text without the NULs after it. Raises `Undecodable`."""
+        """The text without its padding. Raises `Undecodable`."""
         field = self.arrange(data)[: self.size]
         try:
             return field.decode(self._encoding).rstrip("\0")
         except UnicodeError:
-            raise Undecodable(f"{shown(field)} is no {self.name} in {self._encoding}") from None
+            raise Undecodable(f"{shown(field)} is not a {self.name} in {self._encoding}") from None
 
     def pack_one(self, value: Any) -> bytes:
-        """The text and NULs after it. Raises `DoesNotFit`, also for NULs at its end."""
+        """The text with padding. Raises `DoesNotFit`, also for text that ends with NUL."""
         if not isinstance(value, str):
-            raise DoesNotFit(f"{shown(value)} is no text, which {self.name} holds")
+            raise DoesNotFit(f"{shown(value)} is not text, which {self.name} requires")
         try:
             data = value.encode(self._encoding)
         except UnicodeError:
             raise DoesNotFit(f"{shown(value)} can't be encoded in {self._encoding}") from None
         if len(data) > self.size:
             found = f"{shown(value)} has {len(data)} bytes in {self._encoding}"
-            raise DoesNotFit(f"{found}, {self.name} holds up to {self.size}")
+            raise DoesNotFit(f"{found}, allowed in {self.name}: up to {self.size}")
         field = self._padded(data)
         back = self.unpack_one(field)
         if back != value:
-            raise DoesNotFit(f"{shown(value)} would come back as {shown(back)}")
+            raise DoesNotFit(f"{shown(value)} would be read back as {shown(back)}")
         return field

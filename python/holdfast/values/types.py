@@ -1,4 +1,4 @@
-"""The names of types: what a field holds, and how many registers it takes."""
+"""Parses the names of types: content and size of a field."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ FIXED = {
     "bcd16": 2,
     "bcd32": 4,
 }
-"""Types whose name says all: the bytes that an element takes in registers."""
+"""Types without a parameter, with the bytes of an element in registers."""
 
-ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays as float32[10]"
+ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays: float32[10]"
 MAX_REGISTERS = ADDRESSES
 
 _NUMBER = r"(0|[1-9][0-9]{0,5})"
@@ -34,7 +34,7 @@ _NAME = re.compile(rf"(([a-z]+[0-9]*)(?::{_NUMBER})?)(?:\[{_NUMBER}\])?")
 
 @dataclass(frozen=True, slots=True)
 class Type:
-    """A type by its parts."""
+    """A type, split into its parts."""
 
     name: str
     """The whole name, such as `string:5[3]`."""
@@ -43,21 +43,21 @@ class Type:
     base: str
     """`string`."""
     parameter: int
-    """What stands after the colon, 0 if nothing does: 5."""
+    """The number after the colon, 0 without one: 5."""
     width: int
-    """The bytes that an element takes in registers: 6."""
+    """The bytes of an element in registers: 6."""
     count: int | None
-    """The elements of an array: 3. `None` for a single value, which is no array of one."""
+    """The length of an array: 3. `None` for a single value, which differs from an array of 1."""
 
     @property
     def registers(self) -> int:
-        """How many registers a field of this type takes."""
+        """Registers per field of this type."""
         return self.width // 2 * (1 if self.count is None else self.count)
 
 
 @lru_cache(1024)
 def parsed(name: str) -> Type:
-    """The type of a name. Raises `UnknownType`."""
+    """Parses the name of a type. Raises `UnknownType`."""
     match = _NAME.fullmatch(name) if isinstance(name, str) else None
     if match is None:
         raise _unknown(name)
@@ -67,7 +67,7 @@ def parsed(name: str) -> Type:
         raise _unknown(name)
     made = Type(name, element, base, int(parameter or 0), width, int(count) if count else None)
     if not 1 <= made.registers <= MAX_REGISTERS:
-        allowed = f"allowed are 1 to {MAX_REGISTERS}"
+        allowed = f"allowed: 1 to {MAX_REGISTERS}"
         raise UnknownType(f"type {shown(name)} would take {made.registers} registers, {allowed}")
     return made
 
@@ -83,4 +83,4 @@ def _width(base: str, parameter: int | None) -> int | None:
 
 
 def _unknown(name: object) -> UnknownType:
-    return UnknownType(f"type {shown(name)} is unknown, allowed are {ALLOWED}")
+    return UnknownType(f"type {shown(name)} is unknown, allowed: {ALLOWED}")
