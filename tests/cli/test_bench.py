@@ -106,11 +106,11 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("tcp://127.0.0.1", "--count", "126"), "count is 126, one read returns 1 to 125."),
+        (("tcp://127.0.0.1", "--count", "126"), "count is 126, allowed: 1 to 125."),
         (("tcp://127.0.0.1", "--address", "65530"), "the last address is 65535."),
         (
             ("udp://127.0.0.1", "--in-flight", "2"),
-            "only tcp and tls have more than one request in flight.",
+            "more than one request in flight requires tcp or tls.",
         ),
         (("rtu:///dev/ttyX", "--connections", "2"), "a serial line has one connection."),
         (("tcp://127.0.0.1", "--area", "x"), "'x' is not an area"),

@@ -207,7 +207,7 @@ RIGHT = ("127.0.0.1:9000", "coils", "0", "1", "--unit", "1")
             (*RIGHT[:3], "--hex", "1", "--unit", "1"),
             "Error: --hex is '1', allowed: pairs of hex",
         ),
-        ((*RIGHT[:3], "--hex", "01", "--unit", "1"), "Error: data of bits needs a count."),
+        ((*RIGHT[:3], "--hex", "01", "--unit", "1"), "Error: data of bits requires a count."),
         ((*RIGHT[:2], "70000", *RIGHT[3:]), "Error: Invalid value for 'ADDRESS': 70000 is outside"),
         (
             (*RIGHT[:2], "0xg", *RIGHT[3:]),
@@ -218,7 +218,7 @@ RIGHT = ("127.0.0.1:9000", "coils", "0", "1", "--unit", "1")
         (("plant", *RIGHT[1:]), "Error: Invalid value for 'HOST:PORT': 'plant' is not HOST:PORT,"),
         ((":9000", *RIGHT[1:]), "Error: Invalid value for 'HOST:PORT': ':9000' is not HOST:PORT,"),
         (("a:0", *RIGHT[1:]), "Error: Invalid value for 'HOST:PORT': 'a:0': port 0 is outside 1 t"),
-        (("a..b:9000", *RIGHT[1:]), "Error: 'a..b' is no name of a host."),
+        (("a..b:9000", *RIGHT[1:]), "Error: 'a..b' is not a host name."),
         ((*RIGHT, "--timeout", "0"), "Error: Invalid value for '--timeout': 0.0 is not in the ran"),
         ((*RIGHT[:4], "--unit", "65536"), "Error: Invalid value for '--unit': 65536 is outside 0"),
         (

@@ -135,7 +135,7 @@ def test_what_is_no_value_is_told_and_the_others_are_shown(
     result = invoke("read", cli.url(server), "hr", "0", "2", "--type", "bcd16")
     assert result.exit_code == 1
     assert result.stdout.splitlines()[1:] == [
-        "      0  12A4       ? digits 0x12A4 are no bcd16, allowed are 0 to 9",
+        "      0  12A4       ? digits 0x12A4 are not bcd16, allowed: 0 to 9",
         "      1  1234       1234",
     ]
     found = answer("read", cli.url(server), "hr", "0", "2", "--type", "bcd16", code=1)
@@ -191,7 +191,7 @@ def test_a_modicon_number_names_area_and_address(
         (("hr", "0", "x"), "COUNT is 'x', allowed: 1 to 65536."),
         (("hr", "0", "1", "2"), "Got unexpected extra argument (2)."),
         (("hr", "0", "1", "--count", "2"), "COUNT and --count are the same: give only one."),
-        (("hr", "65535", "2"), "2 registers from address 65535 exceed the last address, 65535."),
+        (("hr", "65535", "2"), "2 registers from address 65535: the last address is 65535."),
         (("hr", "0", "--order", "CDAB"), "--order and --encoding require --type."),
         (("hr", "0", "--type", "float33"), "type 'float33' is unknown"),
         (("hr", "0", "--type", "float32", "--order", "ABDC"), "order 'ABDC' is unknown"),
@@ -213,7 +213,7 @@ def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:
 
 
 def test_a_wrong_url_is_wrong_usage() -> None:
-    assert "'plc' is no URL of a device; allowed are tcp://host:502" in usage_error(
+    assert "'plc' is not the URL of a device, allowed: tcp://host:502" in usage_error(
         "read", "plc", "hr", "0"
     )
 

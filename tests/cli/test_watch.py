@@ -292,9 +292,9 @@ def test_a_device_without_addresses_can_not_be_watched() -> None:
     ("arguments", "told"),
     [
         (("tcp://127.0.0.1", "--memory", "x"), "--memory requires FILE."),
-        (("foo://127.0.0.1",), "is no URL of a device"),
+        (("foo://127.0.0.1",), "is not the URL of a device"),
         (("tcp://127.0.0.1", "hr"), "Missing argument 'ADDRESS'."),
-        (("tcp://127.0.0.1", "hr", "65535", "2"), "exceed the last address, 65535."),
+        (("tcp://127.0.0.1", "hr", "65535", "2"), "the last address is 65535."),
     ],
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:

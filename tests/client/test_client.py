@@ -408,7 +408,7 @@ REFUSED: list[tuple[str, tuple[Any, ...], dict[str, Any], type[Exception], str]]
     ("read_coils", (0, -HUGE), {}, ValueError, "count is"),
     ("read_coils", (0.0, 1), {}, TypeError, "float"),
     ("read_coils", (0, "1"), {}, TypeError, "str"),
-    ("read_coils", (0, 1), {"unit": 256}, ValueError, "unit is 256, allowed are 0 to 255"),
+    ("read_coils", (0, 1), {"unit": 256}, ValueError, "unit is 256, allowed: 0 to 255"),
     ("read_coils", (0, 1), {"unit": -1}, ValueError, "unit is -1"),
     ("read_coils", (0, 1), {"unit": True}, ValueError, "unit is True"),
     ("read_coils", (0, 1), {"unit": "1"}, ValueError, "unit is '1'"),
@@ -486,9 +486,9 @@ def test_what_cannot_be_asked_is_not_sent(
 @pytest.mark.parametrize(
     ("options", "error", "text"),
     [
-        ({"unit": 256}, ValueError, "unit is 256, allowed are 0 to 255"),
+        ({"unit": 256}, ValueError, "unit is 256, allowed: 0 to 255"),
         ({"unit": None}, ValueError, "unit is None"),
-        ({"timeout": 0}, ValueError, "timeout is 0, allowed are more than 0 to 86400 seconds"),
+        ({"timeout": 0}, ValueError, "timeout is 0, allowed: more than 0, up to 86400 seconds"),
         ({"timeout": -1}, ValueError, "timeout is -1"),
         ({"timeout": float("nan")}, ValueError, "timeout is nan"),
         ({"timeout": 10**400}, ValueError, "timeout is 1000"),
@@ -505,7 +505,7 @@ def test_what_a_client_cannot_be_is_refused(
 
 @pytest.mark.parametrize("number", [0, 1025, 1.0, True, None])
 def test_the_number_in_flight_has_its_limits(number: Any) -> None:
-    with pytest.raises(ValueError, match="allowed are 1 to 1024"):
+    with pytest.raises(ValueError, match="allowed: 1 to 1024"):
         holdfast.Client("tcp://127.0.0.1", max_in_flight=number)
 
 
@@ -550,39 +550,39 @@ def test_a_target_is_shown_as_a_url() -> None:
 @pytest.mark.parametrize(
     ("url", "text"),
     [
-        ("", "is no URL of a device; allowed are tcp://host:502"),
-        ("plc", "is no URL of a device"),
-        ("http://plc", "is no URL of a device"),
-        ("tls://", "is no address of a device"),
-        ("tls://plc/unit", "is no address of a device"),
-        ("tls://plc?baud=9600", "'baud' is not known, allowed are ca, cert, key, name"),
+        ("", "is not the URL of a device, allowed: tcp://host:502"),
+        ("plc", "is not the URL of a device"),
+        ("http://plc", "is not the URL of a device"),
+        ("tls://", "is not the address of a device"),
+        ("tls://plc/unit", "is not the address of a device"),
+        ("tls://plc?baud=9600", "unknown option 'baud', allowed: ca, cert, key, name"),
         ("tls://plc?ca=a&ca=b", "ca is given twice"),
-        ("tls://plc?ca=", "ca is '', allowed are paths of files"),
-        ("tls://plc?ca=a%00b", r"ca is 'a\\x00b', allowed are paths of files"),
-        ("tls://plc?name=", "name is '', allowed are host names and IP addresses"),
+        ("tls://plc?ca=", "ca is '', allowed: paths of files"),
+        ("tls://plc?ca=a%00b", r"ca is 'a\\x00b', allowed: paths of files"),
+        ("tls://plc?name=", "name is '', allowed: host names and IP addresses"),
         ("tls://plc?cert=a", "cert without key: give both, or neither"),
         ("tls://plc?key=a", "key without cert"),
-        ("tcp://plc?ca=a", "is no address of a device"),
-        ("rtu:///dev/x?ca=a", "'ca' is not known, allowed are baud, parity"),
-        ("tcp://", "is no address of a device"),
+        ("tcp://plc?ca=a", "is not the address of a device"),
+        ("rtu:///dev/x?ca=a", "unknown option 'ca', allowed: baud, parity"),
+        ("tcp://", "is not the address of a device"),
         ("tcp://plc:0", "port 0"),
         ("tcp://plc:65536", "[Pp]ort out of range"),
         ("tcp://plc:x", "x"),
         ("tcp://[::1", "Invalid IPv6 URL"),
-        ("tcp://plc/unit", "is no address of a device"),
-        ("tcp://plc?unit=1", "is no address of a device"),
+        ("tcp://plc/unit", "is not the address of a device"),
+        ("tcp://plc?unit=1", "is not the address of a device"),
         ("tcp://me@plc", "has a user or a fragment"),
         ("tcp://plc#1", "has a user or a fragment"),
         ("rtu://", "names no device"),
         ("rtu:///", "names no device"),
-        ("rtu:///dev/x?baud=10", "baud is '10', allowed are 50 to 4000000"),
+        ("rtu:///dev/x?baud=10", "baud is '10', allowed: 50 to 4000000"),
         ("rtu:///dev/x?baud=fast", "baud is 'fast'"),
-        ("rtu:///dev/x?parity=mark", "parity is 'mark', allowed are none, even, odd"),
-        ("rtu:///dev/x?stop_bits=3", "stop_bits is '3', allowed are 1, 2"),
+        ("rtu:///dev/x?parity=mark", "parity is 'mark', allowed: none, even, odd"),
+        ("rtu:///dev/x?stop_bits=3", "stop_bits is '3', allowed: 1, 2"),
         ("rtu:///dev/x?data_bits=7", "data_bits is 7, allowed with rtu is 8"),
-        ("rtu:///dev/x?silence=0", "silence is '0', allowed are seconds, up to 10"),
-        ("rtu:///dev/x?echo=yes", "echo is 'yes', allowed are 0, 1"),
-        ("rtu:///dev/x?speed=1", "'speed' is not known, allowed are baud, parity"),
+        ("rtu:///dev/x?silence=0", "silence is '0', allowed: seconds, up to 10"),
+        ("rtu:///dev/x?echo=yes", "echo is 'yes', allowed: 0, 1"),
+        ("rtu:///dev/x?speed=1", "unknown option 'speed', allowed: baud, parity"),
         ("rtu:///dev/x?baud=9600&baud=9600", "baud is given twice"),
         ("ascii:///dev/x?silence=1", "'silence' is not known"),
     ],
@@ -593,7 +593,7 @@ def test_a_url_that_names_no_device_is_refused(url: str, text: str) -> None:
 
 
 def test_a_url_is_a_text() -> None:
-    with pytest.raises(TypeError, match="5 is no URL of a device"):
+    with pytest.raises(TypeError, match="5 is not the URL of a device"):
         holdfast.Client(5)  # type: ignore[arg-type]
 
 

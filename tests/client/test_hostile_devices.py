@@ -261,8 +261,8 @@ OBJECTS = "00 00 02"
 @pytest.mark.parametrize(
     ("reply", "text"),
     [
-        ("2b0e 03 01 ff 00 01 00 01 41", "object 0 is said to follow after object 0"),
-        ("2b0e 03 01 ff 05 00", "object 5 is said to follow after object 0"),
+        ("2b0e 03 01 ff 00 01 00 01 41", "object 0 can't follow object 0"),
+        ("2b0e 03 01 ff 05 00", "object 5 can't follow object 0"),
         ("2b0e 03 01 00 00 02 00 01 41", "length"),
         ("2b0e 03 01 00 00 01 00 02 41", "length"),
         ("2b0e 03 01 01 00 01 00 01 41", "length"),

@@ -89,9 +89,9 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    url: tcp://10.0.0.9\n", "", "4: url: missing, allowed: text, as in "
          "tcp://10.0.0.9:502 or rtu:///dev/ttyUSB0?baud=9600"),
         ("url: tcp://10.0.0.9", "url: 7", f"5: url: found 7, allowed: {URLS}"),
-        ("tcp://10.0.0.9", "http://a", "5: url: 'http://a' is no URL of a device; allowed are "
+        ("tcp://10.0.0.9", "http://a", "5: url: 'http://a' is not the URL of a device, allowed: "
          f"{URLS}"),
-        ("tcp://10.0.0.9", "tcp://a:0", "5: url: 'tcp://a:0': port 0, allowed are 1 to 65535"),
+        ("tcp://10.0.0.9", "tcp://a:0", "5: url: 'tcp://a:0': port 0, allowed: 1 to 65535"),
         ("tcp://10.0.0.9", "tls://plc?ca=none.pem",
          "5: url: found ca='none.pem', which can't be read: No such file or directory"),
         ("tcp://10.0.0.9", "tls://plc?cert=p.yaml&key=/",

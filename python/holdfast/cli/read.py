@@ -110,7 +110,7 @@ def _query(place: Place, count: int, kind: str | None, order: str, encoding: str
     if place.address + query.size > ADDRESSES:
         items = showing.counted(query.size, query.noun)
         raise click.UsageError(
-            f"{items} from address {place.address} exceed the last address, {LAST_ADDRESS}."
+            f"{items} from address {place.address}: the last address is {LAST_ADDRESS}."
         )
     return query
 

@@ -109,7 +109,7 @@ def _chosen(words: Sequence[str], modicon: bool) -> tuple[Place, int] | None:
     count = places.counted(left)
     if place.address + count > ADDRESSES:
         raise click.UsageError(
-            f"{count} from address {place.address} exceed the last address, {LAST_ADDRESS}."
+            f"{count} from address {place.address}: the last address is {LAST_ADDRESS}."
         )
     return place, count
 

@@ -1,10 +1,10 @@
 """Clients of Modbus devices, over every transport: `Client` for asyncio, `SyncClient` without it.
 
-Both have the same methods, carry out the same steps (`requests`) and know the same errors
-(`holdfast.errors`). This room must never poll.
+Both have the same methods, run the same steps (`requests`) and raise the same errors
+(`holdfast.errors`). This package never polls.
 
-A connection is made when it is needed, and kept. When it is lost, the calls that waited fail, and
-the next one makes a new connection; no call is repeated.
+A client connects on its first call and keeps the connection. When the connection is lost, pending
+calls fail, and the next call reconnects. No call is retried.
 """
 
 from __future__ import annotations

@@ -23,15 +23,15 @@ MAX_IN_FLIGHT = 1024
 
 
 class Client(BaseClient):
-    """A client for asyncio: every method is awaited.
+    """A client for asyncio. Await every method.
 
-    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS
-    up to `max_in_flight` requests are on their way at once, and replies may come in any order; what
-    is more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers
-    only one at a time. On other transports one request is on its way at once.
+    `url`, `unit`, `timeout` and the errors are as in `SyncClient`. Over TCP and TLS, up to
+    `max_in_flight` requests are in flight, and replies may arrive in any order. Further calls wait
+    for a free place; `timeout` does not include that wait. Set 1 for a device that handles only one
+    request at a time. Other transports have one request in flight.
 
-    Any number of tasks may share a client, in one event loop; in another one after `close`, or
-    when the first is closed. A call that is cancelled leaves the connection usable.
+    Any number of tasks can share a client in one event loop. To use it in another loop, first
+    `close` it or close the first loop. After a cancelled call, the connection remains usable.
 
     >>> async with holdfast.Client("tcp://plc") as plc:
     ...     await plc.read("holding_registers", 100, "float32", order="CDAB")
@@ -43,9 +43,7 @@ class Client(BaseClient):
     ) -> None:
         super().__init__(url, unit, timeout)
         if type(max_in_flight) is not int or not 1 <= max_in_flight <= MAX_IN_FLIGHT:
-            raise ValueError(
-                f"max_in_flight is {max_in_flight!r}, allowed are 1 to {MAX_IN_FLIGHT}"
-            )
+            raise ValueError(f"max_in_flight is {max_in_flight!r}, allowed: 1 to {MAX_IN_FLIGHT}")
         self._transport: AsyncConnection | OneAtATime
         if isinstance(self.target, NetworkTarget) and self.target.transport in IN_FLIGHT:
             self._transport = AsyncConnection(self.target, endpoint(self.target), max_in_flight)
@@ -53,19 +51,19 @@ class Client(BaseClient):
             self._transport = OneAtATime(self.target)
 
     async def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:
-        """`count` coils (function 1); more than 2000 take several requests."""
+        """Reads `count` coils (function 1). More than 2000 take several requests."""
         return await self._run(requests.read_range("coils", address, count), unit)
 
     async def read_discrete_inputs(
         self, address: int, count: int, *, unit: int | None = None
     ) -> list[bool]:
-        """`count` discrete inputs (function 2); more than 2000 take several requests."""
+        """Reads `count` discrete inputs (function 2). More than 2000 take several requests."""
         return await self._run(requests.read_range("discrete_inputs", address, count), unit)
 
     async def read_holding_registers(
         self, address: int, count: int, *, unit: int | None = None
     ) -> list[int]:
-        """`count` holding registers (function 3), 0 to 65535 each; more than 125 take several
+        """Reads `count` holding registers (function 3), 0 to 65535 each. More than 125 take several
         requests.
         """
         return await self._run(requests.read_range("holding_registers", address, count), unit)
@@ -73,7 +71,7 @@ class Client(BaseClient):
     async def read_input_registers(
         self, address: int, count: int, *, unit: int | None = None
     ) -> list[int]:
-        """`count` input registers (function 4), 0 to 65535 each; more than 125 take several
+        """Reads `count` input registers (function 4), 0 to 65535 each. More than 125 take several
         requests.
         """
         return await self._run(requests.read_range("input_registers", address, count), unit)
@@ -88,9 +86,9 @@ class Client(BaseClient):
         encoding: str | None = None,
         unit: int | None = None,
     ) -> Any:
-        """A typed value, as `holdfast.values.decode` makes it: `"float32"`, `"int16[10]"`.
+        """Reads a typed value, as `holdfast.values.decode` does: `"float32"`, `"int16[10]"`.
 
-        `order` is the order of bytes, `encoding` that of a `string:N`.
+        `order` is the byte order, `encoding` the encoding of a `string:N`.
         """
         steps = requests.read_typed(area, address, type, order, encoding)
         return await self._run(steps, unit)
@@ -107,17 +105,17 @@ class Client(BaseClient):
         split: bool = False,
         unit: int | None = None,
     ) -> None:
-        """A typed value, as `holdfast.values.encode` makes it, into coils or holding registers.
+        """Writes a typed value to coils or holding registers, as `holdfast.values.encode` does.
 
-        One bit or register is written by function 5 or 6, more by 15 or 16, one bit of a register
-        (`bit:3`) by 22. What does not fit into one request needs `split`, and is not one step on
-        the device then.
+        Uses function 5 or 6 for one bit or register, 15 or 16 for several, and 22 for one bit of a
+        register (`bit:3`). Values that exceed one request require `split`; the device then does not
+        write them in one step.
         """
         steps = requests.write_typed(area, address, value, type, order, encoding, split=split)
         await self._run(steps, unit)
 
     async def write_coil(self, address: int, value: bool, *, unit: int | None = None) -> None:
-        """One coil (function 5)."""
+        """Writes one coil (function 5)."""
         await self._call(Request.write_coil(address, value), unit)
 
     async def write_coils(
@@ -128,13 +126,13 @@ class Client(BaseClient):
         split: bool = False,
         unit: int | None = None,
     ) -> None:
-        """Coils (function 15): up to 1968, or with `split` any number by several requests, which
-        the device does not carry out as one step.
+        """Writes up to 1968 coils (function 15). With `split`, writes any number, in several
+        requests that the device does not execute in one step.
         """
         await self._run(requests.write_range("coils", address, values, split=split), unit)
 
     async def write_register(self, address: int, value: int, *, unit: int | None = None) -> None:
-        """One holding register (function 6), 0 to 65535."""
+        """Writes one holding register (function 6), 0 to 65535."""
         await self._call(Request.write_register(address, value), unit)
 
     async def write_registers(
@@ -145,8 +143,8 @@ class Client(BaseClient):
         split: bool = False,
         unit: int | None = None,
     ) -> None:
-        """Holding registers (function 16): up to 123, or with `split` any number by several
-        requests, which the device does not carry out as one step.
+        """Writes up to 123 holding registers (function 16). With `split`, writes any number, in
+        several requests that the device does not execute in one step.
         """
         await self._run(
             requests.write_range("holding_registers", address, values, split=split), unit
@@ -173,44 +171,44 @@ class Client(BaseClient):
         return result
 
     async def identify(self, *, unit: int | None = None) -> Identification:
-        """What the device says of itself (function 43/14): all objects that it has."""
+        """Reads all identification objects of the device (function 43/14)."""
         return await self._run(requests.identify(), unit)
 
     async def report_server_id(self, *, unit: int | None = None) -> ServerId:
-        """What the device says of itself by function 17."""
+        """Reads the server id of the device (function 17)."""
         return requests.ServerId(await self._call(Request.report_server_id(), unit))
 
     async def diagnostics(
         self, sub_function: int, data: Sequence[int] = (0,), *, unit: int | None = None
     ) -> list[int]:
-        """Diagnostics (function 8): sends data words to a sub-function, returns those that come.
+        """Sends data words to a diagnostics sub-function (function 8), and returns the reply's.
 
-        Sub-function 4, Force Listen Only Mode, has no reply: it ends in a `RequestTimeout`.
+        Sub-function 4, Force Listen Only Mode, has no reply and raises `RequestTimeout`.
         """
         return await self._run(requests.diagnostics(sub_function, data), unit)
 
     async def event_counter(self, *, unit: int | None = None) -> tuple[bool, int]:
-        """Whether the device is busy, and how many requests it carried out (function 11)."""
+        """Returns whether the device is busy, and its count of completed requests (function 11)."""
         result: tuple[bool, int] = await self._call(Request.event_counter(), unit)
         return result
 
     @property
     def late(self) -> int:
-        """Replies that came after their requests had timed out, and were dropped."""
+        """How many replies were dropped because they arrived after the timeout."""
         return self._transport.late
 
     async def close(self) -> None:
-        """Ends the connection: calls that wait get `ConnectionLost`, a later one connects anew."""
+        """Closes the connection: pending calls raise `ConnectionLost`, a later call reconnects."""
         await self._transport.close()
 
     def _run(self, plan: Plan[Result], unit: int | None) -> Awaitable[Result]:
-        """Carries out a plan."""
+        """Runs a plan."""
         if isinstance(plan, Request):
             return self._call(plan, unit)
         return self._take(plan, unit)
 
     async def _take(self, steps: Steps[Result], unit: int | None) -> Result:
-        """Takes steps."""
+        """Runs the steps of a plan."""
         try:
             request = next(steps)
             while True:

@@ -1,4 +1,4 @@
-"""What both clients are made of: the device, the unit id and the timeout of a call."""
+"""The base class of both clients: target, unit id and timeout."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MAX_TIMEOUT = 86_400.0
 
 
 class BaseClient:
-    """What both clients are made of."""
+    """The settings of a client, checked."""
 
     def __init__(self, url: str, unit: int, timeout: float) -> None:
         self.target = parse(url)
@@ -18,24 +18,24 @@ class BaseClient:
         self.timeout = _timeout(timeout)
 
     def unit_for(self, request: Request, unit: int | None) -> int:
-        """The unit id of a call. Raises `ValueError` for a broadcast that can't be one."""
+        """The unit id of a call. Raises `ValueError` for a function that can't be broadcast."""
         unit = self.unit if unit is None else _unit(unit)
         if unit == 0 and isinstance(self.target, SerialTarget):
             code = request.pdu[0]
             if code not in BROADCAST_CODES:
                 raise ValueError(
-                    f"unit 0 of a serial line is the broadcast, not for function {code}"
+                    f"unit 0 of a serial line is the broadcast, not allowed for function {code}"
                 )
         return unit
 
 
 def _unit(unit: int) -> int:
     if type(unit) is not int or not 0 <= unit <= MAX_UNIT:
-        raise ValueError(f"unit is {unit!r}, allowed are 0 to {MAX_UNIT}")
+        raise ValueError(f"unit is {unit!r}, allowed: 0 to {MAX_UNIT}")
     return unit
 
 
 def _timeout(seconds: float) -> float:
     if not 0 < seconds <= MAX_TIMEOUT:
-        raise ValueError(f"timeout is {seconds!r}, allowed are more than 0 to 86400 seconds")
+        raise ValueError(f"timeout is {seconds!r}, allowed: more than 0, up to 86400 seconds")
     return float(seconds)

@@ -1,9 +1,9 @@
-"""Modbus TCP in asyncio, with TLS or not: many requests in flight on one connection, in no thread.
+"""Modbus TCP and Modbus TLS for asyncio: many requests in flight on one connection, no threads.
 
-The native connection frames requests, matches replies, keeps the deadlines and speaks TLS; here are
-the socket, one alarm and the futures. Requests that are made in one turn of the event loop leave
-with one write, replies that arrive together are handed out together: a busy connection costs few
-wake-ups.
+The native connection frames requests, matches replies, tracks deadlines and handles TLS. This
+module owns the socket, one timer and the futures. Requests from the same turn of the event loop are
+sent in one write, and replies that arrive together are delivered together, so a busy connection
+causes few wake-ups.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class AsyncConnection:
         self._here: _LoopConnection | None = None
 
     def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
-        """Sends a request when there is room for it, and waits for the result.
+        """Sends a request as soon as a place is free, and waits for the result.
 
         Raises `RuntimeError` while the client is in use in another event loop.
         """
@@ -50,7 +50,7 @@ class AsyncConnection:
         return here.call(request, unit, timeout)
 
     async def close(self) -> None:
-        """Ends the connection; calls that wait for anything fail."""
+        """Closes the connection; pending calls fail."""
         loop = asyncio.get_running_loop()
         here = self._here
         if here is None or here.loop is not loop:
@@ -59,11 +59,11 @@ class AsyncConnection:
 
     @property
     def late(self) -> int:
-        """Replies that came after their requests had been given up."""
+        """How many replies arrived after their timeout."""
         return self._late + (0 if self._here is None else self._here.late)
 
     def _move(self, loop: asyncio.AbstractEventLoop) -> _LoopConnection:
-        """Begins anew in another loop: what was left behind in one that is closed is gone."""
+        """Starts over in another loop; drops everything of a closed loop."""
         old = self._here
         if old is not None:
             if old.in_use and not old.loop.is_closed():
@@ -74,7 +74,7 @@ class AsyncConnection:
 
 
 class _LoopConnection:
-    """A connection in its loop, made when it is needed, and again after it was lost."""
+    """A connection in one event loop. Connects on demand, and reconnects after a loss."""
 
     def __init__(
         self,
@@ -129,7 +129,7 @@ class _LoopConnection:
 
     @property
     def in_use(self) -> bool:
-        """Whether there is a connection, or a call that wants one."""
+        """Whether there is a connection, or a pending call."""
         connected = self._open is not None or self._connecting is not None
         return connected or self._free < self._max_in_flight
 
@@ -138,7 +138,7 @@ class _LoopConnection:
         return self._late + (0 if self._open is None else self._open.core.late)
 
     async def _turn(self) -> None:
-        """Waits for one of the places in flight, first come first served."""
+        """Waits for a free place in flight, in the order of the calls."""
         turn = self.loop.create_future()
         self._queue.append(turn)
         try:
@@ -149,7 +149,7 @@ class _LoopConnection:
             raise
 
     def _next_turn(self) -> None:
-        """Gives a place that became free to the next who waits."""
+        """Gives a free place to the next waiting call."""
         while self._queue:
             turn = self._queue.popleft()
             if not turn.done():
@@ -158,7 +158,7 @@ class _LoopConnection:
         self._free += 1
 
     async def _connected(self, deadline: float, timeout: float) -> _Protocol:
-        """The connection, made if need be; several calls may wait for the same one."""
+        """The connection; connects if necessary. Several calls can wait for the same attempt."""
         if self._connecting is None:
             self._connecting = self.loop.create_task(self._connect(timeout))
             self._connecting.add_done_callback(self._connect_ended)
@@ -194,28 +194,28 @@ class _LoopConnection:
 
     def _connect_ended(self, task: asyncio.Task[_Protocol]) -> None:
         self._connecting = None
-        # It may be lost already.
+        # The connection may already be lost.
         if not task.cancelled() and task.exception() is None and task.result().is_ready:
             self._open = task.result()
 
     def lost(self, connection: _Protocol) -> None:
-        """The connection has ended: the next call makes a new one."""
+        """Drops a connection that has ended; the next call reconnects."""
         self._late += connection.core.late
         if self._open is connection:
             self._open = None
 
 
 class _Protocol(asyncio.Protocol):
-    """One connection: requests out, replies in."""
+    """One connection: sends requests and receives replies."""
 
     def __init__(self, here: _LoopConnection, core: Connection) -> None:
         self.core = core
         self._here = here
         self._loop = here.loop
         self.ready: asyncio.Future[None] = self._loop.create_future()
-        """Requests can be sent."""
+        """Done when requests can be sent."""
         self.ended: asyncio.Future[None] = self._loop.create_future()
-        """Its socket is closed."""
+        """Done when the socket is closed."""
         self._futures: dict[int, asyncio.Future[Any]] = {}
         self._alarm: asyncio.TimerHandle | None = None
         self._alarm_at = inf
@@ -230,9 +230,9 @@ class _Protocol(asyncio.Protocol):
     def send(
         self, request: Request, unit: int, deadline: float, timeout: float
     ) -> tuple[int, asyncio.Future[Any]]:
-        """Sends a request: alone at once, beside others with those of this turn of the loop.
+        """Sends a request: at once if no other is pending, else with others of this loop turn.
 
-        Returns its ticket, and what will have the result.
+        Returns its ticket and the future of its result.
         """
         ticket = self.core.send(request, unit, timeout, deadline - timeout)
         if not self._futures:
@@ -246,12 +246,12 @@ class _Protocol(asyncio.Protocol):
         return ticket, future
 
     def cancel(self, ticket: int) -> None:
-        """Nobody waits for the reply any more."""
+        """Drops a request whose caller no longer waits."""
         if self._futures.pop(ticket, None) is not None:
             self.core.cancel(ticket)
 
     def close(self) -> None:
-        """Ends the connection; whoever waits for a reply gets `ConnectionLost`."""
+        """Closes the connection; pending requests raise `ConnectionLost`."""
         self._settle(self.core.close())
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -267,7 +267,7 @@ class _Protocol(asyncio.Protocol):
         self.ended.set_result(None)
 
     def _settle(self, completed: list[tuple[int, Any]]) -> None:
-        """Hands results out, sends what is to be sent, and ends what has ended."""
+        """Delivers results, continues the handshake, and handles the end of the connection."""
         for ticket, result in completed:
             future = self._futures.pop(ticket)
             if future.done():
@@ -283,7 +283,7 @@ class _Protocol(asyncio.Protocol):
             self._end(closed)
 
     def _greet(self) -> None:
-        """Goes on with what comes before the first request."""
+        """Continues the handshake before the first request."""
         self._flush()
         if self.core.is_ready:
             self.ready.set_result(None)
@@ -294,7 +294,7 @@ class _Protocol(asyncio.Protocol):
             self._alarm = None
         if not self.ready.done():
             self.ready.set_exception(why)
-            self.ready.exception()  # Whoever wanted it may be gone.
+            self.ready.exception()  # Marks it retrieved: the waiting call may be cancelled.
         transport, self._transport = self._transport, None
         if transport is not None:
             self._here.lost(self)
@@ -317,7 +317,7 @@ class _Protocol(asyncio.Protocol):
         self._alarm = self._loop.call_at(at, self._look_at_deadlines)
 
     def _look_at_deadlines(self) -> None:
-        """Ends the calls whose time is over, and sets the alarm for the next."""
+        """Ends calls after their deadline, and sets the timer for the next deadline."""
         self._alarm, self._alarm_at = None, inf
         self._settle(self.core.advance(self._loop.time()))
         deadline = self.core.deadline
@@ -326,7 +326,7 @@ class _Protocol(asyncio.Protocol):
 
 
 def explained(error: Exception) -> str:
-    """What the system calls an error, without the address that asyncio adds."""
+    """The system's text for an error, without the address that asyncio adds."""
     if isinstance(error, socket.gaierror):
         return error.strerror or str(error)
     if isinstance(error, OSError) and error.errno is not None:

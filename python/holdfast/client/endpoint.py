@@ -1,4 +1,4 @@
-"""Targets as the native core has them; the files that TLS needs are read here."""
+"""Converts targets to native endpoints, and reads TLS files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def blocking(target: Target) -> BlockingClient:
-    """The native client of a target; it connects when it is first used."""
+    """The native client of a target. It connects on its first call."""
     return BlockingClient(endpoint(target))
 
 
 def endpoint(target: Target) -> Endpoint:
-    """A target as the native core has it."""
+    """The native endpoint of a target. Raises `OSError` and `ValueError` for TLS files."""
     if isinstance(target, SerialTarget):
         return Endpoint.serial(
             target.device,
@@ -37,5 +37,5 @@ def endpoint(target: Target) -> Endpoint:
 
 
 def check_files(tls: Tls) -> None:
-    """Raises `OSError` and `ValueError` for files that can't be used."""
+    """Checks TLS files. Raises `OSError` and `ValueError` for files that can't be used."""
     endpoint(NetworkTarget("tls", "localhost", TLS_PORT, tls))

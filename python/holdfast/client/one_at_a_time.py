@@ -1,4 +1,4 @@
-"""Transports that carry one request at a time, for asyncio: each in a thread of its own."""
+"""Transports with one request at a time for asyncio, each in its own thread."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 class OneAtATime:
-    """A transport that carries one request at a time, in a thread of its own."""
+    """A transport with one request at a time, in its own thread."""
 
     def __init__(self, target: Target) -> None:
         self._core = blocking(target)
         self._executor: ThreadPoolExecutor | None = None
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
-        """Sends a request when its turn has come, and waits for the result."""
+        """Sends a request after the calls before it, and waits for the result."""
         if self._executor is None:
             self._executor = ThreadPoolExecutor(1, "holdfast-client")
         loop = asyncio.get_running_loop()
@@ -38,7 +38,7 @@ class OneAtATime:
         return self._core.call(request, unit, timeout)
 
     async def close(self) -> None:
-        """Ends the connection, once the call under way has ended; those that wait fail."""
+        """Closes the connection after the current call; waiting calls fail."""
         executor, self._executor = self._executor, None
         if executor is not None:
             executor.submit(self._core.close)
@@ -46,5 +46,5 @@ class OneAtATime:
 
     @property
     def late(self) -> int:
-        """Replies that came too late."""
+        """How many replies arrived after their timeout."""
         return self._core.late

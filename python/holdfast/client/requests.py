@@ -1,7 +1,7 @@
-"""What a client can do, as one request, or as steps that yield requests and are given results.
+"""The operations of a client: single requests, or steps that yield requests and receive results.
 
-The same steps serve the client that waits and the one that awaits. Nothing here does I/O. Arguments
-are checked when a request is made, which is before anything is sent.
+Both clients run the same steps. This module does no I/O. Arguments are checked when a request is
+built, before anything is sent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Request, Any, Result]
 Plan: TypeAlias = Request | Steps[Result]
-"""One request whose result is that of the whole, or steps."""
+"""One request whose result is the result of the operation, or steps."""
 
 OBJECT_NAMES = (
     "vendor_name",
@@ -47,7 +47,7 @@ OBJECT_NAMES = (
 
 @dataclass(frozen=True)
 class Identification:
-    """What a device says of itself by function 43/14; a name it does not have is `None`."""
+    """The identification of a device (function 43/14); a missing object is `None`."""
 
     vendor_name: str | None
     product_code: str | None
@@ -57,36 +57,36 @@ class Identification:
     model_name: str | None
     user_application_name: str | None
     conformity_level: int
-    """Which categories the device has, and how it gives them (V1.1b3, 6.21)."""
+    """The categories that the device supports, and how to read them (V1.1b3, 6.21)."""
     objects: dict[int, bytes]
-    """All objects as they came, by object id."""
+    """All objects as received, by object id."""
 
 
 @dataclass(frozen=True)
 class ServerId:
-    """The answer to function 17, whose layout is the device's own."""
+    """The answer to function 17. Its layout depends on the device."""
 
     data: bytes
-    """All of it."""
+    """The whole answer."""
 
     @property
     def server_id(self) -> int | None:
-        """The first byte, which most devices use for an id."""
+        """The first byte, which most devices use as an id."""
         return self.data[0] if self.data else None
 
     @property
     def running(self) -> bool | None:
-        """The run indicator in the second byte, where it is one of its two values."""
+        """The run indicator in the second byte; `None` if it is neither 0x00 nor 0xFF."""
         return {0xFF: True, 0x00: False}.get(self.data[1]) if len(self.data) > 1 else None
 
     @property
     def additional(self) -> bytes:
-        """What follows."""
+        """The bytes after the run indicator."""
         return self.data[2:]
 
 
 def read_range(area: Area, address: int, count: int) -> Plan[list[Any]]:
-    """`count` bits or registers, in as many requests as that takes."""
+    """Reads `count` bits or registers, in several requests if necessary."""
     address, count = index(address), index(count)
     limit = READ_LIMITS.get(area)
     if limit is None or count <= limit:
@@ -107,15 +107,15 @@ def _in_turn(reads: list[Request]) -> Steps[list[Any]]:
 
 
 def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) -> Steps[None]:
-    """Bits or registers, in one request; in more only if that is allowed."""
+    """Writes bits or registers in one request, or with `split` in several."""
     limit = WRITE_LIMITS[area]
     address = index(address)
     make = Request.write_coils if area == "coils" else Request.write_registers
     if len(items) <= limit or not split:
         if len(items) > limit:
             raise ValueError(
-                f"{len(items)} values, one request writes at most {limit}; with split=True they "
-                "are written by several, which the device does not do as one step"
+                f"{len(items)} values, one request writes at most {limit}; use split=True for "
+                "several requests, which the device does not execute in one step"
             )
         yield make(address, items)
         return
@@ -127,7 +127,7 @@ def write_range(area: Area, address: int, items: Sequence[int], *, split: bool) 
 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
-    """A typed value, or an array of them."""
+    """Reads a typed value, or an array of values."""
     codec = codec_for(area, kind, order, encoding)
     plan = read_range(area, address, codec.type.registers)
     raw = (yield plan) if isinstance(plan, Request) else (yield from plan)
@@ -144,8 +144,8 @@ def write_typed(
     *,
     split: bool,
 ) -> Steps[None]:
-    """A typed value: one bit or register by functions 5 and 6, more by 15 and 16; one bit of a
-    register by function 22, which leaves the others alone.
+    """Writes a typed value: one bit or register with functions 5 and 6, several with 15 and 16; one
+    bit of a register with function 22, which keeps the other bits.
     """
     if area not in WRITE_LIMITS:
         raise ValueError(f"area is {area!r}, only {' and '.join(WRITE_LIMITS)} can be written")
@@ -153,7 +153,7 @@ def write_typed(
     raw = codec.encode(value)
     if codec.type.base == "bit":
         if codec.type.count is not None:
-            raise ValueError(f"{kind} is bits of several registers, only one bit can be written")
+            raise ValueError(f"{kind} has bits of several registers, allowed: one bit")
         [mask] = raw
         yield Request.mask_write(address, *((MAX_WORD ^ mask, mask) if value else (mask, 0)))
     elif len(raw) > 1:
@@ -165,7 +165,7 @@ def write_typed(
 
 
 def identify() -> Steps[Identification]:
-    """All objects that the device has, in as many requests as it wants."""
+    """Reads all identification objects, in as many requests as the device requires."""
     objects: dict[int, bytes] = {}
     conformity = 0
     for code in (3, 2, 1):
@@ -173,7 +173,7 @@ def identify() -> Steps[Identification]:
             conformity = yield from _stream(code, objects)
             break
         except ModbusException as error:
-            # A device of a lower level may refuse the higher ones.
+            # A device may refuse levels that it does not support.
             if error.code != ILLEGAL_VALUE or code == 1:
                 raise
     names = {
@@ -184,7 +184,7 @@ def identify() -> Steps[Identification]:
 
 
 def _stream(code: int, objects: dict[int, bytes]) -> Steps[int]:
-    """The objects of one read code; the conformity level."""
+    """Reads the objects of one read code. Returns the conformity level."""
     following: int | None = 0
     conformity = 0
     while following is not None:
@@ -192,15 +192,15 @@ def _stream(code: int, objects: dict[int, bytes]) -> Steps[int]:
         conformity, following, found = yield Request.identification(code, asked)
         objects.update(found)
         if following is not None and (following <= asked or not found):
-            raise InvalidResponse(f"object {following} is said to follow after object {asked}")
+            raise InvalidResponse(f"object {following} can't follow object {asked}")
     return conformity
 
 
 def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
-    """Function 8: data words out and in."""
+    """Sends and receives data words (function 8)."""
     for word in data:
         if type(word) is not int or not 0 <= word <= MAX_WORD:
-            raise ValueError(f"data holds {word!r}, allowed are words 0 to {MAX_WORD}")
+            raise ValueError(f"data contains {word!r}, allowed: words 0 to {MAX_WORD}")
     sent = b"".join(word.to_bytes(2, "big") for word in data)
     came: bytes = yield Request.diagnostics(sub_function, sent)
     return [int.from_bytes(came[at : at + 2], "big") for at in range(0, len(came), 2)]

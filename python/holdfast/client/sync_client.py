@@ -1,4 +1,4 @@
-"""`SyncClient`: a client that waits for each reply."""
+"""`SyncClient`: a client without asyncio."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 
 
 class SyncClient(BaseClient):
-    """A client that waits: every method returns when the device has answered.
+    """A blocking client: every method returns when the device has answered.
 
-    `url` names the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
+    `url` is the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
     `rtu+tcp://host:502`, `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`.
-    `unit` is the unit id, 0 to 255, that a call can replace. `timeout` in seconds covers
-    connecting, sending and receiving.
+    `unit` is the default unit id, 0 to 255; every call can override it. `timeout`, in seconds,
+    covers connection, request and reply together.
 
-    The files of a `tls` URL are read now: `OSError` and `ValueError` say what is wrong with them.
+    Reads the files of a `tls` URL now; raises `OSError` or `ValueError` if they can't be used.
 
-    Threads may share a client; their calls take turns, for which `timeout` does not count.
+    Threads can share a client. Their calls run one after the other; `timeout` does not include the
+    wait for other calls.
 
     Methods raise `ValueError` or `TypeError` before anything is sent, and `ModbusException`,
     `ConnectionLost`, `RequestTimeout` or `InvalidResponse` after; all four are `ModbusError`.
@@ -42,19 +43,19 @@ class SyncClient(BaseClient):
         self._core = blocking(self.target)
 
     def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:
-        """`count` coils (function 1); more than 2000 take several requests."""
+        """Reads `count` coils (function 1). More than 2000 take several requests."""
         return self._run(requests.read_range("coils", address, count), unit)
 
     def read_discrete_inputs(
         self, address: int, count: int, *, unit: int | None = None
     ) -> list[bool]:
-        """`count` discrete inputs (function 2); more than 2000 take several requests."""
+        """Reads `count` discrete inputs (function 2). More than 2000 take several requests."""
         return self._run(requests.read_range("discrete_inputs", address, count), unit)
 
     def read_holding_registers(
         self, address: int, count: int, *, unit: int | None = None
     ) -> list[int]:
-        """`count` holding registers (function 3), 0 to 65535 each; more than 125 take several
+        """Reads `count` holding registers (function 3), 0 to 65535 each. More than 125 take several
         requests.
         """
         return self._run(requests.read_range("holding_registers", address, count), unit)
@@ -62,7 +63,7 @@ class SyncClient(BaseClient):
     def read_input_registers(
         self, address: int, count: int, *, unit: int | None = None
     ) -> list[int]:
-        """`count` input registers (function 4), 0 to 65535 each; more than 125 take several
+        """Reads `count` input registers (function 4), 0 to 65535 each. More than 125 take several
         requests.
         """
         return self._run(requests.read_range("input_registers", address, count), unit)
@@ -77,9 +78,9 @@ class SyncClient(BaseClient):
         encoding: str | None = None,
         unit: int | None = None,
     ) -> Any:
-        """A typed value, as `holdfast.values.decode` makes it: `"float32"`, `"int16[10]"`.
+        """Reads a typed value, as `holdfast.values.decode` does: `"float32"`, `"int16[10]"`.
 
-        `order` is the order of bytes, `encoding` that of a `string:N`.
+        `order` is the byte order, `encoding` the encoding of a `string:N`.
         """
         steps = requests.read_typed(area, address, type, order, encoding)
         return self._run(steps, unit)
@@ -96,17 +97,17 @@ class SyncClient(BaseClient):
         split: bool = False,
         unit: int | None = None,
     ) -> None:
-        """A typed value, as `holdfast.values.encode` makes it, into coils or holding registers.
+        """Writes a typed value to coils or holding registers, as `holdfast.values.encode` does.
 
-        One bit or register is written by function 5 or 6, more by 15 or 16, one bit of a register
-        (`bit:3`) by 22. What does not fit into one request needs `split`, and is not one step on
-        the device then.
+        Uses function 5 or 6 for one bit or register, 15 or 16 for several, and 22 for one bit of a
+        register (`bit:3`). Values that exceed one request require `split`; the device then does not
+        write them in one step.
         """
         steps = requests.write_typed(area, address, value, type, order, encoding, split=split)
         self._run(steps, unit)
 
     def write_coil(self, address: int, value: bool, *, unit: int | None = None) -> None:
-        """One coil (function 5)."""
+        """Writes one coil (function 5)."""
         self._call(Request.write_coil(address, value), unit)
 
     def write_coils(
@@ -117,13 +118,13 @@ class SyncClient(BaseClient):
         split: bool = False,
         unit: int | None = None,
     ) -> None:
-        """Coils (function 15): up to 1968, or with `split` any number by several requests, which
-        the device does not carry out as one step.
+        """Writes up to 1968 coils (function 15). With `split`, writes any number, in several
+        requests that the device does not execute in one step.
         """
         self._run(requests.write_range("coils", address, values, split=split), unit)
 
     def write_register(self, address: int, value: int, *, unit: int | None = None) -> None:
-        """One holding register (function 6), 0 to 65535."""
+        """Writes one holding register (function 6), 0 to 65535."""
         self._call(Request.write_register(address, value), unit)
 
     def write_registers(
@@ -134,8 +135,8 @@ class SyncClient(BaseClient):
         split: bool = False,
         unit: int | None = None,
     ) -> None:
-        """Holding registers (function 16): up to 123, or with `split` any number by several
-        requests, which the device does not carry out as one step.
+        """Writes up to 123 holding registers (function 16). With `split`, writes any number, in
+        several requests that the device does not execute in one step.
         """
         steps = requests.write_range("holding_registers", address, values, split=split)
         self._run(steps, unit)
@@ -161,38 +162,38 @@ class SyncClient(BaseClient):
         return result
 
     def identify(self, *, unit: int | None = None) -> Identification:
-        """What the device says of itself (function 43/14): all objects that it has."""
+        """Reads all identification objects of the device (function 43/14)."""
         return self._run(requests.identify(), unit)
 
     def report_server_id(self, *, unit: int | None = None) -> ServerId:
-        """What the device says of itself by function 17."""
+        """Reads the server id of the device (function 17)."""
         return requests.ServerId(self._call(Request.report_server_id(), unit))
 
     def diagnostics(
         self, sub_function: int, data: Sequence[int] = (0,), *, unit: int | None = None
     ) -> list[int]:
-        """Diagnostics (function 8): sends data words to a sub-function, returns those that come.
+        """Sends data words to a diagnostics sub-function (function 8), and returns the reply's.
 
-        Sub-function 4, Force Listen Only Mode, has no reply: it ends in a `RequestTimeout`.
+        Sub-function 4, Force Listen Only Mode, has no reply and raises `RequestTimeout`.
         """
         return self._run(requests.diagnostics(sub_function, data), unit)
 
     def event_counter(self, *, unit: int | None = None) -> tuple[bool, int]:
-        """Whether the device is busy, and how many requests it carried out (function 11)."""
+        """Returns whether the device is busy, and its count of completed requests (function 11)."""
         result: tuple[bool, int] = self._call(Request.event_counter(), unit)
         return result
 
     @property
     def late(self) -> int:
-        """Replies that came after their requests had timed out, and were dropped."""
+        """How many replies were dropped because they arrived after the timeout."""
         return self._core.late
 
     def close(self) -> None:
-        """Ends the connection after the calls that came before. A later call makes a new one."""
+        """Closes the connection after the calls before it. A later call reconnects."""
         self._core.close()
 
     def _run(self, plan: Plan[Result], unit: int | None) -> Result:
-        """Carries out a plan."""
+        """Runs a plan."""
         if isinstance(plan, Request):
             result: Result = self._call(plan, unit)
             return result

@@ -1,4 +1,4 @@
-"""Whom a client talks to: URLs, read strictly."""
+"""Parses the URL of a device."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Mode: TypeAlias = Literal["rtu", "ascii"]
 Parity: TypeAlias = Literal["none", "even", "odd"]
 
 IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
-"""The transports that carry many requests at once."""
+"""The transports that allow several requests in flight."""
 
 FORMS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
@@ -33,13 +33,13 @@ FORMS = (
 
 @dataclass(frozen=True)
 class NetworkTarget:
-    """A device, or a gateway, behind an address."""
+    """A device or gateway at a network address."""
 
     transport: Transport
     host: str
     port: int
     tls: Tls = NO_FILES
-    """Of transport `tls`."""
+    """Only with transport `tls`."""
 
     def __str__(self) -> str:
         return f"{self.transport}://{joined(self.host, self.port)}"
@@ -56,9 +56,9 @@ class SerialTarget:
     stop_bits: int = 1
     data_bits: int = 8
     silence: float | None = None
-    """Seconds that end an RTU frame; `None` for 3.5 characters."""
+    """Seconds of silence that end an RTU frame; `None`: 3.5 characters."""
     echo: bool = False
-    """Whether the adapter hands back what is sent."""
+    """Whether the adapter echoes sent bytes."""
 
     def __str__(self) -> str:
         return f"{self.mode}://{self.device}"
@@ -68,33 +68,33 @@ Target: TypeAlias = NetworkTarget | SerialTarget
 
 
 def parse(url: str) -> Target:
-    """The target that a URL names. Raises `ValueError`, which says what is allowed."""
+    """Parses the URL of a device. Raises `ValueError` that says what is allowed."""
     if not isinstance(url, str):
-        raise TypeError(f"{url!r} is no URL of a device; allowed are {FORMS}")
+        raise TypeError(f"{url!r} is not the URL of a device, allowed: {FORMS}")
     try:
         parts = urlsplit(url)
         port = parts.port
     except ValueError as error:
-        raise ValueError(f"{url!r}: {error}; allowed are {FORMS}") from None
+        raise ValueError(f"{url!r}: {error}, allowed: {FORMS}") from None
     scheme = parts.scheme
     if parts.fragment or parts.username is not None:
-        raise ValueError(f"{url!r} has a user or a fragment; allowed are {FORMS}")
+        raise ValueError(f"{url!r} has a user or a fragment, allowed: {FORMS}")
     if scheme in TRANSPORTS:
         query = parts.query and scheme != "tls"
         if not parts.hostname or parts.path not in ("", "/") or query:
-            raise ValueError(f"{url!r} is no address of a device; allowed are {FORMS}")
+            raise ValueError(f"{url!r} is not the address of a device, allowed: {FORMS}")
         if port == 0:
-            raise ValueError(f"{url!r}: port 0, allowed are 1 to {LAST_PORT}")
+            raise ValueError(f"{url!r}: port 0, allowed: 1 to {LAST_PORT}")
         port = usual_port(scheme) if port is None else port
         tls = _tls(url, parts.query) if scheme == "tls" else NO_FILES
         return NetworkTarget(scheme, unquote(parts.hostname), port, tls)
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
-    raise ValueError(f"{url!r} is no URL of a device; allowed are {FORMS}")
+    raise ValueError(f"{url!r} is not the URL of a device, allowed: {FORMS}")
 
 
 def in_folder(url: str, folder: Path) -> str:
-    """The URL with files that are relative to this folder made absolute."""
+    """The URL, with paths of files resolved relative to this folder."""
     target = parse(url)
     if not isinstance(target, NetworkTarget) or target.transport != "tls":
         return url
@@ -106,7 +106,7 @@ def in_folder(url: str, folder: Path) -> str:
 
 @dataclass(frozen=True)
 class _Option:
-    """A key of the query: what it may be, and how it is read."""
+    """A key of the query: its allowed values, as text, and its parser."""
 
     allowed: str
     read: Callable[[str], Any]
@@ -155,20 +155,20 @@ OPTIONS: Mapping[str, _Option] = {
 
 
 def _chosen(url: str, scheme: str, query: str) -> dict[str, Any]:
-    """What a query says, of what it may say with this scheme."""
+    """Parses a query with the options of a scheme."""
     chosen: dict[str, Any] = {}
-    # A plus is itself in a URL; only forms of HTML mean a blank by it.
+    # `+` is a literal in a URL; `parse_qsl` would read it as a space, as in HTML forms.
     for key, text in parse_qsl(query.replace("+", "%2B"), keep_blank_values=True):
         option = OPTIONS.get(key)
         if option is None or scheme not in option.schemes:
             known = ", ".join(name for name, each in OPTIONS.items() if scheme in each.schemes)
-            raise ValueError(f"{url!r}: {key!r} is not known, allowed are {known}")
+            raise ValueError(f"{url!r}: unknown option {key!r}, allowed: {known}")
         if key in chosen:
-            raise ValueError(f"{url!r}: {key} is given twice")
+            raise ValueError(f"{url!r}: duplicate option {key}")
         try:
             chosen[key] = option.read(text)
         except ValueError:
-            raise ValueError(f"{url!r}: {key} is {text!r}, allowed are {option.allowed}") from None
+            raise ValueError(f"{url!r}: {key} is {text!r}, allowed: {option.allowed}") from None
     return chosen
 
 
@@ -183,12 +183,12 @@ def _tls(url: str, query: str) -> Tls:
 def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
     device = unquote(path)
     if re.fullmatch(r"/(COM[0-9]+|\\\\\.\\.+)", device):
-        device = device[1:]  # Windows has no folder before its ports.
+        device = device[1:]  # Ports of Windows have no leading slash.
     if device in ("", "/"):
-        raise ValueError(f"{url!r} names no device; allowed are {FORMS}")
+        raise ValueError(f"{url!r} has no device, allowed: {FORMS}")
     chosen = _chosen(url, mode, query)
     if mode == "rtu" and chosen.get("data_bits", 8) != 8:
-        raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu is 8")
+        raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu: 8")
     chosen.setdefault("data_bits", 8 if mode == "rtu" else 7)
     chosen.setdefault("stop_bits", 2 if chosen.get("parity") == "none" else 1)
     return SerialTarget(mode, device, **chosen)
