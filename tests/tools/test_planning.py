@@ -292,7 +292,7 @@ def test_every_block_says_why_it_ends() -> None:
         "gap: 24, max_gap is 5",
         "forbidden: 45",
         "gap: 248, max_gap is 5",
-        "limit: 200 with the next, the most is 125",
+        "limit: 200 with the next read, allowed: 125",
         "nothing more to read",
     ]
     readable: planning.Rules = {"max_gap": 65535, "readable": [("holding_registers", 0, 20)]}
@@ -319,7 +319,7 @@ def test_a_long_read_is_in_several_blocks() -> None:
 
 
 def test_a_forbidden_read_is_named() -> None:
-    with pytest.raises(ValueError, match="coils 3 meets what is forbidden, 1 to 8"):
+    with pytest.raises(ValueError, match="coils 3 overlaps the forbidden range 1 to 8"):
         planning.plan(HOLDING, {"forbidden": [("coils", 1, 9)]})
 
 
@@ -403,7 +403,7 @@ def test_the_plan_of_a_configuration(file: str) -> None:
         "other: udp://10.0.0.10 unit 1, not polled",
         "",
         "area   address  count  reads  gaps  why it ends",
-        "coils        0   2000  0            limit: 2001 with the next, the most is 2000",
+        "coils        0   2000  0            limit: 2001 with the next read, allowed: 2000",
         "coils     2000      1  0            nothing more to read",
         "",
         "2 requests",
@@ -478,7 +478,7 @@ def test_the_plan_of_reads() -> None:
         (("tcp://plc", *READS, "--cost", "1"), "'1' is not REQUEST:REGISTER"),
         (("tcp://plc", *READS, "--forbidden", "hr:3-1"), "'hr:3-1' is not AREA:FIRST-LAST"),
         (("tcp://plc", *READS, "--forbidden", "hr:9"), "holding_registers 0 to 9 meets what is"),
-        (("http://plc", *READS), "is no URL of a device"),
+        (("http://plc", *READS), "is not the URL of a device"),
     ],
 )
 def test_wrong_usage_of_plan_is_told(words: tuple[str, ...], error: str) -> None:

@@ -1,4 +1,4 @@
-"""What the command line offers to other callers too: discovery, inference, plans, load.
+"""Tools for the command line and for other callers: discovery, inference, plans, load tests.
 
-Nothing here knows a terminal.
+This package never uses a terminal.
 """

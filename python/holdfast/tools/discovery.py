@@ -1,14 +1,14 @@
-"""Which addresses a device has: found by reading, with few requests.
+"""Finds the addresses of a device by reading, with few requests.
 
-An address is there if a read that covers it succeeds, and outside if a read of it alone is answered
-with exception 02. Everything else is told apart: other exceptions, silence, replies that are none.
+An address exists if a read that covers it succeeds, and does not exist if a read of it alone
+returns exception 02. Other exceptions, timeouts and invalid replies are listed separately.
 
-Fast, a number of addresses are read as samples, and from each that is there the range around it is
-followed to both ends, in blocks that double and are halved where a read fails. Every address of a
-range that is found has been read; a range that holds no sample is missed. Exact, every address is
-read, in blocks where they are, one by one where they are not.
+The fast search reads samples, then the range around each existing sample to both ends, in blocks
+that double after a success and are halved after a failure. It reads every address of a range that
+it reports; it misses a range without a sample. The exact search reads every address, in blocks
+where addresses exist, one by one elsewhere.
 
-A block that fails although all of it can be read in parts was too large: blocks stay smaller then.
+If a block fails, but all its parts can be read, it was too large: blocks then stay smaller.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 STEP = 256
-"""Addresses between two samples."""
+"""Distance between two samples."""
 
 CLOSER = (1, 2, 4, 8, 16, 32, 64)
-"""How far behind the end of a range the next one is looked for."""
+"""Distances after the end of a range at which to search for the next range."""
 
 GIVE_UP = 5
-"""So many samples all over an area with one and the same failure, other than 02, are enough."""
+"""Skip an area if this many samples across it fail in the same way, other than with 02."""
 
 NO_ANSWER = 2
-"""So many addresses without a reply, when there has never been one, are enough of a device."""
+"""Stop after this many addresses without a reply if the device has never replied."""
 
 SILENT_READS = 8
-"""After so many reads without a reply, one that had a reply is repeated: is the device there?"""
+"""After this many reads without a reply, repeat a read that had one, to check the device."""
 
 Failure: TypeAlias = int | Literal["timeout", "connection", "invalid"]
-"""Why a read failed: an exception code, or what else."""
+"""Why a read failed: an exception code, or a word."""
 
 Outcome: TypeAlias = Failure | None
-"""How a read ended; `None` is well."""
+"""The result of a read; `None` is success."""
 
 Result = TypeVar("Result")
 
@@ -72,45 +72,45 @@ Steps: TypeAlias = Generator[Probe, Outcome, Result]
 
 
 class DeviceSilent(ModbusError):
-    """The device has ceased to answer; what was found until then is in the survey."""
+    """The device has stopped answering; the survey has the results so far."""
 
 
 @dataclass
 class AreaMap:
-    """What is known of an area."""
+    """The results for an area."""
 
     area: Area
     ranges: list[range] = field(default_factory=list)
-    """The addresses that are there, in order; ranges do not touch."""
+    """The existing addresses, sorted; ranges are never adjacent."""
     failures: dict[Failure, list[range]] = field(default_factory=dict)
-    """The addresses that failed otherwise than as outside, by how."""
+    """The addresses that failed other than with exception 02, by failure."""
     requests: int = 0
     given_up: Failure | None = None
-    """Why the rest of the area was not looked at, if it wasn't."""
+    """Why the rest of the area was skipped; `None` if it was not."""
     largest: int = 0
-    """The most addresses that one read returned."""
+    """The largest number of addresses that one read returned."""
 
     @property
     def addresses(self) -> int:
-        """How many addresses are there."""
+        """How many addresses exist."""
         return sum(map(len, self.ranges))
 
     def found(self, first: int, count: int) -> None:
-        """Notes that addresses are there."""
+        """Records existing addresses."""
         _add(self.ranges, first, count)
 
     def failed(self, address: int, failure: Failure) -> None:
-        """Notes that an address could not be read, and why."""
+        """Records an address that could not be read, and why."""
         if failure != ILLEGAL_ADDRESS:
             _add(self.failures.setdefault(failure, []), address, 1)
 
 
 class Survey:
-    """The search for the addresses of a device, to be carried out by `run` or `run_sync`.
+    """A search for the addresses of a device. Run it with `run` or `run_sync`.
 
-    `areas` are looked at within `span`. `exact` reads every address; otherwise samples are read
-    every `step` addresses, and where devices like to begin their ranges. No read is for more than
-    `max_quantity` bits or registers, nor for more than the standard allows.
+    Searches `areas` within `span`. With `exact`, reads every address; otherwise, reads samples at
+    every `step` addresses and at common start addresses. One read is for at most `max_quantity`
+    bits or registers, and never more than the standard allows.
     """
 
     def __init__(
@@ -123,18 +123,18 @@ class Survey:
         span: range = range(ADDRESSES),
     ) -> None:
         if max_quantity is not None and max_quantity < 1:
-            raise ValueError(f"max_quantity is {max_quantity}, allowed are 1 and more")
+            raise ValueError(f"max_quantity is {max_quantity}, allowed: 1 or more")
         if step < 1:
-            raise ValueError(f"step is {step}, allowed are 1 and more")
+            raise ValueError(f"step is {step}, allowed: 1 or more")
         if span.step != 1 or not 0 <= span.start < span.stop <= ADDRESSES:
-            raise ValueError(f"span is {span}, allowed are 0 to {LAST_ADDRESS}")
+            raise ValueError(f"span is {span}, allowed: inside 0 to {LAST_ADDRESS}")
         self.span = span
         self.exact = exact
         self.areas = [AreaMap(area) for area in areas]
         self.at = 0
-        """How many addresses of all areas have been dealt with."""
+        """How many addresses of all areas are done."""
         self.texts: dict[Failure, str] = {}
-        """Failures in words, as the device or the connection told them first."""
+        """The first error message of each failure."""
         self.max_quantity = max_quantity
         self._step = step
         self._answered: Probe | None = None
@@ -142,7 +142,7 @@ class Survey:
 
     @property
     def total(self) -> int:
-        """How many addresses of all areas there are to deal with."""
+        """How many addresses of all areas to search."""
         return len(self.areas) * len(self.span)
 
     @property
@@ -151,14 +151,14 @@ class Survey:
         return sum(found.requests for found in self.areas)
 
     def steps(self) -> Steps[None]:
-        """The reads, one after the other; each is to be answered with how it ended."""
+        """Yields the reads one by one; send the outcome of each."""
         for index, found in enumerate(self.areas):
             search = _Search(self, found, index * len(self.span))
             yield from search.exact() if self.exact else search.fast(self._samples())
             self.at = (index + 1) * len(self.span)
 
     def read(self, found: AreaMap, probe: Probe) -> Steps[Outcome]:
-        """A read; again if it was lost or the device was busy."""
+        """Runs a read; repeats it once if there was no reply or the device was busy."""
         outcome = yield probe
         found.requests += 1
         if outcome == BUSY or isinstance(outcome, str):
@@ -183,10 +183,10 @@ class Survey:
             found.requests += 1
             if not isinstance(outcome, str):
                 return
-        raise DeviceSilent("the device has ceased to answer")
+        raise DeviceSilent("the device stopped answering")
 
     def _samples(self) -> list[int]:
-        """Addresses to look at: evenly spread, and where ranges like to begin."""
+        """The addresses of samples: evenly spaced, and common start addresses."""
         thousands = range(1000, ADDRESSES, 1000)
         likely = {1, 10, 20, *range(0, 10000, 50), *thousands, *(each + 1 for each in thousands)}
         first, stop = self.span.start, self.span.stop
@@ -195,7 +195,7 @@ class Survey:
 
 
 class _Search:
-    """The search in one area; `base` is what of the survey lies before it."""
+    """The search in one area; `base` is the progress of the survey before it."""
 
     def __init__(self, survey: Survey, found: AreaMap, base: int) -> None:
         limit = READ_LIMITS[found.area]
@@ -206,12 +206,12 @@ class _Search:
         self._stop = survey.span.stop
         self._base = base - self._first
         self._failures: dict[int, Failure] = {}
-        """Addresses that were read alone and failed, and how."""
+        """The failure of each address that was read alone and failed."""
         self._places: list[int] = []
-        """The same addresses in order."""
+        """The same addresses, sorted."""
 
     def exact(self) -> Steps[None]:
-        """Every address: follows ranges, and asks one by one where there are none."""
+        """Reads every address: ranges in blocks, other addresses one by one."""
         at = self._first
         while at < self._stop:
             self._survey.at = self._base + at
@@ -222,7 +222,7 @@ class _Search:
             at += 1
 
     def fast(self, samples: Sequence[int]) -> Steps[None]:
-        """The ranges around samples, and those close behind a range."""
+        """Finds the ranges around samples, and ranges close after another range."""
         end = self._first
         for sample in samples:
             self._survey.at = self._base + max(sample, end)
@@ -239,7 +239,7 @@ class _Search:
                 hit = yield from self._first_hit([end + far for far in CLOSER])
 
     def _hopeless(self, samples: Sequence[int]) -> Steps[Outcome]:
-        """Whether the area as a whole fails: as its first sample did, so do some others afar."""
+        """The failure of the whole area, if distant samples fail like the first; else `None`."""
         failure = self._failures[samples[0]]
         if failure in (ILLEGAL_ADDRESS, ILLEGAL_FUNCTION):
             return None if failure == ILLEGAL_ADDRESS else failure
@@ -251,7 +251,7 @@ class _Search:
         return failure
 
     def _first_hit(self, addresses: Iterable[int]) -> Steps[int | None]:
-        """The first address that is there, and was not found yet."""
+        """The first existing address."""
         for address in addresses:
             if address >= self._stop or address in self._failures:
                 continue
@@ -260,12 +260,12 @@ class _Search:
         return None
 
     def _floor(self, address: int) -> int:
-        """The least address that may belong to the range of one that is there."""
+        """The lowest address that can be in the same range as an existing address."""
         at = bisect.bisect(self._places, address)
         return self._places[at - 1] + 1 if at else self._first
 
     def _follow(self, at: int, stop: int) -> Steps[int]:
-        """Reads from `at` up to `stop`; the first address that fails, or `stop`."""
+        """Reads from `at` up to `stop`. Returns the first address that fails, or `stop`."""
         pace = _Pace(self._limit, self._found)
         while at < stop:
             count = min(pace.count, stop - at)
@@ -291,7 +291,7 @@ class _Search:
             self._limit = pace.changed(count, outcome)
 
     def _read(self, address: int, count: int) -> Steps[Outcome]:
-        """Reads, and notes what that says of the addresses."""
+        """Reads, and records the result for the addresses."""
         outcome = yield from self._survey.read(self._found, Probe(self._found.area, address, count))
         if outcome is None:
             self._found.found(address, count)
@@ -303,10 +303,10 @@ class _Search:
 
 
 class _Pace:
-    """How much to read next: twice as much after a success, half of what is left after a failure.
+    """The size of the next read: doubled after a success, half of the rest after a failure.
 
-    A failure means that somewhere in that block is an address that can't be read. If there turns
-    out to be none, the block was too large.
+    After a failure, the block should contain an address that can't be read. If it does not, the
+    block was too large.
     """
 
     def __init__(self, limit: int, found: AreaMap) -> None:
@@ -314,10 +314,10 @@ class _Pace:
         self.count = 1
         self._found = found
         self._suspect: int | None = None
-        """How many addresses ahead there must be one that can't be read."""
+        """The number of next addresses of which at least one should be unreadable."""
 
     def changed(self, count: int, outcome: Outcome) -> int:
-        """Draws the conclusions from a read; the limit from now on."""
+        """Adapts the size after a read. Returns the new limit."""
         if outcome is not None:
             self._suspect = count
             self.count = count // 2
@@ -335,7 +335,7 @@ class _Pace:
 def run_sync(
     survey: Survey, client: SyncClient, progress: Callable[[Survey], object] | None = None
 ) -> None:
-    """Carries a survey out; `progress` is called before every read. Raises `DeviceSilent`."""
+    """Runs a survey; calls `progress` before every read. Raises `DeviceSilent`."""
     steps = survey.steps()
     try:
         probe = next(steps)
@@ -355,7 +355,7 @@ def run_sync(
 async def run(
     survey: Survey, client: Client, progress: Callable[[Survey], object] | None = None
 ) -> None:
-    """Carries a survey out; `progress` is called before every read. Raises `DeviceSilent`."""
+    """Runs a survey; calls `progress` before every read. Raises `DeviceSilent`."""
     steps = survey.steps()
     try:
         probe = next(steps)
@@ -377,7 +377,7 @@ def _kind(probe: Probe) -> str:
 
 
 def _failure(error: ModbusError, survey: Survey) -> Failure:
-    """How a read failed. A device that can't be connected to at all is an error of its own."""
+    """The failure of a read. Raises the error if the first connection already fails."""
     failure: Failure = "timeout"
     if isinstance(error, ModbusException):
         failure = error.code
@@ -392,7 +392,7 @@ def _failure(error: ModbusError, survey: Survey) -> Failure:
 
 
 def _add(ranges: list[range], first: int, count: int) -> None:
-    """Adds addresses to ranges in order, which do not touch."""
+    """Adds addresses to sorted ranges, and joins adjacent ranges."""
     stop = first + count
     begin = bisect.bisect_left(ranges, first, key=lambda each: each.stop)
     end = bisect.bisect_right(ranges, stop, key=lambda each: each.start)

@@ -1,9 +1,9 @@
-"""Which type and byte order registers have: guessed from what they hold, over several reads.
+"""Guesses the type and byte order of registers from their values in several reads.
 
-Every type in every order is tried, and weighed in bits: how usual it is, how much shorter its
-values can be told than the bits they take (small numbers, few digits, plausible magnitudes, text),
-and how little they change from one read to the next in proportion. A wrong order makes numbers of
-odd sizes with many digits, which jump. A known value decides before all that.
+Every type in every order gets a score in bits: how common it is, how much shorter its values can be
+written than the bits they take (small numbers, few digits, plausible magnitudes, text), and how
+little they change between reads, relative to their size. A wrong order gives numbers of unusual
+magnitudes with many digits that jump. A known value takes precedence over all of these.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ LARGE = 1e16
 BITS_A_DIGIT = math.log2(10)
 
 ORDERS = {"ABCD": 0.0, "CDAB": -1.0, "DCBA": -3.0, "BADC": -4.0}
-"""How usual an order is, for two registers and more."""
+"""How common an order is, for two or more registers."""
 
 SWAPPED = {"string": -3.0}
 RARELY_SWAPPED = -7.0
-"""How usual it is that text, and other single registers, have their bytes swapped."""
+"""How common swapped bytes are in text, and in other single registers."""
 
 USUAL = {
     "uint16": 6.0,
@@ -49,24 +49,24 @@ USUAL = {
     "float16": -7.0,
     "string": -6.0,
 }
-"""How usual a type is."""
+"""How common a type is."""
 
 SIGNED = {"uint16": "int16", "uint32": "int32", "uint64": "int64"}
 
 ODD = {"uint16": 1, "int16": 1, "uint32": 3, "int32": 3, "uint64": 8, "int64": 8}
-"""What a number of any size costs more than its bits: large ones are odd where there is room."""
+"""The penalty for large numbers, in bits; they are unusual in large types."""
 
 SCALES = {1.0: 0.0, 0.1: 1.0, 0.01: 1.5, 0.001: 3.0, 10.0: 3.0}
-"""What integers are multiplied by, in search of a known value, and how unusual that is."""
+"""Scales of integers to try for a known value, and how unusual each is."""
 
 MAX_SAVED = {16: 16.0, 32: 16.0, 64: 6.0}
-"""What small numbers of a size can save: zeros before one may as well be none of its own."""
+"""The maximum bonus for small numbers by size: leading zeros may belong to another value."""
 
 USUAL_MAGNITUDE = 6
-"""Powers of ten, up and down, that floats usually are within."""
+"""Powers of ten, up and down, of usual floats."""
 
 PLAUSIBLE = 12.0
-"""The most that all else counts beside a known value."""
+"""The maximum weight of all other criteria with a known value."""
 
 MIN_TEXT = 3
 SMOOTHEST = 9.0
@@ -77,35 +77,35 @@ UNLIKE = 0.1
 
 @dataclass(frozen=True)
 class Guess:
-    """What registers may be."""
+    """A possible type of registers."""
 
     type: str
     order: str
     offset: int
-    """Registers before it."""
+    """Registers before the value."""
     values: tuple[Any, ...]
-    """What it says they held, read by read."""
+    """The decoded value of each read."""
     score: float
-    """0 to 1; only the ranking means something."""
+    """0 to 1; only meaningful for ranking."""
     reasons: tuple[str, ...]
-    """What speaks for it, and against it."""
+    """Reasons for and against the guess."""
     also: str | None = None
-    """A type that says the same of all reads."""
+    """Another type that decodes to the same values in all reads."""
     scale: float = 1.0
-    """What the value is to be multiplied by to be the known one."""
+    """The factor that scales the value to the known value."""
 
 
 def guess(
     reads: Sequence[Sequence[int]], *, like: float | None = None, anywhere: bool = False
 ) -> list[Guess]:
-    """What the registers of several reads may be, the best guess first.
+    """Guesses the type of registers from several reads. Returns the best guess first.
 
-    Values begin at the first register, or with `anywhere` at any. `like` is the known value of one
-    of the reads: then guesses are ranked by how close they come to it, and those that are far from
-    it are left out.
+    Values start at the first register, or with `anywhere` at any register. `like` is the known
+    value of one of the reads: guesses are then ranked by their distance to it, and distant guesses
+    are omitted.
     """
     if not reads or not reads[0] or any(len(read) != len(reads[0]) for read in reads):
-        raise ValueError("reads are to have registers, and all the same number")
+        raise ValueError("all reads require the same number of registers, at least one")
     guesses: list[Guess] = []
     for offset in range(len(reads[0]) if anywhere else 1):
         rest = [read[offset:] for read in reads]
@@ -115,7 +115,7 @@ def guess(
 
 
 def shortest(value: float, kind: str) -> str:
-    """The shortest decimal that is this value of a type of floats: `0.1`, whatever its size."""
+    """The shortest decimal that rounds to this float in its type: `0.1` for every float type."""
     if abs(value) < LARGE and value == int(value):
         return f"{value:.0f}"
     form = FLOATS.get(kind, "d")
@@ -130,7 +130,7 @@ def shortest(value: float, kind: str) -> str:
 
 
 def _candidates(reads: Sequence[Sequence[int]]) -> Iterator[tuple[str, str]]:
-    """The types that fit, in the orders that differ for them."""
+    """The types that fit, each in its distinct orders."""
     size = len(reads[0])
     for kind in USUAL:
         if kind == "string":
@@ -148,7 +148,7 @@ def _candidates(reads: Sequence[Sequence[int]]) -> Iterator[tuple[str, str]]:
 def _weighed(
     reads: Sequence[Sequence[int]], kind: str, order: str, offset: int, like: float | None
 ) -> Iterator[Guess]:
-    """The guess that a candidate is, if its values can be, and nothing else says the same."""
+    """The guesses of a candidate; none if its values are invalid or equal to another type's."""
     registers = values.register_count(kind)
     try:
         found = tuple(values.decode(read[:registers], kind, order) for read in reads)
@@ -189,7 +189,7 @@ def _score(bits: float) -> float:
 
 
 def _saved(value: Any, kind: str, bits: int, reasons: list[str]) -> float:
-    """How many bits shorter a value is told than it is held; negative if it is odd."""
+    """How many bits shorter a value can be written than stored; negative if it is unusual."""
     if isinstance(value, str):
         cost = sum(_letter_cost(letter) for letter in value)
         _note(reasons, "printable text")
@@ -212,7 +212,7 @@ def _saved(value: Any, kind: str, bits: int, reasons: list[str]) -> float:
 
 
 def _float_cost(value: float, kind: str, reasons: list[str]) -> float:
-    """The bits to tell a float: its magnitude, its significant digits."""
+    """The bits to write a float: its magnitude and significant digits."""
     magnitude = abs(math.log10(abs(value)))
     text = shortest(value, kind)
     digits = len(text.partition("e")[0].replace(".", "").strip("-0"))
@@ -227,7 +227,7 @@ def _float_cost(value: float, kind: str, reasons: list[str]) -> float:
 
 
 def _smoothness(found: Sequence[Any], reasons: list[str]) -> float:
-    """How little the values change in proportion, in bits; 0 if they don't."""
+    """How little the values change, relative to their size, in bits; 0 without changes."""
     changes = [pair for pair in itertools.pairwise(found) if pair[0] != pair[1]]
     if not changes:
         return 0.0
@@ -243,7 +243,7 @@ def _smoothness(found: Sequence[Any], reasons: list[str]) -> float:
 
 
 def _distance(value: float, like: float) -> float:
-    """How far a value is from a known one, in proportion to that."""
+    """The distance of a value to a known value, relative to the known value."""
     return abs(value - like) / (abs(like) or 1.0)
 
 
@@ -252,7 +252,7 @@ def _letter_cost(letter: str) -> float:
 
 
 def _text_length(reads: Sequence[Sequence[int]], order: str) -> int:
-    """The bytes of the text at the beginning of all reads, with the NULs behind it; 0 for none."""
+    """The bytes of text, with padding, at the start of all reads; 0 without text."""
     lengths = []
     for read in reads:
         data = bytes(values.decode(read, f"bytes:{2 * len(read)}", order))

@@ -1,7 +1,7 @@
-"""Load for a Modbus server: as many reads as it answers, and how long each took.
+"""Load tests of a Modbus server: sends as many reads as it answers, and measures each.
 
-The clients are those of asyncio, in one thread: what they can ask for in a second, some tens
-of thousands of reads, is the most that can be measured.
+The asyncio clients run in one thread, which limits the test to some tens of thousands of reads per
+second.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ if TYPE_CHECKING:
 
 MIN_TIME = 1e-6
 GROWTH = math.log(1.02)
-"""Times are kept to 2 percent."""
+"""Times are recorded with a precision of 2 percent."""
 
 EDGES = [digit * 10.0**exponent for exponent in range(-6, 4) for digit in (1, 2, 5)]
-"""Where the bars of a histogram begin and end, in seconds."""
+"""The edges of the histogram's bars, in seconds."""
 
 MAX_CONNECTIONS = 1000
 PAUSE = 0.1
-"""Seconds before a connection that was lost is made again."""
+"""Seconds before a reconnect."""
 
 BETWEEN = 0.1
 """Seconds between two calls of `progress`."""
 
 
 class Latencies:
-    """Times of any number of requests, in little memory."""
+    """Latencies of any number of requests, in constant memory."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -55,7 +55,7 @@ class Latencies:
         self._counts: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
-        """One more."""
+        """Adds a latency, in seconds."""
         self.count += 1
         self.total += seconds
         self.least = min(self.least, seconds)
@@ -64,11 +64,11 @@ class Latencies:
 
     @property
     def mean(self) -> float:
-        """The average; 0 if there was none."""
+        """The average in seconds; 0 without requests."""
         return self.total / self.count if self.count else 0.0
 
     def quantile(self, share: float) -> float:
-        """The time within which that share was done, to 2 percent; 0 if there was none."""
+        """The quantile of a share, in seconds, within 2 percent; 0 without requests."""
         wanted = max(1, math.ceil(share * self.count))
         seen = 0
         for step in sorted(self._counts):
@@ -78,7 +78,7 @@ class Latencies:
         return 0.0
 
     def histogram(self) -> list[tuple[float, float, int]]:
-        """From, to, and how many, from the first that has any to the last."""
+        """Start, end and count of each bar, from the first to the last non-empty bar."""
         bars = [0] * (len(EDGES) + 1)
         for step, count in self._counts.items():
             bars[bisect.bisect_right(EDGES, min(self.most, _middle(step)))] += count
@@ -90,7 +90,7 @@ class Latencies:
 
 
 class Load:
-    """Reads of one range by several connections, some in flight on each, for some seconds."""
+    """Reads one range over several connections, with requests in flight, for some seconds."""
 
     def __init__(
         self,
@@ -107,19 +107,19 @@ class Load:
     ) -> None:
         target = parse(url)
         if not 1 <= count <= READ_LIMITS[area]:
-            raise ValueError(f"count is {count}, one read returns 1 to {READ_LIMITS[area]}")
+            raise ValueError(f"count is {count}, allowed: 1 to {READ_LIMITS[area]}")
         if not 0 <= address <= ADDRESSES - count:
             raise ValueError(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
         if not 1 <= connections <= MAX_CONNECTIONS:
-            raise ValueError(f"connections is {connections}, allowed are 1 to {MAX_CONNECTIONS}")
+            raise ValueError(f"connections is {connections}, allowed: 1 to {MAX_CONNECTIONS}")
         if isinstance(target, SerialTarget) and connections > 1:
             raise ValueError("a serial line has one connection")
         many = isinstance(target, NetworkTarget) and target.transport in IN_FLIGHT
         if in_flight > 1 and not many:
-            raise ValueError("only tcp and tls have more than one request in flight")
+            raise ValueError("more than one request in flight requires tcp or tls")
         self.seconds = seconds
         self.elapsed = 0.0
-        """The seconds that it has taken so far."""
+        """Seconds since the start of the test."""
         self.latencies = Latencies()
         self.errors: Counter[str] = Counter()
         self._clients = [
@@ -133,13 +133,13 @@ class Load:
 
     @property
     def rate(self) -> float:
-        """Reads a second."""
+        """Reads per second."""
         return self.latencies.count / self.elapsed if self.elapsed else 0.0
 
     async def run(self, progress: Callable[[Load], object] | None = None) -> None:
-        """Loads the server; `progress` is called now and then.
+        """Runs the test; calls `progress` periodically.
 
-        Before it begins, every connection is made and used once. Raises what the first one raises.
+        Before the test, connects every client and reads once. Raises the error of the first client.
         """
         try:
             await self._read(self._clients[0])
@@ -176,7 +176,7 @@ class Load:
             await self._read(client)
 
     async def _work(self, client: Client, end: float) -> None:
-        """Reads one after the other."""
+        """Reads repeatedly until the end of the test."""
         while (began := time.monotonic()) < end:
             try:
                 await self._read(client)
@@ -192,7 +192,7 @@ class Load:
 
 
 def _kind(error: ModbusError) -> str:
-    """What counts as the same error."""
+    """The category of an error."""
     if isinstance(error, RequestTimeout):
         return "timeout"
     if isinstance(error, ConnectionLost):
@@ -201,5 +201,5 @@ def _kind(error: ModbusError) -> str:
 
 
 def _middle(step: int) -> float:
-    """The time that stands for a step."""
+    """The latency that represents a step."""
     return MIN_TIME * math.exp(GROWTH * (step + 0.5))

@@ -1,6 +1,6 @@
-"""Which requests read a device, why each ends where it does, and what other rules would ask for.
+"""Plans the requests that read a device, and explains why each request ends.
 
-The plan is the native poller's own; here it is explained. Nothing is sent.
+The native poller uses the same plan. Nothing is sent.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Field: TypeAlias = "tuple[Area, int, int]"
 Preset: TypeAlias = Literal["none", "max_insert"]
 
 BITS = 16
-"""Bits that take the room of a register."""
+"""Bits that count as one register."""
 
 
 class Rules(TypedDict, total=False):
-    """What a plan keeps; a range is an area, its first address and the one behind its last."""
+    """The rules of a plan; a range is an area, its first address and the end, exclusive."""
 
     max_gap: int | None
     cost: tuple[float, float] | None
@@ -46,13 +46,13 @@ class Block:
     address: int
     count: int
     reads: tuple[int, ...]
-    """The reads that it carries, or parts of, by their numbers from 0."""
+    """The numbers, from 0, of the reads that it covers completely or in part."""
     holes: tuple[tuple[int, int], ...]
-    """What is read though nothing wants it: addresses and counts."""
+    """Gaps that are also read: addresses and counts."""
     cost: float | None
-    """Milliseconds, where the rules say what reading costs."""
+    """Milliseconds; `None` if the rules have no cost."""
     ends: str
-    """Why it ends where it does."""
+    """Why the request ends."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,18 @@ class Plan:
 
     @property
     def cost(self) -> float | None:
-        """Milliseconds of all requests."""
+        """Milliseconds of all requests, `None` if the rules have no cost."""
         known = [block.cost for block in self.blocks if block.cost is not None]
         return sum(known) if len(known) == len(self.blocks) else None
 
     @property
     def unwanted(self) -> int:
-        """Bits and registers that are read though nothing wants them."""
+        """Bits and registers in gaps that are also read."""
         return sum(count for block in self.blocks for _, count in block.holes)
 
 
 def rules(settings: DeviceConfig) -> Rules:
-    """What the configuration of a device says of its plan."""
+    """The rules of a configured device."""
     cost = settings.cost
     return {
         "max_gap": settings.max_gap,
@@ -88,12 +88,12 @@ def rules(settings: DeviceConfig) -> Rules:
 
 
 def plan(reads: Sequence[Field], rules: Rules) -> Plan:
-    """The plan of some reads. Raises `ValueError` for what can't be read by the rules."""
+    """Plans reads. Raises `ValueError` for a read that the rules do not allow."""
     for area, address, count in reads:
         for start, stop in _of_area(rules.get("forbidden", ()), area):
             if address < stop and start < address + count:
                 raise ValueError(
-                    f"{area} {_span(address, address + count)} meets what is forbidden, "
+                    f"{area} {_span(address, address + count)} overlaps the forbidden range "
                     f"{_span(start, stop)}"
                 )
     parts = [(part, number) for number, read in enumerate(reads) for part in _parts(read, rules)]
@@ -118,10 +118,10 @@ def plan(reads: Sequence[Field], rules: Rules) -> Plan:
 
 
 def preset(reads: Sequence[Field], rules: Rules, name: Preset, fill: int) -> int:
-    """How many requests the rule of that name asks for, with the same limits.
+    """The number of requests by another rule, with the same limits.
 
-    `none`: reads are joined only where one begins exactly where the one before it ends.
-    `max_insert`: also over holes of up to `fill`. Neither knows of forbidden or readable ranges.
+    `none` joins only adjacent reads. `max_insert` also reads gaps of up to `fill`. Both ignore
+    forbidden and readable ranges.
     """
     requests = 0
     for area in AREAS:
@@ -146,7 +146,7 @@ def _most(area: Area, rules: Rules) -> int:
 
 
 def _parts(read: Field, rules: Rules) -> Iterator[Field]:
-    """A read in pieces that one request can carry."""
+    """Splits a read into parts that fit into one request."""
     area, address, count = read
     most = _most(area, rules)
     for at in range(0, count, most):
@@ -154,7 +154,7 @@ def _parts(read: Field, rules: Rules) -> Iterator[Field]:
 
 
 def _first(fields: Sequence[Field], block: tuple[Area, int, int, list[int], int]) -> Field:
-    """The field that a block begins with."""
+    """The first field of a block."""
     return min((fields[each] for each in block[3]), key=lambda field: field[1:])
 
 
@@ -175,7 +175,7 @@ def _cost(area: Area, count: int, rules: Rules) -> float | None:
 
 
 def _ends(block: Field, behind: Field | None, rules: Rules) -> str:
-    """Why a block does not go on with the field behind it."""
+    """Why a block does not include the next field."""
     area, address, count = block
     if behind is None:
         return "nothing more to read"
@@ -200,7 +200,7 @@ def _ends(block: Field, behind: Field | None, rules: Rules) -> str:
     ):
         return f"not readable: {_span(end, behind[1])}"
     if joined > most:
-        return f"limit: {joined} with the next, the most is {most}"
+        return f"limit: {joined} with the next read, allowed: {most}"
     return f"gap: {hole}, which costs more than a request"
 
 
