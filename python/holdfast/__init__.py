@@ -1,7 +1,7 @@
-"""Holdfast: a Modbus memory that many writers fill and many readers read, and clients of devices.
+"""Holdfast: Modbus servers with shared memories, and clients of Modbus devices.
 
-The public names of the library. Everything else is the command line's (`holdfast.cli`), the
-configuration's (`holdfast.config`) or native (`holdfast._core`, which some of these come from).
+This module exports the public names of the library. The command line is in `holdfast.cli`, the
+configuration in `holdfast.config`, and the native core in `holdfast._core`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The former name of `raw_ingest`, which warns."""
+    """Supports the former name of `raw_ingest`, with a deprecation warning."""
     if name == "raw":
         return importlib.import_module("holdfast.raw")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -41,43 +41,42 @@ __all__ = [
 __version__: str
 
 ADDRESSES: Final[int]
-"""How many addresses an area can have."""
+"""Maximum number of addresses in an area."""
 
 MAX_PDU: Final[int]
-"""Bytes of the longest request or reply, without what a transport puts around it."""
+"""Maximum size of a request or reply in bytes, without the framing of a transport."""
 
 AREAS: Final[tuple[Area, ...]]
 """The areas, in the order of their functions."""
 
 FUNCTIONS: Final[tuple[tuple[int, str, bool, Area | None, int, int], ...]]
-"""Each function: its code, its name, whether it writes, the area it is for, and how many bits or
-registers it reads and writes at most."""
+"""Each function: code, name, whether it writes, its area, and the maximum number of bits or
+registers that it reads and writes."""
 
 SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
-"""Each sub-function of function 8: its code, its name, and whether it changes the device."""
+"""Each sub-function of function 8: code, name, and whether it changes the device."""
 
 EXCEPTIONS: Final[dict[int, str]]
-"""The names of exceptions by their codes."""
+"""The names of exceptions, by code."""
 
 FAULTS: Final[dict[str, int]]
-"""Why a device did not answer, as a word: the codes that status blocks and the poller have."""
+"""Why a device did not answer, as a word, with its code in status blocks and the poller."""
 
 class OutOfRange(IndexError):
-    """A range that is not inside its area; nothing was read or written."""
+    """The range is not inside the area. Nothing was read or written."""
 
 @final
 class Memory:
-    """Four areas of bits and 16-bit registers, of fixed size, all 0 at first.
+    """Four areas of bits and 16-bit registers, of fixed size, initially 0.
 
-    An area is given by its size (addresses from 0), or by start and size; one that is left out does
-    not exist. `start + size` is at most 65536. Every read sees all of a write or none of it,
-    whoever writes, and a write that is refused changes nothing. Any thread may call any method.
+    An area is a size (addresses from 0), or start and size; an omitted area does not exist.
+    `start + size` is at most 65536. Every read sees a whole write or none of it, and a refused
+    write changes nothing. Methods are thread-safe.
 
-    `seal` names the gate bit, in coils or discrete inputs: Modbus clients are answered with
-    exception 06 until a write from here leaves that bit at 1: for good (`once`), or as long as it
-    is 1 (`level`).
+    `seal` is the gate bit, in coils or discrete inputs. Modbus clients receive exception 06 until a
+    write other than by Modbus sets that bit to 1: permanently (`once`), or while it is 1 (`level`).
 
-    Raises `ValueError` for a size or gate that can't be.
+    Raises `ValueError` for an invalid size or gate bit.
     """
 
     def __new__(
@@ -95,41 +94,42 @@ class Memory:
 
     @property
     def sealed(self) -> bool:
-        """Whether Modbus clients are refused for now."""
+        """Whether the memory is sealed, so Modbus clients receive exception 06."""
 
     @property
     def seal_changes(self) -> tuple[int, int]:
         """How often the seal opened, and how often it closed again."""
 
     def read(self, area: Area, address: int, count: int) -> list[int]:
-        """`count` bits (0 or 1) or registers (0 to 65535) from `address`, of one moment.
+        """Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
 
         Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1.
         """
 
     def read_many(self, ranges: Sequence[tuple[Area, int, int]]) -> list[list[int]]:
-        """Several ranges of one moment, each as area, address and count; raises as `read`."""
+        """Reads several ranges (area, address, count) as one snapshot. Raises like `read`."""
 
     def write(self, area: Area, address: int, values: Iterable[int]) -> None:
-        """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) as one step.
+        """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
 
-        Raises `OutOfRange` outside the area, `ValueError` for no values, a value too large or an
-        unknown area, `TypeError` for a value of another type; nothing has changed then.
+        Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
+        unknown area, `TypeError` for a value of another type. An error changes nothing.
         """
 
     def write_many(self, writes: Sequence[tuple[Area, int, Iterable[int]]]) -> None:
-        """Several writes of any areas as one step, each as area, address and values.
+        """Writes to several ranges (area, address, values) in one step.
 
-        A later one wins where two overlap. Raises as `write`; when one is refused, none is done.
+        Where two overlap, the later one wins. Raises the errors of `write`; an error in one write
+        prevents all.
         """
 
 class BatchRefused(ValueError):
-    """A write of a batch that is refused; nothing has changed."""
+    """A write of a batch is refused. Nothing has changed."""
 
     command: int
     """The index of the write in the batch."""
     index: int | None
-    """The index of the value in the write, if the value is refused."""
+    """The index of the refused value in the write, `None` if the error is not in one value."""
     reason: Literal[
         "invalid_area",
         "empty",
@@ -141,29 +141,29 @@ class BatchRefused(ValueError):
         "wrong_length",
         "not_registers",
     ]
-    """`invalid_type` is a value of another type, or with `index` `None`, values that are no
-    sequence of integers; `invalid_value` an integer that is too small or too large."""
+    """`invalid_type`: a value of another type, or with `index` `None`, values that are not a
+    sequence of integers. `invalid_value`: an integer out of range."""
 
 def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> int:
-    """Writes to several memories as one step, each with memory, area, address and values.
+    """Writes to several memories (memory, area, address, values) in one step.
 
-    Returns how many values were written. No reader of any of the memories sees a part.
+    Returns the number of written values. Readers of the memories see all writes or none.
 
-    Raises `BatchRefused` for the first write whose area, number of values or range is wrong, then
-    for the first wrong value; no write is done then. An exception of `writes` itself comes before
-    one of a later write, and before one of any value.
+    Raises `BatchRefused` for the first write with an invalid area, number of values or range, else
+    for the first invalid value. An error prevents all writes. An exception from the iterable
+    `writes` takes precedence over errors in later writes, and over errors in values.
     """
 
 @final
 class Rule:
-    """What peers from some networks may do.
+    """What the peers of some networks may do.
 
-    `units` maps unit ids, 0 to 255, to memories; `sources` are networks or addresses, IPv4 or IPv6
-    (an IPv4 address mapped into IPv6 is that IPv4 address). `functions` is a list of the function
-    codes that are allowed, `deny` of those that are not; both exclude each other. `roles` are those
-    that the certificate of a peer may name, over TLS only; "" is the null role, `None` any role.
+    `units` maps unit ids, 0 to 255, to memories. `sources` are networks or addresses, IPv4 or IPv6;
+    an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
+    codes, or `deny`, the codes that are not allowed, but not both. `roles`, only with TLS, are the
+    allowed roles of the peer's certificate: "" is a certificate without a role, `None` is any role.
 
-    Raises `ValueError` for a source or access that can't be.
+    Raises `ValueError` for an invalid source or access.
     """
 
     def __new__(
@@ -179,10 +179,10 @@ class Rule:
 
 @final
 class RawRule:
-    """What senders of Raw Ingest packets from some sources may write.
+    """What the senders of Raw Ingest packets from some sources may write.
 
     `targets` maps unit ids (v1) or memory ids (crc), 0 to 65535, to memories. Raises `ValueError`
-    for an id, source or area that can't be.
+    for an invalid id, source or area.
     """
 
     def __new__(
@@ -191,10 +191,10 @@ class RawRule:
 
 @final
 class ServerTls:
-    """What a server needs for TLS with mutual authentication, of files in PEM that are read now.
+    """Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 
-    `ca_file` has the authorities that vouch for clients, and self-signed certificates of clients;
-    `crl_file` the lists of what these authorities revoked. Raises `ValueError` for a file that
+    `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
+    `crl_file` has the revocation lists of these authorities. Raises `ValueError` for a file that
     can't be used.
     """
 
@@ -209,11 +209,11 @@ class ServerTls:
 
 @final
 class Listener:
-    """The settings of a listener; as constructed, one for Modbus over TCP connections.
+    """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
-    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP; with `tls` it is spoken inside TLS.
-    Times are in seconds, `idle_timeout` 0 is for ever. Raises `ValueError` for an address, limit or
-    time that can't be.
+    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP; `tls` enables TLS. Times are in
+    seconds; `idle_timeout` 0 is unlimited. Raises `ValueError` for an invalid address, limit or
+    time.
     """
 
     def __new__(
@@ -232,7 +232,7 @@ class Listener:
     ) -> Listener: ...
     @staticmethod
     def udp(name: str, bind: str, rules: Sequence[Rule]) -> Listener:
-        """For Modbus over UDP."""
+        """A listener for Modbus over UDP."""
 
     @staticmethod
     def serial(
@@ -247,9 +247,9 @@ class Listener:
         data_bits: int,
         silence: float | None = None,
     ) -> Listener:
-        """For a serial line; the rule's sources are not looked at.
+        """A listener for a serial line; the sources of the rule are ignored.
 
-        `silence` in seconds ends an RTU frame, `None` is 3.5 characters.
+        `silence`, in seconds, ends an RTU frame; `None` is 3.5 characters.
         """
 
     @staticmethod
@@ -264,17 +264,17 @@ class Listener:
         max_connections_per_source: int | None = None,
         request_timeout: float = 10.0,
     ) -> Listener:
-        """For Raw Ingest packets."""
+        """A listener for Raw Ingest packets."""
 
 @final
 class Engine:
-    """Listeners on native threads, served from construction to `stop`.
+    """Runs listeners on native threads, from construction to `stop`.
 
-    `identity` holds identification objects by id, 0 to 2 among them; `events` says which of the
-    listeners' events are kept for `next_event`, `audit` whether writes are for `next_writes`.
+    `identity` has identification objects by id and requires objects 0 to 2. `events` selects the
+    listeners' events that are queued for `next_event`; `audit` queues writes for `next_writes`.
 
-    Raises `OSError` when a listener can't be bound or a device opened (then none is served),
-    `ValueError` for an identity that can't be served.
+    Raises `OSError` if a listener can't be bound or a serial device can't be opened, and then runs
+    no listener; raises `ValueError` for an invalid identity.
     """
 
     def __new__(
@@ -289,41 +289,41 @@ class Engine:
     ) -> Engine: ...
     @property
     def addresses(self) -> list[tuple[str, int] | None]:
-        """Where each listener listens, in the order they were given; `None` for serial lines."""
+        """The address and port of each listener, in their order; `None` for serial lines."""
 
     def counters(self) -> dict[str, ListenerCounters]:
-        """The counters of each listener by name, since the start."""
+        """The counters of each listener since the start, by name."""
 
     def next_event(self, timeout: float) -> tuple[str, str, str | None, str | None] | None:
-        """Listener, kind, peer and reason of the next event, if one comes in `timeout` seconds.
+        """Listener, kind, peer and reason of the next event; `None` after `timeout` seconds.
 
         The reason of `refused_role` is the role.
         """
 
     @property
     def lost_events(self) -> int:
-        """Events that were lost because nobody took them."""
+        """Events that were dropped because the queue was full."""
 
     def next_writes(self, timeout: float, most: int) -> list[dict[str, object]]:
-        """Up to `most` writes that came in, done or refused, as fields of an audit log.
+        """Up to `most` received writes, executed or refused, as fields of an audit log.
 
-        Waits up to `timeout` seconds for the first.
+        Waits up to `timeout` seconds for the first write.
         """
 
     @property
     def lost_writes(self) -> int:
-        """Writes that `next_writes` misses because nobody took them."""
+        """Writes missing from `next_writes` because the queue was full."""
 
     def stop(self) -> None:
-        """Answers what was received and ends; returns within a second. From any thread."""
+        """Answers received requests and stops, within a second. Can be called from any thread."""
 
 @final
 class Request:
-    """A request of a client, checked and encoded; raises `ValueError` for what can't be asked."""
+    """A request of a client, checked and encoded. Raises `ValueError` for an invalid request."""
 
     @staticmethod
     def read(area: Area, address: int, count: int) -> Request:
-        """Functions 1 to 4, by the area."""
+        """Functions 1 to 4, depending on the area."""
 
     @staticmethod
     def write_coil(address: int, value: bool) -> Request:
@@ -369,15 +369,15 @@ class Request:
 
     @property
     def pdu(self) -> bytes:
-        """As it is sent."""
+        """The encoded request, without transport framing."""
 
 @final
 class Endpoint:
-    """What a client, or the poller, talks to. Raises `ValueError` for what can't be."""
+    """The target of a client or the poller. Raises `ValueError` for invalid arguments."""
 
     @staticmethod
     def network(transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int) -> Endpoint:
-        """A device, or a gateway, behind an address."""
+        """A device or gateway at a network address."""
 
     @staticmethod
     def tls(
@@ -388,11 +388,11 @@ class Endpoint:
         key: str | PathLike[str] | None = None,
         name: str | None = None,
     ) -> Endpoint:
-        """Modbus TCP over TLS; the files, in PEM, are read now.
+        """A device with Modbus TCP over TLS. Reads the PEM files at once.
 
-        `ca` has the certificates that are trusted, of authorities or of the device itself; without
-        it they are the system's. `name` is the one that the device's certificate has if it is not
-        `host`. Raises `OSError` and `ValueError` for files that can't be used.
+        `ca` has the trusted certificates, of authorities or of the device itself. Default: the
+        system's authorities. `name` is the name in the device's certificate, if it is not `host`.
+        Raises `OSError` and `ValueError` for files that can't be used.
         """
 
     @staticmethod
@@ -411,84 +411,83 @@ class Endpoint:
 
 @final
 class BlockingClient:
-    """One request and its reply at a time, over any transport; connects when it is needed.
+    """A client with one request at a time, over any transport. Connects on the first call.
 
-    Any thread may call it; the calls take turns. The interpreter is free while a call waits.
+    Thread-safe: calls run one after the other. Releases the interpreter lock while a call waits.
     """
 
     def __new__(cls, endpoint: Endpoint) -> BlockingClient: ...
     def call(self, request: Request, unit: int, timeout: float) -> Any:
-        """The result of a request: values, bytes, or `None` for a write.
+        """Sends a request and returns its result: values, bytes, or `None` for a write.
 
         Raises `holdfast.ModbusError`.
         """
 
     def close(self) -> None:
-        """Ends the connection; the next call makes a new one."""
+        """Closes the connection; the next call reconnects."""
 
     @property
     def late(self) -> int:
-        """Replies that came after their requests had been given up."""
+        """How many replies arrived after their timeout."""
 
 @final
 class Connection:
-    """A TCP connection of a client, with TLS or not, for whoever owns its socket.
+    """The protocol of a client's TCP connection, with or without TLS. The caller owns the socket.
 
-    Times are those of the owner's clock, in seconds. Completed requests are tickets, each with a
+    Times are from the caller's clock, in seconds. Completed requests are tickets, each with a
     result or a `ModbusError`.
     """
 
     def __new__(cls, endpoint: Endpoint) -> Connection: ...
     @property
     def is_ready(self) -> bool:
-        """Whether requests can be sent: TLS, if there is any, is agreed on."""
+        """Whether requests can be sent: the TLS handshake, if any, is complete."""
 
     def send(self, request: Request, unit: int, timeout: float, now: float) -> int:
-        """Queues a request; its ticket. Raises why the connection has ended."""
+        """Queues a request and returns its ticket. Raises the error that ended the connection."""
 
     def outgoing(self) -> bytes:
         """The bytes to send now."""
 
     def receive(self, data: bytes, now: float) -> list[tuple[int, Any]]:
-        """Takes received bytes; the requests that they complete."""
+        """Processes received bytes. Returns the completed requests."""
 
     def advance(self, now: float) -> list[tuple[int, Any]]:
-        """Ends the requests whose time is over."""
+        """Ends requests whose deadline has passed, and returns them."""
 
     @property
     def deadline(self) -> float | None:
-        """When `advance` is to be called."""
+        """The next time to call `advance`."""
 
     def cancel(self, ticket: int) -> None:
-        """Drops a request: its reply, should it come, is counted."""
+        """Drops a request. Its reply, if one arrives, is counted."""
 
     def close(self) -> list[tuple[int, Any]]:
-        """Ends the connection, and with it all requests. Bytes may be left to send."""
+        """Closes the connection and ends all requests. `outgoing` may still have bytes to send."""
 
     def lost(self, error: str | None = None) -> list[tuple[int, Any]]:
-        """The network has ended the connection; `error` is why, unless that was its regular end."""
+        """Reports the end of the network connection; `error` is `None` for a regular close."""
 
     @property
     def closed(self) -> ModbusError | None:
-        """Why it has ended; `None` while it has not."""
+        """The error that ended the connection, `None` while it is open."""
 
     @property
     def late(self) -> int:
-        """Replies that came after their requests had been given up."""
+        """How many replies arrived after their timeout."""
 
 @final
 class PolledDevice:
-    """A device to be polled: what is read, how often, and where it goes.
+    """A device to poll: reads, interval and destinations.
 
     `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
-    `max_gap` (0 when left out) or `cost` (of a request, of a register or 16 bits) says which holes
-    are read; `readable` and `forbidden` are areas with start and end, the end not included.
-    `forward` are hosts, ports, formats (`v1`, `crc`), crc (`required`, `none`), unit or memory ids,
-    and timeouts. `status` is the memory, area and slot of the status block. `start_within` is when
-    the first poll comes at the latest, an interval when left out; `report` hands polls to
-    `Poller.results`; `release` closes the connection after each; with `measured` the device's own
-    answers say what `cost` is after a while. Times are in seconds; interval 0 polls
-    without a pause.
+    `max_gap` (default: 0) or `cost` (of a request, of a register or 16 bits) selects the gaps that
+    are read; `readable` and `forbidden` are areas with start and end, exclusive. `forward` are
+    hosts, ports, formats (`v1`, `crc`), crc (`required`, `none`), unit or memory ids, and timeouts.
+    `status` is the memory, area and slot of the status block. `start_within` is the maximum delay
+    of the first poll (default: the interval). `report` queues polls for `Poller.results`. `release`
+    closes the connection after each poll. With `measured`, measurements replace `cost` after a
+    while. Times are in seconds; interval 0 polls without a pause.
     """
 
     def __new__(
@@ -516,36 +515,36 @@ class PolledDevice:
 
 @final
 class Poller:
-    """Devices that are polled by a native thread, from construction to `stop`.
+    """Polls devices on a native thread, from construction to `stop`.
 
-    Raises `ValueError` for a read that no request can carry or a destination that it does not fit.
+    Raises `ValueError` for a read that no request can carry, or that does not fit its destination.
     """
 
     def __new__(cls, devices: Sequence[PolledDevice]) -> Poller: ...
     def add(self, device: PolledDevice) -> None:
-        """Polls one more device.
+        """Adds a device.
 
-        Raises `ValueError`, also for a name that is taken, and `RuntimeError` after `stop`.
+        Raises `ValueError`, also for a name in use, and `RuntimeError` after `stop`.
         """
 
     def replace(self, name: str, device: PolledDevice, *, at_once: bool = True) -> None:
-        """Polls a device in the place of the one called `name`; it may have the same name.
+        """Replaces the device called `name`; the new device can have the same name.
 
-        The poll under way is completed; counters, connection and schedule stay. `at_once` the new
-        device reads once beside the schedule; not more often than each second, or each interval if
-        that is shorter. Raises `ValueError`, and `RuntimeError` after `stop`; then nothing has
-        changed.
+        The current poll completes; counters, connection and schedule remain. With `at_once`, the
+        new device is also polled once outside the schedule, at most once per second, or per
+        interval if that is shorter. Raises `ValueError`, and `RuntimeError` after `stop`; an error
+        changes nothing.
         """
 
     def write(self, name: str, request: Request) -> int:
         """Sends a write to a device over its own connection, between two reads.
 
-        Returns the number under which `results` has its outcome. Raises `ValueError` for an
-        unknown device and a request that does not write, `RuntimeError` after `stop`.
+        Returns the number of the write in `results`. Raises `ValueError` for an unknown device or a
+        request that does not write, `RuntimeError` after `stop`.
         """
 
     def remove(self, name: str) -> bool:
-        """Stops polling a device; whether there was one of that name."""
+        """Removes a device. Returns whether it existed."""
 
     def results(
         self, timeout: float
@@ -558,34 +557,34 @@ class Poller:
     ):
         """All polls of devices with `report`, and all writes, since the last call.
 
-        Waits up to `timeout` seconds for the first. A poll is a device, the seconds from the
-        poller's start to when the schedule wanted it (to when it began, if that was beside the
-        schedule), and its blocks as they were asked: area, address, count, the bytes (`None` when
-        there are none), the fault as a status block tells it, and the seconds since 1970 when that
-        was known. A write is its number and the fault, 0 when the device has confirmed it. `None`
-        when the poller has stopped and nothing is left.
+        Waits up to `timeout` seconds for the first. A poll is a device, its scheduled time in
+        seconds since the poller's start (its actual start, if outside the schedule), and its blocks
+        in the order of their requests: area, address, count, the bytes (`None` without a valid
+        reply), the fault as in a status block, and the time of the result in seconds since 1970. A
+        write is its number and its fault, 0 if the device confirmed it. Returns `None` when the
+        poller has stopped and no results are left.
         """
 
     @property
     def dropped(self) -> int:
-        """Polls that `results` misses because nobody took them."""
+        """Polls missing from `results` because the queue was full."""
 
     def counters(self) -> dict[str, dict[str, Any]]:
-        """How each device does, by name: its health, counters, and those of its forwards.
+        """The health and counters of each device and of its forwards, by device name.
 
-        `age` is that of the last valid answer, `None` before the first. `plan_error` says why no
-        plan reads the device, `None` as long as one does. `unplanned` counts the polls that were
-        left out for that, `unstored` the reads and status blocks that memory refused.
+        `age` is the age of the last valid reply, `None` before the first. `plan_error` is the
+        reason why the device has no plan, `None` if it has one. `unplanned` counts polls skipped
+        without a plan, `unstored` counts reads and status blocks that memory refused.
         """
 
     def stop(self) -> None:
-        """Stops polling. From any thread."""
+        """Stops polling. Can be called from any thread."""
 
 def pack_raw_ingest(area: Area, values: list[int]) -> bytes:
     """The payload of a Raw Ingest packet.
 
-    Raises `ValueError` for a value too large and an unknown area, `TypeError` for one of another
-    type.
+    Raises `ValueError` for a value out of range or an unknown area, `TypeError` for a value of
+    another type.
     """
 
 def encode_raw_ingest(
@@ -600,8 +599,8 @@ def encode_raw_ingest(
 ) -> bytes:
     """A Raw Ingest packet; `target` is a unit id (v1) or a memory id (crc).
 
-    Raises `ValueError` for a payload that is not that of `count` values, `OverflowError` for a
-    number beyond 65535.
+    Raises `ValueError` for a payload that does not match `count`, `OverflowError` for a number
+    above 65535.
     """
 
 def plan_blocks(
@@ -614,8 +613,8 @@ def plan_blocks(
     readable: Sequence[tuple[Area, int, int]] | None = None,
     forbidden: Sequence[tuple[Area, int, int]] | None = None,
 ) -> list[tuple[Area, int, int, list[int], int]]:
-    """The requests that read all fields (area, address, count), none of which is split.
+    """Plans the requests that read all fields (area, address, count). Fields are never split.
 
-    Each is an area, an address, a count, the indexes of its fields, and how many items no field
-    wants. Raises `ValueError` for a field that no request may read.
+    A request is an area, an address, a count, the indexes of its fields, and the number of bits or
+    registers outside all fields. Raises `ValueError` for a field that no request may read.
     """

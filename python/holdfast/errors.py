@@ -1,27 +1,27 @@
-"""What can go wrong between a client and a device, as errors of clients.
+"""Errors of clients, as a tree of exceptions.
 
     ModbusError
     ├── ModbusException      the device answered with an exception: code, name
     ├── ConnectionLost       the connection ended before the reply
-    │   ├── ConnectFailed    no connection could be made: nothing was sent
-    │   └── TlsFailed        the two sides do not agree on TLS: reason
+    │   ├── ConnectFailed    could not connect: nothing was sent
+    │   └── TlsFailed        TLS failed: reason
     ├── RequestTimeout       no reply within the timeout
-    └── InvalidResponse      bytes that can't be the reply: reason
+    └── InvalidResponse      an invalid reply: reason
 
-The texts are for people; programs decide by class and attributes.
+Messages are for people. Programs should use classes and attributes.
 """
 
 from __future__ import annotations
 
 
 class ModbusError(Exception):
-    """Anything that keeps a call from its result. All other errors of a client derive from it."""
+    """The base class of all errors of a client after the request was checked."""
 
 
 class ModbusException(ModbusError):
     """The device answered with an exception (V1.1b3, 7).
 
-    `code` is the exception code, `name` the standard's name of it, if it has one.
+    `code` is the exception code, `name` its name in the standard, or `unknown`.
     """
 
     def __init__(self, code: int, name: str | None = None) -> None:
@@ -34,18 +34,18 @@ class ModbusException(ModbusError):
 
 
 class ConnectionLost(ModbusError, ConnectionError):
-    """The connection ended before the reply, or could not be made.
+    """The connection was lost before the reply, or could not be opened.
 
-    `maybe_sent` says whether the device may have carried the request out.
+    `maybe_sent` says whether the device may have executed the request.
     """
 
     maybe_sent = True
 
 
 class ConnectFailed(ConnectionLost):
-    """No connection could be made. Nothing was sent.
+    """Could not connect. Nothing was sent.
 
-    `target` is the URL that was tried, without options; `detail` is why, in words.
+    `target` is the URL, without options; `detail` is the reason as text.
     """
 
     maybe_sent = False
@@ -62,8 +62,8 @@ class ConnectFailed(ConnectionLost):
 class TlsFailed(ConnectionLost):
     """TLS failed, most often during its handshake.
 
-    `reason` is one word of docs/modbus-tls.md, such as `expired` or `wrong_name`; `target` is the
-    URL, without options; `detail` is the reason in words.
+    `reason` is a word from docs/modbus-tls.md, such as `expired` or `wrong_name`; `target` is the
+    URL, without options; `detail` is the reason as text.
     """
 
     def __init__(self, reason: str, target: str, detail: str, maybe_sent: bool = False) -> None:
@@ -80,13 +80,13 @@ class TlsFailed(ConnectionLost):
 
 
 class RequestTimeout(ModbusError, TimeoutError):
-    """There was no reply within the timeout. The device may have carried the request out."""
+    """No reply arrived within the timeout. The device may have executed the request."""
 
 
 class InvalidResponse(ModbusError):
-    """Received bytes can't be the reply to the request.
+    """The received bytes are not a valid reply to the request.
 
-    `reason` is one word of docs/client.md, such as `unit_id` or `length`.
+    `reason` is a word from docs/client.md, such as `unit_id` or `length`.
     """
 
     def __init__(self, detail: str, reason: str = "content") -> None:

@@ -1,6 +1,6 @@
-"""The log: one line an event, as text or as JSON, with the same fields.
+"""The log: one line per event, as text or JSON, with the same fields.
 
-It says what happened and to whom; it never holds a secret or a value from memory.
+Log lines never contain secrets or values from memory.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
 
 
 def write(level: int, event: str, **fields: object) -> None:
-    """One event with its fields."""
+    """Logs an event with its fields."""
     LOGGER.log(level, event, extra={"fields": fields})
 
 
 def refused(event: str, *, kind: object, **fields: object) -> None:
-    """A refusal: of one kind only so many are logged in a time, see `Throttle`."""
+    """Logs a refusal. The number of logged refusals of a kind is limited, see `Throttle`."""
     admitted, held_back = _REFUSALS.admit((event, kind), time.monotonic())
     if admitted:
         more = {"held_back": held_back} if held_back else {}
@@ -38,7 +38,7 @@ def refused(event: str, *, kind: object, **fields: object) -> None:
 
 
 def problem(event: str, **fields: object) -> None:
-    """A fault, with the exception that is being handled; throttled as refusals are."""
+    """Logs an error with the current exception, limited like refusals."""
     admitted, held_back = _REFUSALS.admit((event, "fault"), time.monotonic())
     if admitted:
         more = {"held_back": held_back} if held_back else {}
@@ -49,7 +49,7 @@ class TextFormatter(logging.Formatter):
     """`2026-01-31T12:00:00.000Z warning refused_source listener=scada peer=10.0.0.9:51200`."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line, without its end."""
+        """The line, without a line end."""
         fields = "".join(f" {key}={_quoted(value)}" for key, value in _fields(record).items())
         return (
             f"{timestamp(record.created)} {record.levelname.lower()} {record.getMessage()}{fields}"
@@ -57,10 +57,10 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: `time`, `level`, `event`, and the fields."""
+    """One JSON object per line: `time`, `level`, `event`, and the fields."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line, without its end."""
+        """The line, without a line end."""
         head = {
             "time": timestamp(record.created),
             "level": record.levelname.lower(),
@@ -83,16 +83,16 @@ def _quoted(value: object) -> str:
 
 
 def timestamp(seconds: float) -> str:
-    """A time since 1970 as logs write it: UTC, to the millisecond."""
+    """Formats seconds since 1970 as UTC, with milliseconds."""
     moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
     return f"{moment}.{int(seconds % 1 * 1000):03d}Z"
 
 
 class Throttle:
-    """Lets the first `burst` events of a kind through in each `window` of seconds.
+    """Admits the first `burst` events of a kind in each `window` of seconds.
 
-    `admit` says whether an event may be logged, and how many of its kind were held back in the
-    window before: that number is logged with it, so that none is lost without a trace.
+    `admit` returns whether to log an event, and how many events of its kind the window before held
+    back. The log includes that number, so no event is lost without a trace.
     """
 
     def __init__(self, burst: int = 20, window: float = 10.0) -> None:

@@ -1,7 +1,7 @@
-"""What the standard fixes: areas and addresses, functions and their limits, exceptions.
+"""Constants of the standard: areas and addresses, functions and their limits, exceptions.
 
-All of it comes from the native core; what is derived of it is derived here. Nothing else in Python
-writes one of these numbers down.
+The native core defines them, and this module derives others. No other Python module repeats these
+numbers.
 """
 
 from __future__ import annotations
@@ -14,42 +14,42 @@ if TYPE_CHECKING:
     from holdfast.types import Area, Transport
 
 ADDRESSES = _core.ADDRESSES
-"""How many addresses an area can have."""
+"""Maximum number of addresses in an area."""
 
 LAST_ADDRESS = ADDRESSES - 1
 MAX_WORD = 0xFFFF
-"""The largest value of a register, and of every other field of 16 bits."""
+"""The largest value of a register, and of every other 16-bit field."""
 
 MAX_UNIT = 0xFF
 MAX_SERIAL_UNIT = 247
-"""The largest unit id, and that of a device on a serial line (V1.02, 2.2)."""
+"""The largest unit id, and the largest on a serial line (V1.02, 2.2)."""
 
 PORT = 502
 TLS_PORT = 802
-"""The ports of Modbus over TCP and UDP, and over TLS."""
+"""The default ports of Modbus over TCP and UDP, and over TLS."""
 
 
 def usual_port(transport: Transport) -> int:
-    """The port that is meant where none is named."""
+    """The default port of a transport."""
     return TLS_PORT if transport == "tls" else PORT
 
 
 class Function(NamedTuple):
-    """A function that servers and clients here know (V1.1b3, 6)."""
+    """A function that Holdfast supports (V1.1b3, 6)."""
 
     code: int
     name: str
     writes: bool
     """Whether it changes bits or registers."""
     area: Area | None
-    """What it reads or writes; `None` for those that are about the device."""
+    """The area that it accesses; `None` for functions of the device itself."""
     most_read: int
-    """The most bits or registers that it reads, 0 if it reads none."""
+    """Maximum number of bits or registers that it reads, 0 if it reads none."""
     most_written: int
 
 
 MAX_PDU = _core.MAX_PDU
-"""Bytes of the longest request or reply, without what a transport puts around it."""
+"""Maximum size of a request or reply in bytes, without the framing of a transport."""
 
 FUNCTIONS = tuple(Function(*row) for row in _core.FUNCTIONS)
 OF_CODE = {each.code: each for each in FUNCTIONS}
@@ -57,11 +57,10 @@ CODES = tuple(OF_CODE)
 WRITING_CODES = tuple(each.code for each in FUNCTIONS if each.writes)
 
 BROADCAST_CODES = tuple(each.code for each in FUNCTIONS if each.writes and not each.most_read)
-"""Those that may be sent to all units of a serial line: writes without an answer to wait for
-(V1.02, 2.1)."""
+"""Functions that can be broadcast on a serial line: writes that return no values (V1.02, 2.1)."""
 
 READ_WRITE = OF_CODE[23]
-"""The function that writes registers and reads some, as one step."""
+"""The function that writes and reads registers in one step."""
 
 READ_FUNCTIONS: dict[Area, Function] = {
     each.area: each for each in FUNCTIONS if each.area is not None and not each.writes
@@ -71,14 +70,14 @@ READ_FUNCTIONS: dict[Area, Function] = {
 READ_LIMITS: dict[Area, int] = {
     area: function.most_read for area, function in READ_FUNCTIONS.items()
 }
-"""The most bits or registers that one request reads."""
+"""Maximum number of bits or registers that one request reads, by area."""
 
 WRITE_LIMITS: dict[Area, int] = {
     area: max(each.most_written for each in FUNCTIONS if each.area == area)
     for area in READ_FUNCTIONS
     if any(each.writes for each in FUNCTIONS if each.area == area)
 }
-"""The most that one request writes, of the areas that can be written."""
+"""Maximum number of bits or registers that one request writes, by writable area."""
 
 READ_REGISTERS = READ_LIMITS["holding_registers"]
 READ_BITS = READ_LIMITS["coils"]
@@ -86,7 +85,7 @@ WRITE_REGISTERS = WRITE_LIMITS["holding_registers"]
 WRITE_BITS = WRITE_LIMITS["coils"]
 
 EXCEPTIONS = _core.EXCEPTIONS
-"""The names of exceptions by their codes (V1.1b3, 7)."""
+"""The names of exceptions, by code (V1.1b3, 7)."""
 
 _EXCEPTION = {name: code for code, name in EXCEPTIONS.items()}
 
@@ -98,4 +97,4 @@ PATH_UNAVAILABLE = _EXCEPTION["Gateway Path Unavailable"]
 TARGET_SILENT = _EXCEPTION["Gateway Target Device Failed To Respond"]
 
 HARMLESS_DIAGNOSTICS = tuple(code for code, _, changes in _core.SUB_FUNCTIONS if not changes)
-"""Sub-functions of function 8 that change nothing: the echo, the diagnostic register, counters."""
+"""Sub-functions of function 8 that change nothing: echo, diagnostic register, counters."""

@@ -1,4 +1,4 @@
-"""The former name of `holdfast.raw_ingest`. Deprecated: it goes with the next release."""
+"""The former name of `holdfast.raw_ingest`. Deprecated: the next release removes it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import warnings
 from holdfast.raw_ingest import *  # noqa: F403
 
 warnings.warn(
-    "holdfast.raw is now holdfast.raw_ingest; the old name goes with the next release",
+    "holdfast.raw is now holdfast.raw_ingest; the next release removes the old name",
     DeprecationWarning,
     stacklevel=2,
 )

@@ -1,7 +1,7 @@
-"""Raw Ingest, the sender's side: one packet, one connection, one atomic write, one byte of reply.
+"""A sender of Raw Ingest packets: one connection per packet, one atomic write, one reply byte.
 
-`unit` makes a packet of format v1, `memory_id` one of format crc; which of both a receiver speaks,
-its configuration says. Nothing is tried twice: what to do after a failure is the caller's to say.
+`unit` selects packets of format v1, `memory_id` packets of format crc; use the format of the
+receiver's configuration. Nothing is retried: the caller decides what to do after a failure.
 
 >>> await holdfast.raw_ingest.send("10.0.2.9", 9000, "input_registers", 0, [100, 200], unit=1)
 """
@@ -52,9 +52,9 @@ _RESOLVER = Resolver()
 
 
 class RawError(Exception):
-    """A packet that is not known to be written.
+    """The packet was not confirmed.
 
-    `maybe_written` tells whether it may have been: all of it was sent, and no valid reply came.
+    `maybe_written`: the whole packet was sent, but no valid reply arrived.
     """
 
     def __init__(self, what: str, *, maybe_written: bool) -> None:
@@ -64,7 +64,7 @@ class RawError(Exception):
 
 
 class RawRefused(RawError):
-    """The receiver refused the packet (reply 01) and wrote nothing; it never says why."""
+    """The receiver refused the packet (reply 01) and wrote nothing. It gives no reason."""
 
 
 class RawTimeout(RawError, TimeoutError):
@@ -72,7 +72,7 @@ class RawTimeout(RawError, TimeoutError):
 
 
 class Options(TypedDict, total=False):
-    """What `encode` takes beside area, address and values."""
+    """The options of `encode`."""
 
     data: Data | None
     count: int | None
@@ -94,27 +94,27 @@ def encode(
     format: Format | None = None,
     crc: Crc | None = None,
 ) -> bytes:
-    """One packet, of format v1 for a `unit`, of format crc for a `memory_id`.
+    """Encodes one packet: format v1 with `unit`, format crc with `memory_id`.
 
-    `values` are 1 to 65535 bits (0, 1, False, True) or registers (integers 0 to 65535). In place of
-    them, `data` is the payload as the wire has it: registers high byte first, bits packed least
-    significant bit first with their `count`. `crc` is "none" for receivers of format crc that
-    expect no CRC behind the payload. `format` may be given too, and must agree.
+    `values` are 1 to 65535 bits (0, 1, False, True) or registers (integers 0 to 65535). `data` is
+    the alternative: the payload as on the wire, registers high byte first, or bits packed least
+    significant bit first with their `count`. Set `crc` to "none" for receivers of format crc that
+    expect no CRC after the payload. `format` is optional and must match.
 
-    Raises `ValueError` for what no receiver may accept, `TypeError` for a value of another type:
-    nothing is converted, cut or wrapped.
+    Raises `ValueError` for a packet that no receiver accepts, `TypeError` for a value of another
+    type: values are never converted, truncated or wrapped.
     """
     if area not in AREAS:
-        raise ValueError(f"area is {reprlib.repr(area)}, allowed are {', '.join(AREAS)}")
+        raise ValueError(f"area is {reprlib.repr(area)}, allowed: {', '.join(AREAS)}")
     if (unit is None) == (memory_id is None):
-        raise TypeError("a packet has either a unit (format v1) or a memory_id (format crc)")
+        raise TypeError("a packet requires either a unit (format v1) or a memory_id (format crc)")
     layout: Format = "crc" if unit is None else "v1"
     if format not in (None, layout):
         raise ValueError(f"format is {format!r}, but the packet is of format {layout}")
     if crc not in (None, "required", "none"):
-        raise ValueError(f"crc is {crc!r}, allowed are 'required' and 'none'")
+        raise ValueError(f"crc is {crc!r}, allowed: 'required' or 'none'")
     if crc is not None and layout == "v1":
-        raise ValueError("crc is for format crc, a packet of format v1 never has one")
+        raise ValueError("crc requires format crc: a packet of format v1 has no CRC")
     _checked_field("address", address)
     payload, items = _payload(area, values, data, count)
     if address + items > ADDRESSES:
@@ -144,9 +144,9 @@ async def send(
     timeout: float = TIMEOUT,
     **options: Unpack[Options],
 ) -> None:
-    """Sends one packet, as `encode` makes it; returns when the receiver has written it.
+    """Encodes and sends one packet. Returns when the receiver has written it.
 
-    Raises as `encode` before it connects, and as `send_packet`.
+    Raises the errors of `encode` before it connects, and the errors of `send_packet`.
     """
     await send_packet(host, port, encode(area, address, values, **options), timeout=timeout)
 
@@ -161,17 +161,17 @@ def send_sync(
     timeout: float = TIMEOUT,
     **options: Unpack[Options],
 ) -> None:
-    """As `send`, without an event loop."""
+    """Like `send`, without an event loop."""
     send_packet_sync(host, port, encode(area, address, values, **options), timeout=timeout)
 
 
 async def send_packet(host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT) -> None:
-    """Sends a packet that is made already; returns when the receiver has written it.
+    """Sends an encoded packet. Returns when the receiver has written it.
 
-    `timeout`, in seconds, is one deadline for finding and reaching the host, sending, and the
-    reply. Raises `RawRefused`, `RawTimeout`, or `RawError` for everything else that goes wrong; all
-    are a `RawError`, which knows whether the packet may have been written. The connection is
-    closed in any case, also when the task is cancelled.
+    `timeout`, in seconds, covers name resolution, connection, packet and reply together. Raises
+    `RawRefused`, `RawTimeout`, or `RawError` for all other failures; all are `RawError`, and
+    `maybe_written` says whether the packet may have been written. Always closes the connection,
+    also when the task is cancelled.
     """
     attempt = _Attempt(host, port, timeout)
     try:
@@ -185,7 +185,7 @@ async def send_packet(host: str, port: int, packet: bytes, *, timeout: float = T
 
 
 def send_packet_sync(host: str, port: int, packet: bytes, *, timeout: float = TIMEOUT) -> None:
-    """As `send_packet`, without an event loop."""
+    """Like `send_packet`, without an event loop."""
     attempt = _Attempt(host, port, timeout)
     deadline = time.monotonic() + timeout
     try:
@@ -197,17 +197,17 @@ def send_packet_sync(host: str, port: int, packet: bytes, *, timeout: float = TI
 
 
 class _Attempt:
-    """How far one packet has come, and what becomes of that."""
+    """The progress of one packet, and its outcome."""
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
         _checked_field("port", port, least=1)
         if not 0 < timeout < math.inf:
-            raise ValueError(f"timeout is {timeout}, allowed are seconds above 0")
+            raise ValueError(f"timeout is {timeout}, allowed: more than 0 seconds")
         try:
             if not host.encode("idna"):
                 raise UnicodeError
         except UnicodeError:
-            raise ValueError(f"{reprlib.repr(host)} is no name of a host") from None
+            raise ValueError(f"{reprlib.repr(host)} is not a host name") from None
         self.peer = joined(host, port)
         self.timeout = timeout
         self.connected = False
@@ -224,24 +224,24 @@ class _Attempt:
         return RawError(f"{self.peer}: {what}", maybe_written=self.sent)
 
     def conclude(self, reply: bytes) -> None:
-        """Returns if the reply says that the packet was written."""
+        """Returns if the reply confirms the packet; otherwise raises `RawError`."""
         if reply == DONE and self.sent:
             return
         if reply == REFUSED:
             raise RawRefused(f"{self.peer} refused the packet", maybe_written=False)
         if reply == DONE:
-            what = "answered 00 before it had the packet"
+            what = "answered 00 before it had the whole packet"
         elif reply:
-            what = f"answered {reply.hex()}, allowed are 00 and 01"
+            what = f"answered {reply.hex()}, allowed: 00 or 01"
         else:
             what = "closed the connection without a reply"
         raise RawError(f"{self.peer} {what}", maybe_written=self.sent)
 
 
 async def _connected(host: str, port: int, deadline: float) -> socket.socket:
-    """A connection to the first address of the host that takes one.
+    """Connects to the first address of the host that accepts.
 
-    Each address has its share of the time that is left, so that a dead one does not use up all.
+    Each address gets a share of the remaining time, so that one dead address does not use it up.
     """
     loop = asyncio.get_running_loop()
     found = await asyncio.wrap_future(_RESOLVER.look_up(host, port))
@@ -263,7 +263,7 @@ async def _connected(host: str, port: int, deadline: float) -> socket.socket:
 
 
 def _connected_sync(host: str, port: int, deadline: float) -> socket.socket:
-    """As `_connected`."""
+    """Like `_connected`, without an event loop."""
     found = _RESOLVER.wait_for(host, port, _left(deadline))
     for others, (family, address) in _countdown(found):
         try:
@@ -284,7 +284,7 @@ def _connected_sync(host: str, port: int, deadline: float) -> socket.socket:
 
 
 def _countdown(found: Sequence[SocketAddress]) -> Iterator[tuple[int, SocketAddress]]:
-    """The addresses, each with how many come after it."""
+    """The addresses, each with the number of addresses after it."""
     return zip(reversed(range(len(found))), found, strict=True)
 
 
@@ -294,10 +294,10 @@ def _prepare(connection: socket.socket) -> None:
 
 
 async def _exchange(attempt: _Attempt, connection: socket.socket, packet: bytes) -> bytes:
-    """The reply, or nothing when there is none.
+    """Sends the packet and returns the reply, empty without one.
 
-    It is awaited from the start: a receiver may refuse a packet by its header. What becomes of the
-    rest of the packet then is of no interest.
+    Waits for the reply from the start: a receiver can refuse a packet by its header. The rest of
+    the packet does not matter then.
     """
     loop = asyncio.get_running_loop()
     attempt.connected = True
@@ -313,7 +313,7 @@ async def _exchange(attempt: _Attempt, connection: socket.socket, packet: bytes)
 def _exchange_sync(
     attempt: _Attempt, connection: socket.socket, packet: bytes, deadline: float
 ) -> bytes:
-    """As `_exchange`."""
+    """Like `_exchange`, without an event loop."""
     attempt.connected = True
     unsent = memoryview(packet)
     with selectors.DefaultSelector() as selector:
@@ -345,50 +345,50 @@ def _left(deadline: float) -> float:
 def _payload(
     area: Area, values: Iterable[int] | None, data: Data | None, count: int | None
 ) -> tuple[bytes, int]:
-    """The payload, and how many values it has."""
+    """The payload, and its number of values."""
     if (values is None) == (data is None):
-        raise TypeError("a packet has either values or data")
+        raise TypeError("a packet requires either values or data")
     if count is not None:
         _checked_field("count", count, least=1)
     if data is not None:
         return _checked(area, data, count)
     if isinstance(values, Data):
-        raise TypeError("values are bytes, which are given as data")
+        raise TypeError("values are bytes; pass them as data")
     items = list(values or ())
     if not 1 <= len(items) <= MAX_FIELD:
-        raise ValueError(f"values are {len(items)}, allowed are 1 to {MAX_FIELD}")
+        raise ValueError(f"found {len(items)} values, allowed: 1 to {MAX_FIELD}")
     if count not in (None, len(items)):
-        raise ValueError(f"count is {count}, but values are {len(items)}")
+        raise ValueError(f"count is {count}, but found {len(items)} values")
     return pack_raw_ingest(area, items), len(items)
 
 
 def _checked(area: Area, data: Data, count: int | None) -> tuple[bytes, int]:
-    """Data as it is, and how many values it has."""
+    """Checks a payload. Returns it as bytes, with its number of values."""
     if not isinstance(data, Data):
         raise TypeError(f"data is {reprlib.repr(data)}, not bytes")
     payload = bytes(data)
     if area in BIT_AREAS:
         if count is None:
-            raise TypeError("data of bits needs a count")
+            raise TypeError("data of bits requires a count")
         if len(payload) != (count + 7) // 8:
             raise ValueError(
-                f"{count} {area} are {(count + 7) // 8} bytes, data has {len(payload)}"
+                f"{count} {area} require {(count + 7) // 8} bytes, data has {len(payload)}"
             )
         return payload, count
     if len(payload) % 2 or not 1 <= len(payload) // 2 <= MAX_FIELD:
         raise ValueError(
-            f"data has {len(payload)} bytes, allowed are 2 for each of 1 to {MAX_FIELD}"
+            f"data has {len(payload)} bytes, allowed: 2 for each of 1 to {MAX_FIELD} registers"
         )
     if count not in (None, len(payload) // 2):
-        raise ValueError(f"count is {count}, but data is {len(payload) // 2} registers")
+        raise ValueError(f"count is {count}, but data has {len(payload) // 2} registers")
     return payload, len(payload) // 2
 
 
 def _checked_field(name: str, value: object, least: int = 0) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(
-            f"{name} is {reprlib.repr(value)}, allowed are integers {least} to {MAX_FIELD}"
+            f"{name} is {reprlib.repr(value)}, allowed: integers {least} to {MAX_FIELD}"
         )
     if not least <= value <= MAX_FIELD:
-        raise ValueError(f"{name} is {value}, allowed are {least} to {MAX_FIELD}")
+        raise ValueError(f"{name} is {value}, allowed: {least} to {MAX_FIELD}")
     return value

@@ -1,7 +1,7 @@
-"""A Modbus TCP server over memories, for use from Python.
+"""A Modbus TCP server for memories, for use from Python.
 
-It is one listener of the native engine; the engine's threads serve it, outside the interpreter.
-An appliance with several listeners is `holdfast.appliance`.
+The server is one listener of the native engine, whose threads serve it outside the interpreter.
+`holdfast.appliance` has appliances with several listeners.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ SOURCES = tuple(map(str, LOOPBACK))
 
 @dataclass(frozen=True, kw_only=True)
 class Identity:
-    """The identification objects of all units, and names of single ones.
+    """The identification objects of all units, and names of single units.
 
-    Texts are sent as UTF-8, at most 244 bytes each; an empty one that is not mandatory is left out.
-    `unit_names` by unit id, 0 to 255, take the place of `user_application_name`; `private_objects`
-    are those by id, 128 to 255.
+    Text is sent as UTF-8, at most 244 bytes each. Optional objects with empty text are omitted.
+    `unit_names`, by unit id 0 to 255, override `user_application_name`. `private_objects` are by
+    object id, 128 to 255.
     """
 
     vendor_name: str = "Holdfast"
@@ -44,7 +44,7 @@ class Identity:
     private_objects: Mapping[int, str] = field(default_factory=dict)
 
     def objects(self) -> list[tuple[int, str]]:
-        """Object ids and texts, the three mandatory ones first."""
+        """Object ids and texts, the three mandatory objects first."""
         mandatory = [self.vendor_name, self.product_code, self.revision]
         optional = [
             self.vendor_url,
@@ -63,16 +63,16 @@ class Identity:
 class Server:
     """Serves memories over Modbus TCP, from `start` (or `with`) to `stop`.
 
-    `units` maps unit ids, 0 to 255, to memories; what peers from `sources` may do with them is
-    `access`, and `functions` or `deny`, lists of function codes. In place of these, `rules` are
-    several grants, of which the first that names a peer's address holds. A peer that none names is
-    closed at once. `bind` is `address:port`; port 0 lets the system pick one.
+    `units` maps unit ids, 0 to 255, to memories. Peers from `sources` have `access` to them,
+    limited by `functions` or `deny`, lists of function codes. Alternatively, set `rules`: the first
+    rule whose sources contain the peer applies. A peer without a rule is disconnected at once.
+    `bind` is `address:port`; port 0 lets the system pick a port.
 
-    Times are in seconds: `idle_timeout` without a request (0 keeps a connection for ever),
-    `request_timeout` from the first byte of a request to its last, and for a peer to take its
-    replies. `workers` is the number of native threads.
+    Times are in seconds. `idle_timeout` is the time without a request; 0 is unlimited.
+    `request_timeout` is the time from the first byte of a request to its last, and the time for a
+    peer to read its replies. `workers` is the number of native threads.
 
-    Raises `ValueError` or `TypeError` for arguments that can't be, at once.
+    Raises `ValueError` or `TypeError` at once for invalid arguments.
 
     >>> memory = holdfast.Memory(holding_registers=100)
     >>> with holdfast.Server({1: memory}, bind="127.0.0.1:5020", access="read-write"):
@@ -99,7 +99,7 @@ class Server:
     ) -> None:
         if rules is None:
             if units is None or access is None:
-                raise TypeError("a server needs units and access, or rules")
+                raise TypeError("a server requires units and access, or rules")
             rule = _core.Rule(
                 units,
                 sources=list(sources),
@@ -109,9 +109,9 @@ class Server:
             )
             rules = [rule]
         elif units is not None or access is not None:
-            raise TypeError("a server has units and access, or rules, not both")
+            raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= workers <= MAX_WORKERS:
-            raise ValueError(f"workers is {workers}, allowed are 1 to {MAX_WORKERS}")
+            raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
         self._listener = _core.Listener(
             "server",
             bind,
@@ -127,12 +127,12 @@ class Server:
         self._engine: _core.Engine | None = None
 
     def start(self) -> Self:
-        """Listens and serves, until `stop`.
+        """Listens and serves until `stop`.
 
-        Raises `OSError` when the address can't be bound, `RuntimeError` when it runs already.
+        Raises `OSError` if the address can't be bound, `RuntimeError` if the server is running.
         """
         if self._engine is not None:
-            raise RuntimeError("the server runs already")
+            raise RuntimeError("the server is already running")
         self._engine = _core.Engine(
             [self._listener],
             identity=self._identity.objects(),
@@ -142,9 +142,9 @@ class Server:
         return self
 
     def stop(self) -> None:
-        """Answers what was received, ends all connections and stops listening, within a second.
+        """Answers received requests, closes all connections and stops listening, within a second.
 
-        From any thread, any number of times; it can be started again.
+        Can be called from any thread and more than once. The server can be started again.
         """
         engine, self._engine = self._engine, None
         if engine is not None:
@@ -152,18 +152,18 @@ class Server:
 
     @property
     def address(self) -> tuple[str, int]:
-        """The address and port that it listens on. Raises `RuntimeError` when it does not run."""
+        """The address and port of the server. Raises `RuntimeError` if it is not running."""
         address = self._running().addresses[0]
         assert address is not None
         return address
 
     def counters(self) -> ModbusCounters:
-        """What it counted since it was started. Raises `RuntimeError` when it does not run."""
+        """The counters since the start. Raises `RuntimeError` if the server is not running."""
         return cast("ModbusCounters", self._running().counters()["server"])
 
     def _running(self) -> _core.Engine:
         if self._engine is None:
-            raise RuntimeError("the server does not run")
+            raise RuntimeError("the server is not running")
         return self._engine
 
     def __enter__(self) -> Self:

@@ -13,17 +13,17 @@ BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 
 Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp"]
-"""How a device with an address is talked to."""
+"""The transport to a device with a network address."""
 
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
 
 WhenFull: TypeAlias = Literal["refuse", "evict"]
 
 Extent: TypeAlias = int | tuple[int, int]
-"""The addresses of an area: a size from 0, or start and size."""
+"""The addresses of an area: a size, with addresses from 0, or start and size."""
 
 Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
-"""The gate bit of a memory: area (of bits), address, and when it opens."""
+"""The gate bit of a memory: area of bits, address, and mode."""
 
 PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
 """What a poll found: area, address, count, the bytes if there are any, the fault, and the seconds
@@ -31,7 +31,7 @@ since 1970 when that was known."""
 
 
 class ConnectionCounters(TypedDict):
-    """Connections of one listener: how many are `open`, and what became of the others."""
+    """Connections of one listener: `open` is the current number, the others count outcomes."""
 
     accepted: int
     refused_source: int
@@ -47,10 +47,10 @@ class ConnectionCounters(TypedDict):
 
 
 class FrameCounters(TypedDict):
-    """Frames that are no requests.
+    """Frames that are not requests.
 
-    With a protocol id other than 0, with an impossible length, damaged (check sum, characters), on
-    a serial line for a unit that is not served.
+    `foreign`: a protocol id other than 0. `broken`: an impossible length. `damaged`: a wrong
+    checksum or character. `other_unit`: on a serial line, a unit that is not served.
     """
 
     foreign: int
@@ -60,7 +60,7 @@ class FrameCounters(TypedDict):
 
 
 class PacketCounters(TypedDict):
-    """Raw Ingest packets: written, the values in them, refused by reason."""
+    """Raw Ingest packets: written packets, their values, and refused packets by reason."""
 
     accepted: int
     values: int
@@ -68,7 +68,7 @@ class PacketCounters(TypedDict):
 
 
 class ModbusCounters(TypedDict):
-    """What a Modbus listener counted: requests by function code, exceptions by exception code."""
+    """Counters of a Modbus listener: requests by function code, exceptions by exception code."""
 
     requests: dict[int, int]
     exceptions: dict[int, int]
@@ -78,7 +78,7 @@ class ModbusCounters(TypedDict):
 
 
 class RawCounters(TypedDict):
-    """What a Raw Ingest listener counted."""
+    """Counters of a Raw Ingest listener."""
 
     packets: PacketCounters
     connections: ConnectionCounters

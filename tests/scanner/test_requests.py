@@ -45,7 +45,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unitId": 256}, "Expected `int` <= 255 - at `$.unitId`"),
     ({"transport": "rtu+tcp", "unitId": 0}, "unitId is 0, which is the broadcast of a serial line"),
     ({"transport": "can"}, "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp"),
-    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed are ABCD"),
+    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed: ABCD"),
     ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
     ({"scanRate": 86_400_001}, "scanRate is 86400001, allowed are"),
     ({"scanRate": 100.5}, "Expected `int | null`, got `float` - at `$.scanRate`"),
@@ -65,7 +65,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         {"tags": [tag("a", 0) | {"address": 0.5}]},
         "Expected `int`, got `float` - at `$.tags[0].address`",
     ),
-    ({"tags": [tag("a", 0, encoding="ascii")]}, "tags[0]: encoding 'ascii' is for strings, uint16"),
+    (
+        {"tags": [tag("a", 0, encoding="ascii")]},
+        "tags[0]: encoding 'ascii' is for strings, not for uint16",
+    ),
     ({"tags": [tag("a", 0, "string:2", encoding="x")]}, "tags[0]: encoding 'x' is unknown"),
     (
         {"tags": [tag("a", 0, "uint16[124]", writable=True)]},
@@ -87,7 +90,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         {"tags": [tag("a", 65535, "int32")]},
         "tags[0]: int32 from address 65535: the last address is",
     ),
-    ({"tags": [tag("a", 0, "int8")]}, "tags[0]: type 'int8' is unknown, allowed are"),
+    ({"tags": [tag("a", 0, "int8")]}, "tags[0]: type 'int8' is unknown, allowed:"),
     ({"tags": [tag("a", 0, "string:252")]}, "tag 'a': string:252 has 126 registers, one request"),
     ({"tags": [tag("a", 0, functionCode="coils")]}, "allowed are coil, discrete, holding, input"),
     (

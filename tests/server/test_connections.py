@@ -462,7 +462,7 @@ def test_a_stop_of_a_stopped_server_does_nothing(memory: holdfast.Memory) -> Non
 
 
 def test_a_server_that_runs_is_not_started_again(server: holdfast.Server) -> None:
-    with pytest.raises(RuntimeError, match="runs already"):
+    with pytest.raises(RuntimeError, match="already running"):
         server.start()
 
 
