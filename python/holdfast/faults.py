@@ -1,4 +1,4 @@
-"""Why a polled device did not answer: codes of the native poller, as words and as texts."""
+"""Faults of polled devices: the codes of the native poller, as words and as texts."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from holdfast import _core
 from holdfast.errors import ModbusException
 
 FAULTS = _core.FAULTS
-"""Why a polled device did not answer, in a word, with the codes that the poller has for it. A fault
-of another code is an exception of the device.
+"""Why a polled device did not answer, as a word, with the fault code of the poller. A fault with
+another code is an exception of the device.
 """
 
 NO_CONNECTION = FAULTS["refused"]
@@ -25,19 +25,19 @@ _TEXTS = {
 
 
 def is_exception(fault: int) -> bool:
-    """Whether a fault is an exception; otherwise the request or its reply got lost."""
+    """Whether a fault is an exception of the device; otherwise there was no valid reply."""
     return fault not in _WORDS
 
 
 def fault_word(fault: int) -> str:
-    """A fault as logs have it: `timeout`, `exception 02`, `none` for 0."""
+    """A fault as a word for logs: `timeout`, `exception 02`, `none` for 0."""
     if fault == 0:
         return "none"
     return _WORDS.get(fault, f"exception {fault:02X}")
 
 
 def fault_text(fault: int) -> str:
-    """A fault in words for people: `no reply in time`, `exception 02 (Illegal Data Address)`."""
+    """A fault as text: `no reply in time`, `exception 02 (Illegal Data Address)`."""
     if fault in _core.EXCEPTIONS:
         return str(ModbusException(fault, _core.EXCEPTIONS[fault]))
     return fault_word(fault) if is_exception(fault) else _TEXTS[fault]

@@ -26,8 +26,8 @@ Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
 """The gate bit of a memory: area of bits, address, and mode."""
 
 PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
-"""What a poll found: area, address, count, the bytes if there are any, the fault, and the seconds
-since 1970 when that was known."""
+"""One block of a poll: area, address, count, the bytes or `None`, the fault, and the time of the
+result in seconds since 1970."""
 
 
 class ConnectionCounters(TypedDict):

@@ -136,7 +136,7 @@ def test_it_can_be_ended_earlier_with_what_was_measured(server: holdfast.Server)
 
 def test_connections_are_limited() -> None:
     for connections in (0, 1001):
-        with pytest.raises(ValueError, match="allowed are 1 to 1000"):
+        with pytest.raises(ValueError, match="allowed: 1 to 1000"):
             Load("tcp://127.0.0.1", "coils", 0, 1, connections=connections)
 
 

@@ -177,7 +177,7 @@ def test_a_file_has_a_whole_area(tmp_path: Path) -> None:
         (b"-1\n", "Error: <stdin>:1: '-1' is not an integer, decimal or 0x."),
         (b"1\n\xff\n", "Error: <stdin> is not UTF-8 text."),
         (b"1\n65536\n", "Error: values[1] is 65536, allowed are integers 0 to 65535."),
-        (b"", "Error: values are 0, allowed are 1 to 65535."),
+        (b"", "Error: found 0 values, allowed: 1 to 65535."),
     ],
 )
 def test_a_wrong_value_in_a_file_is_named(text: bytes, told: str) -> None:

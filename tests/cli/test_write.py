@@ -99,7 +99,7 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
 ) -> None:
     many = [str(number) for number in range(300)]
     told = usage_error("write", cli.url(server), "hr", "0", *many)
-    assert told.startswith("Error: 300 values, one request writes at most 123; with --split ")
+    assert told.startswith("Error: 300 values, one request writes at most 123; use --split ")
     found = answer("write", cli.url(server), "hr", "0", *many, "--split", "--verify")
     assert (found["ok"], found["count"], found["verified"]) == (True, 300, True)
     assert memory.read("holding_registers", 0, 300) == list(range(300))
@@ -122,7 +122,7 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         (("hr", "0", "x", "--type", "float32"), "'x' is not a number."),
         (("hr", "0", "1e99", "--type", "float32"), "of float32."),
         (("hr", "0", "xy", "--type", "bytes:1"), "'xy' is not hex, allowed: pairs of hex digits."),
-        (("hr", "0", "ABC", "--type", "string:2"), "holds up to 2."),
+        (("hr", "0", "ABC", "--type", "string:2"), "allowed in string:2: up to 2."),
         (("hr", "0", "1", "--type", "int16[2]"), "int16[2] takes 2 values, found 1."),
         (("hr", "0", "1", "0", "--type", "bit:1"), "bit:1 takes one value, found 2."),
         (("co", "0", "1", "--type", "int16"), "coils contain bits; the only type is bool."),

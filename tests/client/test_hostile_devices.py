@@ -285,7 +285,7 @@ def test_an_identification_ends_though_a_device_always_has_more(make: Make, dial
         asked.answer(bytes([0x2B, 0x0E, 3, 1, 0xFF, following, 1, asked.pdu[3], 1, 65]))
 
     device = make("tcp", then=more)
-    with pytest.raises(holdfast.InvalidResponse, match="object 255 is said to follow after"):
+    with pytest.raises(holdfast.InvalidResponse, match="object 255 can't follow object"):
         dial(device.url).identify()
     assert len(device.requests) == 256
 

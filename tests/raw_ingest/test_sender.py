@@ -231,7 +231,7 @@ WRONG: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("nothing", {"values": [None]}, TypeError, "values[0] is None, allowed are integers 0"),
     ("a bit", {"area": "coils", "values": [2]}, ValueError, "values[0] is 2, allowed are 0, 1, F"),
     ("a bit of 1.0", {"area": "coils", "values": [1.0]}, TypeError, "values[0] is 1.0, allowed"),
-    ("bytes as values", {"values": b"\0\1"}, TypeError, "values are bytes, which are given as"),
+    ("bytes as values", {"values": b"\0\1"}, TypeError, "values are bytes; pass them as data"),
     ("nothing at all", {"values": None}, TypeError, "a packet requires either values or data"),
     ("values and data", {"data": b"\0\1"}, TypeError, "a packet requires either values or data"),
     ("another count", {"count": 2}, ValueError, "count is 2, but found 3 values"),
@@ -248,7 +248,7 @@ WRONG: list[tuple[str, dict[str, Any], type[Exception], str]] = [
         "data of another count",
         {"values": None, "data": b"\0\1", "count": 2},
         ValueError,
-        "count is 2, but data is 1 registers",
+        "count is 2, but data has 1 registers",
     ),
     (
         "bits without a count",
@@ -270,11 +270,16 @@ WRONG: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ),
     ("a unit", {"unit": 65536}, ValueError, "unit is 65536, allowed: 0 to 65535"),
     ("a unit as truth", {"unit": True}, TypeError, "unit is True, allowed: integers 0 to"),
-    ("no target", {"unit": None}, TypeError, "a packet has either a unit (format v1) or a mem"),
-    ("both targets", {"memory_id": 1}, TypeError, "a packet has either a unit (format v1) or"),
+    (
+        "no target",
+        {"unit": None},
+        TypeError,
+        "a packet requires either a unit (format v1) or a mem",
+    ),
+    ("both targets", {"memory_id": 1}, TypeError, "a packet requires either a unit (format v1) or"),
     ("a memory id", {"unit": None, "memory_id": -1}, ValueError, "memory_id is -1, allowed:"),
     ("the other format", {"format": "crc"}, ValueError, "format is 'crc', but the packet is of"),
-    ("a CRC in v1", {"crc": "required"}, ValueError, "crc is for format crc, a packet of format"),
+    ("a CRC in v1", {"crc": "required"}, ValueError, "crc requires format crc: a packet of format"),
     ("another CRC", {"unit": None, "memory_id": 1, "crc": "no"}, ValueError, "crc is 'no', allow"),
 ]
 

@@ -175,7 +175,7 @@ def test_every_guess_is_what_the_registers_hold(
 
 @pytest.mark.parametrize("found", [[], [[]], [[1], [1, 2]]])
 def test_reads_without_registers_or_of_other_sizes_are_refused(found: list[list[int]]) -> None:
-    with pytest.raises(ValueError, match="reads are to have registers"):
+    with pytest.raises(ValueError, match="all reads require the same number of registers"):
         guess(found)
 
 

@@ -477,7 +477,10 @@ def test_the_plan_of_reads() -> None:
         (("tcp://plc", "--read", "xx:0:1"), "'xx' is not an area"),
         (("tcp://plc", *READS, "--cost", "1"), "'1' is not REQUEST:REGISTER"),
         (("tcp://plc", *READS, "--forbidden", "hr:3-1"), "'hr:3-1' is not AREA:FIRST-LAST"),
-        (("tcp://plc", *READS, "--forbidden", "hr:9"), "holding_registers 0 to 9 meets what is"),
+        (
+            ("tcp://plc", *READS, "--forbidden", "hr:9"),
+            "holding_registers 0 to 9 overlaps the forbidden",
+        ),
         (("http://plc", *READS), "is not the URL of a device"),
     ],
 )

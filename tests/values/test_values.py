@@ -535,7 +535,7 @@ def test_a_digit_over_9_is_refused(nibble: int, digit: int) -> None:
         values.Undecodable, match=f"^digits 0x{register:04X} are not bcd16, allowed: 0 to 9$"
     ):
         decode([register], "bcd16")
-    with pytest.raises(values.Undecodable, match=r"^values\[1\]: digits 0x0000.... are no bcd32"):
+    with pytest.raises(values.Undecodable, match=r"^values\[1\]: digits 0x0000.... are not bcd32"):
         decode([0, 0, register, 0], "bcd32[2]", "CDAB")
 
 
@@ -572,8 +572,8 @@ def test_a_text_has_the_encoding_that_is_given(encoding: str, order: str) -> Non
 @pytest.mark.parametrize(
     ("value", "encoding", "text"),
     [
-        ("HELLO", None, "'HELLO' has 5 bytes in ascii, string:4 holds up to 4"),
-        ("°°°", "utf-8", "'°°°' has 6 bytes in utf-8, string:4 holds up to 4"),
+        ("HELLO", None, "'HELLO' has 5 bytes in ascii, allowed in string:4: up to 4"),
+        ("°°°", "utf-8", "'°°°' has 6 bytes in utf-8, allowed in string:4: up to 4"),
         ("°", None, "'°' can't be encoded in ascii"),
         ("A\0", None, r"'A\x00' would be read back as 'A'"),
         (b"A", None, "b'A' is not text, which string:4 requires"),
@@ -677,7 +677,7 @@ def test_an_array_has_all_its_values() -> None:
         (
             "string:1[2]",
             ["A", "AB"],
-            "values[1]: 'AB' has 2 bytes in ascii, string:1 holds up to 1",
+            "values[1]: 'AB' has 2 bytes in ascii, allowed in string:1: up to 1",
         ),
     ],
     ids=repr,
