@@ -228,6 +228,7 @@ class Listener:
         when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
+        frame_timeout: float | None = None,
         tls: ServerTls | None = None,
     ) -> Listener: ...
     @staticmethod

@@ -167,6 +167,10 @@ class RtuConnection(wire.Connection):
             self._receive(patience)
         return got
 
+    def comes(self, seconds: float) -> bool:
+        """Whether bytes come within this time, or have come."""
+        return bool(self._received or select.select([self.socket], [], [], seconds)[0])
+
     def is_quiet(self) -> bool:
         """Returns whether no unread bytes have arrived."""
         return not self._received and not select.select([self.socket], [], [], 0)[0]

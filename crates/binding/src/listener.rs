@@ -117,7 +117,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, tls=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, tls=None))]
     fn new(
         name: String,
         bind: &str,
@@ -128,6 +128,7 @@ impl Listener {
         when_full: &str,
         idle_timeout: f64,
         request_timeout: f64,
+        frame_timeout: Option<f64>,
         tls: Option<PyRef<'_, ServerTls>>,
     ) -> PyResult<Listener> {
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
@@ -139,6 +140,9 @@ impl Listener {
             limits: limits(max_connections, max_connections_per_source, when_full)?,
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
+            frame_timeout: frame_timeout
+                .map(|time| time_to_wait("frame_timeout", time))
+                .transpose()?,
             tls: tls.map(|tls| Arc::clone(&tls.core)),
         });
         Ok(Listener { core: ListenerSettings { name, kind } })

@@ -90,16 +90,18 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
     settings: Listener = config.listeners[name]
     match settings:
         case ModbusTcpListener() | ModbusTlsListener() | ModbusRtuOverTcpListener():
+            rtu = settings if isinstance(settings, ModbusRtuOverTcpListener) else None
             return _core.Listener(
                 name,
                 str(settings.bind),
                 [_rule(rule, memories) for rule in settings.rules],
-                framing="rtu" if settings.type == "modbus-rtu-over-tcp" else "mbap",
+                framing="mbap" if rtu is None else "rtu",
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
                 when_full=settings.when_full,
                 idle_timeout=settings.idle_timeout,
                 request_timeout=settings.request_timeout,
+                frame_timeout=None if rtu is None else rtu.frame_timeout,
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
             )
         case ModbusUdpListener():

@@ -10,6 +10,7 @@ use std::cell::RefCell;
 use std::future::poll_fn;
 use std::io;
 use std::marker::PhantomData;
+use std::mem;
 use std::net::SocketAddr;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
@@ -73,6 +74,9 @@ pub(crate) struct Timeouts {
     /// The longest time from the first byte of a request to its last, and for a peer to read its
     /// replies.
     pub(crate) request: Duration,
+    /// The longest time between two reads of a request. After that, what follows may be the next
+    /// request; `None` where frames can't be told apart that way.
+    pub(crate) frame: Option<Duration>,
 }
 
 pub(crate) struct Connection<F, S> {
@@ -85,6 +89,8 @@ pub(crate) struct Connection<F, S> {
     last_request: Instant,
     /// When the incomplete request began.
     begun: Option<Instant>,
+    /// When bytes of the incomplete request were last read.
+    last_read: Instant,
     /// Reads since the last pause.
     turns: u32,
 }
@@ -98,6 +104,8 @@ struct Answering<F> {
     /// The beginning of an incomplete request.
     partial: [u8; MAX_REQUEST_LEN],
     partial_len: usize,
+    /// Nothing followed that beginning for [`Timeouts::frame`]: it may be all of it.
+    is_doubtful: bool,
     framing: PhantomData<F>,
 }
 
@@ -131,6 +139,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             unsent: Vec::new(),
             last_request,
             begun: None,
+            last_read: last_request,
             turns: 0,
         }
     }
@@ -213,7 +222,10 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
         if self.answering.partial_len == 0 && !self.stream.is_amid_record() {
             self.begun = None;
-        } else if answered.consumed > 0 || self.begun.is_none() {
+            return;
+        }
+        self.last_read = now;
+        if answered.consumed > 0 || self.begun.is_none() {
             self.begun = Some(now);
         }
     }
@@ -231,7 +243,11 @@ impl<F: Framing, S: Stream> Connection<F, S> {
 
     fn deadline(&self) -> (Instant, Kind) {
         match (self.begun, self.timeouts.idle) {
-            (Some(begun), _) => (begun + self.timeouts.request, Kind::RequestTimeout),
+            (Some(begun), _) => {
+                let deadline = begun + self.timeouts.request;
+                let silent = self.timeouts.frame.map(|frame| self.last_read + frame);
+                (silent.map_or(deadline, |silent| silent.min(deadline)), Kind::RequestTimeout)
+            }
             (None, Some(idle)) => (self.last_request + idle, Kind::Idle),
             (None, None) => (self.last_request + FAR, Kind::Idle),
         }
@@ -246,9 +262,21 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    fn overdue(&self) -> Result<(), Kind> {
+    /// Doubts the beginning of a request that nothing followed, or ends the connection.
+    fn overdue(&mut self) -> Result<(), Kind> {
         let (deadline, kind) = self.deadline();
-        if Instant::now() < deadline { Ok(()) } else { Err(kind) }
+        let now = Instant::now();
+        if now < deadline {
+            return Ok(());
+        }
+        match self.begun {
+            Some(begun) if now < begun + self.timeouts.request => {
+                self.answering.is_doubtful = true;
+                self.begun = None;
+                Ok(())
+            }
+            _ => Err(kind),
+        }
     }
 
     /// Answers what the system has already received, then ends.
@@ -276,6 +304,7 @@ impl<F: Framing> Answering<F> {
             rights,
             partial,
             partial_len: 0,
+            is_doubtful: false,
             framing: PhantomData,
         }
     }
@@ -290,6 +319,7 @@ impl<F: Framing> Answering<F> {
     fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
         let mut answered = Answered { len: 0, requests: 0, consumed: 0, broken: false };
         let mut rest = input;
+        let is_doubtful = mem::take(&mut self.is_doubtful);
         loop {
             match F::next(rest) {
                 Next::Request { tag, unit_id, pdu, len } => {
@@ -310,7 +340,11 @@ impl<F: Framing> Answering<F> {
                     answered.broken = true;
                     break;
                 }
-                Next::Incomplete => break,
+                Next::Incomplete => {
+                    let Some(len) = is_doubtful.then(|| F::resync(rest)).flatten() else { break };
+                    rest = &rest[len..];
+                    self.unit_server.counters.frames.damaged.add();
+                }
             }
         }
         answered.consumed = input.len() - rest.len();

@@ -36,6 +36,11 @@ pub(crate) trait Framing: Send + Sync + 'static {
 
     fn next(bytes: &[u8]) -> Next<'_>;
 
+    /// Where the next request starts if an incomplete one before it never ends.
+    fn resync(_bytes: &[u8]) -> Option<usize> {
+        None
+    }
+
     /// Completes a frame with a PDU of `pdu_len` bytes in place. Returns the length of the frame.
     fn complete(frame: &mut [u8], tag: u16, unit_id: u8, pdu_len: usize) -> usize;
 }
@@ -80,9 +85,17 @@ impl Framing for Rtu {
         match rtu::next_request(bytes) {
             rtu::Next::Incomplete => Next::Incomplete,
             rtu::Next::Frame { unit_id, pdu, len } => Next::Request { tag: 0, unit_id, pdu, len },
-            rtu::Next::Damaged { len } => Next::Damaged { len },
-            rtu::Next::Broken => Next::Broken,
+            rtu::Next::Damaged { .. } | rtu::Next::Broken => match rtu::resync(bytes) {
+                Some(len) => Next::Damaged { len },
+                // The next frame shows where frames start.
+                None if bytes.len() < rtu::MAX_LEN => Next::Incomplete,
+                None => Next::Damaged { len: bytes.len() },
+            },
         }
+    }
+
+    fn resync(bytes: &[u8]) -> Option<usize> {
+        rtu::resync(bytes)
     }
 
     fn complete(frame: &mut [u8], _tag: u16, unit_id: u8, pdu_len: usize) -> usize {

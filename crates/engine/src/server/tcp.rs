@@ -42,6 +42,8 @@ pub struct StreamSettings {
     /// The longest time from the first byte of a request to its last, and for a peer to read its
     /// replies. With TLS also for the handshake.
     pub request_timeout: Duration,
+    /// With RTU frames: the silence after which an incomplete request may be followed by the next.
+    pub frame_timeout: Option<Duration>,
     /// `None` is plain TCP.
     pub tls: Option<Arc<ServerTls>>,
 }
@@ -59,7 +61,11 @@ impl ModbusStream {
         ModbusStream {
             unit_server,
             policy: Policy::of(&settings.rules),
-            timeouts: Timeouts { idle: settings.idle_timeout, request: settings.request_timeout },
+            timeouts: Timeouts {
+                idle: settings.idle_timeout,
+                request: settings.request_timeout,
+                frame: settings.frame_timeout,
+            },
             framing: settings.framing,
             tls: settings.tls.clone(),
         }

@@ -124,6 +124,27 @@ pub fn next_request(bytes: &[u8]) -> Next<'_> {
     }
 }
 
+/// After a damaged frame: where the next frames start, if `bytes` end with complete frames of known
+/// functions. They must fill the bytes to the end: data of a damaged frame that look like a frame
+/// are not a request.
+///
+/// ```
+/// use holdfast_protocol::frame::rtu;
+///
+/// let received = [0, 17, 3, 0, 107, 0, 3, 0x76, 0x87];
+/// assert_eq!(rtu::resync(&received), Some(1));
+/// assert_eq!(rtu::resync(&received[..8]), None);
+/// ```
+pub fn resync(bytes: &[u8]) -> Option<usize> {
+    (1..bytes.len().min(MAX_LEN + 1)).find(|start| {
+        let mut rest = &bytes[*start..];
+        while let Some(len) = known_and_whole(rest) {
+            rest = &rest[len..];
+        }
+        rest.is_empty()
+    })
+}
+
 enum DataLen {
     Known(usize),
     /// The length is in a later byte.
@@ -162,7 +183,7 @@ fn first_fit(bytes: &[u8]) -> Next<'_> {
     // When the last byte of the data equals the first byte of the CRC of the bytes before it, the
     // CRC matches one byte too early. The remaining byte is 0, and no frame for unit 0 starts with
     // it.
-    let longer = first < longest && bytes[first] == 0 && !is_known_and_whole(&bytes[first..]);
+    let longer = first < longest && bytes[first] == 0 && known_and_whole(&bytes[first..]).is_none();
     let len = first + usize::from(longer);
     match decode(&bytes[..len]) {
         Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
@@ -170,15 +191,12 @@ fn first_fit(bytes: &[u8]) -> Next<'_> {
     }
 }
 
-/// Whether bytes start with a complete frame of a known function.
-fn is_known_and_whole(bytes: &[u8]) -> bool {
-    let [_, function_code, data @ ..] = bytes else {
-        return false;
-    };
-    match request_data_len(*function_code, data) {
-        DataLen::Known(len) => bytes.get(..2 + len + 2).is_some_and(|frame| decode(frame).is_ok()),
-        DataLen::Incomplete | DataLen::Unknown => false,
-    }
+/// The length of the complete frame of a known function that bytes start with.
+fn known_and_whole(bytes: &[u8]) -> Option<usize> {
+    let [_, function_code, data @ ..] = bytes else { return None };
+    let DataLen::Known(len) = request_data_len(*function_code, data) else { return None };
+    let len = 2 + len + 2;
+    decode(bytes.get(..len)?).is_ok().then_some(len)
 }
 
 /// The length of the frame at the start of `bytes`, according to its function code. The frame
