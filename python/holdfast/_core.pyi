@@ -106,6 +106,12 @@ class Memory:
         Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1.
         """
 
+    def mirror(self, ranges: Sequence[tuple[Area, int, int]]) -> None:
+        """Reserves ranges (area, address, count) for the poller; others can't write them any more.
+
+        They replace those of an earlier call. Raises `ValueError` for a range outside its area.
+        """
+
     def read_many(self, ranges: Sequence[tuple[Area, int, int]]) -> list[list[int]]:
         """Reads several ranges (area, address, count) as one snapshot. Raises like `read`."""
 

@@ -131,6 +131,7 @@ const fn reason(refusal: Refusal) -> &'static str {
         Refusal::OutOfRange => "out_of_range",
         Refusal::GateBit => "gate_bit",
         Refusal::WrongLength => "wrong_length",
+        Refusal::Mirrored => "mirrored",
         Refusal::NotRegisters => "not_registers",
     }
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use holdfast_memory::{
-    Access, Area, Gate, GateMode, Layout, Memory as Core, Read, Refusal, Span, Write,
+    Access, Area, Gate, GateMode, Layout, Memory as Core, Mirrored, Read, Refusal, Span, Write,
 };
 use pyo3::exceptions::{PyIndexError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -70,6 +70,14 @@ impl Memory {
             }
         }
         Ok(areas)
+    }
+
+    fn mirror(&self, ranges: Vec<(String, u16, usize)>) -> PyResult<()> {
+        let ranges = ranges
+            .into_iter()
+            .map(|(area, address, count)| Ok(Mirrored { area: named(&area)?, address, count }));
+        let ranges = ranges.collect::<PyResult<_>>()?;
+        self.core.mirror(ranges).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
     #[getter]

@@ -11,6 +11,8 @@ pub enum LayoutError {
     GateNotABit,
     #[error("the gate bit {address} is outside its area")]
     GateOutside { address: u16 },
+    #[error("the mirrored range from address {address} is empty or outside its area")]
+    MirrorOutside { address: u16 },
 }
 
 /// Why an operation was refused.
@@ -24,6 +26,8 @@ pub enum Refusal {
     GateBit,
     #[error("the range has no items, or the number of bytes does not match it")]
     WrongLength,
+    #[error("the range mirrors a device")]
+    Mirrored,
     #[error("only registers can be masked")]
     NotRegisters,
 }

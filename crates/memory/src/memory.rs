@@ -17,6 +17,23 @@ pub enum Access {
     Client,
     /// A source of data. It ignores the seal and can open it.
     Ingest,
+    /// A source of data that alone writes the mirrored ranges.
+    Mirror,
+}
+
+/// Items that [`Access::Mirror`] alone writes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Mirrored {
+    pub area: Area,
+    pub address: u16,
+    pub count: usize,
+}
+
+impl Mirrored {
+    fn overlaps(&self, area: Area, address: u16, count: usize) -> bool {
+        let (start, first) = (usize::from(address), usize::from(self.address));
+        self.area == area && start < first + self.count && first < start + count
+    }
 }
 
 /// When the gate bit opens the seal.
@@ -51,6 +68,7 @@ pub struct Memory {
     rank: u64,
     layout: Layout,
     gate: Option<Gate>,
+    mirrored: RwLock<Vec<Mirrored>>,
     content: RwLock<Content>,
 }
 
@@ -85,6 +103,7 @@ impl Memory {
             rank: NEXT_RANK.fetch_add(1, Ordering::Relaxed),
             layout,
             gate,
+            mirrored: RwLock::default(),
             content: RwLock::new(Content { areas, sealed: gate.is_some(), seal_changes: (0, 0) }),
         })
     }
@@ -95,6 +114,26 @@ impl Memory {
 
     pub const fn gate(&self) -> Option<Gate> {
         self.gate
+    }
+
+    /// Reserves ranges for [`Access::Mirror`], in place of those of an earlier call.
+    ///
+    /// # Errors
+    /// [`LayoutError`] for a range outside its area. Nothing has changed then.
+    pub fn mirror(&self, ranges: Vec<Mirrored>) -> Result<(), LayoutError> {
+        for &Mirrored { area, address, count } in &ranges {
+            if count == 0 || !self.span(area).holds(address, count) {
+                return Err(LayoutError::MirrorOutside { address });
+            }
+        }
+        *self.mirrored.write().unwrap_or_else(PoisonError::into_inner) = ranges;
+        Ok(())
+    }
+
+    fn is_mirrored(&self, access: Access, area: Area, address: u16, count: usize) -> bool {
+        let mirrored = || self.mirrored.read().unwrap_or_else(PoisonError::into_inner);
+        access != Access::Mirror
+            && mirrored().iter().any(|range| range.overlaps(area, address, count))
     }
 
     pub fn sealed(&self) -> bool {
@@ -139,8 +178,8 @@ impl Memory {
     /// Writes one range atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `GateBit`. Nothing has
-    /// changed then.
+    /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `GateBit`, `Mirrored`.
+    /// Nothing has changed then.
     pub fn write(&self, access: Access, write: Write<'_>) -> Result<(), Refusal> {
         self.write_many(access, &[write]).map_err(|refused| refused.refusal)
     }
@@ -161,7 +200,7 @@ impl Memory {
     /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, atomically.
     ///
     /// # Errors
-    /// [`Refusal::Sealed`] (for a client), then `NotRegisters`, `OutOfRange`.
+    /// [`Refusal::Sealed`] (for a client), then `NotRegisters`, `OutOfRange`, `Mirrored`.
     pub fn mask_write(
         &self,
         access: Access,
@@ -172,6 +211,7 @@ impl Memory {
     ) -> Result<(), Refusal> {
         let offset = match self.span(area).offset(address, 1) {
             _ if area.is_bits() => Err(Refusal::NotRegisters),
+            Some(_) if self.is_mirrored(access, area, address, 1) => Err(Refusal::Mirrored),
             offset => offset.ok_or(Refusal::OutOfRange),
         };
         let mut content = self.exclusive();
@@ -223,6 +263,8 @@ impl Memory {
                 Refusal::OutOfRange
             } else if access == Access::Client && self.gate.is_some_and(|gate| gate.is_in(write)) {
                 Refusal::GateBit
+            } else if self.is_mirrored(access, write.area, write.address, write.count) {
+                Refusal::Mirrored
             } else {
                 continue;
             };
@@ -258,7 +300,9 @@ impl Memory {
 
     /// Updates the seal from the gate bit. Called once, after all writes of an ingest.
     fn settle(&self, access: Access, content: &mut Content) {
-        if let (Access::Ingest, Some(gate)) = (access, self.gate) {
+        if access != Access::Client
+            && let Some(gate) = self.gate
+        {
             let offset = usize::from(gate.address - self.span(gate.area).start());
             let open = bits::get(&content.areas[gate.area.index()], offset);
             let sealed = match gate.mode {
@@ -382,4 +426,65 @@ fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
         memory.apply(access, content, writes.iter().map(|placed| &placed.write));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const REGISTERS: Area = Area::HoldingRegisters;
+
+    fn writing(area: Area, address: u16, bytes: &[u8]) -> Write<'_> {
+        Write { area, address, count: if area.is_bits() { 1 } else { bytes.len() / 2 }, bytes }
+    }
+
+    fn mirroring() -> Memory {
+        let span = Span::new(0, 20).unwrap();
+        let layout = Layout::default().with(REGISTERS, span).with(Area::Coils, span);
+        let memory = Memory::new(layout, None).unwrap();
+        let range = Mirrored { area: REGISTERS, address: 5, count: 3 };
+        memory.mirror(vec![range]).unwrap();
+        memory
+    }
+
+    #[test]
+    fn only_the_mirror_writes_mirrored_ranges() {
+        let memory = mirroring();
+        for access in [Access::Client, Access::Ingest] {
+            for (address, len, refused) in
+                [(4, 1, false), (4, 2, true), (5, 1, true), (7, 9, true), (8, 1, false)]
+            {
+                let bytes = [1; 20];
+                let done = memory.write(access, writing(REGISTERS, address, &bytes[..2 * len]));
+                assert_eq!(done == Err(Refusal::Mirrored), refused, "{address} {len}");
+            }
+            memory.write(access, writing(Area::Coils, 5, &[1])).unwrap();
+            let masked = memory.mask_write(access, REGISTERS, 6, 0, 0);
+            assert_eq!(masked, Err(Refusal::Mirrored));
+            let (write, mut out) = (writing(REGISTERS, 7, &[9, 9]), [0; 2]);
+            let read = Read { area: REGISTERS, address: 0, count: 1, out: &mut out };
+            assert_eq!(memory.write_then_read(access, write, read), Err(Refusal::Mirrored));
+            let both = [(&memory, writing(REGISTERS, 0, &[7, 7])), (&memory, write)];
+            let refused = Refused { index: 1, refusal: Refusal::Mirrored };
+            assert_eq!(write_across(access, &both), Err(refused));
+        }
+        let mut out = [0; 6];
+        let read = Read { area: REGISTERS, address: 5, count: 3, out: &mut out };
+        memory.read(Access::Client, read).unwrap();
+        assert_eq!(out, [0; 6]);
+        memory.write(Access::Mirror, writing(REGISTERS, 4, &[1; 8])).unwrap();
+    }
+
+    #[test]
+    fn ranges_outside_the_area_are_refused_and_change_nothing() {
+        let memory = mirroring();
+        for (address, count) in [(18, 3), (0, 0)] {
+            let range = Mirrored { area: REGISTERS, address, count };
+            assert_eq!(memory.mirror(vec![range]), Err(LayoutError::MirrorOutside { address }));
+        }
+        let write = writing(REGISTERS, 5, &[1, 1]);
+        assert_eq!(memory.write(Access::Ingest, write), Err(Refusal::Mirrored));
+        memory.mirror(Vec::new()).unwrap();
+        memory.write(Access::Ingest, write).unwrap();
+    }
 }

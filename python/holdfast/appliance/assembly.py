@@ -174,6 +174,20 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
     )
 
 
+def mirror(config: Config, memories: Mapping[str, Memory]) -> None:
+    """Reserves the ranges that devices are read into, unless local writes are allowed there."""
+    mirrored: dict[str, list[tuple[Area, int, int]]] = {}
+    for device in config.devices.values():
+        if not device.enabled or device.writes == "local":
+            continue
+        for read in device.reads:
+            if (into := read.into) is not None:
+                ranges = mirrored.setdefault(into.memory, [])
+                ranges.append((into.area, into.address, read.count))
+    for memory, ranges in mirrored.items():
+        memories[memory].mirror(ranges)
+
+
 def disabled_status(name: str) -> list[int]:
     """Returns the registers of the status block of a device that is not polled."""
     text = name.encode("ascii", "replace")[:STATUS_NAME].ljust(STATUS_NAME, b"\0")

@@ -147,6 +147,7 @@ class _Running:
             foreign.entry_point(name, settings)
         if config.gateway is not None and config.gateway.tls is not None:
             _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
+        assembly.mirror(config, memories)
         devices = [
             assembly.device(name, config, memories)
             for name, device in config.devices.items()

@@ -143,6 +143,8 @@ class DeviceConfig(Model):
     """The URL of the device, or of the gateway in front of it."""
     unit: UnitId
     """The unit id, 0 to 255; on a serial line 1 to 247."""
+    writes: Literal["refuse", "local"] = "refuse"
+    """Writes into ranges that its reads go into: refused, or kept until the next poll."""
     enabled: bool = True
     """Whether it is polled."""
     interval: Annotated[

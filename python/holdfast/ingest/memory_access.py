@@ -266,6 +266,10 @@ class MemoryAccess:
                 return _malformed(index, "values are empty", where)
             case "out_of_range":
                 return self._out_of_range(memory, area, address, len(values), index)
+            case "mirrored":
+                found = f"{_of(index)}{len(values)} from address {_shown(address)} of {area}"
+                detail = f"{found} overlap a range that mirrors a device"
+                return Refused("mirrored", detail, **where)
             case "invalid_value" | "invalid_type" if refused.index is not None:
                 shown = _shown(values[refused.index])
                 wrong = "outside" if refused.reason == "invalid_value" else "not"

@@ -20,7 +20,7 @@ impl Destination {
     pub(super) fn write(&self, count: u32, bytes: &[u8]) -> Result<(), Refusal> {
         let Destination { area, address, .. } = *self;
         let write = Write { area, address, count: count as usize, bytes };
-        self.memory.write(Access::Ingest, write)
+        self.memory.write(Access::Mirror, write)
     }
 
     /// Whether `count` items fit.

@@ -279,7 +279,9 @@ fn write(memory: &Memory, write: Write<'_>) -> Result<(), ExceptionCode> {
 fn exception(refusal: Refusal) -> ExceptionCode {
     match refusal {
         Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
-        Refusal::OutOfRange | Refusal::GateBit => ExceptionCode::IllegalDataAddress,
+        Refusal::OutOfRange | Refusal::GateBit | Refusal::Mirrored => {
+            ExceptionCode::IllegalDataAddress
+        }
         Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
     }
 }

@@ -42,6 +42,12 @@ REFUSALS = Refusals(
         "the body is incomplete: 1024 bytes arrived in time",
     ),
     Refusal(
+        409,
+        ("mirrored",),
+        "The range mirrors a device, and only its poller writes it",
+        "1 from address 40 of holding_registers overlap a range that mirrors a device",
+    ),
+    Refusal(
         413,
         ("too_large",),
         "The body is too large; the connection is closed",
@@ -61,4 +67,4 @@ QUERY = ("malformed",)
 MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 """Refusals of a range by the memory access."""
 
-VALUES = ("invalid_value",)
+VALUES = ("invalid_value", "mirrored")
