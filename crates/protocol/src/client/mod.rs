@@ -14,7 +14,8 @@
 //!   ids tell it apart; where they do not, the connection ends, and a serial line is silenced first.
 //! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
 //!   the other side may have gone without a word.
-//! * Only reads are ever sent twice, and only as datagrams.
+//! * Only reads are ever sent twice: as datagrams, when the device closed a connection instead of
+//!   answering on it again, and as often as its [`Tolerance`] says.
 //!
 //! A connection that has ended stays so: the driver makes a new one.
 
@@ -23,9 +24,11 @@ mod datagram;
 mod flights;
 mod line;
 mod stream;
+mod tolerance;
 
 pub use connection::Connection;
 pub use flights::{Done, Ticket};
+pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Tolerance};
 
 use core::time::Duration;
 
@@ -58,19 +61,20 @@ pub enum Transport {
     Udp,
     /// RTU frames in a stream. One request at a time.
     RtuOverTcp,
+    /// RTU frames in datagrams. One request at a time; none is sent again by itself.
+    RtuOverUdp,
+    /// ASCII frames in a stream. One request at a time.
+    AsciiOverTcp,
     /// RTU frames on a serial line. One request at a time.
-    SerialRtu(Line),
+    SerialRtu {
+        /// What separates two frames.
+        silence: Duration,
+    },
     /// ASCII frames on a serial line. One request at a time.
-    SerialAscii(Line),
-}
-
-/// What is known of a serial line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Line {
-    /// What separates two frames.
-    pub silence: Duration,
-    /// The adapter hands back what is sent. One that does is also noticed by itself.
-    pub echo: bool,
+    SerialAscii {
+        /// What separates two frames.
+        silence: Duration,
+    },
 }
 
 /// Why a request has no response.
