@@ -15,6 +15,7 @@ mod forward;
 mod handshake;
 mod learned;
 mod link;
+mod pace;
 pub mod plan;
 mod results;
 mod search;
@@ -25,6 +26,7 @@ mod thread;
 
 pub use device::{DeviceSettings, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
+pub use pace::InFlight;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};
