@@ -12,11 +12,11 @@ from holdfast.client.target import SerialTarget, parse
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
 from holdfast.config.files import check_readable
 from holdfast.config.initial import extent
+from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES
 from holdfast.config.memory_checks import addresses
 from holdfast.config.scalars import NOT_ON_A_LINE, parse_url
 from holdfast.config.scanning import parse_pollable
-from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.words import choice, listing, show
 from holdfast.net.allow_list import AllowedDevice
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
