@@ -17,6 +17,7 @@ __all__ = [
     "FUNCTIONS",
     "MAX_PDU",
     "SUB_FUNCTIONS",
+    "Attempt",
     "BatchRefused",
     "BlockingClient",
     "Connection",
@@ -376,7 +377,9 @@ class Endpoint:
     """What a client, or the poller, talks to. Raises `ValueError` for what can't be."""
 
     @staticmethod
-    def network(transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int) -> Endpoint:
+    def network(
+        transport: Literal["tcp", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp"], host: str, port: int
+    ) -> Endpoint:
         """A device, or a gateway, behind an address."""
 
     @staticmethod
@@ -405,9 +408,23 @@ class Endpoint:
         stop_bits: int,
         data_bits: int,
         silence: float | None = None,
-        echo: bool = False,
     ) -> Endpoint:
         """A serial line."""
+
+    def tolerating(
+        self,
+        *,
+        accept_unit: int | Literal["any"] | None = None,
+        pad: bool = False,
+        echo: bool = False,
+        pause: float = 0.0,
+        pause_after_connect: float = 0.0,
+        retries: int = 0,
+        retry_busy: bool = False,
+        close_after: int = 0,
+        reconnect: float = 0.0,
+    ) -> Endpoint:
+        """The same device, treated as `holdfast.client.tolerance.Tolerance` says."""
 
 @final
 class BlockingClient:
@@ -435,15 +452,22 @@ class Connection:
     """A TCP connection of a client, with TLS or not, for whoever owns its socket.
 
     Times are those of the owner's clock, in seconds. Completed requests are tickets, each with a
-    result or a `ModbusError`.
+    result, a `ModbusError`, or an `Attempt` when the request may be sent again.
     """
 
-    def __new__(cls, endpoint: Endpoint) -> Connection: ...
+    def __new__(cls, endpoint: Endpoint, now: float) -> Connection: ...
     @property
     def is_ready(self) -> bool:
         """Whether requests can be sent: TLS, if there is any, is agreed on."""
 
-    def send(self, request: Request, unit: int, timeout: float, now: float) -> int:
+    def send(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        now: float,
+        attempt: Attempt | None = None,
+    ) -> int:
         """Queues a request; its ticket. Raises why the connection has ended."""
 
     def outgoing(self) -> bytes:
@@ -475,6 +499,18 @@ class Connection:
     @property
     def late(self) -> int:
         """Replies that came after their requests had been given up."""
+
+@final
+class Attempt:
+    """A request that failed may be sent again. Given to `Connection.send` then."""
+
+    @property
+    def pause(self) -> float:
+        """Seconds to wait before."""
+
+    @property
+    def has_own_timeout(self) -> bool:
+        """Whether its timeout begins anew."""
 
 @final
 class PolledDevice:
@@ -509,6 +545,7 @@ class PolledDevice:
         forward: Sequence[tuple[str, int, str, str, int, float]] | None = None,
         status: tuple[Memory, Area, int] | None = None,
         start_within: float | None = None,
+        in_flight: int | None = 1,
         report: bool = False,
         release: bool = False,
         measured: bool = False,

@@ -23,6 +23,7 @@ import pytest
 
 import holdfast
 from holdfast.client.target import NetworkTarget, SerialTarget, Tls, parse
+from holdfast.client.tolerance import Tolerance
 from holdfast.server import Identity
 from holdfast.types import AREAS
 from support import lines, transports, wire
@@ -531,7 +532,7 @@ def test_the_number_in_flight_has_its_limits(number: Any) -> None:
         ("rtu:///dev/ttyS0?parity=none", SerialTarget("rtu", "/dev/ttyS0", 19200, "none", 2, 8)),
         (
             "rtu:///dev/a%20b?baud=115200&parity=odd&stop_bits=2&silence=0.01&echo=1",
-            SerialTarget("rtu", "/dev/a b", 115200, "odd", 2, 8, 0.01, True),
+            SerialTarget("rtu", "/dev/a b", 115200, "odd", 2, 8, 0.01, Tolerance(echo=True)),
         ),
         ("ascii:///dev/ttyS0", SerialTarget("ascii", "/dev/ttyS0", 19200, "even", 1, 7)),
         ("ascii:///dev/ttyS0?data_bits=8", SerialTarget("ascii", "/dev/ttyS0", data_bits=8)),

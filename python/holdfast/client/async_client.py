@@ -10,7 +10,7 @@ from holdfast.client.base import BaseClient
 from holdfast.client.connection import AsyncConnection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.one_at_a_time import OneAtATime
-from holdfast.client.target import IN_FLIGHT, NetworkTarget
+from holdfast.client.target import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
 from holdfast.errors import ModbusException
 
 if TYPE_CHECKING:
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from holdfast.client.requests import Identification, Plan, Result, ServerId, Steps
     from holdfast.types import Area
-
-MAX_IN_FLIGHT = 1024
 
 
 class Client(BaseClient):
@@ -39,7 +37,7 @@ class Client(BaseClient):
     """
 
     def __init__(
-        self, url: str, *, unit: int = 1, timeout: float = 1.0, max_in_flight: int = 16
+        self, url: str, *, unit: int = 1, timeout: float = 1.0, max_in_flight: int = 1
     ) -> None:
         super().__init__(url, unit, timeout)
         if type(max_in_flight) is not int or not 1 <= max_in_flight <= MAX_IN_FLIGHT:

@@ -19,6 +19,7 @@ from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wa
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
 from holdfast.scanner.tags import tag
+from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -66,7 +67,7 @@ def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription
         Plan.of(request.plan),
     )
     target = source.target
-    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport == "rtu+tcp"):
+    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
         raise Refused("unitId is 0, which is the broadcast of a serial line")
     tags: dict[str, Tag] = {}
     for index, entry in enumerate(request.tags):

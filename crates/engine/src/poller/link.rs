@@ -47,7 +47,7 @@ pub(super) enum Priority {
 }
 
 pub(super) enum Link {
-    Tcp(TcpLink),
+    Tcp(Box<TcpLink>),
     Blocking(BlockingLink),
 }
 
@@ -62,7 +62,7 @@ impl Link {
                 let (failures, failed) = Default::default();
                 let (pace, connecting) = (Pace::new(in_flight), Mutex::default());
                 let (ended, open) = Default::default();
-                Link::Tcp(TcpLink {
+                Link::Tcp(Box::new(TcpLink {
                     host,
                     port,
                     tls,
@@ -73,7 +73,7 @@ impl Link {
                     failed,
                     ended,
                     open,
-                })
+                }))
             }
             place => Link::Blocking(BlockingLink::new(Endpoint { place, tolerance })),
         })

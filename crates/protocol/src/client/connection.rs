@@ -70,7 +70,9 @@ impl Connection {
         };
         let mut flights = Flights::default();
         flights.tolerance = tolerance;
-        Connection { wire, flights, ready_at: now + tolerance.pause_after_connect, sent: 0 }
+        let pause = tolerance.pause_after_connect;
+        let ready_at = if pause.is_zero() { Time::ZERO } else { now + pause };
+        Connection { wire, flights, ready_at, sent: 0 }
     }
 
     /// Sends a request, or queues it until the line is silent. `timeout` runs from now, and again
@@ -206,7 +208,9 @@ impl Connection {
         if self.flights.len() == waiting || !tolerance.is_one_at_a_time() {
             return;
         }
-        self.ready_at = self.ready_at.max(now + tolerance.pause);
+        if !tolerance.pause.is_zero() {
+            self.ready_at = self.ready_at.max(now + tolerance.pause);
+        }
         if tolerance.close_after > 0 && self.sent >= tolerance.close_after {
             self.flights.close(Closed::BySelf, &mut sink);
         }
