@@ -196,7 +196,9 @@ impl Open {
     fn is_usable(&mut self) -> bool {
         match self.transport {
             Transport::Tcp => self.used.elapsed() <= IDLE || !self.stream.has_ended(),
-            Transport::RtuOverTcp | Transport::AsciiOverTcp => self.stream.is_quiet(),
+            Transport::RtuOverTcp | Transport::AsciiOverTcp | Transport::RtuOverUdp => {
+                self.stream.is_quiet()
+            }
             _ => true,
         }
     }

@@ -1,8 +1,9 @@
 //! A link: one connection to one address, or one serial line, shared by all devices behind it.
 //!
 //! Over Modbus TCP several requests can be in flight, as the settings of the devices say. All other
-//! transports carry one request at a time, in a thread of their own. A link that can't be connected fails at once until its pause is over. What ends a
-//! connection is decided by [`Connection`]; the next request makes a new one.
+//! transports carry one request at a time, in a thread of their own. A link that can't be connected
+//! fails at once until its pause is over. What ends a connection is decided by [`Connection`]; the
+//! next request makes a new one.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -23,7 +24,7 @@ use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff;
 use super::handshake;
-use super::pace::{InFlight, Pace};
+use super::pace::{InFlight, Pace, Priority};
 use super::status::Fault;
 use crate::client::{BlockingClient, ClientError, Endpoint, Place};
 use crate::tls::Channel;
@@ -34,17 +35,6 @@ const CHUNK: usize = 16 * 1024;
 
 /// The bytes of a read, none of a write, or why it was not answered.
 pub(super) type Answer = Result<Vec<u8>, Fault>;
-
-/// How much a request matters beside others.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Priority {
-    Usual,
-    /// To a unit that was silent the last time: it leaves room for the others.
-    Doubtful,
-    /// Somebody waits for it: it goes first where requests go one at a time, and tries an address
-    /// whose pause is not over.
-    Urgent,
-}
 
 pub(super) enum Link {
     Tcp(Box<TcpLink>),

@@ -8,8 +8,6 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
 use tokio::time::Instant;
 
-use super::link::Priority;
-
 /// The most requests that `auto` has in flight.
 const MAX_AUTO: usize = 16;
 
@@ -22,6 +20,17 @@ const FLAT: f64 = 1.25;
 
 /// `auto` tries more requests in flight again after this time.
 const RETRY_AFTER: Duration = Duration::from_secs(300);
+
+/// How much a request matters beside others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Priority {
+    Usual,
+    /// To a unit that was silent the last time: it leaves room for the others.
+    Doubtful,
+    /// Somebody waits for it: it goes first where requests go one at a time, and tries an address
+    /// whose pause is not over.
+    Urgent,
+}
 
 /// How many requests may be in flight on a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
