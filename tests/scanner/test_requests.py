@@ -44,7 +44,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"plan": {"forbidden": [[0, 1]] * 33}}, "Expected `array` of length <= 32"),
     ({"unitId": 256}, "Expected `int` <= 255 - at `$.unitId`"),
     ({"transport": "rtu+tcp", "unitId": 0}, "unitId is 0, which is the broadcast of a serial line"),
-    ({"transport": "can"}, "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp"),
+    (
+        {"transport": "can"},
+        "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp, ascii+tcp, rtu+udp",
+    ),
     ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed are ABCD"),
     ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
     ({"scanRate": 86_400_001}, "scanRate is 86400001, allowed are"),

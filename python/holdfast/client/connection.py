@@ -257,7 +257,7 @@ class _Protocol(asyncio.Protocol):
         now = deadline - timeout
         if self._has_pauses or attempt is not None:
             now = self._loop.time()
-        ticket = self.core.send(request, unit, deadline - now, now, attempt)
+        ticket = self.core.send(request, unit, max(deadline - now, 0.0), now, attempt)
         if not self._futures:
             self._flush()
         elif not self._flushing:
