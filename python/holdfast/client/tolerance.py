@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-MAX_PAUSE = 60.0
+MAX_PAUSE = 60
 MAX_RETRIES = 10
 MAX_CLOSE_AFTER = 65_535
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
-from holdfast.client.target import NetworkTarget, SerialTarget, parse
+from holdfast.client.target import SerialTarget, parse
 from holdfast.client.tolerance import STRICT, Tolerance
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, ToleranceConfig
 from holdfast.config.files import check_readable
@@ -88,7 +88,8 @@ class DeviceChecks:
     def _device(self, path: KeyPath, device: dict[Any, Any], taken: dict[str, KeyPath]) -> None:
         target = parsed(_target, device.get("url"))
         if target is not None:
-            self._tolerance(path, target, device)
+            target = self._tolerance(path, target, device)
+            self._shared(path, target, device)
         if isinstance(target, SerialTarget):
             self._line(path, target, device.get("unit"), taken)
         elif target is not None:
@@ -112,22 +113,27 @@ class DeviceChecks:
         if isinstance(device.get("status"), dict):
             self._status((*path, "status"), device["status"])
 
-    def _tolerance(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> None:
-        """What devices share: those of one address have one connection."""
-        block, shared = device.get("tolerance"), target.tolerance
-        if block is not None:
-            where = (*path, "tolerance")
-            if shared != STRICT:
-                message = "found beside options of the URL, allowed: one of both"
-                self.report.add(where, message, of_key=True)
-            if mapping(block).get("echo") is True and not _has_echo(target):
-                message = "found true, allowed with RTU and ASCII frames only"
-                self.report.add((*where, "echo"), message)
-            found = fitting(TypeAdapter(ToleranceConfig), block)
-            shared = STRICT if found is None else Tolerance(**found.model_dump())
-        if not isinstance(target, NetworkTarget):
+    def _tolerance(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> Target:
+        """The target with what its device needs tolerated."""
+        block = device.get("tolerance")
+        if block is None:
+            return target
+        where = (*path, "tolerance")
+        if target.tolerance != STRICT:
+            message = "found beside options of the URL, allowed: one of both"
+            self.report.add(where, message, of_key=True)
+        if mapping(block).get("echo") is True and not _has_echo(target):
+            message = "found true, allowed with RTU and ASCII frames only"
+            self.report.add((*where, "echo"), message)
+        found = fitting(TypeAdapter(ToleranceConfig), block)
+        tolerance = STRICT if found is None else Tolerance(**found.model_dump())
+        return replace(target, tolerance=tolerance)
+
+    def _shared(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> None:
+        """What devices of one address share, which have one connection."""
+        if isinstance(target, SerialTarget):
             return
-        settings = _Shared(shared, device.get("in_flight", 1))
+        settings = _Shared(target.tolerance, device.get("in_flight", 1))
         key = (target.transport, target.host, target.port)
         first, other = self._addresses.setdefault(key, (path, settings))
         if settings != other:

@@ -23,7 +23,7 @@ from holdfast.config.scalars import (
     UnitId,
     whole_number,
 )
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.types import Area, RegisterArea
 
 MIN_INTERVAL = 0.01
@@ -135,12 +135,13 @@ class StatusConfig(Model):
 
 
 Pause = Annotated[float, Field(ge=0, le=MAX_PAUSE, allow_inf_nan=False), whole_number]
+AcceptUnit = Annotated[Annotated[int, Field(ge=0, le=MAX_UNIT)] | Literal["any"] | None, NotNull()]
 
 
 class ToleranceConfig(Model):
     """How to treat a device that deviates from the standard."""
 
-    accept_unit: Annotated[UnitId | Literal["any"] | None, NotNull()] = None
+    accept_unit: AcceptUnit = None
     """A unit id that replies may carry besides that of the request, or any."""
     pad: bool = False
     """Whether surplus bytes at the end of a reply are ignored."""
