@@ -38,6 +38,15 @@ class Awaited:
             return attribute
         return lambda *args, **named: self._wait(attribute(*args, **named))
 
+    @property
+    def timeout(self) -> float:
+        """That of the client."""
+        return self._client.timeout
+
+    @timeout.setter
+    def timeout(self, seconds: float) -> None:
+        self._client.timeout = seconds
+
     def end(self) -> None:
         """Closes everything; nothing may have gone wrong unseen."""
         try:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 STREAMS = ("tcp", "rtu+tcp")
+DATAGRAMS = ("udp", "rtu+udp")
 LINES = ("rtu", "ascii")
 
 
@@ -263,9 +264,16 @@ class Hostile(ABC):
         behaviour(asked)
 
 
+def framing_of(kind: str) -> Framing:
+    """The framing of a scheme."""
+    frames = kind.partition("+")[0]
+    return OnLine({"rtu": lines.RTU, "ascii": lines.ASCII}[frames]) if frames in LINES else Mbap()
+
+
 class Stream(Hostile):
-    """Behind TCP: MBAP or RTU frames. `greet` is done with each connection first; whoever is `deaf`
-    reads nothing.
+    """Behind TCP: MBAP, RTU or ASCII frames.
+
+    `greet` is done with each connection first; a device that is `deaf` reads nothing.
     """
 
     def __init__(
@@ -277,7 +285,7 @@ class Stream(Hostile):
         deaf: bool = False,
     ) -> None:
         super().__init__(*script, then=then)
-        self._framing = Mbap() if kind == "tcp" else OnLine(lines.RTU)
+        self._framing = framing_of(kind)
         self._greet = greet
         self._deaf = deaf
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -315,18 +323,21 @@ class Stream(Hostile):
 
 
 class Udp(Hostile):
-    def __init__(self, *script: Behaviour, then: Behaviour = good) -> None:
+    """Behind UDP: MBAP or RTU frames."""
+
+    def __init__(self, *script: Behaviour, then: Behaviour = good, kind: str = "udp") -> None:
         super().__init__(*script, then=then)
+        self._framing = framing_of(kind)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
-        self.url = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
+        self.url = f"{kind}://127.0.0.1:{self._socket.getsockname()[1]}"
 
     def sources(self) -> list[Any]:
         return [self._socket]
 
     def read(self, source: Any) -> Peer:  # noqa: ARG002
         data, address = self._socket.recvfrom(65536)
-        peer = Sender(Mbap(), self._socket, address)
+        peer = Sender(self._framing, self._socket, address)
         peer.received = data
         return peer
 

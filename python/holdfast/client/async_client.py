@@ -11,7 +11,7 @@ from holdfast.client.connection import AsyncConnection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.one_at_a_time import OneAtATime
 from holdfast.client.target import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
-from holdfast.errors import ModbusException
+from holdfast.errors import InvalidResponse, ModbusException
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
@@ -214,7 +214,7 @@ class Client(BaseClient):
             while True:
                 try:
                     reply = await self._call(request, unit)
-                except ModbusException as error:
+                except (ModbusException, InvalidResponse) as error:
                     request = steps.throw(error)
                 else:
                     request = steps.send(reply)

@@ -8,7 +8,7 @@ from holdfast._core import Request
 from holdfast.client import requests
 from holdfast.client.base import BaseClient
 from holdfast.client.endpoint import blocking
-from holdfast.errors import ModbusException
+from holdfast.errors import InvalidResponse, ModbusException
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -201,7 +201,7 @@ class SyncClient(BaseClient):
             while True:
                 try:
                     reply = self._call(request, unit)
-                except ModbusException as error:
+                except (ModbusException, InvalidResponse) as error:
                     request = plan.throw(error)
                 else:
                     request = plan.send(reply)
