@@ -72,7 +72,8 @@ def read(
     that AREA can be left out.
 
     URL is tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502,
-    rtu:///dev/ttyUSB0?baud=19200 or ascii:///dev/ttyUSB0.
+    rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200 or
+    ascii:///dev/ttyUSB0.
 
     Exit codes: 0 read, 1 not all could be read, 2 wrong usage.
     """

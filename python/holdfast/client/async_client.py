@@ -25,8 +25,9 @@ class Client(BaseClient):
 
     `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS
     up to `max_in_flight` requests are on their way at once, and replies may come in any order; what
-    is more waits for its turn, which `timeout` does not cover. Give 1 for a device that answers
-    only one at a time. On other transports one request is on its way at once.
+    is more waits for its turn, which `timeout` does not cover. More than 1 is faster where a device
+    accepts it; many drop requests that overlap. Each reply starts the timeouts of later requests
+    again. On other transports one request is on its way at once.
 
     Any number of tasks may share a client, in one event loop; in another one after `close`, or
     when the first is closed. A call that is cancelled leaves the connection usable.

@@ -21,11 +21,15 @@ class SyncClient(BaseClient):
     """A client that waits: every method returns when the device has answered.
 
     `url` names the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
-    `rtu+tcp://host:502`, `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`.
-    `unit` is the unit id, 0 to 255, that a call can replace. `timeout` in seconds covers
-    connecting, sending and receiving.
+    `rtu+tcp://host:502`, `rtu+udp://host:502`, `ascii+tcp://host:502`,
+    `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`, with options for a device
+    that deviates from the standard. `unit` is the unit id, 0 to 255, that a call can replace.
+    `timeout` in seconds covers connecting, sending and receiving.
 
     The files of a `tls` URL are read now: `OSError` and `ValueError` say what is wrong with them.
+
+    A read is sent again when a connection that was used before ends without a byte of the reply,
+    and as often as `retries` of the URL says. A write is never sent twice.
 
     Threads may share a client; their calls take turns, for which `timeout` does not count.
 
