@@ -298,6 +298,26 @@ def test_a_device_that_needs_a_pause_after_each_request_gets_it(make: Make, dial
     assert len(device.asked) == 5
 
 
+@pytest.mark.parametrize("option", ["pause", "pause_after_connect"])
+def test_a_call_that_is_cancelled_during_a_pause_sends_nothing(option: str) -> None:
+    async def main() -> None:
+        with Stream("tcp") as device:
+            url = f"{device.url}?{option}={5 * SHORT}"
+            async with holdfast.Client(url, timeout=wire.DEADLINE) as plc:
+                if option == "pause":
+                    await plc.read_holding_registers(6, 1)
+                task = asyncio.create_task(plc.write_register(7, 70))
+                await asyncio.to_thread(wire.until, lambda: connections(device), "it connects")
+                await asyncio.sleep(0)
+                task.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+                assert await plc.read_holding_registers(7, 1) == [7]
+            assert 6 not in codes(device)
+
+    run(main)
+
+
 @pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "ascii+tcp"])
 def test_a_device_that_needs_a_pause_after_connecting_gets_it(
     kind: str, make: Make, dial: Dial

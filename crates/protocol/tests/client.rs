@@ -669,6 +669,40 @@ fn a_pause_separates_requests_and_does_not_count_as_waiting() {
 }
 
 #[test]
+fn a_request_that_is_cancelled_during_a_pause_is_not_sent() {
+    let tolerance = Tolerance { pause_after_connect: SECOND, ..STRICT };
+    for cancelled in 0..3 {
+        let mut client = Client::tolerant(Transport::Tcp, tolerance);
+        let tickets = [client.send(read()), client.send(WRITE), client.send(read())];
+        client.connection.cancel(tickets[cancelled]);
+        assert_eq!(client.outgoing(), []);
+        client.after(SECOND);
+        let pdus = [&[3, 0, 3, 0, 1][..], &[6, 0, 3, 0, 7], &[3, 0, 3, 0, 1]];
+        let sent: Vec<u8> = (0..3)
+            .filter(|index| *index != cancelled)
+            .flat_map(|index| mbap_frame(index as u16, 7, pdus[index]))
+            .collect();
+        assert_eq!(client.outgoing(), sent);
+        for index in (0..3).filter(|index| *index != cancelled) {
+            let reply = if index == 1 { pdus[1] } else { &[3, 2, 0, 1] };
+            client.receive(&mbap_frame(index as u16, 7, reply));
+            assert_eq!(client.got()[0].0, tickets[index]);
+        }
+    }
+
+    let mut client = Client::tolerant(Transport::Tcp, Tolerance { pause: SECOND, ..STRICT });
+    client.send(read());
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    client.outgoing();
+    let ticket = client.send(WRITE);
+    client.connection.cancel(ticket);
+    assert_eq!(client.connection.deadline(), None);
+    client.send(read());
+    client.after(SECOND);
+    assert_eq!(client.outgoing(), mbap_frame(2, 7, &[3, 0, 3, 0, 1]));
+}
+
+#[test]
 fn a_reply_to_a_request_that_was_not_sent_yet_ends_the_connection() {
     let mut client = Client::tolerant(Transport::Tcp, Tolerance { pause: SECOND, ..STRICT });
     client.send(read());

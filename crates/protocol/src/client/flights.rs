@@ -122,6 +122,11 @@ impl Flights {
         self.waiting.get(position)
     }
 
+    /// The requests behind the one with that number.
+    pub(super) fn after(&self, ticket: Ticket) -> impl Iterator<Item = &Flight> {
+        self.waiting.iter().filter(move |flight| flight.ticket > ticket)
+    }
+
     /// Takes out the request with that number.
     pub(super) fn take(&mut self, ticket: Ticket) -> Option<Flight> {
         let position = self.waiting.iter().position(|flight| flight.ticket == ticket)?;

@@ -4,7 +4,7 @@
 use alloc::collections::BTreeMap;
 use alloc::vec::Vec;
 
-use super::flights::{Call, Done, Flights, Ticket};
+use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::{Closed, Failure, InvalidResponse, MAX_CONSECUTIVE_TIMEOUTS, Time};
 use crate::frame::mbap::{self, Next};
 
@@ -49,10 +49,20 @@ impl Stream {
         Some(flights.push(call, id, now))
     }
 
-    /// Gives a request up: its reply, should it come, is dropped.
+    /// Gives a request up: its reply, should it come, is dropped. One that waits for a pause is not
+    /// sent.
     pub(super) fn cancel(&mut self, flights: &mut Flights, ticket: Ticket) {
-        if let Some(flight) = flights.take(ticket) {
+        // While there is a pause, all requests are in `out`, in their order.
+        let behind: usize = flights.after(ticket).map(frame_len).sum();
+        let Some(flight) = flights.take(ticket) else { return };
+        if flights.held.is_none() {
             self.given_up.insert(flight.transaction_id, flight.ticket);
+            return;
+        }
+        let end = flights.out.len().saturating_sub(behind);
+        flights.out.drain(end.saturating_sub(frame_len(&flight))..end);
+        if flights.len() == 0 {
+            flights.held = None;
         }
     }
 
@@ -167,6 +177,10 @@ impl Stream {
             None => !self.partial.is_empty() && flights.len() == 0,
         }
     }
+}
+
+fn frame_len(flight: &Flight) -> usize {
+    mbap::HEADER_LEN + flight.request.pdu().len()
 }
 
 /// The frame at the start of `bytes`. With `pad`, an exception reply ends after its exception code:
