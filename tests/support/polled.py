@@ -94,14 +94,18 @@ class Fake:
 
     def stop(self) -> None:
         """Ends all connections and listens no more."""
-        for each in (self._listening, *self._open):
-            if each is not None:
-                with contextlib.suppress(OSError):
-                    each.shutdown(socket.SHUT_RDWR)
+        if self._listening is not None:
+            with contextlib.suppress(OSError):
+                self._listening.shutdown(socket.SHUT_RDWR)
+            # The first thread accepts connections: after its end there are no more.
+            self._threads.pop(0).join()
+            self._listening.close()
+            self._listening = None
+        for each in self._open:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
         while self._threads:
             self._threads.pop().join()
-        if self._listening is not None:
-            self._listening.close()
         self._open.clear()
 
     def _run(self, work: Callable[[socket.socket], None], of: socket.socket) -> None:
