@@ -17,6 +17,7 @@ __all__ = [
     "FUNCTIONS",
     "MAX_PDU",
     "SUB_FUNCTIONS",
+    "Attempt",
     "BatchRefused",
     "BlockingClient",
     "Connection",
@@ -383,8 +384,10 @@ class Endpoint:
     """The target of a client or the poller. Raises `ValueError` for invalid arguments."""
 
     @staticmethod
-    def network(transport: Literal["tcp", "udp", "rtu+tcp"], host: str, port: int) -> Endpoint:
-        """A device or gateway at a network address."""
+    def network(
+        transport: Literal["tcp", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp"], host: str, port: int
+    ) -> Endpoint:
+        """A device, or a gateway, behind an address."""
 
     @staticmethod
     def tls(
@@ -412,9 +415,23 @@ class Endpoint:
         stop_bits: int,
         data_bits: int,
         silence: float | None = None,
-        echo: bool = False,
     ) -> Endpoint:
         """A serial line."""
+
+    def tolerating(
+        self,
+        *,
+        accept_unit: int | Literal["any"] | None = None,
+        pad: bool = False,
+        echo: bool = False,
+        pause: float = 0.0,
+        pause_after_connect: float = 0.0,
+        retries: int = 0,
+        retry_busy: bool = False,
+        close_after: int = 0,
+        reconnect: float = 0.0,
+    ) -> Endpoint:
+        """The same device, treated as `holdfast.client.tolerance.Tolerance` says."""
 
 @final
 class BlockingClient:
@@ -441,17 +458,24 @@ class BlockingClient:
 class Connection:
     """The protocol of a client's TCP connection, with or without TLS. The caller owns the socket.
 
-    Times are from the caller's clock, in seconds. Completed requests are tickets, each with a
-    result or a `ModbusError`.
+    Times are those of the owner's clock, in seconds. Completed requests are tickets, each with a
+    result, a `ModbusError`, or an `Attempt` when the request may be sent again.
     """
 
-    def __new__(cls, endpoint: Endpoint) -> Connection: ...
+    def __new__(cls, endpoint: Endpoint, now: float) -> Connection: ...
     @property
     def is_ready(self) -> bool:
         """Whether requests can be sent: the TLS handshake, if any, is complete."""
 
-    def send(self, request: Request, unit: int, timeout: float, now: float) -> int:
-        """Queues a request and returns its ticket. Raises the error that ended the connection."""
+    def send(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        now: float,
+        attempt: Attempt | None = None,
+    ) -> int:
+        """Queues a request; its ticket. Raises why the connection has ended."""
 
     def outgoing(self) -> bytes:
         """The bytes to send now."""
@@ -482,6 +506,18 @@ class Connection:
     @property
     def late(self) -> int:
         """How many replies arrived after their timeout."""
+
+@final
+class Attempt:
+    """A request that failed may be sent again. Given to `Connection.send` then."""
+
+    @property
+    def pause(self) -> float:
+        """Seconds to wait before."""
+
+    @property
+    def has_own_timeout(self) -> bool:
+        """Whether its timeout begins anew."""
 
 @final
 class PolledDevice:
@@ -515,6 +551,7 @@ class PolledDevice:
         forward: Sequence[tuple[str, int, str, str, int, float]] | None = None,
         status: tuple[Memory, Area, int] | None = None,
         start_within: float | None = None,
+        in_flight: int | None = 1,
         report: bool = False,
         release: bool = False,
         measured: bool = False,

@@ -12,10 +12,13 @@ RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
 BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 
-Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp"]
-"""The transport to a device with a network address."""
+Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp"]
+"""How a device with an address is talked to."""
 
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
+
+SERIAL_FRAMES: tuple[Transport, ...] = ("rtu+tcp", "ascii+tcp", "rtu+udp")
+"""Those that carry the frames of a serial line. Unit id 0 is its broadcast."""
 
 WhenFull: TypeAlias = Literal["refuse", "evict"]
 

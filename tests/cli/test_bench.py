@@ -66,7 +66,8 @@ def test_errors_are_counted_by_kind() -> None:
             return None
         if number == 7:
             return b"\x03\x01\x00"
-        return HANG_UP if number == 9 else registers(pdu)
+        # A read is repeated once when a connection ends that was used before.
+        return HANG_UP if number in (9, 10) else registers(pdu)
 
     with FakeDevice(answers) as device:
         options = ("--timeout", "0.05", "--seconds", "0.6")

@@ -503,7 +503,9 @@ def test_replies_in_another_order(version: str, authority: Authority, plc: Owner
             each.answer()
 
     async def main() -> None:
-        async with holdfast.Client(relay.url(ca=authority.ca), timeout=wire.DEADLINE) as client:
+        async with holdfast.Client(
+            relay.url(ca=authority.ca), timeout=wire.DEADLINE, max_in_flight=16
+        ) as client:
             calls = [client.read_holding_registers(at, 1) for at in range(16)]
             assert await asyncio.gather(*calls) == [[at] for at in range(16)]
 
@@ -572,7 +574,7 @@ def test_calls_that_wait_end_when_the_client_is_closed(
     version: str, authority: Authority, plc: Owner
 ) -> None:
     async def main() -> None:
-        client = holdfast.Client(relay.url(ca=authority.ca), timeout=wire.DEADLINE)
+        client = holdfast.Client(relay.url(ca=authority.ca), timeout=wire.DEADLINE, max_in_flight=3)
         calls = [asyncio.create_task(client.read_holding_registers(at, 1)) for at in range(3)]
         while len(device.requests) < 3:
             await asyncio.sleep(0.001)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.client.target import NetworkTarget, Tls
+from holdfast.client.tolerance import Tolerance
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ ANOTHER = """\
 """
 URLS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
-    "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+    "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
 RECEIVER = "raw://host:port, as in raw://10.0.2.9:9000 or raw://[fd00::9]:9000"
 READS = "  reads: a list"
@@ -116,6 +117,25 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          "8: max_registers: found 126, allowed: an integer from 1 to 125"),
         ("    reads", "    max_bits: 0\n    reads",
          "8: max_bits: found 0, allowed: an integer from 1 to 2000"),
+        ("    reads", "    in_flight: 0\n    reads",
+         "8: in_flight: found 0, allowed: an integer from 1 to 1024 or auto"),
+        ("    reads", "    in_flight: many\n    reads",
+         "8: in_flight: found 'many', allowed: an integer from 1 to 1024 or auto"),
+        ("    reads", "    tolerance: {pause: 61}\n    reads",
+         "8: tolerance.pause: found 61, allowed: a number from 0 to 60"),
+        ("    reads", "    tolerance: {retries: 11}\n    reads",
+         "8: tolerance.retries: found 11, allowed: an integer from 0 to 10"),
+        ("    reads", "    tolerance: {accept_unit: all}\n    reads",
+         "8: tolerance.accept_unit: found 'all', allowed: an integer from 0 to 255 or any"),
+        ("    reads", "    tolerance: {close_after: 65536}\n    reads",
+         "8: tolerance.close_after: found 65536, allowed: an integer from 0 to 65535"),
+        ("    reads", "    tolerance: {padding: true}\n    reads",
+         "8: tolerance.padding: unknown key, allowed: accept_unit, pad, echo, pause, "
+         "pause_after_connect, retries, retry_busy, close_after, reconnect; did you mean 'pad'?"),
+        ("    reads", "    tolerance: {echo: true}\n    reads",
+         "8: tolerance.echo: found true, allowed with RTU and ASCII frames only"),
+        ("url: tcp://10.0.0.9\n", "url: tcp://10.0.0.9?pad=1\n    tolerance: {retries: 1}\n",
+         "6: tolerance: found beside options of the URL, allowed: one of both"),
         ("    reads", "    max_gap: 1\n    cost: {per_request: 1, per_register: 1}\n    reads",
          "9: cost: found together with max_gap, allowed: only one of them"),
         ("    reads", "    cost: {per_request: 1}\n    reads",
@@ -188,6 +208,62 @@ def test_a_right_device_is_right(folder: Folder) -> None:
 )  # fmt: skip
 def test_a_device_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:
     assert problem in told(folder, changed(old, new))
+
+
+SHARED = HEAD + METER + ANOTHER
+
+
+@pytest.mark.parametrize(
+    ("changes", "differs"),
+    [
+        ({"    unit: 2": "    unit: 2\n    in_flight: 2"},
+         "17: devices.other.in_flight: found another in_flight"),
+        ({"    unit: 1": "    unit: 1\n    in_flight: auto"},
+         "16: devices.other.url: found another in_flight"),
+        ({"    unit: 2": "    unit: 2\n    tolerance: {pad: true}"},
+         "17: devices.other.tolerance: found another tolerance"),
+        ({"    unit: 1": "    unit: 1\n    tolerance: {pad: true}"},
+         "16: devices.other.url: found another tolerance"),
+        ({"tcp://10.0.0.9\n    unit: 2": "tcp://10.0.0.9?retries=1\n    unit: 2"},
+         "15: devices.other.url: found another tolerance"),
+    ],
+)  # fmt: skip
+def test_devices_at_one_address_have_the_same_tolerance_and_requests_in_flight(
+    folder: Folder, changes: dict[str, str], differs: str
+) -> None:
+    text = SHARED
+    for old, new in changes.items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+
+    [problem] = folder.problems(text)
+
+    assert problem.startswith(f"p.yaml:{differs} than ")
+    assert problem.endswith(" has at this address, allowed: the same")
+    other = text.replace("  other:\n    url: tcp://10.0.0.9", "  other:\n    url: udp://10.0.0.9")
+    assert folder.config(other)
+
+
+def test_a_tolerance_is_that_of_the_url_or_of_the_block(folder: Folder) -> None:
+    options = folder.config(changed("10.0.0.9", "10.0.0.9?pad=1&accept_unit=any&pause=0.5"))
+    block = folder.config(
+        changed("    reads", "    tolerance: {pad: true, accept_unit: any, pause: 0.5}\n    reads")
+    )
+
+    expected = Tolerance(pad=True, accept_unit="any", pause=0.5)
+    assert options.devices["meter"].target.tolerance == expected
+    assert block.devices["meter"].target.tolerance == expected
+    for config in (options, block):
+        assert folder.config(config.dump()) == config
+
+
+def test_devices_of_one_line_have_the_same_tolerance(folder: Folder) -> None:
+    text = SHARED.replace("tcp://10.0.0.9", "rtu:///dev/line")
+    assert folder.config(text)
+    assert folder.problems(text.replace("unit: 2", "unit: 2\n    tolerance: {echo: true}")) == [
+        "p.yaml:15: devices.other.url: found other settings of the line than devices.meter in line "
+        "4 has, allowed: the same"
+    ]
 
 
 def test_an_area_that_the_memory_lacks_is_told(folder: Folder) -> None:

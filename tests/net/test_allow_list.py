@@ -43,10 +43,10 @@ def test_the_list_says_which_addresses(address: str, port: int, allowed: bool) -
 @pytest.mark.parametrize(
     ("entry", "port", "transports"),
     [
-        ("10.0.0.0/8", 502, {"tcp", "udp", "rtu+tcp", "tls"}),
+        ("10.0.0.0/8", 502, {"tcp", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp", "tls"}),
         ("10.0.0.0/8", 802, {"tls"}),
         ("10.0.0.0/8:502", 802, set()),
-        ("10.0.0.0/8:802", 802, {"tcp", "udp", "rtu+tcp", "tls"}),
+        ("10.0.0.0/8:802", 802, {"tcp", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp", "tls"}),
         ("10.0.0.0/8:802", 502, set()),
     ],
 )

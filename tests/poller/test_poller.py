@@ -474,7 +474,7 @@ def test_a_dead_unit_behind_a_gateway_does_not_delay_the_others(
     devices = {
         f"unit {unit}".replace(" ", "-"): device(
             "", read("holding_registers", 0, 4, ("holding_registers", unit * 10)), unit=unit,
-            status=block(slot), timeout=1,
+            status=block(slot), timeout=1, in_flight=8,
         )
         for slot, unit in enumerate((1, 2, 7, 8, 9))
     }  # fmt: skip
@@ -496,7 +496,9 @@ def test_a_dead_unit_behind_a_gateway_does_not_delay_the_others(
 def test_many_dead_units_behind_a_gateway_leave_room_for_the_others(run: Run) -> None:
     """More than there are requests in flight."""
     devices = {
-        f"d{unit}": device("", read("coils", unit, 1, ("coils", unit)), unit=unit, timeout=0.5)
+        f"d{unit}": device(
+            "", read("coils", unit, 1, ("coils", unit)), unit=unit, timeout=0.5, in_flight=8
+        )
         for unit in range(1, 30)
     }
     with Fake(lambda request: data(request) if request.unit > 27 else None) as fake:
@@ -854,10 +856,11 @@ def test_a_stop_does_not_wait_for_those_who_hang(run: Run, tmp_path: Path) -> No
         ]
         devices = {
             f"d{number}": device(
-                place, read("coils", number, 1, ("coils", number)), unit=number % 50 + 1, timeout=60
+                place, read("coils", number, 1, ("coils", number)), unit=number % 50 + 1,
+                timeout=60, in_flight=8,
             )
             for number, place in enumerate(places * 10)
-        }
+        }  # fmt: skip
         last = read("coils", 99, 1, ("coils", 99))
         devices["answers"] = device(other.url, last, forward=forward)
         appliance = run(configuration(devices))

@@ -15,6 +15,7 @@ from holdfast.scanner import ScannerLimits
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.hosts import Allowed
 from holdfast.scanner.schema import json_schema
+from support.brokers import free_port
 from support.nats_bus import leaving, subscription, tag
 from support.paths import ROOT
 
@@ -44,8 +45,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"plan": {"forbidden": [[0, 1]] * 33}}, "Expected `array` of length <= 32"),
     ({"unitId": 256}, "Expected `int` <= 255 - at `$.unitId`"),
     ({"transport": "rtu+tcp", "unitId": 0}, "unitId is 0, which is the broadcast of a serial line"),
-    ({"transport": "can"}, "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp"),
-    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed: ABCD"),
+    (
+        {"transport": "can"},
+        "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp, ascii+tcp, rtu+udp",
+    ),
+    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed are ABCD"),
     ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
     ({"scanRate": 86_400_001}, "scanRate is 86400001, allowed are"),
     ({"scanRate": 100.5}, "Expected `int | null`, got `float` - at `$.scanRate`"),
@@ -261,6 +265,30 @@ def test_devices_on_one_serial_line_have_the_same_settings(
     assert "baud 9600" in ask("one", "rtu:///dev/ttyNONE0")["error"]
     assert ask("two", "rtu:///dev/ttyNONE0?baud=9600&parity=even")["success"]
     assert ask("three", "rtu:///dev/ttyNONE1")["success"]
+
+
+@pytest.mark.parametrize(
+    "place", ["tcp://127.0.0.1:{}", "rtu+udp://127.0.0.1:{}", "tls://127.0.0.1:{}"]
+)
+def test_devices_at_one_address_have_the_same_tolerance(
+    run_scanner: Run, caller: Caller, place: str
+) -> None:
+    run_scanner()
+    place = place.format(free_port())
+
+    def ask(id: str, url: str) -> Any:
+        request = {"deviceId": id, "subscriberId": "x", "url": url, "tags": [tag("a", 0)]}
+        return caller.request("modbus.subscribe", request)
+
+    assert ask("one", f"{place}?pad=1&retries=2")["success"]
+    for url, error in (
+        (place, "pad of {} is True for one already, not False; devices at one address have the"),
+        (f"{place}?pad=1&retries=1", "retries of {} is 2 for one already, not 1"),
+        (f"{place}?pad=1&retries=2&accept_unit=any", "accept_unit of {} is the default for one"),
+    ):
+        assert error.format(place) in ask("two", url)["error"]
+    assert f"one is known as {place} (pad True, retries 2)" in ask("one", place)["error"]
+    assert ask("two", f"{place}?retries=2&pad=1")["success"]
 
 
 def test_a_serial_device_is_refused_that_is_not_named(scanner: Running, caller: Caller) -> None:

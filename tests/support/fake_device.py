@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 STREAMS = ("tcp", "rtu+tcp")
+DATAGRAMS = ("udp", "rtu+udp")
 LINES = ("rtu", "ascii")
 
 HANG_UP = b""
@@ -313,8 +314,14 @@ class ScriptedDevice(ABC):
         behaviour(asked)
 
 
+def framing_of(kind: str) -> Framing:
+    """Returns the framing of a scheme."""
+    frames = kind.partition("+")[0]
+    return OnLine({"rtu": lines.RTU, "ascii": lines.ASCII}[frames]) if frames in LINES else Mbap()
+
+
 class Stream(ScriptedDevice):
-    """Over TCP, with MBAP or RTU frames.
+    """Over TCP, with MBAP, RTU or ASCII frames.
 
     Calls `greet` with each connection first. With `deaf`, reads nothing. With `in_turn`, accepts a
     connection when the previous one has ended. With `port`, listens only from `start` on.
@@ -331,7 +338,7 @@ class Stream(ScriptedDevice):
         port: int | None = None,
     ) -> None:
         super().__init__(*script, then=then)
-        self._framing = Mbap() if kind == "tcp" else OnLine(lines.RTU)
+        self._framing = framing_of(kind)
         self._greet = greet
         self._deaf = deaf
         self._in_turn = in_turn
@@ -399,18 +406,21 @@ class FakeDevice(Stream):
 
 
 class Udp(ScriptedDevice):
-    def __init__(self, *script: Behaviour, then: Behaviour = good) -> None:
+    """Over UDP, with MBAP or RTU frames."""
+
+    def __init__(self, *script: Behaviour, then: Behaviour = good, kind: str = "udp") -> None:
         super().__init__(*script, then=then)
+        self._framing = framing_of(kind)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
-        self.url = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
+        self.url = f"{kind}://127.0.0.1:{self._socket.getsockname()[1]}"
 
     def sources(self) -> list[Any]:
         return [self._socket]
 
     def read(self, source: Any) -> Peer:  # noqa: ARG002
         data, address = self._socket.recvfrom(65536)
-        peer = Sender(Mbap(), self._socket, address)
+        peer = Sender(self._framing, self._socket, address)
         peer.received = data
         return peer
 

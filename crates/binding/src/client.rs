@@ -4,11 +4,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use holdfast_engine::client::{
-    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, exception_name,
+    BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Place, exception_name,
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineMode, LineParity, SerialLine};
+use holdfast_protocol::client::{AcceptUnit, Tolerance};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, Function, Range, Registers, Request as CoreRequest,
@@ -189,15 +190,18 @@ impl Endpoint {
     #[staticmethod]
     fn network(transport: &str, host: String, port: u16) -> PyResult<Endpoint> {
         let core = match transport {
-            "tcp" => CoreEndpoint::Tcp { host, port, tls: None },
-            "rtu+tcp" => CoreEndpoint::RtuOverTcp { host, port },
-            "udp" => CoreEndpoint::Udp { host, port },
+            "tcp" => Place::Tcp { host, port, tls: None },
+            "rtu+tcp" => Place::RtuOverTcp { host, port },
+            "ascii+tcp" => Place::AsciiOverTcp { host, port },
+            "udp" => Place::Udp { host, port },
+            "rtu+udp" => Place::RtuOverUdp { host, port },
             _ => {
-                let message = format!("transport is {transport:?}, allowed are tcp, rtu+tcp, udp");
+                let allowed = "tcp, rtu+tcp, ascii+tcp, udp, rtu+udp";
+                let message = format!("transport is {transport:?}, allowed are {allowed}");
                 return Err(PyValueError::new_err(message));
             }
         };
-        Ok(Endpoint { core })
+        Ok(Endpoint { core: core.into() })
     }
 
     #[staticmethod]
@@ -218,11 +222,11 @@ impl Endpoint {
         let name = name.unwrap_or(&host);
         let tls = ClientTls::new(ClientSettings { ca: ca.as_deref(), own, name });
         let tls = Some(Arc::new(tls.map_err(unusable)?));
-        Ok(Endpoint { core: CoreEndpoint::Tcp { host, port, tls } })
+        Ok(Endpoint { core: Place::Tcp { host, port, tls }.into() })
     }
 
     #[staticmethod]
-    #[pyo3(signature = (device, *, mode, baud, parity, stop_bits, data_bits, silence=None, echo=false))]
+    #[pyo3(signature = (device, *, mode, baud, parity, stop_bits, data_bits, silence=None))]
     fn serial(
         device: String,
         mode: &str,
@@ -231,10 +235,41 @@ impl Endpoint {
         stop_bits: i128,
         data_bits: i128,
         silence: Option<f64>,
-        echo: bool,
     ) -> PyResult<Endpoint> {
         let line = line(device, mode, baud, parity, stop_bits, data_bits, silence)?;
-        Ok(Endpoint { core: CoreEndpoint::Serial { line, echo } })
+        Ok(Endpoint { core: Place::Serial(line).into() })
+    }
+
+    #[pyo3(signature = (*, accept_unit=None, pad=false, echo=false, pause=0.0, pause_after_connect=0.0, retries=0, retry_busy=false, close_after=0, reconnect=0.0))]
+    fn tolerating(
+        &self,
+        accept_unit: Option<&Bound<'_, PyAny>>,
+        pad: bool,
+        echo: bool,
+        pause: f64,
+        pause_after_connect: f64,
+        retries: i128,
+        retry_busy: bool,
+        close_after: i128,
+        reconnect: f64,
+    ) -> PyResult<Endpoint> {
+        let accept_unit = match accept_unit {
+            None => AcceptUnit::Requested,
+            Some(any) if any.extract().is_ok_and(|word: &str| word == "any") => AcceptUnit::Any,
+            Some(unit) => AcceptUnit::Also(byte("accept_unit", integer(unit)?)?),
+        };
+        let tolerance = Tolerance {
+            accept_unit,
+            pad,
+            echo,
+            pause: seconds("pause", pause)?,
+            pause_after_connect: seconds("pause_after_connect", pause_after_connect)?,
+            retries: byte("retries", retries)?,
+            retry_busy,
+            close_after: within("close_after", close_after, 0..=65_535)? as u32,
+            reconnect: seconds("reconnect", reconnect)?,
+        };
+        Ok(Endpoint { core: CoreEndpoint { place: self.core.place.clone(), tolerance } })
     }
 }
 

@@ -5,11 +5,13 @@ use std::io;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use holdfast_engine::client::{ClientError, Endpoint as CoreEndpoint, Lost};
+use holdfast_engine::client::{ClientError, Lost, Place};
 use holdfast_engine::tls::client::ClientTls;
 use holdfast_engine::tls::{Channel, TlsFailure};
-use holdfast_protocol::client::{Closed, Connection as Core, Done, Failure, Ticket, Transport};
-use pyo3::exceptions::PyValueError;
+use holdfast_protocol::client::{
+    Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
+};
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
@@ -40,6 +42,27 @@ struct Tls {
     heard: bool,
 }
 
+/// A request that failed may be sent again.
+#[pyclass(frozen, module = "holdfast")]
+pub struct Attempt {
+    core: CoreAttempt,
+}
+
+#[pymethods]
+impl Attempt {
+    /// Seconds to wait before.
+    #[getter]
+    fn pause(&self) -> f64 {
+        self.core.pause().as_secs_f64()
+    }
+
+    /// Whether its timeout begins anew.
+    #[getter]
+    fn has_own_timeout(&self) -> bool {
+        self.core.has_own_timeout()
+    }
+}
+
 enum Ending {
     /// The flag says whether the peer may have carried out a request.
     Tls(TlsFailure, bool),
@@ -52,9 +75,9 @@ type Completed<'py> = Vec<(u64, Bound<'py, PyAny>)>;
 #[pymethods]
 impl Connection {
     #[new]
-    fn new(endpoint: PyRef<'_, Endpoint>) -> PyResult<Connection> {
-        let CoreEndpoint::Tcp { tls, .. } = &endpoint.core else {
-            return Err(PyValueError::new_err("endpoint is not TCP or TLS"));
+    fn new(endpoint: PyRef<'_, Endpoint>, now: f64) -> PyResult<Connection> {
+        let Place::Tcp { tls, .. } = &endpoint.core.place else {
+            return Err(PyValueError::new_err("endpoint is not one of TCP or TLS"));
         };
         let to = endpoint.core.to_string();
         let tls = match tls {
@@ -63,7 +86,7 @@ impl Connection {
                 raised(ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
             })?),
         };
-        let core = Core::new(Transport::Tcp);
+        let core = Core::tolerant(Transport::Tcp, endpoint.core.tolerance, clock(now)?);
         Ok(Connection { state: Mutex::new(State { core, tls, ending: None }), to })
     }
 
@@ -75,17 +98,23 @@ impl Connection {
         agreed && state.core.closed().is_none()
     }
 
-    /// Queues a request and returns its ticket.
+    /// Queues a request; its ticket.
+    #[pyo3(signature = (request, unit, timeout, now, attempt=None))]
     fn send(
         &self,
         request: PyRef<'_, Request>,
         unit: i128,
         timeout: f64,
         now: f64,
+        attempt: Option<PyRef<'_, Attempt>>,
     ) -> PyResult<u64> {
         let (unit, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
+        let attempt = attempt.map_or_else(Default::default, |attempt| attempt.core);
         let mut state = self.state();
-        match state.core.send(unit, &request.encoded, timeout, clock(now)?) {
+        if !state.core.has_room() {
+            return Err(PyRuntimeError::new_err("the device takes one request at a time"));
+        }
+        match state.core.send_again(unit, &request.encoded, timeout, attempt, clock(now)?) {
             Ok(ticket) => Ok(ticket.0),
             Err(why) => Err(raised(self.error(&state.ending, why.failure(), timeout))),
         }
@@ -242,7 +271,10 @@ impl<'py> Completions<'py> {
     fn add(&mut self, connection: &Connection, ending: &Option<Ending>, done: Done<'_>) {
         let value = match done.outcome {
             Ok(response) => Reply::new(response).into_python(self.py),
-            Err(failure) => Ok(exception(self.py, connection.error(ending, failure, done.timeout))),
+            Err(failure) => match done.again {
+                Some(core) => Bound::new(self.py, Attempt { core }).map(Bound::into_any),
+                None => Ok(exception(self.py, connection.error(ending, failure, done.timeout))),
+            },
         };
         match (&mut self.all, value) {
             (Ok(all), Ok(value)) => all.push((done.ticket.0, value)),

@@ -27,7 +27,7 @@ mod _core {
     #[pymodule_export]
     use super::client::{BlockingClient, Endpoint, Request};
     #[pymodule_export]
-    use super::connection::Connection;
+    use super::connection::{Attempt, Connection};
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]

@@ -5,8 +5,8 @@ use std::time::SystemTime;
 
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    Batch, Destination, DeviceSettings, DeviceState, Fault, ForwardSettings, Poll, Poller as Core,
-    PollerError, ReadSettings, StatusSettings,
+    Batch, Destination, DeviceSettings, DeviceState, Fault, ForwardSettings, InFlight, Poll,
+    Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
@@ -17,7 +17,10 @@ use crate::arguments::{byte, seconds, within, word};
 use crate::client::{Endpoint, Request};
 use crate::memory::{Memory, named};
 
-/// An area, the first address, and the address after the last.
+/// The most requests in flight at one address.
+const MAX_IN_FLIGHT: usize = 1024;
+
+/// An area, its first address, and the one behind its last.
 type Range = (String, u32, u32);
 
 /// A memory, an area and an address.
@@ -41,7 +44,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, report=false, release=false, measured=false))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=false, release=false, measured=false))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -58,6 +61,7 @@ impl PolledDevice {
         forward: Option<Vec<Forward>>,
         status: Option<Place<'_>>,
         start_within: Option<f64>,
+        in_flight: Option<i128>,
         report: bool,
         release: bool,
         measured: bool,
@@ -78,6 +82,12 @@ impl PolledDevice {
         let core = DeviceSettings {
             name,
             endpoint: endpoint.core.clone(),
+            in_flight: match in_flight {
+                Some(number) => {
+                    InFlight::Fixed(within("in_flight", number, 1..=MAX_IN_FLIGHT)? as u16)
+                }
+                None => InFlight::Auto,
+            },
             unit_id: byte("unit", unit)?,
             interval: seconds("interval", interval)?,
             timeout: seconds("timeout", timeout)?,

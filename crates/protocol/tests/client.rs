@@ -6,7 +6,8 @@
 use std::time::Duration;
 
 use holdfast_protocol::client::{
-    Closed, Connection, Done, Failure, InvalidResponse, Line, TURNAROUND, Ticket, Transport,
+    AcceptUnit, Attempt, BUSY_PAUSE, Closed, Connection, Done, Failure, InvalidResponse,
+    TURNAROUND, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, EncodedRequest, Range, Request, Response, ResponseError};
@@ -19,12 +20,25 @@ fn read() -> Request<'static> {
 const WRITE: Request<'_> = Request::WriteSingleRegister { address: 3, value: 7 };
 const SECOND: Duration = Duration::from_secs(1);
 const SILENCE: Duration = Duration::from_millis(2);
-const LINE: Line = Line { silence: SILENCE, echo: false };
+const RTU: Transport = Transport::SerialRtu { silence: SILENCE };
+const ASCII: Transport = Transport::SerialAscii { silence: SILENCE };
+const STRICT: Tolerance = Tolerance {
+    accept_unit: AcceptUnit::Requested,
+    pad: false,
+    echo: false,
+    pause: Duration::ZERO,
+    pause_after_connect: Duration::ZERO,
+    retries: 0,
+    retry_busy: false,
+    close_after: 0,
+    reconnect: Duration::ZERO,
+};
 
 /// The result of a request: registers as bytes, empty for a write.
 type Got = (Ticket, Result<Vec<u8>, Failure>);
 
-fn noted(got: &mut Vec<Got>, done: &Done<'_>) {
+fn noted(got: &mut Vec<Got>, again: &mut Option<Attempt>, done: &Done<'_>) {
+    *again = done.again;
     let outcome = done.outcome.map(|response| match response {
         Response::Registers(registers) => registers.as_bytes().to_vec(),
         Response::Bits(bits) => bits.as_bytes().to_vec(),
@@ -38,11 +52,18 @@ struct Client {
     connection: Connection,
     now: Duration,
     got: Vec<Got>,
+    /// What the last result said of another attempt.
+    again: Option<Attempt>,
 }
 
 impl Client {
     fn new(transport: Transport) -> Client {
-        Client { connection: Connection::new(transport), now: SECOND, got: Vec::new() }
+        Client::tolerant(transport, Tolerance::default())
+    }
+
+    fn tolerant(transport: Transport, tolerance: Tolerance) -> Client {
+        let connection = Connection::tolerant(transport, tolerance, SECOND);
+        Client { connection, now: SECOND, got: Vec::new(), again: None }
     }
 
     fn try_send(&mut self, request: Request<'_>) -> Result<Ticket, Closed> {
@@ -61,14 +82,19 @@ impl Client {
     }
 
     fn receive(&mut self, bytes: &[u8]) {
-        let got = &mut self.got;
-        self.connection.receive(bytes, self.now, |done| noted(got, &done));
+        let (got, again) = (&mut self.got, &mut self.again);
+        self.connection.receive(bytes, self.now, |done| noted(got, again, &done));
     }
 
     fn after(&mut self, time: Duration) {
         self.now += time;
-        let got = &mut self.got;
-        self.connection.advance(self.now, |done| noted(got, &done));
+        let (got, again) = (&mut self.got, &mut self.again);
+        self.connection.advance(self.now, |done| noted(got, again, &done));
+    }
+
+    fn close(&mut self, why: Closed) {
+        let (got, again) = (&mut self.got, &mut self.again);
+        self.connection.close(why, |done| noted(got, again, &done));
     }
 
     fn got(&mut self) -> Vec<Got> {
@@ -184,7 +210,8 @@ fn a_timeout_ends_one_request_and_not_the_connection() {
     let second = client.send(read());
     client.after(SECOND / 2);
     assert_eq!(client.got(), [(first, Err(Failure::Timeout))]);
-    assert!(client.connection.is_waiting_for(second) && !client.connection.is_waiting_for(first));
+    assert_eq!(client.connection.deadline_of(first), None);
+    assert_eq!(client.connection.deadline_of(second), Some(client.now + SECOND / 2));
     client.receive(&mbap_frame(1, 7, &[3, 2, 0, 2]));
     assert_eq!(client.got(), [(second, Ok(vec![0, 2]))]);
     assert_eq!(client.connection.deadline(), None);
@@ -247,7 +274,7 @@ fn closing_fails_every_request_in_flight() {
         let mut client = Client::new(Transport::Tcp);
         let ticket = client.send(read());
         let got = &mut client.got;
-        client.connection.close(why, |done| noted(got, &done));
+        client.connection.close(why, |done| noted(got, &mut None, &done));
         assert_eq!(client.got(), [(ticket, Err(Failure::Closed(why)))]);
         client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
         client.after(SECOND);
@@ -335,8 +362,8 @@ fn an_error_ends_rtu_in_a_stream() {
 }
 
 #[test]
-fn a_serial_line_waits_for_silence_and_discards_earlier_bytes() {
-    let mut client = Client::new(Transport::SerialRtu(LINE));
+fn a_serial_line_is_silent_before_a_request_and_what_came_before_is_thrown_away() {
+    let mut client = Client::new(RTU);
     client.receive(&[1, 2, 3]);
     let ticket = client.send(read());
     assert_eq!(client.outgoing(), []);
@@ -354,8 +381,8 @@ fn a_serial_line_waits_for_silence_and_discards_earlier_bytes() {
 }
 
 #[test]
-fn on_a_line_that_is_never_silent_a_request_times_out_unsent() {
-    let mut client = Client::new(Transport::SerialRtu(LINE));
+fn a_serial_line_that_is_never_silent_lets_the_request_time_out_unsent() {
+    let mut client = Client::new(RTU);
     client.receive(&[0]);
     let ticket = client.send(read());
     while client.got.is_empty() {
@@ -368,8 +395,8 @@ fn on_a_line_that_is_never_silent_a_request_times_out_unsent() {
 }
 
 #[test]
-fn a_broadcast_on_a_serial_line_has_no_reply() {
-    for transport in [Transport::SerialRtu(LINE), Transport::SerialAscii(LINE)] {
+fn nobody_replies_to_a_broadcast_of_a_serial_line() {
+    for transport in [RTU, ASCII] {
         let mut client = Client::new(transport);
         let request = EncodedRequest::new(&WRITE);
         let timeout = TURNAROUND / 10;
@@ -386,12 +413,8 @@ fn a_broadcast_on_a_serial_line_has_no_reply() {
 #[test]
 fn an_invalid_reply_does_not_end_a_serial_line() {
     for (transport, bad, good) in [
-        (Transport::SerialRtu(LINE), rtu_frame(8, &[3, 2, 0, 1]), rtu_frame(7, &[3, 2, 0, 1])),
-        (
-            Transport::SerialAscii(LINE),
-            ascii_frame(8, &[3, 2, 0, 1]),
-            ascii_frame(7, &[3, 2, 0, 1]),
-        ),
+        (RTU, rtu_frame(8, &[3, 2, 0, 1]), rtu_frame(7, &[3, 2, 0, 1])),
+        (ASCII, ascii_frame(8, &[3, 2, 0, 1]), ascii_frame(7, &[3, 2, 0, 1])),
     ] {
         let mut client = Client::new(transport);
         let first = client.send(read());
@@ -412,12 +435,10 @@ fn an_invalid_reply_does_not_end_a_serial_line() {
 #[test]
 fn an_echo_is_removed_if_it_is_expected_or_cannot_be_a_reply() {
     for (echo, request) in [(false, read()), (true, read()), (true, WRITE)] {
-        let line = Line { silence: SILENCE, echo };
         for ascii in [false, true] {
             let frame = |pdu: &[u8]| if ascii { ascii_frame(7, pdu) } else { rtu_frame(7, pdu) };
-            let transport =
-                if ascii { Transport::SerialAscii(line) } else { Transport::SerialRtu(line) };
-            let mut client = Client::new(transport);
+            let tolerance = Tolerance { echo, ..STRICT };
+            let mut client = Client::tolerant(if ascii { ASCII } else { RTU }, tolerance);
             let ticket = client.send(request);
             let sent = client.outgoing();
             let reply: &[u8] = if request == read() { &[3, 2, 0, 5] } else { &[6, 0, 3, 0, 7] };
@@ -441,13 +462,358 @@ fn the_reply_to_a_dropped_request_on_a_line_is_not_taken_for_another() {
     assert!(client.connection.has_room());
 }
 
+#[test]
+fn the_timeout_of_a_request_runs_from_the_reply_before_it() {
+    let mut client = Client::new(Transport::Tcp);
+    let [first, second, third] = [(); 3].map(|()| client.send(read()));
+    for (id, ticket) in [(0, first), (1, second)] {
+        client.after(SECOND * 3 / 4);
+        client.receive(&mbap_frame(id, 7, &[3, 2, 0, 1]));
+        assert_eq!(client.got(), [(ticket, Ok(vec![0, 1]))]);
+    }
+    client.after(SECOND * 3 / 4);
+    assert_eq!(client.got(), []);
+    client.after(SECOND / 4);
+    assert_eq!(client.got(), [(third, Err(Failure::Timeout))]);
+}
+
+#[test]
+fn a_reply_to_a_later_request_gives_an_earlier_one_no_more_time() {
+    let mut client = Client::new(Transport::Tcp);
+    let [first, _] = [(); 2].map(|()| client.send(read()));
+    client.after(SECOND / 2);
+    client.receive(&mbap_frame(1, 7, &[3, 2, 0, 1]));
+    client.got();
+    client.after(SECOND / 2);
+    assert_eq!(client.got(), [(first, Err(Failure::Timeout))]);
+}
+
+#[test]
+fn a_late_reply_gives_later_requests_their_time() {
+    let mut client = Client::new(Transport::Tcp);
+    client.send(read());
+    client.after(SECOND / 2);
+    let second = client.send(read());
+    client.after(SECOND / 2);
+    client.after(SECOND / 4);
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    assert_eq!(client.connection.deadline_of(second), Some(client.now + SECOND));
+}
+
+/// A connection that has carried a reply.
+fn used(tolerance: Tolerance) -> Client {
+    let mut client = Client::tolerant(Transport::Tcp, tolerance);
+    client.send(read());
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    client.got();
+    client
+}
+
+#[test]
+fn a_read_is_repeated_once_when_a_used_connection_ends_without_a_byte_of_its_reply() {
+    let mut client = used(STRICT);
+    let request = EncodedRequest::new(&read());
+    client.send(read());
+    client.close(Closed::ByPeer);
+    let again = client.again.take().unwrap();
+    assert!(again.pause().is_zero() && !again.has_own_timeout());
+    let mut client = used(STRICT);
+    client.connection.send_again(7, &request, SECOND, again, SECOND).unwrap();
+    client.close(Closed::ByPeer);
+    assert_eq!((client.got().len(), client.again), (1, None));
+}
+
+#[test]
+fn nothing_else_is_repeated() {
+    let lost = |mut client: Client, request, bytes: &[u8], why| {
+        client.send(request);
+        client.receive(bytes);
+        client.close(why);
+        assert_eq!(client.got().len(), 1);
+        client.again
+    };
+    let fresh = Client::new(Transport::Tcp);
+    assert_eq!(lost(fresh, read(), &[], Closed::ByPeer), None);
+    assert_eq!(lost(used(STRICT), WRITE, &[], Closed::ByPeer), None);
+    assert_eq!(lost(used(STRICT), read(), &[0], Closed::ByPeer), None);
+    assert_eq!(lost(used(STRICT), read(), &[], Closed::BySelf), None);
+    let retried = Tolerance { retries: 3, retry_busy: true, ..STRICT };
+    assert_eq!(lost(used(retried), WRITE, &[], Closed::ByPeer), None);
+    assert_eq!(lost(used(retried), read(), &[], Closed::BySelf), None);
+}
+
+#[test]
+fn reads_are_retried_as_often_as_the_device_needs() {
+    let busy = Tolerance { retries: 2, retry_busy: true, pause: SECOND / 100, ..STRICT };
+    let exception = |code| {
+        move |client: &mut Client| {
+            let reply = mbap_frame(0, 7, &[0x83, code]);
+            client.receive(&reply);
+        }
+    };
+    type Case = (Tolerance, Box<dyn Fn(&mut Client)>, Option<Duration>);
+    let cases: [Case; 6] = [
+        (busy, Box::new(exception(6)), Some(BUSY_PAUSE)),
+        (busy, Box::new(exception(5)), Some(BUSY_PAUSE)),
+        (busy, Box::new(exception(2)), None),
+        (busy, Box::new(|client| client.after(SECOND)), Some(SECOND / 100)),
+        (Tolerance { retry_busy: false, ..busy }, Box::new(exception(6)), None),
+        (Tolerance { retries: 0, ..busy }, Box::new(exception(6)), None),
+    ];
+    for (tolerance, fail, pause) in cases {
+        let request = EncodedRequest::new(&read());
+        let mut attempt = Attempt::default();
+        for retry in 0..=tolerance.retries {
+            let mut client = Client::tolerant(Transport::Tcp, tolerance);
+            client.connection.send_again(7, &request, SECOND, attempt, SECOND).unwrap();
+            fail(&mut client);
+            let expected = pause.filter(|_| retry < tolerance.retries);
+            assert_eq!(client.again.map(|again| again.pause()), expected);
+            let Some(again) = client.again else { break };
+            assert!(again.has_own_timeout());
+            attempt = again;
+        }
+    }
+}
+
+#[test]
+fn a_unit_id_is_accepted_where_the_device_may_send_it() {
+    for (accept_unit, found, accepted) in [
+        (AcceptUnit::Also(0), 0, true),
+        (AcceptUnit::Also(0), 7, true),
+        (AcceptUnit::Also(0), 1, false),
+        (AcceptUnit::Any, 255, true),
+        (AcceptUnit::Requested, 0, false),
+    ] {
+        let tolerance = Tolerance { accept_unit, ..STRICT };
+        let pdu = [3, 2, 0, 1];
+        for (transport, frame) in [
+            (Transport::Tcp, mbap_frame(0, found, &pdu)),
+            (Transport::Udp, mbap_frame(0, found, &pdu)),
+            (Transport::RtuOverTcp, rtu_frame(found, &pdu)),
+            (ASCII, ascii_frame(found, &pdu)),
+        ] {
+            let mut client = Client::tolerant(transport, tolerance);
+            client.send(read());
+            client.receive(&frame);
+            client.after(SECOND);
+            let outcome = client.got().remove(0).1;
+            assert_eq!(outcome.is_ok(), accepted, "{transport:?} {accept_unit:?} {found}");
+        }
+    }
+}
+
+#[test]
+fn padding_is_ignored_where_the_device_may_send_some() {
+    let tolerance = Tolerance { pad: true, ..STRICT };
+    for transport in [Transport::Tcp, Transport::Udp] {
+        let mut client = Client::tolerant(transport, tolerance);
+        let first = client.send(read());
+        client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1, 0, 0, 0]));
+        assert_eq!(client.got(), [(first, Ok(vec![0, 1]))]);
+        let second = client.send(read());
+        client.receive(&[0, 1, 0, 0, 0, 4, 7, 0x83, 3]);
+        assert_eq!(client.got(), [(second, Err(Failure::Exception(3)))]);
+        let third = client.send(read());
+        client.receive(&mbap_frame(2, 7, &[3, 2, 0, 3]));
+        assert_eq!(client.got(), [(third, Ok(vec![0, 3]))]);
+        // More registers than were asked for are no padding.
+        client.send(read());
+        client.receive(&mbap_frame(3, 7, &[3, 4, 0, 1, 0, 1]));
+        assert!(matches!(client.got()[0].1, Err(Failure::Invalid(_))));
+    }
+    let mut client = Client::tolerant(Transport::RtuOverTcp, tolerance);
+    let ticket = client.send(read());
+    client.receive(&[rtu_frame(7, &[3, 2, 0, 1]), vec![0, 0]].concat());
+    client.receive(&[0]);
+    assert_eq!(client.got(), [(ticket, Ok(vec![0, 1]))]);
+    assert_eq!(client.connection.closed(), None);
+}
+
+#[test]
+fn what_a_header_counts_beyond_an_exception_may_come_later() {
+    for surplus in [&[][..], &[0], &[1]] {
+        let mut client = Client::tolerant(Transport::Tcp, Tolerance { pad: true, ..STRICT });
+        client.send(read());
+        client.receive(&[0, 0, 0, 0, 0, 4, 7, 0x83, 2]);
+        let second = client.send(read());
+        client.receive(&[surplus, &mbap_frame(1, 7, &[3, 2, 0, 3])].concat());
+        assert_eq!(client.got()[1..], [(second, Ok(vec![0, 3]))], "{surplus:?}");
+    }
+}
+
+#[test]
+fn a_pause_separates_requests_and_does_not_count_as_waiting() {
+    let tolerance = Tolerance { pause: SECOND * 2, pause_after_connect: SECOND * 3, ..STRICT };
+    for (transport, reply) in [
+        (Transport::Tcp, mbap_frame(0, 7, &[3, 2, 0, 1])),
+        (Transport::RtuOverTcp, rtu_frame(7, &[3, 2, 0, 1])),
+        (Transport::Udp, mbap_frame(0, 7, &[3, 2, 0, 1])),
+    ] {
+        let mut client = Client::tolerant(transport, tolerance);
+        for (wait, answer) in [(3, true), (2, false)] {
+            client.send(read());
+            assert!(!client.connection.has_room());
+            assert_eq!(client.outgoing(), []);
+            assert_eq!(client.connection.deadline(), Some(client.now + SECOND * wait));
+            client.after(SECOND * wait);
+            assert!(!client.outgoing().is_empty());
+            assert_eq!(client.got(), []);
+            if answer {
+                client.receive(&reply);
+            } else {
+                client.after(SECOND);
+            }
+            assert_eq!(client.got()[0].1.is_ok(), answer, "{transport:?}");
+        }
+    }
+}
+
+#[test]
+fn a_request_that_is_cancelled_during_a_pause_is_not_sent() {
+    let tolerance = Tolerance { pause_after_connect: SECOND, ..STRICT };
+    for cancelled in 0..3 {
+        let mut client = Client::tolerant(Transport::Tcp, tolerance);
+        let tickets = [client.send(read()), client.send(WRITE), client.send(read())];
+        client.connection.cancel(tickets[cancelled]);
+        assert_eq!(client.outgoing(), []);
+        client.after(SECOND);
+        let pdus = [&[3, 0, 3, 0, 1][..], &[6, 0, 3, 0, 7], &[3, 0, 3, 0, 1]];
+        let sent: Vec<u8> = (0..3)
+            .filter(|index| *index != cancelled)
+            .flat_map(|index| mbap_frame(index as u16, 7, pdus[index]))
+            .collect();
+        assert_eq!(client.outgoing(), sent);
+        for index in (0..3).filter(|index| *index != cancelled) {
+            let reply = if index == 1 { pdus[1] } else { &[3, 2, 0, 1] };
+            client.receive(&mbap_frame(index as u16, 7, reply));
+            assert_eq!(client.got()[0].0, tickets[index]);
+        }
+    }
+
+    let mut client = Client::tolerant(Transport::Tcp, Tolerance { pause: SECOND, ..STRICT });
+    client.send(read());
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    client.outgoing();
+    let ticket = client.send(WRITE);
+    client.connection.cancel(ticket);
+    assert_eq!(client.connection.deadline(), None);
+    client.send(read());
+    client.after(SECOND);
+    assert_eq!(client.outgoing(), mbap_frame(2, 7, &[3, 0, 3, 0, 1]));
+}
+
+#[test]
+fn a_reply_to_a_request_that_was_not_sent_yet_ends_the_connection() {
+    let mut client = Client::tolerant(Transport::Tcp, Tolerance { pause: SECOND, ..STRICT });
+    client.send(read());
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    client.got();
+    client.send(WRITE);
+    client.receive(&mbap_frame(1, 7, &[6, 0, 3, 0, 7]));
+    let invalid = InvalidResponse::TransactionId(1);
+    assert_eq!(client.connection.closed(), Some(Closed::Invalid(invalid)));
+}
+
+#[test]
+fn a_connection_ends_after_as_many_requests_as_the_device_allows() {
+    let mut client = Client::tolerant(Transport::Tcp, Tolerance { close_after: 2, ..STRICT });
+    for id in 0..2 {
+        assert_eq!(client.connection.closed(), None);
+        client.send(read());
+        assert!(!client.connection.has_room());
+        client.receive(&mbap_frame(id, 7, &[3, 2, 0, 1]));
+        assert_eq!(client.got().len(), 1);
+    }
+    assert_eq!(client.connection.closed(), Some(Closed::BySelf));
+}
+
+#[test]
+fn stray_bytes_before_an_rtu_reply_are_skipped() {
+    let reply = rtu_frame(7, &[3, 2, 0, 42]);
+    let strays: [&[u8]; 6] = [&[0], &[0xFF], &[7], &[7, 3], &[7, 7, 3, 1], &[0x55; 40]];
+    for transport in [Transport::RtuOverTcp, Transport::RtuOverUdp, RTU] {
+        for stray in strays {
+            let mut client = Client::new(transport);
+            let ticket = client.send(read());
+            for byte in [stray, &reply].concat() {
+                client.receive(&[byte]);
+            }
+            let expected = match stray {
+                // With what follows, these look like a longer reply.
+                [7, 3] => Err(Failure::Timeout),
+                _ => Ok(vec![0, 42]),
+            };
+            client.after(SECOND);
+            assert_eq!(client.got(), [(ticket, expected)], "{transport:?} {stray:?}");
+        }
+    }
+}
+
+#[test]
+fn stray_bytes_alone_are_an_invalid_reply() {
+    let mut client = Client::new(Transport::RtuOverTcp);
+    let ticket = client.send(read());
+    client.receive(&[0xFF; 9]);
+    assert_eq!(client.got(), []);
+    client.after(SECOND);
+    let invalid = InvalidResponse::Frame(FrameError::CheckSum);
+    assert_eq!(client.got(), [(ticket, Err(Failure::Invalid(invalid)))]);
+}
+
+#[test]
+fn an_echo_in_a_stream_is_taken_away() {
+    for (tolerance, stray) in [(STRICT, &[][..]), (Tolerance { echo: true, ..STRICT }, &[0])] {
+        let mut client = Client::tolerant(Transport::RtuOverTcp, tolerance);
+        let ticket = client.send(read());
+        let echo = client.outgoing();
+        client.receive(&[stray, &echo, &rtu_frame(7, &[3, 2, 0, 42])].concat());
+        assert_eq!(client.got(), [(ticket, Ok(vec![0, 42]))]);
+    }
+}
+
+#[test]
+fn a_reply_that_equals_its_request_is_no_echo() {
+    // 24 coils from address 0x03C8, whose reply has the three bytes C8 00 18.
+    let request = Request::ReadCoils(Range::new(0x03C8, 24).unwrap());
+    let mut client = Client::new(RTU);
+    let ticket = client.send(request);
+    let reply = client.outgoing();
+    client.receive(&reply);
+    assert_eq!(client.got(), [(ticket, Ok(vec![0xC8, 0, 24]))]);
+}
+
+fn tolerances() -> impl Strategy<Value = Tolerance> {
+    let unit = prop_oneof![
+        Just(AcceptUnit::Requested),
+        any::<u8>().prop_map(AcceptUnit::Also),
+        Just(AcceptUnit::Any)
+    ];
+    let flags = any::<[bool; 3]>();
+    (unit, flags, 0..3u32, 0..3u32, 0..3u8, 0..3u32).prop_map(
+        |(accept_unit, [pad, echo, retry_busy], pause, connect, retries, close_after)| Tolerance {
+            accept_unit,
+            pad,
+            echo,
+            pause: SECOND / 4 * pause,
+            pause_after_connect: SECOND / 4 * connect,
+            retries,
+            retry_busy,
+            close_after,
+            reconnect: Duration::ZERO,
+        },
+    )
+}
+
 fn transports() -> impl Strategy<Value = Transport> {
     prop_oneof![
         Just(Transport::Tcp),
         Just(Transport::Udp),
         Just(Transport::RtuOverTcp),
-        Just(Transport::SerialRtu(LINE)),
-        Just(Transport::SerialAscii(Line { silence: SILENCE, echo: true })),
+        Just(RTU),
+        Just(ASCII),
+        Just(Transport::RtuOverUdp),
+        Just(Transport::AsciiOverTcp),
     ]
 }
 
@@ -455,6 +821,7 @@ proptest! {
     #[test]
     fn for_any_bytes_every_request_has_one_result_and_memory_is_bounded(
         transport in transports(),
+        tolerance in tolerances(),
         steps in prop::collection::vec(
             prop_oneof![
                 prop::collection::vec(any::<u8>(), 1..300).prop_map(Some),
@@ -466,7 +833,7 @@ proptest! {
             1..40,
         ),
     ) {
-        let mut client = Client::new(transport);
+        let mut client = Client::tolerant(transport, tolerance);
         let mut tickets = Vec::new();
         for step in steps {
             if client.connection.has_room() && client.connection.closed().is_none() {
@@ -508,7 +875,7 @@ proptest! {
         let reply = &reply[..2 + bytes.len()];
         let stream = match transport {
             Transport::Tcp | Transport::Udp => mbap_frame(0, 7, reply),
-            Transport::SerialAscii(_) => [sent, ascii_frame(7, reply)].concat(),
+            ASCII | Transport::AsciiOverTcp => [sent, ascii_frame(7, reply)].concat(),
             _ => rtu_frame(7, reply),
         };
         let mut rest = &stream[..];

@@ -169,6 +169,7 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
         ],
         status=None if status is None else (memories[status.memory], status.area, status.slot),
         start_within=min(settings.interval, SPREAD),
+        in_flight=None if settings.in_flight == "auto" else settings.in_flight,
         measured=settings.cost is not None and settings.cost.measured,
         **planning.rules(settings),
     )

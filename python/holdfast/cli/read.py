@@ -71,7 +71,8 @@ def read(
     4x0001, which counts from 1 and includes the area (0, 1, 3, 4), so AREA is optional.
 
     URL is tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502,
-    rtu:///dev/ttyUSB0?baud=19200 or ascii:///dev/ttyUSB0.
+    rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200 or
+    ascii:///dev/ttyUSB0.
 
     Exit codes: 0 all values read, 1 some values not read, 2 wrong usage.
     """

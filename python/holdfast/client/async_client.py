@@ -10,8 +10,8 @@ from holdfast.client.base import BaseClient
 from holdfast.client.connection import AsyncConnection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.one_at_a_time import OneAtATime
-from holdfast.client.target import IN_FLIGHT, NetworkTarget
-from holdfast.errors import ModbusException
+from holdfast.client.target import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
+from holdfast.errors import InvalidResponse, ModbusException
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
@@ -19,16 +19,15 @@ if TYPE_CHECKING:
     from holdfast.client.requests import Identification, Plan, Result, ServerId, Steps
     from holdfast.types import Area
 
-MAX_IN_FLIGHT = 1024
-
 
 class Client(BaseClient):
     """A client for asyncio. Await every method.
 
-    `url`, `unit`, `timeout` and the errors are as in `SyncClient`. Over TCP and TLS, up to
-    `max_in_flight` requests are in flight, and replies may arrive in any order. Further calls wait
-    for a free place; `timeout` does not include that wait. Set 1 for a device that handles only one
-    request at a time. Other transports have one request in flight.
+    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS
+    up to `max_in_flight` requests are on their way at once, and replies may come in any order; what
+    is more waits for its turn, which `timeout` does not cover. More than 1 is faster where a device
+    accepts it; many drop requests that overlap. Each reply starts the timeouts of later requests
+    again. On other transports one request is on its way at once.
 
     Any number of tasks can share a client in one event loop. To use it in another loop, first
     `close` it or close the first loop. After a cancelled call, the connection remains usable.
@@ -39,7 +38,7 @@ class Client(BaseClient):
     """
 
     def __init__(
-        self, url: str, *, unit: int = 1, timeout: float = 1.0, max_in_flight: int = 16
+        self, url: str, *, unit: int = 1, timeout: float = 1.0, max_in_flight: int = 1
     ) -> None:
         super().__init__(url, unit, timeout)
         if type(max_in_flight) is not int or not 1 <= max_in_flight <= MAX_IN_FLIGHT:
@@ -214,7 +213,7 @@ class Client(BaseClient):
             while True:
                 try:
                     reply = await self._call(request, unit)
-                except ModbusException as error:
+                except (ModbusException, InvalidResponse) as error:
                     request = steps.throw(error)
                 else:
                     request = steps.send(reply)

@@ -16,7 +16,7 @@ from collections import deque
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from holdfast._core import Connection
+from holdfast._core import Attempt, Connection
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class AsyncConnection:
     def __init__(self, target: NetworkTarget, endpoint: Endpoint, max_in_flight: int) -> None:
         self._target = target
         self._endpoint = endpoint
-        self._max_in_flight = max_in_flight
+        self._max_in_flight = 1 if target.tolerance.is_one_at_a_time else max_in_flight
         self._late = 0
         self._here: _LoopConnection | None = None
 
@@ -90,6 +90,7 @@ class _LoopConnection:
         self._queue: deque[asyncio.Future[None]] = deque()
         self._open: _Protocol | None = None
         self._connecting: asyncio.Task[_Protocol] | None = None
+        self._connect_at = -inf
         self._late = 0
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
@@ -99,15 +100,23 @@ class _LoopConnection:
             await self._turn()
         try:
             deadline = self.loop.time() + timeout
-            connection = self._open
-            if connection is None:
-                connection = await self._connected(deadline, timeout)
-            ticket, future = connection.send(request, unit, deadline, timeout)
-            try:
-                return await future
-            except asyncio.CancelledError:
-                connection.cancel(ticket)
-                raise
+            attempt = None
+            while True:
+                connection = self._open
+                if connection is None:
+                    connection = await self._connected(deadline, timeout)
+                ticket, future = connection.send(request, unit, deadline, timeout, attempt)
+                try:
+                    result = await future
+                except asyncio.CancelledError:
+                    connection.cancel(ticket)
+                    raise
+                if type(result) is not Attempt:
+                    return result
+                attempt = result
+                await asyncio.sleep(attempt.pause)
+                if attempt.has_own_timeout:
+                    deadline = self.loop.time() + timeout
         finally:
             if self._queue:
                 self._next_turn()
@@ -174,7 +183,11 @@ class _LoopConnection:
         return connecting.result()
 
     async def _connect(self, timeout: float) -> _Protocol:
-        target, protocol = self._target, _Protocol(self, Connection(self._endpoint))
+        target = self._target
+        if self._connect_at > self.loop.time():
+            await asyncio.sleep(min(self._connect_at - self.loop.time(), timeout))
+        core = Connection(self._endpoint, self.loop.time())
+        protocol = _Protocol(self, core, has_pauses=target.tolerance.has_pauses)
         try:
             async with asyncio.timeout(timeout):
                 try:
@@ -199,7 +212,8 @@ class _LoopConnection:
             self._open = task.result()
 
     def lost(self, connection: _Protocol) -> None:
-        """Drops a connection that has ended; the next call reconnects."""
+        """The connection has ended: the next call makes a new one."""
+        self._connect_at = self.loop.time() + self._target.tolerance.reconnect
         self._late += connection.core.late
         if self._open is connection:
             self._open = None
@@ -208,8 +222,9 @@ class _LoopConnection:
 class _Protocol(asyncio.Protocol):
     """One connection: sends requests and receives replies."""
 
-    def __init__(self, here: _LoopConnection, core: Connection) -> None:
+    def __init__(self, here: _LoopConnection, core: Connection, *, has_pauses: bool) -> None:
         self.core = core
+        self._has_pauses = has_pauses
         self._here = here
         self._loop = here.loop
         self.ready: asyncio.Future[None] = self._loop.create_future()
@@ -228,19 +243,29 @@ class _Protocol(asyncio.Protocol):
         return self._transport is not None and self.core.is_ready
 
     def send(
-        self, request: Request, unit: int, deadline: float, timeout: float
+        self,
+        request: Request,
+        unit: int,
+        deadline: float,
+        timeout: float,
+        attempt: Attempt | None,
     ) -> tuple[int, asyncio.Future[Any]]:
         """Sends a request: at once if no other is pending, else with others of this loop turn.
 
         Returns its ticket and the future of its result.
         """
-        ticket = self.core.send(request, unit, timeout, deadline - timeout)
+        now = deadline - timeout
+        if self._has_pauses or attempt is not None:
+            now = self._loop.time()
+        ticket = self.core.send(request, unit, max(deadline - now, 0.0), now, attempt)
         if not self._futures:
             self._flush()
         elif not self._flushing:
             self._flushing = True
             self._loop.call_soon(self._flush)
         future = self._futures[ticket] = self._loop.create_future()
+        if self._has_pauses:
+            deadline = self.core.deadline or deadline
         if deadline < self._alarm_at:
             self._set_alarm(deadline)
         return ticket, future
@@ -320,6 +345,8 @@ class _Protocol(asyncio.Protocol):
         """Ends calls after their deadline, and sets the timer for the next deadline."""
         self._alarm, self._alarm_at = None, inf
         self._settle(self.core.advance(self._loop.time()))
+        if self._has_pauses:
+            self._flush()
         deadline = self.core.deadline
         if deadline is not None and self._transport is not None:
             self._set_alarm(deadline)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
@@ -18,7 +19,11 @@ def blocking(target: Target) -> BlockingClient:
 
 
 def endpoint(target: Target) -> Endpoint:
-    """The native endpoint of a target. Raises `OSError` and `ValueError` for TLS files."""
+    """A target as the native core has it."""
+    return _place(target).tolerating(**asdict(target.tolerance))
+
+
+def _place(target: Target) -> Endpoint:
     if isinstance(target, SerialTarget):
         return Endpoint.serial(
             target.device,
@@ -28,7 +33,6 @@ def endpoint(target: Target) -> Endpoint:
             stop_bits=target.stop_bits,
             data_bits=target.data_bits,
             silence=target.silence,
-            echo=target.echo,
         )
     if target.transport == "tls":
         of = target.tls

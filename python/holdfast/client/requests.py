@@ -15,6 +15,7 @@ from holdfast._core import Request
 from holdfast.errors import InvalidResponse, ModbusException
 from holdfast.protocol import (
     ADDRESSES,
+    ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     LAST_ADDRESS,
     MAX_WORD,
@@ -43,6 +44,12 @@ OBJECT_NAMES = (
     "model_name",
     "user_application_name",
 )
+
+MANDATORY_OBJECTS = frozenset(range(3))
+"""Those of the basic category."""
+
+REFUSALS = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
+"""Exceptions of a device that does not have a category."""
 
 
 @dataclass(frozen=True)
@@ -165,17 +172,27 @@ def write_typed(
 
 
 def identify() -> Steps[Identification]:
-    """Reads all identification objects, in as many requests as the device requires."""
+    """All objects that the device has, in as many requests as it wants.
+
+    A device may refuse the read codes of categories that it does not have, or leave out the objects
+    of lower categories: then these are asked for too.
+    """
     objects: dict[int, bytes] = {}
-    conformity = 0
+    levels: list[int] = []
     for code in (3, 2, 1):
         try:
-            conformity = yield from _stream(code, objects)
-            break
+            levels.append((yield from _stream(code, objects)))
         except ModbusException as error:
-            # A device may refuse levels that it does not support.
-            if error.code != ILLEGAL_VALUE or code == 1:
+            if not levels and (error.code not in REFUSALS or code == 1):
                 raise
+        except InvalidResponse:
+            # What the device has said already stands.
+            if not levels:
+                raise
+            break
+        if objects.keys() >= MANDATORY_OBJECTS:
+            break
+    conformity = levels[0]
     names = {
         name: objects[number].decode("utf-8", "replace") if number in objects else None
         for number, name in enumerate(OBJECT_NAMES)

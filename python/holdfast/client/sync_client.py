@@ -8,7 +8,7 @@ from holdfast._core import Request
 from holdfast.client import requests
 from holdfast.client.base import BaseClient
 from holdfast.client.endpoint import blocking
-from holdfast.errors import ModbusException
+from holdfast.errors import InvalidResponse, ModbusException
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,15 +20,18 @@ if TYPE_CHECKING:
 class SyncClient(BaseClient):
     """A blocking client: every method returns when the device has answered.
 
-    `url` is the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
-    `rtu+tcp://host:502`, `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`.
-    `unit` is the default unit id, 0 to 255; every call can override it. `timeout`, in seconds,
-    covers connection, request and reply together.
+    `url` names the device: `tcp://host:502`, `tls://host:802?ca=ca.pem`, `udp://host:502`,
+    `rtu+tcp://host:502`, `rtu+udp://host:502`, `ascii+tcp://host:502`,
+    `rtu:///dev/ttyUSB0?baud=19200&parity=even` or `ascii:///dev/ttyUSB0`, with options for a device
+    that deviates from the standard. `unit` is the unit id, 0 to 255, that a call can replace.
+    `timeout` in seconds covers connecting, sending and receiving.
 
     Reads the files of a `tls` URL now; raises `OSError` or `ValueError` if they can't be used.
 
-    Threads can share a client. Their calls run one after the other; `timeout` does not include the
-    wait for other calls.
+    A read is sent again when a connection that was used before ends without a byte of the reply,
+    and as often as `retries` of the URL says. A write is never sent twice.
+
+    Threads may share a client; their calls take turns, for which `timeout` does not count.
 
     Methods raise `ValueError` or `TypeError` before anything is sent, and `ModbusException`,
     `ConnectionLost`, `RequestTimeout` or `InvalidResponse` after; all four are `ModbusError`.
@@ -202,7 +205,7 @@ class SyncClient(BaseClient):
             while True:
                 try:
                     reply = self._call(request, unit)
-                except ModbusException as error:
+                except (ModbusException, InvalidResponse) as error:
                     request = plan.throw(error)
                 else:
                     request = plan.send(reply)

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from holdfast.client.tolerance import (
+    MAX_CLOSE_AFTER,
+    MAX_PAUSE,
+    MAX_RETRIES,
+    STRICT,
+    Tolerance,
+)
 from holdfast.net.addresses import LAST_PORT, joined
 from holdfast.net.tls import NO_FILES
 from holdfast.net.tls import Tls as Tls
-from holdfast.protocol import usual_port
-from holdfast.types import TRANSPORTS
+from holdfast.protocol import MAX_UNIT, usual_port
+from holdfast.types import SERIAL_FRAMES, TRANSPORTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -22,12 +29,22 @@ if TYPE_CHECKING:
 Mode: TypeAlias = Literal["rtu", "ascii"]
 Parity: TypeAlias = Literal["none", "even", "odd"]
 
+SERIAL = ("rtu", "ascii")
+ALL = (*TRANSPORTS, *SERIAL)
+MBAP = tuple(each for each in TRANSPORTS if each not in SERIAL_FRAMES)
+
+MAX_SILENCE = 10.0
+"""Seconds."""
+
 IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
 """The transports that allow several requests in flight."""
 
+MAX_IN_FLIGHT = 1024
+"""The most requests in flight on one connection."""
+
 FORMS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
-    "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+    "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
 
 
@@ -39,7 +56,8 @@ class NetworkTarget:
     host: str
     port: int
     tls: Tls = NO_FILES
-    """Only with transport `tls`."""
+    """Of transport `tls`."""
+    tolerance: Tolerance = STRICT
 
     def __str__(self) -> str:
         return f"{self.transport}://{joined(self.host, self.port)}"
@@ -56,9 +74,8 @@ class SerialTarget:
     stop_bits: int = 1
     data_bits: int = 8
     silence: float | None = None
-    """Seconds of silence that end an RTU frame; `None`: 3.5 characters."""
-    echo: bool = False
-    """Whether the adapter echoes sent bytes."""
+    """Seconds that end an RTU frame; `None` for 3.5 characters."""
+    tolerance: Tolerance = STRICT
 
     def __str__(self) -> str:
         return f"{self.mode}://{self.device}"
@@ -80,14 +97,18 @@ def parse(url: str) -> Target:
     if parts.fragment or parts.username is not None:
         raise ValueError(f"{url!r} has a user or a fragment, allowed: {FORMS}")
     if scheme in TRANSPORTS:
-        query = parts.query and scheme != "tls"
-        if not parts.hostname or parts.path not in ("", "/") or query:
+        if not parts.hostname or parts.path not in ("", "/"):
             raise ValueError(f"{url!r} is not the address of a device, allowed: {FORMS}")
         if port == 0:
             raise ValueError(f"{url!r}: port 0, allowed: 1 to {LAST_PORT}")
         port = usual_port(scheme) if port is None else port
-        tls = _tls(url, parts.query) if scheme == "tls" else NO_FILES
-        return NetworkTarget(scheme, unquote(parts.hostname), port, tls)
+        chosen = _chosen(url, scheme, parts.query)
+        tolerance = _taken(Tolerance, chosen)
+        try:
+            tls = Tls(**chosen)
+        except ValueError as error:
+            raise ValueError(f"{url!r}: {error}") from None
+        return NetworkTarget(scheme, unquote(parts.hostname), port, tls, tolerance)
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
     raise ValueError(f"{url!r} is not the URL of a device, allowed: {FORMS}")
@@ -101,7 +122,9 @@ def in_folder(url: str, folder: Path) -> str:
     tls = target.tls.in_folder(folder)
     if tls == target.tls:
         return url
-    return f"{url.partition('?')[0]}?{tls.query}"
+    location, _, query = url.partition("?")
+    kept = [each for each in query.split("&") if unquote(each.partition("=")[0]) not in TLS_KEYS]
+    return f"{location}?{'&'.join([tls.query, *kept])}"
 
 
 @dataclass(frozen=True)
@@ -110,7 +133,7 @@ class _Option:
 
     allowed: str
     read: Callable[[str], Any]
-    schemes: tuple[str, ...] = field(default=("rtu", "ascii"))
+    schemes: tuple[str, ...] = SERIAL
 
 
 def _one_of(*words: str, read: Callable[[str], Any] = str) -> _Option:
@@ -129,9 +152,33 @@ def _baud(text: str) -> int:
 
 
 def _seconds(text: str) -> float:
-    if not re.fullmatch(r"[0-9]*\.?[0-9]+", text) or not 0 < float(text) <= 10:
+    seconds = _pause(text)
+    if not 0 < seconds <= MAX_SILENCE:
+        raise ValueError(text)
+    return seconds
+
+
+def _pause(text: str) -> float:
+    if not re.fullmatch(r"[0-9]*\.?[0-9]+", text) or not float(text) <= MAX_PAUSE:
         raise ValueError(text)
     return float(text)
+
+
+def _up_to(most: int) -> Callable[[str], int]:
+    def number(text: str) -> int:
+        if not re.fullmatch("[0-9]{1,9}", text) or int(text) > most:
+            raise ValueError(text)
+        return int(text)
+
+    return number
+
+
+def _unit(text: str) -> int | str:
+    return text if text == "any" else _up_to(MAX_UNIT)(text)
+
+
+def _flag(schemes: tuple[str, ...]) -> _Option:
+    return _Option("0, 1", _one_of("0", "1", read=lambda text: text == "1").read, schemes)
 
 
 def _text(text: str) -> str:
@@ -146,12 +193,30 @@ OPTIONS: Mapping[str, _Option] = {
     "stop_bits": _one_of("1", "2", read=int),
     "data_bits": _one_of("7", "8", read=int),
     "silence": _Option("seconds, up to 10", _seconds, ("rtu",)),
-    "echo": _one_of("0", "1", read=lambda text: text == "1"),
+    "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, ALL),
+    "pad": _flag(ALL),
+    "echo": _flag(tuple(each for each in ALL if each not in MBAP)),
+    "pause": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
+    "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
+    "retries": _Option(f"0 to {MAX_RETRIES}", _up_to(MAX_RETRIES), ALL),
+    "retry_busy": _flag(ALL),
+    "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), ALL),
+    "reconnect": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
     "ca": _Option("paths of files", _text, ("tls",)),
     "cert": _Option("paths of files", _text, ("tls",)),
     "key": _Option("paths of files", _text, ("tls",)),
     "name": _Option("host names and IP addresses", _text, ("tls",)),
 }
+
+
+TLS_KEYS = tuple(name for name, each in OPTIONS.items() if each.schemes == ("tls",))
+
+
+def _taken(kind: type[Any], chosen: dict[str, Any]) -> Any:
+    """A dataclass of the keys that are its fields, which are taken out."""
+    return kind(
+        **{each.name: chosen.pop(each.name) for each in fields(kind) if each.name in chosen}
+    )
 
 
 def _chosen(url: str, scheme: str, query: str) -> dict[str, Any]:
@@ -172,14 +237,6 @@ def _chosen(url: str, scheme: str, query: str) -> dict[str, Any]:
     return chosen
 
 
-def _tls(url: str, query: str) -> Tls:
-    chosen = _chosen(url, "tls", query)
-    try:
-        return Tls(**chosen)
-    except ValueError as error:
-        raise ValueError(f"{url!r}: {error}") from None
-
-
 def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
     device = unquote(path)
     if re.fullmatch(r"/(COM[0-9]+|\\\\\.\\.+)", device):
@@ -191,4 +248,5 @@ def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
         raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu: 8")
     chosen.setdefault("data_bits", 8 if mode == "rtu" else 7)
     chosen.setdefault("stop_bits", 2 if chosen.get("parity") == "none" else 1)
-    return SerialTarget(mode, device, **chosen)
+    tolerance = _taken(Tolerance, chosen)
+    return SerialTarget(mode, device, tolerance=tolerance, **chosen)

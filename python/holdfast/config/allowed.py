@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from holdfast.config.lenient import entries, mapping
 from holdfast.config.schema import cached
-from holdfast.config.tolerance import entries, mapping
 from holdfast.config.words import choice, listing
 
 if TYPE_CHECKING:

@@ -9,19 +9,22 @@ import os
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter
+
 from holdfast.client.target import SerialTarget, parse
-from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
+from holdfast.client.tolerance import STRICT, Tolerance
+from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, ToleranceConfig
 from holdfast.config.files import check_readable
 from holdfast.config.initial import extent
+from holdfast.config.lenient import entries, fitting, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES
 from holdfast.config.memory_checks import addresses
 from holdfast.config.scalars import NOT_ON_A_LINE, parse_url
 from holdfast.config.scanning import parse_pollable
-from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.words import choice, listing, show
 from holdfast.net.allow_list import AllowedDevice
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
-from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, Area
+from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, SERIAL_FRAMES, Area
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,6 +54,14 @@ class Claim:
         return f"{self.area} {extent(self.addresses)} of {self.memory}"
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """What devices of one address have in common."""
+
+    tolerance: Tolerance
+    in_flight: object
+
+
 @dataclass
 class DeviceChecks:
     """Checks the devices of one file; files are relative to `folder`."""
@@ -64,6 +75,7 @@ class DeviceChecks:
     def __post_init__(self) -> None:
         self._claims: list[Claim] = []
         self._lines: dict[str, tuple[KeyPath, SerialTarget]] = {}
+        self._addresses: dict[tuple[str, str, int], tuple[KeyPath, _Shared]] = {}
 
     def check(self, data: dict[Any, Any]) -> None:
         """Reports what is wrong."""
@@ -76,6 +88,9 @@ class DeviceChecks:
 
     def _device(self, path: KeyPath, device: dict[Any, Any], taken: dict[str, KeyPath]) -> None:
         target = parsed(_target, device.get("url"))
+        if target is not None:
+            target = self._tolerance(path, target, device)
+            self._shared(path, target, device)
         if isinstance(target, SerialTarget):
             self._line(path, target, device.get("unit"), taken)
         elif target is not None:
@@ -98,6 +113,35 @@ class DeviceChecks:
                 self._read((*path, "reads", index), read, forbidden, forwarded=forwarded)
         if isinstance(device.get("status"), dict):
             self._status((*path, "status"), device["status"])
+
+    def _tolerance(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> Target:
+        """The target with what its device needs tolerated."""
+        block = device.get("tolerance")
+        if block is None:
+            return target
+        where = (*path, "tolerance")
+        if target.tolerance != STRICT:
+            message = "found beside options of the URL, allowed: one of both"
+            self.report.add(where, message, of_key=True)
+        if mapping(block).get("echo") is True and not _has_echo(target):
+            message = "found true, allowed with RTU and ASCII frames only"
+            self.report.add((*where, "echo"), message)
+        found = fitting(TypeAdapter(ToleranceConfig), block)
+        tolerance = STRICT if found is None else Tolerance(**found.model_dump())
+        return replace(target, tolerance=tolerance)
+
+    def _shared(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> None:
+        """What devices of one address share, which have one connection."""
+        if isinstance(target, SerialTarget):
+            return
+        settings = _Shared(target.tolerance, device.get("in_flight", 1))
+        key = (target.transport, target.host, target.port)
+        first, other = self._addresses.setdefault(key, (path, settings))
+        if settings != other:
+            differs = "in_flight" if settings.in_flight != other.in_flight else "tolerance"
+            where = (*path, differs if differs in device else "url")
+            message = f"found another {differs} than {self._named(first)} has at this address"
+            self.report.add(where, f"{message}, allowed: the same")
 
     def _line(
         self, path: KeyPath, target: SerialTarget, unit: object, taken: dict[str, KeyPath]
@@ -307,3 +351,7 @@ def _meet(one: range, other: range) -> bool:
 
 def _last(path: KeyPath) -> str:
     return f"{path[-2]}[{path[-1]}]"
+
+
+def _has_echo(target: Target) -> bool:
+    return isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
-from holdfast.client.target import Target, parse
+from holdfast.client.target import MAX_IN_FLIGHT, Target, parse
+from holdfast.client.tolerance import MAX_CLOSE_AFTER, MAX_PAUSE, MAX_RETRIES, Tolerance
 from holdfast.config.base import Model
 from holdfast.config.memories import Register, Size
 from holdfast.config.receiver import Receiver, parse_receiver
@@ -21,7 +23,7 @@ from holdfast.config.scalars import (
     UnitId,
     whole_number,
 )
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.types import Area, RegisterArea
 
 MIN_INTERVAL = 0.01
@@ -132,6 +134,33 @@ class StatusConfig(Model):
         return range(self.slot * STATUS_BLOCK, (self.slot + 1) * STATUS_BLOCK)
 
 
+Pause = Annotated[float, Field(ge=0, le=MAX_PAUSE, allow_inf_nan=False), whole_number]
+AcceptUnit = Annotated[Annotated[int, Field(ge=0, le=MAX_UNIT)] | Literal["any"] | None, NotNull()]
+
+
+class ToleranceConfig(Model):
+    """How to treat a device that deviates from the standard."""
+
+    accept_unit: AcceptUnit = None
+    """A unit id that replies may carry besides that of the request, or any."""
+    pad: bool = False
+    """Whether surplus bytes at the end of a reply are ignored."""
+    echo: bool = False
+    """Whether the adapter repeats what is sent; for RTU and ASCII frames."""
+    pause: Pause = 0.0
+    """Seconds between the end of a request and the next; one request is in flight then."""
+    pause_after_connect: Pause = 0.0
+    """Seconds between connecting and the first request."""
+    retries: Annotated[int, Field(ge=0, le=MAX_RETRIES)] = 0
+    """How often a read is sent again after a timeout, an invalid reply or a lost connection."""
+    retry_busy: bool = False
+    """Whether retries covers exceptions 05 and 06 too."""
+    close_after: Annotated[int, Field(ge=0, le=MAX_CLOSE_AFTER)] = 0
+    """Requests after which the connection is closed, 0 for never; one is in flight then."""
+    reconnect: Pause = 0.0
+    """Seconds between the end of a connection and the next attempt to connect."""
+
+
 def _max_gap(data: dict[str, Any]) -> int | None:
     return 0 if data["cost"] is None else None
 
@@ -155,6 +184,10 @@ class DeviceConfig(Model):
     """Seconds from the start of a poll to the start of the next."""
     timeout: Duration = 1.0
     """Seconds for a request and its reply."""
+    in_flight: Annotated[int, Field(ge=1, le=MAX_IN_FLIGHT)] | Literal["auto"] = 1
+    """The most requests in flight at its address, over TCP; auto: more while replies stay fast."""
+    tolerance: Annotated[ToleranceConfig | None, NotNull()] = None
+    """How to treat it if it deviates from the standard; in place of these options of the URL."""
     reads: Annotated[tuple[ReadConfig, ...], Strict(False), Field(min_length=1)]
     """The ranges to read."""
     cost: Annotated[CostConfig | None, NotNull()] = None
@@ -179,4 +212,7 @@ class DeviceConfig(Model):
     @property
     def target(self) -> Target:
         """The parts of the URL."""
-        return parse(self.url)
+        target = parse(self.url)
+        if self.tolerance is None:
+            return target
+        return replace(target, tolerance=Tolerance(**self.tolerance.model_dump()))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from holdfast.config.lenient import entries, mapping
 from holdfast.config.scalars import is_name
-from holdfast.config.tolerance import entries, mapping
 from holdfast.config.unique import refuse_repeats
 from holdfast.config.words import guess, listing, show
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.addresses import parse_source
 from holdfast.config.allowed import allowed
+from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
 from holdfast.config.scalars import MAX_CONNECTIONS
 from holdfast.config.tls_checks import check_server_tls
-from holdfast.config.tolerance import entries, integer, mapping, parsed
 from holdfast.config.unique import refuse_repeats
 from holdfast.config.words import show
 from holdfast.net.addresses import Network, covers

@@ -13,6 +13,7 @@ from holdfast.config import source
 from holdfast.config.allowed import allowed
 from holdfast.config.device_checks import DeviceChecks
 from holdfast.config.grant_checks import GrantChecks, doubt_grants
+from holdfast.config.lenient import mapping
 from holdfast.config.listener_checks import ListenerChecks
 from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
@@ -21,7 +22,6 @@ from holdfast.config.report import Report
 from holdfast.config.service_checks import ServiceChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
-from holdfast.config.tolerance import mapping
 from holdfast.config.words import show
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from pydantic import TypeAdapter
 
 from holdfast.config import initial, source
+from holdfast.config.lenient import fitting, integer, mapping
 from holdfast.config.memories import Extent, Span
 from holdfast.config.problems import ConfigError
-from holdfast.config.tolerance import fitting, integer, mapping
 from holdfast.config.unique import Owners
 from holdfast.config.words import listing, show
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.broker import parse_broker, parse_topic_filter
 from holdfast.config.files import check_readable
+from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.scanning import parse_server
 from holdfast.config.tls_checks import check_client_tls
-from holdfast.config.tolerance import entries, mapping, parsed
 from holdfast.config.unique import Owners
 from holdfast.config.words import choice, listing, show
 

@@ -6,8 +6,8 @@ import os
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.addresses import Bind, parse_bind
+from holdfast.config.lenient import mapping, parsed
 from holdfast.config.listeners import CONNECTION_TYPES, DATAGRAM_TYPES, SERIAL_TYPES
-from holdfast.config.tolerance import mapping, parsed
 from holdfast.config.unique import Owners
 from holdfast.config.words import show
 

@@ -21,6 +21,7 @@ from holdfast.gateway.fields import listed, malformed
 from holdfast.gateway.pool import Full, Unusable
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
+from holdfast.types import SERIAL_FRAMES
 from holdfast.web.requests import BadRequest
 
 if TYPE_CHECKING:
@@ -37,8 +38,10 @@ TOO_MANY_BEFORE = (
     "Connection timeout: the request waited behind other requests to this device, and was not sent"
 )
 NO_BROADCAST = (
-    "unitId 0 is the broadcast of a serial line, which has no response; with transport rtu+tcp "
-    f"it allows only writes with functions {listed(BROADCAST_CODES)}"
+    "unitId 0 is the broadcast of a serial line, which nobody answers; with transport "
+    + ", ".join(SERIAL_FRAMES)
+    + " "
+    f"allowed are writes by functions {listed(BROADCAST_CODES)}"
 )
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which has no response"
 
@@ -65,7 +68,7 @@ class RequestedDevice:
         self.host: str = given["host"]
         self.port: int = given["port"] or usual_port(self.transport)
         self.unit: int = given["unitId"]
-        self.is_broadcast = self.unit == 0 and self.transport == "rtu+tcp"
+        self.is_broadcast = self.unit == 0 and self.transport in SERIAL_FRAMES
         if self.is_broadcast and not broadcast:
             raise malformed(NO_BROADCAST)
         self._name: str | None = given["serverName"]

@@ -6,18 +6,20 @@ by itself. The registry checks it against the existing subscriptions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlsplit
 
 from holdfast.client import target as targets
 from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.client.tolerance import STRICT
 from holdfast.net.addresses import address_in, unbracketed
 from holdfast.protocol import usual_port
 from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
 from holdfast.scanner.tags import tag
+from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,8 +32,8 @@ if TYPE_CHECKING:
 SCAN_RATE = 1000
 TIMEOUT = 1000
 
-SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence", "echo")
-"""The settings that all devices on one serial line must share."""
+LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
+"""What all devices on one serial line have alike."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription
         Plan.of(request.plan),
     )
     target = source.target
-    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport == "rtu+tcp"):
+    if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
         raise Refused("unitId is 0, which is the broadcast of a serial line")
     tags: dict[str, Tag] = {}
     for index, entry in enumerate(request.tags):
@@ -109,11 +111,9 @@ def _target(request: SubscribeRequest) -> Target:
         try:
             parts = urlsplit(request.url)
             for key in dict(parse_qsl(parts.query, keep_blank_values=True)):
-                if parts.scheme == "tls" and key != "name":
-                    raise Refused(
-                        f"url: {key} is given, allowed is only name; TLS files are settings of the "
-                        "scanner"
-                    )
+                if parts.scheme == "tls" and key != "name" and key not in asdict(STRICT):
+                    allowed = "allowed are name and the tolerance options; files are the scanner's"
+                    raise Refused(f"url: {key} is given, {allowed}")
             return targets.parse(request.url)
         except ValueError as error:
             raise Refused(f"url: {error}") from None
@@ -153,7 +153,7 @@ class Registry:
         new = [id for id in asked.tags if device is None or id not in device.tags]
         self._check_limits(device, asked, len(new))
         if device is None:
-            self._check_line(asked)
+            self._check_shared(asked)
         else:
             _check_known(device, asked)
             device.source.plan.check([asked.tags[id] for id in new])
@@ -218,21 +218,23 @@ class Registry:
         [(of, id)] = found
         return self.devices[of], self.devices[of].tags[id]
 
-    def _check_line(self, asked: Subscription) -> None:
-        """Checks that a new device has the same settings of its serial line as the others on it."""
+    def _check_shared(self, asked: Subscription) -> None:
+        """Checks that a new device has the settings of the devices that share its connection."""
         target = asked.source.target
-        if not isinstance(target, SerialTarget):
-            return
+        place, settings = _place(target), _settings(target)
         for device in self.devices.values():
-            other = device.source.target
-            if not isinstance(other, SerialTarget) or other.device != target.device:
+            if _place(device.source.target) != place:
                 continue
-            for key in SETTINGS:
-                known, said = getattr(other, key), getattr(target, key)
-                if known != said:
+            for key, known in _settings(device.source.target).items():
+                if known != settings[key]:
+                    at = (
+                        "on one serial line"
+                        if isinstance(target, SerialTarget)
+                        else "at one address"
+                    )
                     raise Refused(
-                        f"{key} of {target.device} is already {_shown(known)} for {device.id}, "
-                        f"not {_shown(said)}; devices on one serial line must share its settings"
+                        f"{key} of {place} is {_shown(known)} for {device.id} already, "
+                        f"not {_shown(settings[key])}; devices {at} have the same settings"
                     )
 
     def _check_limits(self, device: ScannedDevice | None, asked: Subscription, new: int) -> None:
@@ -279,14 +281,32 @@ def check_address(device: ScannedDevice, asked: Subscription) -> None:
         )
 
 
+def _place(target: Target) -> str:
+    """What devices share that have one connection."""
+    return target.device if isinstance(target, SerialTarget) else str(target)
+
+
+def _settings(target: Target) -> dict[str, object]:
+    """What devices of one connection have in common."""
+    line = LINE_SETTINGS if isinstance(target, SerialTarget) else ()
+    return {key: getattr(target, key) for key in line} | asdict(target.tolerance)
+
+
 def _told(source: Source) -> str:
     """Formats the address of a device with everything that identifies it."""
     target = source.target
+    usual: dict[str, object] = asdict(STRICT)
     more = ""
     if isinstance(target, SerialTarget):
-        more = f" ({', '.join(f'{key} {_shown(getattr(target, key))}' for key in SETTINGS[1:])})"
+        usual["mode"] = target.mode
     elif target.tls.name is not None:
         more = f" with the name {target.tls.name}"
+    said = [
+        f"{key} {_shown(value)}"
+        for key, value in _settings(target).items()
+        if key not in usual or value != usual[key]
+    ]
+    more += f" ({', '.join(said)})" if said else ""
     return f"{target}{more} unit {source.unit}"
 
 

@@ -1,14 +1,14 @@
 //! A blocking client: it drives a [`Connection`] in the calling thread.
 //!
-//! The connection is opened on first use and kept open. Calls are never repeated: if a call fails
-//! after its request may have been sent, the caller gets the error.
+//! The connection is made when it is needed, and kept. [`Done::again`] decides what is sent again.
 
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
+use std::thread;
 use std::time::{Duration, Instant};
 
-use holdfast_protocol::client::{Closed, Connection, Done, Transport};
+use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Transport};
 use holdfast_protocol::pdu::{EncodedRequest, Response};
 
 use super::byte_stream::{ByteStream, StreamError};
@@ -26,11 +26,19 @@ const IDLE: Duration = Duration::from_millis(50);
 pub struct BlockingClient {
     endpoint: Endpoint,
     turns: Turns,
-    open: Mutex<Option<Open>>,
+    state: Mutex<State>,
     late: AtomicU64,
 }
 
-/// An open connection.
+/// The connection, if there is one.
+#[derive(Default)]
+struct State {
+    open: Option<Open>,
+    /// When the last one ended.
+    ended: Option<Instant>,
+}
+
+/// A connection that is open.
 struct Open {
     stream: Box<dyn ByteStream>,
     connection: Connection,
@@ -40,12 +48,19 @@ struct Open {
     used: Instant,
 }
 
+/// A request, and how often it was sent before.
+struct Call<'r> {
+    unit_id: u8,
+    request: &'r EncodedRequest,
+    attempt: Attempt,
+}
+
 impl BlockingClient {
     pub fn new(endpoint: Endpoint) -> BlockingClient {
         BlockingClient {
             endpoint,
             turns: Turns::default(),
-            open: Mutex::default(),
+            state: Mutex::default(),
             late: AtomicU64::new(0),
         }
     }
@@ -64,34 +79,70 @@ impl BlockingClient {
         take: impl FnOnce(Response<'_>) -> T,
     ) -> Result<T, ClientError> {
         let _turn = self.turns.take();
-        let deadline = Instant::now() + timeout;
-        let mut held = self.open.lock().unwrap_or_else(PoisonError::into_inner);
-        if held.as_mut().is_some_and(|open| !open.is_usable()) {
-            *held = None;
-        }
-        let open = match held.as_mut() {
-            Some(open) => open,
-            None => held.insert(Open::new(&self.endpoint, deadline, timeout)?),
-        };
-        let late = open.connection.late();
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let mut take = Some(take);
-        let mut result = None;
-        let lost = open.call(unit_id, request, deadline, &mut |done: Done<'_>| {
-            let Some(take) = take.take() else { unreachable!("a call has one result") };
-            result = Some(match done.outcome {
-                Ok(response) => Ok(take(response)),
-                Err(failure) => Err(ClientError::new(failure, timeout)),
+        let mut call = Call { unit_id, request, attempt: Attempt::default() };
+        let mut deadline = Instant::now() + timeout;
+        loop {
+            let open = self.connected(&mut state, deadline, timeout)?;
+            let late = open.connection.late();
+            let (mut result, mut again) = (None, None);
+            let lost = open.call(&call, deadline, &mut |done: Done<'_>| {
+                let Some(take) = take.take_if(|_| done.outcome.is_ok() || done.again.is_none())
+                else {
+                    assert!(done.again.is_some(), "a call has one result");
+                    again = done.again;
+                    return;
+                };
+                result = Some(match done.outcome {
+                    Ok(response) => Ok(take(response)),
+                    Err(failure) => Err(ClientError::new(failure, timeout)),
+                });
             });
-        });
-        self.late.fetch_add(open.connection.late() - late, Ordering::Relaxed);
-        if open.connection.closed().is_some() {
-            *held = None;
+            self.late.fetch_add(open.connection.late() - late, Ordering::Relaxed);
+            if open.connection.closed().is_some() {
+                state.end();
+            }
+            match (result, lost, again) {
+                (_, _, Some(attempt)) => {
+                    thread::sleep(attempt.pause());
+                    if attempt.has_own_timeout() {
+                        deadline = Instant::now() + timeout;
+                    }
+                    call.attempt = attempt;
+                }
+                (Some(Err(ClientError::Lost(_))) | None, Some(error), None) => {
+                    return Err(self.lost(error));
+                }
+                (Some(result), _, None) => return result,
+                (None, None, None) => unreachable!("a call ends with a result"),
+            }
         }
-        match (result, lost) {
-            (Some(Err(ClientError::Lost(_))) | None, Some(error)) => Err(self.lost(error)),
-            (Some(result), _) => result,
-            (None, None) => unreachable!("a call ends with a result"),
+    }
+
+    /// The connection, which is made if there is none that works.
+    fn connected<'s>(
+        &self,
+        state: &'s mut State,
+        deadline: Instant,
+        timeout: Duration,
+    ) -> Result<&'s mut Open, ClientError> {
+        if state.open.as_mut().is_some_and(|open| !open.is_usable()) {
+            state.end();
         }
+        if state.open.is_none() {
+            let from = state.ended.map(|ended| ended + self.endpoint.tolerance.reconnect);
+            if let Some(from) = from.filter(|from| *from > Instant::now()) {
+                thread::sleep(from.min(deadline).saturating_duration_since(Instant::now()));
+            }
+            let opened = Open::new(&self.endpoint, deadline, timeout);
+            if opened.is_err() {
+                state.end();
+            }
+            state.open = Some(opened?);
+        }
+        let Some(open) = &mut state.open else { unreachable!("it was made") };
+        Ok(open)
     }
 
     fn lost(&self, error: StreamError) -> ClientError {
@@ -108,7 +159,7 @@ impl BlockingClient {
     /// Closes the connection after the calls before this one. The next call opens a new one.
     pub fn close(&self) {
         let _turn = self.turns.take();
-        *self.open.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        self.state.lock().unwrap_or_else(PoisonError::into_inner).end();
     }
 
     /// The number of replies that came after their request had ended.
@@ -117,11 +168,17 @@ impl BlockingClient {
     }
 }
 
+impl State {
+    fn end(&mut self) {
+        *self = State { open: None, ended: Some(Instant::now()) };
+    }
+}
+
 impl Open {
     fn new(endpoint: &Endpoint, deadline: Instant, timeout: Duration) -> Result<Open, ClientError> {
-        let transport = endpoint.transport();
+        let transport = endpoint.place.transport();
         let to = || endpoint.to_string();
-        let stream = connect(endpoint, deadline).map_err(|error| match error {
+        let stream = connect(&endpoint.place, deadline).map_err(|error| match error {
             StreamError::TimedOut => ClientError::ConnectTimeout { to: to(), after: timeout },
             StreamError::Ended => {
                 ClientError::Connect { to: to(), error: ErrorKind::UnexpectedEof.into() }
@@ -129,7 +186,8 @@ impl Open {
             StreamError::Io(error) => ClientError::Connect { to: to(), error },
             StreamError::Tls(failure) => ClientError::Tls { to: to(), failure, maybe_sent: false },
         })?;
-        let (connection, now) = (Connection::new(transport), Instant::now());
+        let now = Instant::now();
+        let connection = Connection::tolerant(transport, endpoint.tolerance, Duration::ZERO);
         Ok(Open { stream, connection, transport, epoch: now, used: now })
     }
 
@@ -138,7 +196,9 @@ impl Open {
     fn is_usable(&mut self) -> bool {
         match self.transport {
             Transport::Tcp => self.used.elapsed() <= IDLE || !self.stream.has_ended(),
-            Transport::RtuOverTcp => self.stream.is_quiet(),
+            Transport::RtuOverTcp | Transport::AsciiOverTcp | Transport::RtuOverUdp => {
+                self.stream.is_quiet()
+            }
             _ => true,
         }
     }
@@ -146,12 +206,11 @@ impl Open {
     /// Carries out a request. Returns the I/O error, if there was one.
     fn call(
         &mut self,
-        unit_id: u8,
-        request: &EncodedRequest,
+        call: &Call<'_>,
         deadline: Instant,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Option<StreamError> {
-        let exchanged = self.exchange(unit_id, request, deadline, sink);
+        let exchanged = self.exchange(call, deadline, sink);
         self.used = Instant::now();
         let error = exchanged.err()?;
         self.connection.close(Closed::ByPeer, sink);
@@ -160,14 +219,13 @@ impl Open {
 
     fn exchange(
         &mut self,
-        unit_id: u8,
-        request: &EncodedRequest,
+        call: &Call<'_>,
         deadline: Instant,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK];
-        if matches!(self.transport, Transport::SerialRtu(_) | Transport::SerialAscii(_)) {
-            // On a line that is never silent, the request times out.
+        if matches!(self.transport, Transport::SerialRtu { .. } | Transport::SerialAscii { .. }) {
+            // A line that never falls silent is left to the timeout.
             while Instant::now() < deadline
                 && let Some(len) = self.stream.receive_now(&mut chunk)?
             {
@@ -176,7 +234,8 @@ impl Open {
         }
         let now = Instant::now();
         let timeout = deadline.saturating_duration_since(now);
-        let sent = self.connection.send(unit_id, request, timeout, now - self.epoch);
+        let Call { unit_id, request, attempt, .. } = *call;
+        let sent = self.connection.send_again(unit_id, request, timeout, attempt, now - self.epoch);
         if let Err(why) = sent {
             self.connection.close(why, sink);
             return Ok(());
@@ -184,10 +243,11 @@ impl Open {
         loop {
             let outgoing = self.connection.outgoing();
             if !outgoing.is_empty() {
-                match self.stream.send(outgoing, deadline) {
-                    // Part of the request may have been sent.
+                let until = self.epoch + self.connection.deadline().unwrap_or(now - self.epoch);
+                match self.stream.send(outgoing, until) {
+                    // A part of it may have been sent.
                     Err(StreamError::TimedOut) => {
-                        self.connection.advance(deadline - self.epoch, &mut *sink);
+                        self.connection.advance(until - self.epoch, &mut *sink);
                         self.connection.close(Closed::TimedOut, sink);
                         return Ok(());
                     }

@@ -185,6 +185,16 @@ impl ByteStream for UdpSocket {
         UdpSocket::send(self, bytes)?;
         Ok(())
     }
+
+    fn is_quiet(&self) -> bool {
+        let peek = || {
+            self.set_nonblocking(true)?;
+            let peeked = self.peek(&mut [0]);
+            self.set_nonblocking(false)?;
+            peeked
+        };
+        peek().is_err_and(|error: io::Error| error.kind() == ErrorKind::WouldBlock)
+    }
 }
 
 impl ByteStream for serial2::SerialPort {

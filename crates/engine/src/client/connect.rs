@@ -1,25 +1,29 @@
-//! Connects to endpoints.
+//! From the place of a device to what bytes travel on.
 
 use std::time::Instant;
 
-use super::Endpoint;
+use super::Place;
 use super::byte_stream::{ByteStream, StreamError, TcpByteStream, connect_udp};
 use super::tls_stream::TlsStream;
 
-/// Opens a stream to an endpoint.
+/// Opens a stream to a device.
 pub(super) fn connect(
-    endpoint: &Endpoint,
+    place: &Place,
     deadline: Instant,
 ) -> Result<Box<dyn ByteStream>, StreamError> {
-    Ok(match endpoint {
-        Endpoint::Tcp { host, port, tls: None } | Endpoint::RtuOverTcp { host, port } => {
+    Ok(match place {
+        Place::Tcp { host, port, tls: None }
+        | Place::RtuOverTcp { host, port }
+        | Place::AsciiOverTcp { host, port } => {
             Box::new(TcpByteStream::connect(host, *port, deadline)?)
         }
-        Endpoint::Tcp { host, port, tls: Some(tls) } => {
+        Place::Tcp { host, port, tls: Some(tls) } => {
             let stream = TcpByteStream::connect(host, *port, deadline)?;
             Box::new(TlsStream::agree(stream, tls, deadline)?)
         }
-        Endpoint::Udp { host, port } => Box::new(connect_udp(host, *port)?),
-        Endpoint::Serial { line, .. } => Box::new(line.open_blocking()?),
+        Place::Udp { host, port } | Place::RtuOverUdp { host, port } => {
+            Box::new(connect_udp(host, *port)?)
+        }
+        Place::Serial(line) => Box::new(line.open_blocking()?),
     })
 }

@@ -3,61 +3,67 @@
 use std::fmt;
 use std::sync::Arc;
 
-use holdfast_protocol::client::{Line, Transport};
+use holdfast_protocol::client::{Tolerance, Transport};
 
 use crate::serial_line::{LineMode, SerialLine};
 use crate::tls::client::ClientTls;
 
-/// A device or a gateway, and how to connect to it.
+/// A device, or a gateway: where it is, and what it needs.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Endpoint {
-    Tcp {
-        host: String,
-        port: u16,
-        tls: Option<Arc<ClientTls>>,
-    },
-    RtuOverTcp {
-        host: String,
-        port: u16,
-    },
-    Udp {
-        host: String,
-        port: u16,
-    },
-    /// With `echo`, the adapter echoes sent bytes. An echo is also detected without this setting.
-    Serial {
-        line: SerialLine,
-        echo: bool,
-    },
+pub struct Endpoint {
+    pub place: Place,
+    pub tolerance: Tolerance,
 }
 
-impl Endpoint {
-    /// The transport of this endpoint.
+/// Where a device is, and how it is reached.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Place {
+    Tcp { host: String, port: u16, tls: Option<Arc<ClientTls>> },
+    RtuOverTcp { host: String, port: u16 },
+    AsciiOverTcp { host: String, port: u16 },
+    Udp { host: String, port: u16 },
+    RtuOverUdp { host: String, port: u16 },
+    Serial(SerialLine),
+}
+
+impl Place {
+    /// How requests travel to it.
     pub fn transport(&self) -> Transport {
         match self {
-            Endpoint::Tcp { .. } => Transport::Tcp,
-            Endpoint::RtuOverTcp { .. } => Transport::RtuOverTcp,
-            Endpoint::Udp { .. } => Transport::Udp,
-            Endpoint::Serial { line, echo } => {
-                let settings = Line { silence: line.silence(), echo: *echo };
+            Place::Tcp { .. } => Transport::Tcp,
+            Place::RtuOverTcp { .. } => Transport::RtuOverTcp,
+            Place::AsciiOverTcp { .. } => Transport::AsciiOverTcp,
+            Place::Udp { .. } => Transport::Udp,
+            Place::RtuOverUdp { .. } => Transport::RtuOverUdp,
+            Place::Serial(line) => {
+                let silence = line.silence();
                 match line.mode {
-                    LineMode::Rtu { .. } => Transport::SerialRtu(settings),
-                    LineMode::Ascii => Transport::SerialAscii(settings),
+                    LineMode::Rtu { .. } => Transport::SerialRtu { silence },
+                    LineMode::Ascii => Transport::SerialAscii { silence },
                 }
             }
         }
     }
 }
 
-/// The URL without its options.
+impl From<Place> for Endpoint {
+    /// A device that follows the standard.
+    fn from(place: Place) -> Endpoint {
+        Endpoint { place, tolerance: Tolerance::default() }
+    }
+}
+
+/// The URL, without its options.
 impl fmt::Display for Endpoint {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (scheme, host, port) = match self {
-            Endpoint::Tcp { host, port, tls: None } => ("tcp", host, port),
-            Endpoint::Tcp { host, port, tls: Some(_) } => ("tls", host, port),
-            Endpoint::RtuOverTcp { host, port } => ("rtu+tcp", host, port),
-            Endpoint::Udp { host, port } => ("udp", host, port),
-            Endpoint::Serial { line, .. } => {
+        let (scheme, host, port) = match &self.place {
+            Place::Tcp { host, port, tls: None } => ("tcp", host, port),
+            Place::Tcp { host, port, tls: Some(_) } => ("tls", host, port),
+            Place::RtuOverTcp { host, port } => ("rtu+tcp", host, port),
+            Place::AsciiOverTcp { host, port } => ("ascii+tcp", host, port),
+            Place::Udp { host, port } => ("udp", host, port),
+            Place::RtuOverUdp { host, port } => ("rtu+udp", host, port),
+            Place::Serial(line) => {
                 let scheme = if line.mode == LineMode::Ascii { "ascii" } else { "rtu" };
                 return write!(formatter, "{scheme}://{}", line.device);
             }

@@ -11,7 +11,7 @@ mod tls_stream;
 mod turns;
 
 pub use blocking::BlockingClient;
-pub use endpoint::Endpoint;
+pub use endpoint::{Endpoint, Place};
 
 use std::io;
 use std::time::Duration;

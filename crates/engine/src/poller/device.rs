@@ -28,7 +28,8 @@ use super::caught::{Panicked, caught};
 use super::cost::Samples;
 use super::forward::{Forward, ForwardSettings};
 use super::learned::{Learned, Unreadable};
-use super::link::{Link, Priority};
+use super::link::Link;
+use super::pace::{InFlight, Priority};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::results::{BlockResult, Poll, Results};
 use super::search;
@@ -52,6 +53,9 @@ const OFF_SCHEDULE_INTERVAL: Duration = Duration::from_secs(1);
 pub struct DeviceSettings {
     pub name: String,
     pub endpoint: Endpoint,
+    /// Requests in flight at its address, over TCP. Of devices that share an address, the first one
+    /// decides this and [`Endpoint::tolerance`].
+    pub in_flight: InFlight,
     pub unit_id: u8,
     /// The time between polls; 0 polls without a pause.
     pub interval: Duration,

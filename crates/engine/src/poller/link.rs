@@ -1,9 +1,9 @@
 //! A link: one connection or one serial line, shared by all devices behind it.
 //!
-//! Over Modbus TCP, several requests are in flight, so that a dead unit does not delay others
-//! behind the same gateway. Other transports carry one request at a time, in a thread of their own.
-//! After a failed connect, requests fail immediately until the backoff is over. [`Connection`]
-//! decides when a connection ends. The next request opens a new one.
+//! Over Modbus TCP several requests can be in flight, as the settings of the devices say. All other
+//! transports carry one request at a time, in a thread of their own. A link that can't be connected
+//! fails at once until its pause is over. What ends a connection is decided by [`Connection`]; the
+//! next request makes a new one.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -12,55 +12,60 @@ use std::rc::Rc;
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
-use holdfast_protocol::client::{Closed, Connection, Done, Failure, Ticket, Transport};
+use holdfast_protocol::client::{
+    Attempt, Closed, Connection, Done, Failure, Ticket, Tolerance, Transport,
+};
 use holdfast_protocol::pdu::{EncodedRequest, Response};
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
-use tokio::sync::{Mutex, Semaphore, oneshot};
+use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
-use tokio::time::{Instant, timeout_at};
+use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff;
 use super::handshake;
+use super::pace::{InFlight, Pace, Priority};
 use super::status::Fault;
-use crate::client::{BlockingClient, ClientError, Endpoint};
+use crate::client::{BlockingClient, ClientError, Endpoint, Place};
 use crate::tls::Channel;
 use crate::tls::client::ClientTls;
 
-/// The most requests in flight on one connection.
-const IN_FLIGHT: usize = 8;
-
-/// The most doubtful requests among them.
-const DOUBTFUL: usize = 4;
-
-/// Bytes per read of a socket.
+/// Bytes taken from a socket at once.
 const CHUNK: usize = 16 * 1024;
 
 /// The bytes of a read, empty for a write; or the fault.
 pub(super) type Answer = Result<Vec<u8>, Fault>;
 
-/// The priority of a request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Priority {
-    Usual,
-    /// To a unit that did not answer the last request. It leaves room for the others.
-    Doubtful,
-    /// A caller waits for it. It goes first where requests are sent one at a time, and ignores the
-    /// backoff.
-    Urgent,
-}
-
 pub(super) enum Link {
-    Tcp(TcpLink),
+    Tcp(Box<TcpLink>),
     Blocking(BlockingLink),
 }
 
 impl Link {
-    /// Must be called in the context of a `LocalSet`.
-    pub(super) fn new(endpoint: Endpoint) -> Rc<Link> {
-        Rc::new(match endpoint {
-            Endpoint::Tcp { host, port, tls } => Link::Tcp(TcpLink::new(host, port, tls)),
-            other => Link::Blocking(BlockingLink::new(other)),
+    /// In the context of a `LocalSet`.
+    pub(super) fn new(endpoint: Endpoint, in_flight: InFlight) -> Rc<Link> {
+        let Endpoint { place, tolerance } = endpoint;
+        Rc::new(match place {
+            Place::Tcp { host, port, tls } => {
+                let one = tolerance.is_one_at_a_time();
+                let in_flight = if one { InFlight::Fixed(1) } else { in_flight };
+                let (failures, failed) = Default::default();
+                let (pace, connecting) = (Pace::new(in_flight), Mutex::default());
+                let (ended, open) = Default::default();
+                Link::Tcp(Box::new(TcpLink {
+                    host,
+                    port,
+                    tls,
+                    tolerance,
+                    pace,
+                    connecting,
+                    failures,
+                    failed,
+                    ended,
+                    open,
+                }))
+            }
+            place => Link::Blocking(BlockingLink::new(Endpoint { place, tolerance })),
         })
     }
 
@@ -109,21 +114,27 @@ pub(super) struct TcpLink {
     host: String,
     port: u16,
     tls: Option<Arc<ClientTls>>,
-    places: Semaphore,
-    doubtful: Semaphore,
+    tolerance: Tolerance,
+    pace: Pace,
     connecting: Mutex<()>,
     failures: Cell<u32>,
     /// The earliest time of the next attempt after a failed one, and the fault.
     failed: Cell<Option<(Instant, Fault)>>,
+    /// When the last connection ended.
+    ended: Rc<Cell<Option<Instant>>>,
     open: Rc<RefCell<Option<Open>>>,
 }
 
-/// An open connection.
+/// What becomes of a request, and whether it is sent again.
+type Outcome = (Answer, Option<Attempt>);
+
+/// A connection that is open.
 struct Open {
     connection: Connection,
     /// The zero of the clock of the connection.
     epoch: Instant,
-    waiting: HashMap<Ticket, oneshot::Sender<Answer>>,
+    waiting: HashMap<Ticket, oneshot::Sender<Outcome>>,
+    ended: Rc<Cell<Option<Instant>>>,
     writer: tokio::net::tcp::OwnedWriteHalf,
     tls: Option<Channel>,
     /// Bytes that the socket has not accepted yet.
@@ -132,20 +143,6 @@ struct Open {
 }
 
 impl TcpLink {
-    fn new(host: String, port: u16, tls: Option<Arc<ClientTls>>) -> TcpLink {
-        TcpLink {
-            host,
-            port,
-            tls,
-            places: Semaphore::new(IN_FLIGHT),
-            doubtful: Semaphore::new(DOUBTFUL),
-            connecting: Mutex::default(),
-            failures: Cell::new(0),
-            failed: Cell::new(None),
-            open: Rc::default(),
-        }
-    }
-
     async fn call(
         &self,
         unit_id: u8,
@@ -153,18 +150,41 @@ impl TcpLink {
         timeout: Duration,
         priority: Priority,
     ) -> Answer {
-        let doubtful = priority == Priority::Doubtful;
-        let _doubtful = if doubtful { self.doubtful.acquire().await.ok() } else { None };
-        let Ok(_place) = self.places.acquire().await else { return Err(Fault::Reset) };
-        let deadline = Instant::now() + timeout;
-        if self.open.borrow().is_none() {
-            self.connect(deadline, priority).await?;
-        }
-        let (ticket, mut answer) = self.send(unit_id, request, deadline)?;
+        let _place = self.pace.place(priority).await;
+        let mut deadline = Instant::now() + timeout;
+        let mut attempt = Attempt::default();
         loop {
-            match timeout_at(deadline, &mut answer).await {
-                Ok(answer) => return answer.unwrap_or(Err(Fault::Reset)),
-                Err(_) => self.advance(ticket),
+            if self.open.borrow().is_none() {
+                self.connect(deadline, priority).await?;
+            }
+            let began = Instant::now();
+            let (answer, again) = self.carry_out(unit_id, request, deadline, attempt).await?;
+            match answer {
+                Err(Fault::Timeout) => self.pace.timed_out(Instant::now()),
+                _ => self.pace.answered(began.elapsed(), Instant::now()),
+            }
+            let Some(next) = again else { return answer };
+            sleep(next.pause()).await;
+            if next.has_own_timeout() {
+                deadline = Instant::now() + timeout;
+            }
+            attempt = next;
+        }
+    }
+
+    /// Sends a request on the connection, and waits for what becomes of it.
+    async fn carry_out(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        deadline: Instant,
+        attempt: Attempt,
+    ) -> Result<Outcome, Fault> {
+        let mut outcome = self.send(unit_id, request, deadline, attempt)?;
+        loop {
+            match timeout_at(self.due(), &mut outcome).await {
+                Ok(outcome) => return outcome.or(Err(Fault::Reset)),
+                Err(_) => self.advance(),
             }
         }
     }
@@ -180,6 +200,9 @@ impl TcpLink {
             && priority != Priority::Urgent
         {
             return Err(fault);
+        }
+        if let Some(ended) = self.ended.get() {
+            sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
         let address = (self.host.as_str(), self.port);
         let connected = timeout_at(deadline, async {
@@ -210,9 +233,10 @@ impl TcpLink {
         let _ = stream.set_nodelay(true);
         let (reader, writer) = stream.into_split();
         let open = Open {
-            connection: Connection::new(Transport::Tcp),
+            connection: Connection::tolerant(Transport::Tcp, self.tolerance, Duration::ZERO),
             epoch: Instant::now(),
             waiting: HashMap::new(),
+            ended: Rc::clone(&self.ended),
             writer,
             tls,
             unsent: Vec::new(),
@@ -230,17 +254,19 @@ impl TcpLink {
         unit_id: u8,
         request: &EncodedRequest,
         deadline: Instant,
-    ) -> Result<(Ticket, oneshot::Receiver<Answer>), Fault> {
+        attempt: Attempt,
+    ) -> Result<oneshot::Receiver<Outcome>, Fault> {
         let mut open = self.open.borrow_mut();
         let found = open.as_mut().ok_or(Fault::Reset)?;
         let now = Instant::now();
         let timeout = deadline.saturating_duration_since(now);
-        let ticket = found.connection.send(unit_id, request, timeout, now - found.epoch);
+        let sent = now - found.epoch;
+        let ticket = found.connection.send_again(unit_id, request, timeout, attempt, sent);
         match ticket {
             Ok(ticket) if found.write() => {
                 let (sender, receiver) = oneshot::channel();
                 found.waiting.insert(ticket, sender);
-                Ok((ticket, receiver))
+                Ok(receiver)
             }
             _ => {
                 *open = None;
@@ -249,25 +275,31 @@ impl TcpLink {
         }
     }
 
-    /// Ends the requests whose timeout has expired. Closes the connection if that was one timeout
-    /// too many.
-    fn advance(&self, ticket: Ticket) {
+    /// When something is due on the connection.
+    fn due(&self) -> Instant {
+        let open = self.open.borrow();
+        let due = open.as_ref().and_then(|open| Some(open.epoch + open.connection.deadline()?));
+        due.unwrap_or_else(Instant::now)
+    }
+
+    /// Ends the requests whose time is over, and the connection if that was too much; sends what has
+    /// waited for a pause.
+    fn advance(&self) {
         let mut open = self.open.borrow_mut();
         let Some(found) = open.as_mut() else { return };
         let Open { connection, waiting, .. } = found;
         connection.advance(found.epoch.elapsed(), |done| hand_on(waiting, &done));
-        debug_assert!(!connection.is_waiting_for(ticket), "an expired request is not in flight");
-        if connection.closed().is_some() {
+        if connection.closed().is_some() || !found.write() {
             *open = None;
         }
     }
 }
 
-/// Passes a result to its caller.
-fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Answer>>, done: &Done<'_>) {
+/// Gives a result to who waits for it.
+fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Outcome>>, done: &Done<'_>) {
     if let Some(sender) = waiting.remove(&done.ticket) {
-        // A stopped device no longer waits.
-        let _ = sender.send(answer(done.outcome));
+        // A device that was stopped does not wait any more.
+        let _ = sender.send((answer(done.outcome), done.again));
     }
 }
 
@@ -302,6 +334,7 @@ impl Open {
 
 impl Drop for Open {
     fn drop(&mut self) {
+        self.ended.set(Some(Instant::now()));
         if let Some(tls) = &mut self.tls {
             tls.end(&mut self.unsent);
             let _ = self.writer.try_write(&self.unsent);

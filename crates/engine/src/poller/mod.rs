@@ -15,6 +15,7 @@ mod handshake;
 mod health;
 mod learned;
 mod link;
+mod pace;
 pub mod plan;
 mod results;
 mod search;
@@ -25,7 +26,7 @@ mod thread;
 
 pub use device::{DeviceSettings, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
-pub use health::Health;
+pub use pace::InFlight;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};

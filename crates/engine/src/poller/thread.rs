@@ -17,12 +17,13 @@ use tokio::task::{AbortHandle, LocalSet, spawn_local};
 use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned, Turn};
 use super::forward::{Forward, ForwardCounters};
-use super::link::{Link, Priority};
+use super::link::Link;
+use super::pace::Priority;
 use super::plan::{PlanError, PlanLimits};
 use super::results::{Results, Written};
 use super::state::DeviceState;
 use super::status::Fault;
-use crate::client::Endpoint;
+use crate::client::{Endpoint, Place};
 use crate::tls::client::Identity;
 
 #[derive(Debug, Error)]
@@ -292,13 +293,13 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                 let phase = spread(planned.settings.start_within, started);
                 started += 1;
                 let name = planned.settings.name.clone();
-                let link = link_to(&planned.settings.endpoint, &mut links);
+                let link = link_to(&planned.settings, &mut links);
                 let device = Running::start(*planned, polled, link, phase, &results);
                 let before = running.insert(name, device);
                 debug_assert!(before.is_none(), "{IN_ORDER}");
             }
             Order::Replace { name, device: planned, polled, at_once } => {
-                let link = link_to(&planned.settings.endpoint, &mut links);
+                let link = link_to(&planned.settings, &mut links);
                 let before = running.remove(&name);
                 debug_assert!(before.is_some(), "{IN_ORDER}");
                 let name = planned.settings.name.clone();
@@ -418,11 +419,12 @@ fn made(
     (Device::new(planned, polled.state, to, forwards, report), tasks)
 }
 
-/// Returns the link to an endpoint, which all its devices share.
-fn link_to(endpoint: &Endpoint, links: &mut HashMap<Address, Weak<Link>>) -> Rc<Link> {
+/// The link to a device, shared with all other devices at the same address.
+fn link_to(device: &DeviceSettings, links: &mut HashMap<Address, Weak<Link>>) -> Rc<Link> {
+    let DeviceSettings { endpoint, in_flight, .. } = device;
     let known = links.entry(address(endpoint)).or_default();
     known.upgrade().unwrap_or_else(|| {
-        let link = Link::new(endpoint.clone());
+        let link = Link::new(endpoint.clone(), *in_flight);
         *known = Rc::downgrade(&link);
         link
     })
@@ -437,14 +439,14 @@ fn spread(within: Duration, number: u32) -> Duration {
 type Address = (String, Option<Arc<Identity>>);
 
 fn address(endpoint: &Endpoint) -> Address {
-    match endpoint {
-        Endpoint::Tcp { host, port, tls } => {
-            let identity = tls.as_ref().map(|tls| Arc::clone(tls.identity()));
-            (format!("tcp://{host}:{port}"), identity)
-        }
-        Endpoint::RtuOverTcp { host, port } => (format!("rtu+tcp://{host}:{port}"), None),
-        Endpoint::Udp { host, port } => (format!("udp://{host}:{port}"), None),
-        Endpoint::Serial { line, .. } => (format!("serial:{}", line.device), None),
+    let identity = match &endpoint.place {
+        Place::Tcp { tls: Some(tls), .. } => Some(Arc::clone(tls.identity())),
+        _ => None,
+    };
+    match &endpoint.place {
+        Place::Serial(line) => (format!("serial:{}", line.device), None),
+        Place::Tcp { host, port, .. } => (format!("tcp://{host}:{port}"), identity),
+        _ => (endpoint.to_string(), None),
     }
 }
 
@@ -488,6 +490,7 @@ mod tests {
     use holdfast_protocol::pdu::{Range, Request};
 
     use super::*;
+    use crate::poller::InFlight;
     use crate::poller::plan::Strategy;
     use crate::poller::{Destination, ReadSettings, StatusSettings};
 
@@ -501,7 +504,8 @@ mod tests {
     fn settings() -> DeviceSettings {
         DeviceSettings {
             name: "meter".into(),
-            endpoint: Endpoint::Tcp { host: "127.0.0.1".into(), port: 502, tls: None },
+            endpoint: Place::Tcp { host: "127.0.0.1".into(), port: 502, tls: None }.into(),
+            in_flight: InFlight::Fixed(1),
             unit_id: 1,
             interval: Duration::from_secs(1),
             timeout: Duration::from_secs(1),

@@ -3,10 +3,10 @@
 use core::time::Duration;
 
 use super::datagram::Datagrams;
-use super::flights::{Done, Flights, Ticket};
+use super::flights::{Call, Done, Flights, Ticket};
 use super::line::{Framing, OneAtATime};
 use super::stream::Stream;
-use super::{Closed, Time, Transport};
+use super::{Attempt, Closed, Time, Tolerance, Transport};
 use crate::pdu::EncodedRequest;
 
 /// One connection, from start to end.
@@ -37,6 +37,10 @@ use crate::pdu::EncodedRequest;
 pub struct Connection {
     wire: Wire,
     flights: Flights,
+    /// The next request is not sent before.
+    ready_at: Time,
+    /// Requests so far.
+    sent: u32,
 }
 
 #[derive(Debug)]
@@ -47,20 +51,32 @@ enum Wire {
 }
 
 impl Connection {
-    /// A new connection.
+    /// A connection that was just made, to a device that follows the standard.
     pub fn new(transport: Transport) -> Connection {
-        let one = |framing, line| Wire::OneAtATime(OneAtATime::new(framing, line));
+        Connection::tolerant(transport, Tolerance::default(), Time::ZERO)
+    }
+
+    /// A connection that was made `now`, to a device that needs this tolerance.
+    pub fn tolerant(transport: Transport, tolerance: Tolerance, now: Time) -> Connection {
+        let one =
+            |framing, silence| Wire::OneAtATime(OneAtATime::new(framing, silence, tolerance.echo));
         let wire = match transport {
             Transport::Tcp => Wire::Stream(Stream::default()),
             Transport::Udp => Wire::Datagrams(Datagrams::default()),
-            Transport::RtuOverTcp => one(Framing::Rtu, None),
-            Transport::SerialRtu(line) => one(Framing::Rtu, Some(line)),
-            Transport::SerialAscii(line) => one(Framing::Ascii, Some(line)),
+            Transport::RtuOverTcp | Transport::RtuOverUdp => one(Framing::Rtu, None),
+            Transport::AsciiOverTcp => one(Framing::Ascii, None),
+            Transport::SerialRtu { silence } => one(Framing::Rtu, Some(silence)),
+            Transport::SerialAscii { silence } => one(Framing::Ascii, Some(silence)),
         };
-        Connection { wire, flights: Flights::default() }
+        let mut flights = Flights::default();
+        flights.tolerance = tolerance;
+        let pause = tolerance.pause_after_connect;
+        let ready_at = if pause.is_zero() { Time::ZERO } else { now + pause };
+        Connection { wire, flights, ready_at, sent: 0 }
     }
 
-    /// Sends a request, or queues it until the line is silent. `timeout` starts now.
+    /// Sends a request, or queues it until the line is silent. `timeout` runs from now, and again
+    /// from each reply to a request that was sent before it.
     ///
     /// # Errors
     /// [`Closed`]: the reason why the connection has ended, or [`Closed::NoTransactionId`].
@@ -75,25 +91,46 @@ impl Connection {
         timeout: Duration,
         now: Time,
     ) -> Result<Ticket, Closed> {
+        self.send_again(unit_id, request, timeout, Attempt::default(), now)
+    }
+
+    /// Does the same for a request that was sent before, with [`Done::again`] of that time.
+    ///
+    /// # Errors
+    /// As [`Connection::send`].
+    ///
+    /// # Panics
+    /// As [`Connection::send`].
+    pub fn send_again(
+        &mut self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        attempt: Attempt,
+        now: Time,
+    ) -> Result<Ticket, Closed> {
         if let Some(why) = self.flights.closed {
             return Err(why);
         }
         assert!(self.has_room(), "one request at a time");
-        let flights = &mut self.flights;
-        match &mut self.wire {
+        self.sent += 1;
+        let start = now.max(self.ready_at);
+        let (flights, call) = (&mut self.flights, Call { unit_id, request, timeout, attempt });
+        let ticket = match &mut self.wire {
             Wire::Stream(stream) => {
-                stream.send(flights, unit_id, request, timeout, now).ok_or(Closed::NoTransactionId)
+                stream.send(flights, call, start).ok_or(Closed::NoTransactionId)?
             }
-            Wire::Datagrams(datagrams) => {
-                Ok(datagrams.send(flights, unit_id, request, timeout, now))
-            }
-            Wire::OneAtATime(line) => Ok(line.send(flights, unit_id, request, timeout, now)),
-        }
+            Wire::Datagrams(datagrams) => datagrams.send(flights, call, start),
+            Wire::OneAtATime(line) => return Ok(line.send(flights, call, start, now)),
+        };
+        flights.held = (start > now).then_some(start);
+        Ok(ticket)
     }
 
     /// Whether another request can be sent now.
     pub fn has_room(&self) -> bool {
-        matches!(self.wire, Wire::Stream(_)) || self.flights.len() == 0
+        let many = matches!(self.wire, Wire::Stream(_));
+        self.flights.len() == 0 || (many && !self.flights.tolerance.is_one_at_a_time())
     }
 
     /// The number of requests in flight.
@@ -101,14 +138,15 @@ impl Connection {
         self.flights.len()
     }
 
-    /// Whether a request is in flight.
-    pub fn is_waiting_for(&self, ticket: Ticket) -> bool {
-        self.flights.contains(ticket)
+    /// When the timeout of a request ends; `None` once it has its result. Replies to requests sent
+    /// before it move this moment.
+    pub fn deadline_of(&self, ticket: Ticket) -> Option<Time> {
+        self.flights.deadline_of(ticket)
     }
 
     /// The bytes to send; over UDP, exactly one datagram.
     pub fn outgoing(&self) -> &[u8] {
-        &self.flights.out
+        if self.flights.held.is_some() { &[] } else { &self.flights.out }
     }
 
     /// Reports that the first `len` bytes of [`Connection::outgoing`] have been sent.
@@ -123,17 +161,23 @@ impl Connection {
             return;
         }
         let flights = &mut self.flights;
+        let waiting = flights.len();
+        flights.reply_begun = true;
         match &mut self.wire {
-            Wire::Stream(stream) => stream.receive(flights, bytes, &mut sink),
-            Wire::Datagrams(datagrams) => datagrams.receive(flights, bytes, &mut sink),
+            Wire::Stream(stream) => stream.receive(flights, bytes, now, &mut sink),
+            Wire::Datagrams(datagrams) => datagrams.receive(flights, bytes, now, &mut sink),
             Wire::OneAtATime(line) => line.receive(flights, bytes, now, &mut sink),
         }
+        self.after(waiting, now, sink);
     }
 
     /// When to call [`Connection::advance`], unless another call comes first.
     pub fn deadline(&self) -> Option<Time> {
         if self.flights.closed.is_some() {
             return None;
+        }
+        if self.flights.held.is_some() {
+            return self.flights.held;
         }
         match &self.wire {
             Wire::Stream(_) => self.flights.deadline(),
@@ -149,10 +193,27 @@ impl Connection {
             return;
         }
         let flights = &mut self.flights;
+        flights.held = flights.held.filter(|until| *until > now);
+        let waiting = flights.len();
         match &mut self.wire {
             Wire::Stream(stream) => stream.advance(flights, now, &mut sink),
             Wire::Datagrams(datagrams) => datagrams.advance(flights, now, &mut sink),
             Wire::OneAtATime(line) => line.advance(flights, now, &mut sink),
+        }
+        self.after(waiting, now, sink);
+    }
+
+    /// Does what follows the end of a request: a pause, or the end of the connection.
+    fn after(&mut self, waiting: usize, now: Time, mut sink: impl FnMut(Done<'_>)) {
+        let tolerance = &self.flights.tolerance;
+        if self.flights.len() == waiting || !tolerance.is_one_at_a_time() {
+            return;
+        }
+        if !tolerance.pause.is_zero() {
+            self.ready_at = self.ready_at.max(now + tolerance.pause);
+        }
+        if tolerance.close_after > 0 && self.sent >= tolerance.close_after {
+            self.flights.close(Closed::BySelf, &mut sink);
         }
     }
 

@@ -2,10 +2,10 @@
 
 use core::time::Duration;
 
-use super::flights::{Done, Flights, Ticket};
-use super::{Closed, Failure, InvalidResponse, Time, UDP_ATTEMPTS};
+use super::flights::{Call, Done, Flights, Ticket};
+use super::stream;
+use super::{Closed, Failure, InvalidResponse, Time, Tolerance, UDP_ATTEMPTS};
 use crate::frame::mbap::{self, Next};
-use crate::pdu::EncodedRequest;
 
 #[derive(Debug, Default)]
 pub(super) struct Datagrams {
@@ -22,20 +22,13 @@ struct Repeat {
 }
 
 impl Datagrams {
-    pub(super) fn send(
-        &mut self,
-        flights: &mut Flights,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
-        now: Time,
-    ) -> Ticket {
+    pub(super) fn send(&mut self, flights: &mut Flights, call: Call<'_>, now: Time) -> Ticket {
         let id = self.next_id;
         self.next_id = id.wrapping_add(1);
-        let every = timeout / UDP_ATTEMPTS;
-        let left = if request.request().is_read() { UDP_ATTEMPTS - 1 } else { 0 };
+        let every = call.timeout / UDP_ATTEMPTS;
+        let left = if call.request.request().is_read() { UDP_ATTEMPTS - 1 } else { 0 };
         self.repeat = (left > 0).then_some(Repeat { at: now + every, every, left });
-        let ticket = flights.push(unit_id, request, id, now, timeout);
+        let ticket = flights.push(call, id, now);
         write(flights);
         ticket
     }
@@ -48,15 +41,17 @@ impl Datagrams {
         &mut self,
         flights: &mut Flights,
         datagram: &[u8],
+        now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        let invalid = match mbap::next(datagram) {
-            Next::Frame { transaction_id, unit_id, pdu, len } if len == datagram.len() => {
-                let expected =
-                    flights.first().map(|flight| (flight.transaction_id, flight.unit_id));
-                if expected == Some((transaction_id, unit_id)) {
+        let Tolerance { pad, accept_unit, .. } = flights.tolerance;
+        let invalid = match stream::next(datagram, pad).0 {
+            Next::Frame { transaction_id, unit_id, pdu, len } if pad || len == datagram.len() => {
+                let is_expected = flights.position(transaction_id).is_some()
+                    && flights.first().is_some_and(|one| accept_unit.accepts(one.unit_id, unit_id));
+                if is_expected {
                     self.repeat = None;
-                    flights.answer(0, pdu, sink)
+                    flights.answer(0, pdu, now, sink)
                 } else {
                     flights.late += 1;
                     None
@@ -77,7 +72,7 @@ impl Datagrams {
     ) {
         if let Some(flight) = flights.expired(now) {
             self.repeat = None;
-            return flight.end(Err(Failure::Timeout), sink);
+            return flights.end(flight, Err(Failure::Timeout), sink);
         }
         if let Some(Repeat { at, every, left }) = self.repeat
             && at <= now

@@ -4,7 +4,8 @@ use alloc::collections::VecDeque;
 use alloc::vec::Vec;
 use core::time::Duration;
 
-use super::{Closed, Failure, InvalidResponse, Time};
+use super::{Attempt, Closed, Failure, InvalidResponse, Time, Tolerance};
+use crate::frame::rtu;
 use crate::pdu::{EncodedRequest, Response, ResponseError};
 
 /// The number of a request on its connection.
@@ -20,6 +21,17 @@ pub struct Done<'d> {
     pub timeout: Duration,
     /// The response, or why the request failed.
     pub outcome: Result<Response<'d>, Failure>,
+    /// The request may be sent again: give this to [`super::Connection::send_again`].
+    pub again: Option<Attempt>,
+}
+
+/// What a request is sent with.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Call<'r> {
+    pub(super) unit_id: u8,
+    pub(super) request: &'r EncodedRequest,
+    pub(super) timeout: Duration,
+    pub(super) attempt: Attempt,
 }
 
 /// A request in flight.
@@ -31,6 +43,7 @@ pub(super) struct Flight {
     pub(super) request: EncodedRequest,
     pub(super) sent: Time,
     timeout: Duration,
+    attempt: Attempt,
     pub(super) deadline: Time,
     /// Whether the result is to be dropped.
     abandoned: bool,
@@ -46,6 +59,13 @@ pub(super) struct Flights {
     /// The number of late replies, which were dropped.
     pub(super) late: u64,
     next_ticket: u64,
+    pub(super) tolerance: Tolerance,
+    /// `out` waits until then: the pause after the request before.
+    pub(super) held: Option<Time>,
+    /// Replies so far.
+    answered: u64,
+    /// Whether bytes were received since the last reply.
+    pub(super) reply_begun: bool,
 }
 
 impl Flights {
@@ -63,11 +83,9 @@ impl Flights {
 
     pub(super) fn push(
         &mut self,
-        unit_id: u8,
-        request: &EncodedRequest,
+        Call { unit_id, request, timeout, attempt }: Call<'_>,
         transaction_id: u16,
         sent: Time,
-        timeout: Duration,
     ) -> Ticket {
         let ticket = Ticket(self.next_ticket);
         self.next_ticket += 1;
@@ -80,14 +98,23 @@ impl Flights {
             request,
             sent,
             timeout,
+            attempt,
             deadline,
             abandoned: false,
         });
         ticket
     }
 
-    /// The position of the request with this transaction id.
+    /// When the timeout of a request ends.
+    pub(super) fn deadline_of(&self, ticket: Ticket) -> Option<Time> {
+        self.waiting.iter().find(|flight| flight.ticket == ticket).map(|flight| flight.deadline)
+    }
+
+    /// The place of the request with that transaction id. One that is held was not sent.
     pub(super) fn position(&self, transaction_id: u16) -> Option<usize> {
+        if self.held.is_some() {
+            return None;
+        }
         self.waiting.iter().position(|flight| flight.transaction_id == transaction_id)
     }
 
@@ -95,8 +122,9 @@ impl Flights {
         self.waiting.get(position)
     }
 
-    pub(super) fn contains(&self, ticket: Ticket) -> bool {
-        self.waiting.iter().any(|flight| flight.ticket == ticket)
+    /// The requests behind the one with that number.
+    pub(super) fn after(&self, ticket: Ticket) -> impl Iterator<Item = &Flight> {
+        self.waiting.iter().filter(move |flight| flight.ticket > ticket)
     }
 
     /// Removes the request with this ticket.
@@ -118,17 +146,22 @@ impl Flights {
         self.waiting.remove(position)
     }
 
-    /// Checks a PDU that answers the request at this position, and reports the result. Returns the
-    /// error if the PDU cannot be its response.
+    /// Judges a PDU that answers the request at this place, and hands the result on. A PDU that
+    /// can't be its response is returned. The timeouts of requests sent later start again: a device
+    /// that handles one request at a time can't have begun them before.
     pub(super) fn answer(
         &mut self,
         position: usize,
         pdu: &[u8],
+        now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Option<InvalidResponse> {
         let flight = self.waiting.remove(position)?;
-        let request = flight.request.request();
-        let (outcome, invalid) = match request.response(pdu) {
+        self.restart_after(flight.ticket, now);
+        self.answered += 1;
+        self.reply_begun = false;
+        let outcome = flight.request.request().response(self.without_padding(&flight, pdu));
+        let (outcome, invalid) = match outcome {
             Ok(response) => (Ok(response), None),
             Err(ResponseError::Exception(code)) => (Err(Failure::Exception(code.code())), None),
             Err(ResponseError::UnknownException(code)) => (Err(Failure::Exception(code)), None),
@@ -137,21 +170,51 @@ impl Flights {
                 (Err(Failure::Invalid(invalid)), Some(invalid))
             }
         };
-        if !flight.abandoned {
-            let Flight { ticket, timeout, .. } = flight;
-            sink(Done { ticket, timeout, outcome });
-        }
+        self.end(flight, outcome, sink);
         invalid
     }
 
-    /// Ends the first request with a result other than a reply.
+    /// Starts the timeouts of requests again that were sent after this one.
+    pub(super) fn restart_after(&mut self, ticket: Ticket, now: Time) {
+        for later in self.waiting.iter_mut().filter(|flight| flight.ticket > ticket) {
+            later.deadline = now + later.timeout;
+        }
+    }
+
+    /// The PDU, without surplus bytes behind it if the device may send some.
+    fn without_padding<'p>(&self, flight: &Flight, pdu: &'p [u8]) -> &'p [u8] {
+        if !self.tolerance.pad {
+            return pdu;
+        }
+        let len = rtu::response_pdu_len(pdu, flight.request.pdu().len());
+        len.ok().flatten().and_then(|len| pdu.get(..len)).unwrap_or(pdu)
+    }
+
+    /// Hands a result on, unless nobody wants it any more.
+    pub(super) fn end(
+        &self,
+        flight: Flight,
+        outcome: Result<Response<'_>, Failure>,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        let Flight { ticket, timeout, attempt, request, abandoned, .. } = flight;
+        if !abandoned {
+            let stale = self.answered > 0 && !self.reply_begun;
+            let failed = outcome.as_ref().err();
+            let again =
+                failed.and_then(|error| attempt.next(&request, *error, stale, &self.tolerance));
+            sink(Done { ticket, timeout, outcome, again });
+        }
+    }
+
+    /// Ends the first request with a result that is no reply.
     pub(super) fn finish(
         &mut self,
         outcome: Result<Response<'_>, Failure>,
         sink: &mut impl FnMut(Done<'_>),
     ) {
         if let Some(flight) = self.waiting.pop_front() {
-            flight.end(outcome, sink);
+            self.end(flight, outcome, sink);
         }
     }
 
@@ -164,20 +227,7 @@ impl Flights {
         self.out.clear();
         let failure = why.failure();
         while let Some(flight) = self.waiting.pop_front() {
-            flight.end(Err(failure), sink);
-        }
-    }
-}
-
-impl Flight {
-    pub(super) fn end(
-        self,
-        outcome: Result<Response<'_>, Failure>,
-        sink: &mut impl FnMut(Done<'_>),
-    ) {
-        if !self.abandoned {
-            let Flight { ticket, timeout, .. } = self;
-            sink(Done { ticket, timeout, outcome });
+            self.end(flight, Err(failure), sink);
         }
     }
 }

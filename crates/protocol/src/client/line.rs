@@ -6,10 +6,10 @@
 use alloc::vec::Vec;
 use core::time::Duration;
 
-use super::flights::{Done, Flights, Ticket};
-use super::{Closed, Failure, InvalidResponse, Line, TURNAROUND, Time};
+use super::flights::{Call, Done, Flight, Flights, Ticket};
+use super::{Closed, Failure, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
-use crate::pdu::{self, EncodedRequest, Response};
+use crate::pdu::{self, Response};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Framing {
@@ -30,6 +30,8 @@ pub(super) struct OneAtATime {
     /// The frame of the request.
     frame: Vec<u8>,
     received: Vec<u8>,
+    /// What is wrong with the received bytes, none of which fits the request.
+    stray: Option<FrameError>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,15 +52,16 @@ enum State {
 }
 
 impl OneAtATime {
-    pub(super) fn new(framing: Framing, line: Option<Line>) -> OneAtATime {
+    pub(super) fn new(framing: Framing, silence: Option<Duration>, echo: bool) -> OneAtATime {
         OneAtATime {
             framing,
-            silence: line.map(|line| line.silence),
-            echo: line.is_some_and(|line| line.echo),
+            silence,
+            echo,
             state: State::Idle,
             used: Time::ZERO,
             frame: Vec::new(),
             received: Vec::new(),
+            stray: None,
         }
     }
 
@@ -73,11 +76,11 @@ impl OneAtATime {
     pub(super) fn send(
         &mut self,
         flights: &mut Flights,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
+        call: Call<'_>,
+        start: Time,
         now: Time,
     ) -> Ticket {
+        let Call { unit_id, request, .. } = call;
         self.frame.clear();
         match self.framing {
             Framing::Rtu => encode(&mut self.frame, [0; rtu::MAX_LEN], |frame| {
@@ -88,8 +91,10 @@ impl OneAtATime {
             }),
         }
         self.received.clear();
-        let ticket = flights.push(unit_id, request, 0, now, timeout);
-        self.state = State::Quieting { until: self.silence.map_or(now, |time| self.used + time) };
+        self.stray = None;
+        let ticket = flights.push(call, 0, start);
+        let until = self.silence.map_or(start, |silence| start.max(self.used + silence));
+        self.state = State::Quieting { until };
         self.transmit(flights, now);
         ticket
     }
@@ -147,6 +152,7 @@ impl OneAtATime {
     /// Handles bytes without a request in flight: a late reply, or data from another sender.
     fn unrequested(&mut self, flights: &mut Flights, now: Time, sink: &mut impl FnMut(Done<'_>)) {
         match self.silence {
+            None if flights.tolerance.pad && self.state == State::Idle => {}
             None => flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink),
             Some(silence) => {
                 self.used = now;
@@ -166,12 +172,12 @@ impl OneAtATime {
         sink: &mut impl FnMut(Done<'_>),
     ) {
         let expected = flights.first().map_or(found, |flight| flight.unit_id);
-        if found != expected {
+        if !flights.tolerance.accept_unit.accepts(expected, found) {
             let invalid = InvalidResponse::UnitId { expected, found };
             return self.invalid(flights, invalid, now, sink);
         }
         self.rest(now);
-        if let Some(invalid) = flights.answer(0, pdu, sink)
+        if let Some(invalid) = flights.answer(0, pdu, now, sink)
             && self.silence.is_none()
         {
             flights.close(Closed::Invalid(invalid), sink);
@@ -213,7 +219,8 @@ impl OneAtATime {
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });
             self.rest(now);
-            flight.end(Err(Failure::Timeout), sink);
+            let invalid = self.stray.map(InvalidResponse::Frame);
+            flights.end(flight, Err(invalid.map_or(Failure::Timeout, Failure::Invalid)), sink);
             if sent && self.silence.is_none() {
                 flights.close(Closed::TimedOut, sink);
             }
@@ -222,28 +229,45 @@ impl OneAtATime {
         self.transmit(flights, now);
     }
 
-    /// Parses the reply at the start of the received bytes; `None` while more bytes are needed.
+    /// The reply in what was received; `None` while more bytes are needed. Stray bytes before it are
+    /// skipped: the reply begins at the first byte that fits the request and the CRC.
     fn rtu(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
         let Some(flight) = flights.first() else { return Ok(None) };
-        let may_be_echo = !*echoed
-            && (self.echo || (self.silence.is_some() && flight.request.request().is_read()));
-        if may_be_echo && self.received.starts_with(&self.frame) {
-            self.received.drain(..self.frame.len());
+        let may_be_echo = !*echoed && (self.echo || is_no_reply(flight));
+        let echo = self.received.windows(self.frame.len()).position(|bytes| bytes == self.frame);
+        if may_be_echo && let Some(start) = echo {
+            self.received.drain(..start + self.frame.len());
             (*echoed, self.echo) = (true, true);
         }
         if self.echo && !*echoed {
             return Ok(None);
         }
+        let request = flight.request.pdu();
+        let mut failure = None;
+        self.stray = None;
+        for start in 0..self.received.len() {
+            let bytes = &self.received[start..];
+            let fits = flights.tolerance.accept_unit.accepts(flight.unit_id, bytes[0])
+                && bytes.get(1).is_none_or(|code| code & 0x7F == request[0]);
+            if start > 0 && !fits {
+                continue;
+            }
+            match rtu::response_len(bytes, request.len()) {
+                Ok(Some(len)) if len <= bytes.len() => match rtu::decode(&bytes[..len]) {
+                    Ok(reply) => return Ok(Some(Reply::new(reply))),
+                    Err(error) if fits => failure = failure.or(Some(error)),
+                    Err(error) => self.stray = Some(error),
+                },
+                Ok(_) if fits => return Ok(None),
+                Ok(_) => self.stray = Some(FrameError::CheckSum),
+                Err(error) => self.stray = Some(error),
+            }
+        }
         // The beginning of an echo is not a damaged reply.
         let echo_begun = may_be_echo && !*echoed && self.frame.starts_with(&self.received);
-        let len = rtu::response_len(&self.received, flight.request.pdu().len());
-        let reply = len.and_then(|len| {
-            len.and_then(|len| self.received.get(..len)).map(rtu::decode).transpose()
-        });
-        match reply {
-            Err(_) if echo_begun => Ok(None),
-            Err(error) => Err(error),
-            Ok(reply) => Ok(reply.map(Reply::new)),
+        match failure {
+            Some(error) if !echo_begun => Err(error),
+            _ => Ok(None),
         }
     }
 
@@ -254,7 +278,7 @@ impl OneAtATime {
             let line: Vec<u8> = self.received.drain(..end + 2).collect();
             let start = line.iter().rposition(|byte| *byte == b':').unwrap_or(0);
             let line = &line[start..];
-            let may_be_echo = !*echoed && (self.echo || flight.request.request().is_read());
+            let may_be_echo = !*echoed && (self.echo || is_no_reply(flight));
             if may_be_echo && line == self.frame {
                 (*echoed, self.echo) = (true, true);
                 continue;
@@ -266,7 +290,13 @@ impl OneAtATime {
     }
 }
 
-/// A reply without its frame.
+/// Whether the request itself, sent back, can't be taken for its reply.
+fn is_no_reply(flight: &Flight) -> bool {
+    let request = flight.request.request();
+    request.is_read() && request.response(flight.request.pdu()).is_err()
+}
+
+/// A reply that was taken out of its frame.
 struct Reply {
     unit_id: u8,
     pdu: Vec<u8>,

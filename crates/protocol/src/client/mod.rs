@@ -7,14 +7,15 @@
 //!
 //! The rules of a connection:
 //!
-//! * A reply is accepted only if its transaction id (if any), unit id, function and length match
-//!   the request. On a stream, any other reply ends the connection, because the two sides are out
-//!   of step.
-//! * A request that timed out is abandoned. With transaction ids, its late reply is dropped and
-//!   counted. Without them, the connection ends; a serial line waits for silence instead.
-//! * A connection ends when a reply was cut off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a
-//!   received byte: the other side may be gone.
-//! * Only reads are sent twice, and only as datagrams.
+//! * A reply counts only when transaction id (where there is one), unit id, function and length are
+//!   those of the request. On a stream, anything else ends the connection: the two sides no longer
+//!   mean the same thing.
+//! * A request that timed out is given up. Its late reply is dropped and counted where transaction
+//!   ids tell it apart; where they do not, the connection ends, and a serial line is silenced first.
+//! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
+//!   the other side may have gone without a word.
+//! * Only reads are ever sent twice: as datagrams, when the device closed a connection instead of
+//!   answering on it again, and as often as its [`Tolerance`] says.
 //!
 //! An ended connection cannot be used again: the driver creates a new one.
 
@@ -23,9 +24,11 @@ mod datagram;
 mod flights;
 mod line;
 mod stream;
+mod tolerance;
 
 pub use connection::Connection;
 pub use flights::{Done, Ticket};
+pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Tolerance};
 
 use core::time::Duration;
 
@@ -58,19 +61,20 @@ pub enum Transport {
     Udp,
     /// RTU frames in a stream. One request at a time.
     RtuOverTcp,
+    /// RTU frames in datagrams. One request at a time; none is sent again by itself.
+    RtuOverUdp,
+    /// ASCII frames in a stream. One request at a time.
+    AsciiOverTcp,
     /// RTU frames on a serial line. One request at a time.
-    SerialRtu(Line),
+    SerialRtu {
+        /// What separates two frames.
+        silence: Duration,
+    },
     /// ASCII frames on a serial line. One request at a time.
-    SerialAscii(Line),
-}
-
-/// Settings of a serial line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Line {
-    /// The silence between two frames.
-    pub silence: Duration,
-    /// Whether the adapter echoes sent bytes. An echo is also detected without this setting.
-    pub echo: bool,
+    SerialAscii {
+        /// What separates two frames.
+        silence: Duration,
+    },
 }
 
 /// Why a request failed.

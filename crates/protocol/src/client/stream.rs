@@ -1,14 +1,15 @@
 //! MBAP frames in a stream: many requests in flight, matched by transaction id (Messaging on TCP/IP
 //! Implementation Guide V1.0b, 4.4.2).
 
-use alloc::collections::BTreeSet;
+use alloc::collections::BTreeMap;
 use alloc::vec::Vec;
-use core::time::Duration;
 
-use super::flights::{Done, Flights, Ticket};
+use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::{Closed, Failure, InvalidResponse, MAX_CONSECUTIVE_TIMEOUTS, Time};
 use crate::frame::mbap::{self, Next};
-use crate::pdu::EncodedRequest;
+
+/// Bytes of an exception reply.
+const EXCEPTION_LEN: usize = mbap::HEADER_LEN + 2;
 
 /// The number of transaction ids.
 const IDS: usize = 65_536;
@@ -16,41 +17,52 @@ const IDS: usize = 65_536;
 #[derive(Debug, Default)]
 pub(super) struct Stream {
     next_id: u16,
-    /// Transaction ids of abandoned requests, whose replies may still arrive.
-    given_up: BTreeSet<u16>,
-    /// The beginning of an incomplete frame.
+    /// Transaction ids of requests that were given up: their replies may still come.
+    given_up: BTreeMap<u16, Ticket>,
+    /// The beginning of a frame.
     partial: Vec<u8>,
     /// The number of timeouts since the last received byte, and the time of the last one.
     timeouts: u32,
     timed_out: Time,
+    /// Bytes that the header of an exception reply counted beyond its end. They may come, or not.
+    surplus: usize,
 }
 
 impl Stream {
     pub(super) fn send(
         &mut self,
         flights: &mut Flights,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
+        call: Call<'_>,
         now: Time,
     ) -> Option<Ticket> {
         if flights.len() + self.given_up.len() >= IDS {
             return None;
         }
         let mut id = self.next_id;
-        while self.given_up.contains(&id) || flights.position(id).is_some() {
+        while self.given_up.contains_key(&id) || flights.position(id).is_some() {
             id = id.wrapping_add(1);
         }
         self.next_id = id.wrapping_add(1);
-        flights.out.extend_from_slice(&mbap::header(id, unit_id, request.pdu().len()));
-        flights.out.extend_from_slice(request.pdu());
-        Some(flights.push(unit_id, request, id, now, timeout))
+        let pdu = call.request.pdu();
+        flights.out.extend_from_slice(&mbap::header(id, call.unit_id, pdu.len()));
+        flights.out.extend_from_slice(pdu);
+        Some(flights.push(call, id, now))
     }
 
-    /// Abandons a request. A late reply to it is dropped.
+    /// Gives a request up: its reply, should it come, is dropped. One that waits for a pause is not
+    /// sent.
     pub(super) fn cancel(&mut self, flights: &mut Flights, ticket: Ticket) {
-        if let Some(flight) = flights.take(ticket) {
-            self.given_up.insert(flight.transaction_id);
+        // While there is a pause, all requests are in `out`, in their order.
+        let behind: usize = flights.after(ticket).map(frame_len).sum();
+        let Some(flight) = flights.take(ticket) else { return };
+        if flights.held.is_none() {
+            self.given_up.insert(flight.transaction_id, flight.ticket);
+            return;
+        }
+        let end = flights.out.len().saturating_sub(behind);
+        flights.out.drain(end.saturating_sub(frame_len(&flight))..end);
+        if flights.len() == 0 {
+            flights.held = None;
         }
     }
 
@@ -58,6 +70,7 @@ impl Stream {
         &mut self,
         flights: &mut Flights,
         bytes: &[u8],
+        now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
         self.timeouts = 0;
@@ -69,13 +82,16 @@ impl Stream {
             &partial
         };
         loop {
-            let invalid = match mbap::next(rest) {
+            rest = self.without_surplus(flights, rest);
+            let (next, surplus) = next(rest, flights.tolerance.pad);
+            self.surplus = surplus.unwrap_or(self.surplus);
+            let invalid = match next {
                 Next::Incomplete => break,
                 Next::Foreign { protocol_id, .. } => Some(InvalidResponse::ProtocolId(protocol_id)),
                 Next::Broken { length } => Some(InvalidResponse::Length(length)),
                 Next::Frame { transaction_id, unit_id, pdu, len } => {
                     rest = &rest[len..];
-                    self.frame(flights, transaction_id, unit_id, pdu, sink)
+                    self.frame(flights, (transaction_id, unit_id, pdu), now, sink)
                 }
             };
             if let Some(invalid) = invalid {
@@ -89,28 +105,45 @@ impl Stream {
             partial.drain(..taken);
             self.partial = partial;
         }
+        flights.reply_begun = !self.partial.is_empty();
+    }
+
+    /// Drops what the last exception reply had beyond its end.
+    fn without_surplus<'b>(&mut self, flights: &Flights, mut bytes: &'b [u8]) -> &'b [u8] {
+        while self.surplus > 0
+            && let Some((id, _)) = bytes.split_first_chunk::<2>()
+        {
+            let id = u16::from_be_bytes(*id);
+            if flights.position(id).is_some() || self.given_up.contains_key(&id) {
+                break;
+            }
+            self.surplus -= 1;
+            bytes = &bytes[1..];
+        }
+        bytes
     }
 
     fn frame(
         &mut self,
         flights: &mut Flights,
-        id: u16,
-        unit_id: u8,
-        pdu: &[u8],
+        (id, unit_id, pdu): (u16, u8, &[u8]),
+        now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Option<InvalidResponse> {
         let Some(position) = flights.position(id) else {
-            if self.given_up.remove(&id) {
+            if let Some(ticket) = self.given_up.remove(&id) {
                 flights.late += 1;
+                flights.reply_begun = false;
+                flights.restart_after(ticket, now);
                 return None;
             }
             return Some(InvalidResponse::TransactionId(id));
         };
         let expected = flights.get(position)?.unit_id;
-        if unit_id != expected {
+        if !flights.tolerance.accept_unit.accepts(expected, unit_id) {
             return Some(InvalidResponse::UnitId { expected, found: unit_id });
         }
-        flights.answer(position, pdu, sink)
+        flights.answer(position, pdu, now, sink)
     }
 
     pub(super) fn advance(
@@ -122,12 +155,12 @@ impl Stream {
         let mut timed_out = false;
         while let Some(flight) = flights.expired(now) {
             timed_out = true;
-            self.given_up.insert(flight.transaction_id);
+            self.given_up.insert(flight.transaction_id, flight.ticket);
             if self.timeouts == 0 || flight.sent >= self.timed_out {
                 self.timeouts += 1;
                 self.timed_out = now;
             }
-            flight.end(Err(Failure::Timeout), sink);
+            flights.end(flight, Err(Failure::Timeout), sink);
         }
         if timed_out && self.has_broken_off(flights) {
             flights.close(Closed::BrokenOff, sink);
@@ -140,8 +173,33 @@ impl Stream {
     /// next reply would be taken for it.
     fn has_broken_off(&self, flights: &Flights) -> bool {
         match self.partial.first_chunk::<2>() {
-            Some(id) => self.given_up.contains(&u16::from_be_bytes(*id)),
+            Some(id) => self.given_up.contains_key(&u16::from_be_bytes(*id)),
             None => !self.partial.is_empty() && flights.len() == 0,
         }
     }
+}
+
+fn frame_len(flight: &Flight) -> usize {
+    mbap::HEADER_LEN + flight.request.pdu().len()
+}
+
+/// The frame at the start of `bytes`. With `pad`, an exception reply ends after its exception code:
+/// then also how many more bytes its header counts.
+pub(super) fn next(bytes: &[u8], pad: bool) -> (Next<'_>, Option<usize>) {
+    match short_exception(bytes) {
+        Some((frame, surplus)) if pad => (frame, Some(surplus)),
+        _ => (mbap::next(bytes), None),
+    }
+}
+
+/// An exception reply whose header counts more bytes than it has, and how many more.
+fn short_exception(bytes: &[u8]) -> Option<(Next<'_>, usize)> {
+    let frame = bytes.first_chunk::<EXCEPTION_LEN>()?;
+    let length = usize::from(u16::from_be_bytes([frame[4], frame[5]]));
+    let is_short = frame[2..4] == [0, 0] && length > 3 && frame[7] & 0x80 != 0;
+    let transaction_id = u16::from_be_bytes([frame[0], frame[1]]);
+    is_short.then(|| {
+        let (unit_id, pdu) = (frame[6], &frame[7..]);
+        (Next::Frame { transaction_id, unit_id, pdu, len: EXCEPTION_LEN }, length - 3)
+    })
 }

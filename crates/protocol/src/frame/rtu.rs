@@ -213,10 +213,20 @@ fn known_and_whole(bytes: &[u8]) -> Option<usize> {
 /// # Errors
 /// [`FrameError::Length`] for an unknown function, or an invalid count.
 pub fn response_len(bytes: &[u8], request_len: usize) -> Result<Option<usize>, FrameError> {
-    let Some(&[_, function_code, ref data @ ..]) = bytes.get(..bytes.len().min(MAX_LEN)) else {
-        return Ok(None);
-    };
-    let data_len = match function_code {
+    let pdu = bytes.get(1..bytes.len().min(MAX_LEN)).unwrap_or_default();
+    match response_pdu_len(pdu, request_len)?.map(|len| 1 + len + 2) {
+        Some(len) if len > MAX_LEN => Err(FrameError::Length),
+        len => Ok(len),
+    }
+}
+
+/// The length of the PDU at the start of `bytes`, in the same way.
+pub(crate) fn response_pdu_len(
+    bytes: &[u8],
+    request_len: usize,
+) -> Result<Option<usize>, FrameError> {
+    let Some((function_code, data)) = bytes.split_first() else { return Ok(None) };
+    let data_len = match *function_code {
         0x80.. => Some(1),
         1..=4 | 17 | 23 => data.first().map(|count| 1 + usize::from(*count)),
         5 | 6 | 11 | 15 | 16 => Some(4),
@@ -225,10 +235,7 @@ pub fn response_len(bytes: &[u8], request_len: usize) -> Result<Option<usize>, F
         43 => identification_len(data),
         _ => return Err(FrameError::Length),
     };
-    match data_len.map(|len| 2 + len + 2) {
-        Some(len) if len > MAX_LEN => Err(FrameError::Length),
-        len => Ok(len),
-    }
+    Ok(data_len.map(|len| 1 + len))
 }
 
 /// MEI type, read code, conformity, more, next, number of objects, then the objects.

@@ -9,6 +9,7 @@ use tokio::task::{LocalSet, spawn_local};
 use tokio::time::timeout;
 
 use super::*;
+use crate::client::Place;
 use crate::poller::caught::spawn_watched;
 use crate::poller::health::Health;
 
@@ -56,7 +57,7 @@ fn with_device<F: Future<Output = ()>>(test: impl FnOnce(Endpoint) -> F) {
             }
         });
         let host = "127.0.0.1".to_owned();
-        timeout(TIMEOUT, test(Endpoint::Tcp { host, port, tls: None })).await.unwrap();
+        timeout(TIMEOUT, test(Place::Tcp { host, port, tls: None }.into())).await.unwrap();
     });
 }
 
@@ -95,6 +96,7 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
     DeviceSettings {
         name: "meter".into(),
         endpoint,
+        in_flight: InFlight::Fixed(1),
         unit_id: 1,
         interval: Duration::from_millis(1),
         timeout: TIMEOUT,
@@ -111,7 +113,7 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
 }
 
 fn made(settings: DeviceSettings, state: &Arc<DeviceState>, results: &Arc<Results>) -> Device {
-    let link = Link::new(settings.endpoint.clone());
+    let link = Link::new(settings.endpoint.clone(), settings.in_flight);
     let planned = Planned::new(settings).unwrap();
     let to = (link, Rc::default());
     Device::new(planned, Arc::clone(state), to, Vec::new(), Some(Arc::clone(results)))

@@ -1,0 +1,289 @@
+//! How many requests are in flight on a link.
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+use std::rc::Rc;
+use std::time::Duration;
+
+use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
+use tokio::time::Instant;
+
+/// The most requests that `auto` has in flight.
+const MAX_AUTO: usize = 16;
+
+/// Answers after which `auto` judges how many are in flight.
+const ANSWERS: u32 = 20;
+
+/// A round trip may take so much longer than that of a single request before the device is held to
+/// answer one request after the other.
+const FLAT: f64 = 1.25;
+
+/// `auto` tries more requests in flight again after this time.
+const RETRY_AFTER: Duration = Duration::from_secs(300);
+
+/// How much a request matters beside others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Priority {
+    Usual,
+    /// To a unit that was silent the last time: it leaves room for the others.
+    Doubtful,
+    /// Somebody waits for it: it goes first where requests go one at a time, and tries an address
+    /// whose pause is not over.
+    Urgent,
+}
+
+/// How many requests may be in flight on a link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum InFlight {
+    Fixed(u16),
+    /// More while round trips stay as short as those of single requests, one after a timeout.
+    Auto,
+}
+
+/// Hands out the places of a link: to urgent requests first, otherwise in the order of asking.
+pub(super) struct Pace {
+    places: Rc<Places>,
+    doubtful: Semaphore,
+    auto: Option<RefCell<Auto>>,
+}
+
+#[derive(Default)]
+struct Places {
+    free: Cell<usize>,
+    urgent: RefCell<VecDeque<oneshot::Sender<Place>>>,
+    usual: RefCell<VecDeque<oneshot::Sender<Place>>>,
+    /// Places that are taken away as soon as they are given back.
+    owed: Cell<usize>,
+}
+
+/// A request may be in flight while it lasts.
+pub(super) struct Place(Option<Rc<Places>>);
+
+struct Auto {
+    limit: usize,
+    answers: u32,
+    sum: Duration,
+    /// The mean round trip of single requests.
+    alone: Option<Duration>,
+    /// No more places before.
+    settled: Option<Instant>,
+}
+
+impl Pace {
+    pub(super) fn new(in_flight: InFlight) -> Pace {
+        let (limit, auto) = match in_flight {
+            InFlight::Fixed(limit) => (usize::from(limit), None),
+            InFlight::Auto => (1, Some(RefCell::new(Auto::new()))),
+        };
+        let places = Rc::<Places>::default();
+        places.free.set(limit);
+        Pace { places, doubtful: Semaphore::new((limit / 2).max(1)), auto }
+    }
+
+    /// Waits for a place, which is taken while the result lasts. Doubtful requests leave room for the
+    /// others.
+    pub(super) async fn place(&self, priority: Priority) -> (Place, Option<SemaphorePermit<'_>>) {
+        let doubtful = match priority {
+            Priority::Doubtful => Some(self.doubtful.acquire().await.expect("it is never closed")),
+            Priority::Usual | Priority::Urgent => None,
+        };
+        let place = match self.places.take() {
+            Some(place) => place,
+            None => {
+                let (sender, place) = oneshot::channel();
+                self.places.queue(priority).borrow_mut().push_back(sender);
+                place.await.expect("places outlive those who wait for one")
+            }
+        };
+        (place, doubtful)
+    }
+
+    /// A request was answered after this time.
+    pub(super) fn answered(&self, took: Duration, now: Instant) {
+        let Some(auto) = &self.auto else { return };
+        let was_full = self.places.free.get() == 0;
+        match auto.borrow_mut().answered(took, was_full, now) {
+            Change::None => {}
+            Change::More => self.places.give(),
+            Change::Fewer(places) => self.take_away(places),
+        }
+    }
+
+    /// A request was not answered in time.
+    pub(super) fn timed_out(&self, now: Instant) {
+        if let Some(auto) = &self.auto {
+            let fewer = auto.borrow_mut().back_to(1, now);
+            self.take_away(fewer);
+        }
+    }
+
+    fn take_away(&self, places: usize) {
+        let free = places.min(self.places.free.get());
+        self.places.free.set(self.places.free.get() - free);
+        self.places.owed.set(self.places.owed.get() + places - free);
+    }
+}
+
+impl Places {
+    fn take(self: &Rc<Places>) -> Option<Place> {
+        let free = self.free.get().checked_sub(1)?;
+        self.free.set(free);
+        Some(Place(Some(Rc::clone(self))))
+    }
+
+    fn queue(&self, priority: Priority) -> &RefCell<VecDeque<oneshot::Sender<Place>>> {
+        if priority == Priority::Urgent { &self.urgent } else { &self.usual }
+    }
+
+    /// Gives a place to whoever has waited longest, urgent requests first.
+    fn give(self: &Rc<Places>) {
+        for queue in [&self.urgent, &self.usual] {
+            loop {
+                let Some(next) = queue.borrow_mut().pop_front() else { break };
+                match next.send(Place(Some(Rc::clone(self)))) {
+                    Ok(()) => return,
+                    // Who waited was stopped. The place is not given back: it is still here.
+                    Err(mut place) => place.0 = None,
+                }
+            }
+        }
+        self.free.set(self.free.get() + 1);
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let Some(places) = self.0.take() else { return };
+        match places.owed.get().checked_sub(1) {
+            Some(owed) => places.owed.set(owed),
+            None => places.give(),
+        }
+    }
+}
+
+#[derive(Debug, PartialEq, Eq)]
+enum Change {
+    None,
+    More,
+    Fewer(usize),
+}
+
+impl Auto {
+    fn new() -> Auto {
+        Auto { limit: 1, answers: 0, sum: Duration::ZERO, alone: None, settled: None }
+    }
+
+    fn answered(&mut self, took: Duration, was_full: bool, now: Instant) -> Change {
+        // Answers while places are free say nothing of more requests.
+        if !was_full {
+            return Change::None;
+        }
+        self.answers += 1;
+        self.sum += took;
+        if self.answers < ANSWERS {
+            return Change::None;
+        }
+        let mean = self.sum / self.answers;
+        (self.answers, self.sum) = (0, Duration::ZERO);
+        if self.limit == 1 {
+            self.alone = Some(mean);
+        }
+        let alone = self.alone.unwrap_or(mean);
+        if mean > alone.mul_f64(FLAT) {
+            return Change::Fewer(self.back_to(self.limit - 1, now));
+        }
+        if self.limit == MAX_AUTO || self.settled.is_some_and(|until| now < until) {
+            return Change::None;
+        }
+        self.limit += 1;
+        Change::More
+    }
+
+    /// Places that are too many now.
+    fn back_to(&mut self, limit: usize, now: Instant) -> usize {
+        let fewer = self.limit - limit;
+        *self = Auto { alone: self.alone, limit, ..Auto::new() };
+        self.settled = Some(now + RETRY_AFTER);
+        fewer
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: Duration = Duration::from_millis(1);
+
+    /// Answers that all take this long, while all places are taken.
+    fn answer(auto: &mut Auto, took: Duration, now: Instant) -> Change {
+        for _ in 1..ANSWERS {
+            assert_eq!(auto.answered(took, true, now), Change::None);
+        }
+        auto.answered(took, true, now)
+    }
+
+    #[test]
+    fn there_are_more_while_round_trips_stay_short() {
+        let (mut auto, now) = (Auto::new(), Instant::now());
+        for limit in 2..=MAX_AUTO {
+            assert_eq!(answer(&mut auto, 10 * MS, now), Change::More);
+            assert_eq!(auto.limit, limit);
+        }
+        assert_eq!(answer(&mut auto, 10 * MS, now), Change::None);
+    }
+
+    #[test]
+    fn a_device_that_answers_one_after_the_other_gets_one() {
+        let (mut auto, now) = (Auto::new(), Instant::now());
+        assert_eq!(answer(&mut auto, 10 * MS, now), Change::More);
+        assert_eq!(answer(&mut auto, 20 * MS, now), Change::Fewer(1));
+        assert_eq!(answer(&mut auto, 10 * MS, now), Change::None);
+        assert_eq!(answer(&mut auto, 10 * MS, now + RETRY_AFTER), Change::More);
+    }
+
+    #[test]
+    fn free_places_show_nothing() {
+        let (mut auto, now) = (Auto::new(), Instant::now());
+        for _ in 0..3 * ANSWERS {
+            assert_eq!(auto.answered(MS, false, now), Change::None);
+        }
+    }
+
+    #[tokio::test]
+    async fn a_timeout_takes_all_places_but_one_even_those_that_are_taken() {
+        let (pace, now) = (Pace::new(InFlight::Auto), Instant::now());
+        let mut taken = vec![pace.place(Priority::Usual).await];
+        for _ in 0..3 {
+            for _ in 0..ANSWERS {
+                pace.answered(10 * MS, now);
+            }
+            taken.push(pace.place(Priority::Usual).await);
+        }
+        pace.timed_out(now);
+        drop(taken);
+        assert_eq!((pace.places.free.get(), pace.places.owed.get()), (1, 0));
+    }
+
+    #[tokio::test]
+    async fn urgent_requests_go_first_and_who_was_stopped_takes_no_place() {
+        let pace = Pace::new(InFlight::Fixed(1));
+        let taken = pace.place(Priority::Usual).await;
+        let mut usual = Box::pin(pace.place(Priority::Usual));
+        let mut stopped = Box::pin(pace.place(Priority::Urgent));
+        let mut urgent = Box::pin(pace.place(Priority::Urgent));
+        assert!(is_pending(&mut usual) && is_pending(&mut stopped));
+        assert!(is_pending(&mut urgent));
+        drop(stopped);
+        drop(taken);
+        assert!(is_pending(&mut usual));
+        drop(urgent.await);
+        drop(usual.await);
+        assert_eq!(pace.places.free.get(), 1);
+    }
+
+    /// Whether a future waits still.
+    fn is_pending<T>(future: &mut std::pin::Pin<Box<impl Future<Output = T>>>) -> bool {
+        let mut context = std::task::Context::from_waker(std::task::Waker::noop());
+        future.as_mut().poll(&mut context).is_pending()
+    }
+}

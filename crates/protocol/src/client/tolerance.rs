@@ -1,0 +1,114 @@
+//! What a device may do that the standard does not allow, and how often a request is sent again.
+
+use core::time::Duration;
+
+use super::{Closed, Failure};
+use crate::pdu::EncodedRequest;
+
+/// The pause before a read is sent again to a device that is busy.
+pub const BUSY_PAUSE: Duration = Duration::from_millis(100);
+
+/// How to treat a device that deviates from the standard. The default follows the standard.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Tolerance {
+    /// Unit ids that a reply may carry.
+    pub accept_unit: AcceptUnit,
+    /// Ignores surplus bytes at the end of a reply. Over TCP and UDP, an exception reply ends after its
+    /// exception code whatever length its header has.
+    pub pad: bool,
+    /// The adapter repeats what is sent. An adapter that repeats reads is noticed without it.
+    pub echo: bool,
+    /// Time between the end of a request and the next. Only one request is in flight then.
+    pub pause: Duration,
+    /// Time between connecting and the first request.
+    pub pause_after_connect: Duration,
+    /// How often a read is sent again after a timeout, an invalid reply or a lost connection. Each
+    /// retry has the whole timeout.
+    pub retries: u8,
+    /// Counts exceptions 05 and 06 of a read as failures that [`Tolerance::retries`] covers.
+    pub retry_busy: bool,
+    /// Requests after which the connection ends; 0 for no limit. Only one request is in flight then.
+    pub close_after: u32,
+    /// Time between the end of a connection and the next attempt to connect. The driver keeps it.
+    pub reconnect: Duration,
+}
+
+impl Tolerance {
+    /// Whether a transport that can carry several requests at once carries one.
+    pub const fn is_one_at_a_time(&self) -> bool {
+        !self.pause.is_zero() || self.close_after > 0
+    }
+}
+
+/// Unit ids that a reply may carry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AcceptUnit {
+    /// That of the request.
+    #[default]
+    Requested,
+    /// That of the request, or this one.
+    Also(u8),
+    /// Any.
+    Any,
+}
+
+impl AcceptUnit {
+    pub(super) fn accepts(self, requested: u8, found: u8) -> bool {
+        match self {
+            _ if found == requested => true,
+            AcceptUnit::Requested => false,
+            AcceptUnit::Also(unit_id) => found == unit_id,
+            AcceptUnit::Any => true,
+        }
+    }
+}
+
+/// How often a request was sent before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Attempt {
+    retries: u8,
+    reconnected: bool,
+    pause: Duration,
+}
+
+impl Attempt {
+    /// The next attempt after a failure, if there is one. Only reads are sent again. `stale` says that
+    /// the connection had carried replies before, and ended without a byte of this one.
+    pub(super) fn next(
+        self,
+        request: &EncodedRequest,
+        failure: Failure,
+        stale: bool,
+        tolerance: &Tolerance,
+    ) -> Option<Attempt> {
+        if !request.request().is_read() {
+            return None;
+        }
+        if failure == Failure::Closed(Closed::ByPeer) && stale && !self.reconnected {
+            return Some(Attempt { reconnected: true, ..self });
+        }
+        let pause = match failure {
+            Failure::Exception(5 | 6) if tolerance.retry_busy => tolerance.pause.max(BUSY_PAUSE),
+            Failure::Exception(_) | Failure::Closed(Closed::BySelf | Closed::NoTransactionId) => {
+                return None;
+            }
+            Failure::Timeout | Failure::Invalid(_) | Failure::Closed(_) => tolerance.pause,
+        };
+        (self.retries < tolerance.retries).then(|| Attempt {
+            retries: self.retries + 1,
+            reconnected: false,
+            pause,
+        })
+    }
+
+    /// The time to wait before sending.
+    pub const fn pause(&self) -> Duration {
+        self.pause
+    }
+
+    /// Whether the attempt has a timeout of its own. A read that is repeated because a device had
+    /// closed its connection has not.
+    pub const fn has_own_timeout(&self) -> bool {
+        !self.reconnected
+    }
+}
