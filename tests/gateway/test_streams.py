@@ -297,7 +297,7 @@ def test_a_device_that_falls_silent_ends_its_map(gateway: Running) -> None:
         options = {"areas": ["holding_registers"], "timeout": 200}
         result = mapped(gateway, device.port, **options).next("result")
     assert result["success"] is False
-    assert "ceased to answer" in result["error"]
+    assert "stopped answering" in result["error"]
     assert result["reason"] == "timeout"
     [[first, last]] = result["areas"][0]["ranges"]
     assert first == 0

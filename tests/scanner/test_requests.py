@@ -37,7 +37,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"port": 0}, "Expected `int` >= 1 - at `$.port`"),
     ({"port": "502"}, "Expected `int | null`, got `str` - at `$.port`"),
     ({"url": "tcp://127.0.0.1"}, "both url and host are given, allowed is only one"),
-    ({"host": None, "port": None, "url": "http://127.0.0.1"}, "url: 'http://127.0.0.1' is no URL"),
+    (
+        {"host": None, "port": None, "url": "http://127.0.0.1"},
+        "url: 'http://127.0.0.1' is not the URL",
+    ),
     ({"host": None, "port": None, "url": "tls://127.0.0.1?ca=/etc/passwd"}, "url: ca is given, al"),
     ({"host": None, "port": None, "url": "tls://127.0.0.1?cert=a&key=b"}, "url: cert is given, al"),
     ({"host": None, "port": None, "url": "tls://127.0.0.1?sni=a"}, "url: sni is given, allo"),
