@@ -1,6 +1,7 @@
 //! A blocking client: it drives a [`Connection`] in the calling thread.
 //!
-//! The connection is made when it is needed, and kept. [`Done::again`] decides what is sent again.
+//! The connection is opened on first use and kept open. [`Done::again`] decides whether a request is
+//! sent again.
 
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -30,15 +31,15 @@ pub struct BlockingClient {
     late: AtomicU64,
 }
 
-/// The connection, if there is one.
+/// The state of the connection.
 #[derive(Default)]
 struct State {
     open: Option<Open>,
-    /// When the last one ended.
+    /// When the last connection ended.
     ended: Option<Instant>,
 }
 
-/// A connection that is open.
+/// An open connection.
 struct Open {
     stream: Box<dyn ByteStream>,
     connection: Connection,
@@ -48,7 +49,7 @@ struct Open {
     used: Instant,
 }
 
-/// A request, and how often it was sent before.
+/// A request and its attempt.
 struct Call<'r> {
     unit_id: u8,
     request: &'r EncodedRequest,
@@ -120,7 +121,7 @@ impl BlockingClient {
         }
     }
 
-    /// The connection, which is made if there is none that works.
+    /// Returns a usable connection; opens one if necessary.
     fn connected<'s>(
         &self,
         state: &'s mut State,
@@ -141,7 +142,7 @@ impl BlockingClient {
             }
             state.open = Some(opened?);
         }
-        let Some(open) = &mut state.open else { unreachable!("it was made") };
+        let Some(open) = &mut state.open else { unreachable!("it was just opened") };
         Ok(open)
     }
 
@@ -225,7 +226,7 @@ impl Open {
     ) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK];
         if matches!(self.transport, Transport::SerialRtu { .. } | Transport::SerialAscii { .. }) {
-            // A line that never falls silent is left to the timeout.
+            // On a line that is never silent, the request times out.
             while Instant::now() < deadline
                 && let Some(len) = self.stream.receive_now(&mut chunk)?
             {
@@ -245,7 +246,7 @@ impl Open {
             if !outgoing.is_empty() {
                 let until = self.epoch + self.connection.deadline().unwrap_or(now - self.epoch);
                 match self.stream.send(outgoing, until) {
-                    // A part of it may have been sent.
+                    // Part of the request may have been sent.
                     Err(StreamError::TimedOut) => {
                         self.connection.advance(until - self.epoch, &mut *sink);
                         self.connection.close(Closed::TimedOut, sink);

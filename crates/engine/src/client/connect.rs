@@ -1,4 +1,4 @@
-//! From the place of a device to what bytes travel on.
+//! Connects to devices.
 
 use std::time::Instant;
 

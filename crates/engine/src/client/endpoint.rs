@@ -8,14 +8,14 @@ use holdfast_protocol::client::{Tolerance, Transport};
 use crate::serial_line::{LineMode, SerialLine};
 use crate::tls::client::ClientTls;
 
-/// A device, or a gateway: where it is, and what it needs.
+/// A device or a gateway: its address, and its tolerance.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
     pub place: Place,
     pub tolerance: Tolerance,
 }
 
-/// Where a device is, and how it is reached.
+/// The address of a device, and its transport.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Place {
     Tcp { host: String, port: u16, tls: Option<Arc<ClientTls>> },
@@ -27,7 +27,7 @@ pub enum Place {
 }
 
 impl Place {
-    /// How requests travel to it.
+    /// The transport of this place.
     pub fn transport(&self) -> Transport {
         match self {
             Place::Tcp { .. } => Transport::Tcp,
@@ -53,7 +53,7 @@ impl From<Place> for Endpoint {
     }
 }
 
-/// The URL, without its options.
+/// The URL without its options.
 impl fmt::Display for Endpoint {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (scheme, host, port) = match &self.place {

@@ -1,9 +1,9 @@
 //! A link: one connection or one serial line, shared by all devices behind it.
 //!
-//! Over Modbus TCP several requests can be in flight, as the settings of the devices say. All other
-//! transports carry one request at a time, in a thread of their own. A link that can't be connected
-//! fails at once until its pause is over. What ends a connection is decided by [`Connection`]; the
-//! next request makes a new one.
+//! Over Modbus TCP, several requests can be in flight, if the settings of the devices allow it. Other
+//! transports carry one request at a time, in a thread of their own. After a failed connect, requests
+//! fail immediately until the backoff is over. [`Connection`] decides when a connection ends. The next
+//! request opens a new one.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -30,7 +30,7 @@ use crate::client::{BlockingClient, ClientError, Endpoint, Place};
 use crate::tls::Channel;
 use crate::tls::client::ClientTls;
 
-/// Bytes taken from a socket at once.
+/// Bytes per read of a socket.
 const CHUNK: usize = 16 * 1024;
 
 /// The bytes of a read, empty for a write; or the fault.
@@ -42,7 +42,7 @@ pub(super) enum Link {
 }
 
 impl Link {
-    /// In the context of a `LocalSet`.
+    /// Must be called in the context of a `LocalSet`.
     pub(super) fn new(endpoint: Endpoint, in_flight: InFlight) -> Rc<Link> {
         let Endpoint { place, tolerance } = endpoint;
         Rc::new(match place {
@@ -125,10 +125,10 @@ pub(super) struct TcpLink {
     open: Rc<RefCell<Option<Open>>>,
 }
 
-/// What becomes of a request, and whether it is sent again.
+/// The result of a request, and its next attempt, if there is one.
 type Outcome = (Answer, Option<Attempt>);
 
-/// A connection that is open.
+/// An open connection.
 struct Open {
     connection: Connection,
     /// The zero of the clock of the connection.
@@ -172,7 +172,7 @@ impl TcpLink {
         }
     }
 
-    /// Sends a request on the connection, and waits for what becomes of it.
+    /// Sends a request on the connection, and waits for its result.
     async fn carry_out(
         &self,
         unit_id: u8,
@@ -180,9 +180,9 @@ impl TcpLink {
         deadline: Instant,
         attempt: Attempt,
     ) -> Result<Outcome, Fault> {
-        let mut outcome = self.send(unit_id, request, deadline, attempt)?;
+        let mut sent = self.send(unit_id, request, deadline, attempt)?;
         loop {
-            match timeout_at(self.due(), &mut outcome).await {
+            match timeout_at(self.due(), &mut sent.outcome).await {
                 Ok(outcome) => return outcome.or(Err(Fault::Reset)),
                 Err(_) => self.advance(),
             }
@@ -255,7 +255,7 @@ impl TcpLink {
         request: &EncodedRequest,
         deadline: Instant,
         attempt: Attempt,
-    ) -> Result<oneshot::Receiver<Outcome>, Fault> {
+    ) -> Result<Sent<'_>, Fault> {
         let mut open = self.open.borrow_mut();
         let found = open.as_mut().ok_or(Fault::Reset)?;
         let now = Instant::now();
@@ -264,9 +264,9 @@ impl TcpLink {
         let ticket = found.connection.send_again(unit_id, request, timeout, attempt, sent);
         match ticket {
             Ok(ticket) if found.write() => {
-                let (sender, receiver) = oneshot::channel();
+                let (sender, outcome) = oneshot::channel();
                 found.waiting.insert(ticket, sender);
-                Ok(receiver)
+                Ok(Sent { link: self, ticket, outcome })
             }
             _ => {
                 *open = None;
@@ -295,10 +295,30 @@ impl TcpLink {
     }
 }
 
-/// Gives a result to who waits for it.
+/// A request in flight. It is cancelled when its device is stopped.
+struct Sent<'l> {
+    link: &'l TcpLink,
+    ticket: Ticket,
+    outcome: oneshot::Receiver<Outcome>,
+}
+
+impl Drop for Sent<'_> {
+    fn drop(&mut self) {
+        self.outcome.close();
+        if let Some(open) = self.link.open.borrow_mut().as_mut()
+            // A new connection counts its tickets anew: this one may be of another request.
+            && open.waiting.get(&self.ticket).is_some_and(oneshot::Sender::is_closed)
+        {
+            open.waiting.remove(&self.ticket);
+            open.connection.cancel(self.ticket);
+        }
+    }
+}
+
+/// Hands a result to the caller that waits for it.
 fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Outcome>>, done: &Done<'_>) {
     if let Some(sender) = waiting.remove(&done.ticket) {
-        // A device that was stopped does not wait any more.
+        // A device that was stopped does not wait.
         let _ = sender.send((answer(done.outcome), done.again));
     }
 }
@@ -507,4 +527,49 @@ fn carried_out(
     };
     (*failures, *retry_at) = (0, None);
     answer.or(Err(fault))
+}
+
+#[cfg(test)]
+mod tests {
+    use holdfast_protocol::pdu::{Range, Request};
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpListener;
+    use tokio::runtime::Builder;
+    use tokio::task::{LocalSet, spawn_local};
+
+    use super::*;
+
+    const TIMEOUT: Duration = Duration::from_secs(60);
+
+    #[test]
+    fn a_request_whose_device_was_stopped_leaves_its_place() {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
+            let tolerance = Tolerance { close_after: 100, ..Tolerance::default() };
+            let place = Place::Tcp { host, port, tls: None };
+            let link = Link::new(Endpoint { place, tolerance }, InFlight::Fixed(1));
+            let range = Range::new(0, 1).unwrap();
+            let read = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
+
+            let (for_stopped, request) = (Rc::clone(&link), read.clone());
+            let stopped = spawn_local(async move {
+                for_stopped.call(1, &request, TIMEOUT, Priority::Usual).await
+            });
+            let (mut device, _) = listener.accept().await.unwrap();
+            let mut request = [0; 12];
+            device.read_exact(&mut request).await.unwrap();
+            stopped.abort();
+            assert!(stopped.await.unwrap_err().is_cancelled());
+
+            let next =
+                spawn_local(async move { link.call(1, &read, TIMEOUT, Priority::Usual).await });
+            let mut request = [0; 12];
+            device.read_exact(&mut request).await.unwrap();
+            let reply = [request[0], request[1], 0, 0, 0, 5, 1, 3, 2, 0, 7];
+            device.write_all(&reply).await.unwrap();
+            assert_eq!(next.await.unwrap(), Ok(vec![0, 7]));
+        });
+    }
 }

@@ -2,10 +2,10 @@
 
 use core::time::Duration;
 
-use super::datagram::Datagrams;
 use super::flights::{Call, Done, Flights, Ticket};
 use super::line::{Framing, OneAtATime};
-use super::stream::Stream;
+use super::tcp::Stream;
+use super::udp::Datagrams;
 use super::{Attempt, Closed, Time, Tolerance, Transport};
 use crate::pdu::EncodedRequest;
 

@@ -20,11 +20,11 @@
 //! An ended connection cannot be used again: the driver creates a new one.
 
 mod connection;
-mod datagram;
 mod flights;
 mod line;
-mod stream;
+mod tcp;
 mod tolerance;
+mod udp;
 
 pub use connection::Connection;
 pub use flights::{Done, Ticket};
