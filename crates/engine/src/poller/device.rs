@@ -475,7 +475,7 @@ impl Device {
         self.hand_over(due, gathered);
     }
 
-    /// Hands the blocks of a poll to whoever takes results, who finds the health that it left.
+    /// Sends the blocks of a poll to the results. Called after the health of the poll is stored.
     fn hand_over(&self, due: Instant, gathered: Gathered) {
         if let Some(results) = &self.report {
             let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
