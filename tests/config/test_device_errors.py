@@ -261,8 +261,8 @@ def test_devices_of_one_line_have_the_same_tolerance(folder: Folder) -> None:
     text = SHARED.replace("tcp://10.0.0.9", "rtu:///dev/line")
     assert folder.config(text)
     assert folder.problems(text.replace("unit: 2", "unit: 2\n    tolerance: {echo: true}")) == [
-        "p.yaml:15: devices.other.url: found other settings of the line than devices.meter in line "
-        "4 has, allowed: the same"
+        "p.yaml:15: devices.other.url: found line settings that differ from those of devices.meter "
+        "in line 4, allowed: the same settings"
     ]
 
 

@@ -52,7 +52,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         {"transport": "can"},
         "at `$.transport`, allowed are tcp, tls, udp, rtu+tcp, ascii+tcp, rtu+udp",
     ),
-    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed are ABCD"),
+    ({"byteOrder": "ABDC"}, "tags[0]: order 'ABDC' is unknown, allowed: ABCD"),
     ({"scanRate": 49}, "scanRate is 49, allowed are 50 to 86400000 ms"),
     ({"scanRate": 86_400_001}, "scanRate is 86400001, allowed are"),
     ({"scanRate": 100.5}, "Expected `int | null`, got `float` - at `$.scanRate`"),
@@ -285,9 +285,12 @@ def test_devices_at_one_address_have_the_same_tolerance(
 
     assert ask("one", f"{place}?pad=1&retries=2")["success"]
     for url, error in (
-        (place, "pad of {} is True for one already, not False; devices at one address have the"),
-        (f"{place}?pad=1&retries=1", "retries of {} is 2 for one already, not 1"),
-        (f"{place}?pad=1&retries=2&accept_unit=any", "accept_unit of {} is the default for one"),
+        (place, "pad of {} is already True for one, not False; devices at one address have the"),
+        (f"{place}?pad=1&retries=1", "retries of {} is already 2 for one, not 1"),
+        (
+            f"{place}?pad=1&retries=2&accept_unit=any",
+            "accept_unit of {} is already the default for one",
+        ),
     ):
         assert error.format(place) in ask("two", url)["error"]
     assert f"one is known as {place} (pad True, retries 2)" in ask("one", place)["error"]

@@ -38,10 +38,8 @@ TOO_MANY_BEFORE = (
     "Connection timeout: the request waited behind other requests to this device, and was not sent"
 )
 NO_BROADCAST = (
-    "unitId 0 is the broadcast of a serial line, which nobody answers; with transport "
-    + ", ".join(SERIAL_FRAMES)
-    + " "
-    f"allowed are writes by functions {listed(BROADCAST_CODES)}"
+    "unitId 0 is the broadcast of a serial line, which has no response; with transport "
+    f"{listed(SERIAL_FRAMES)} it allows only writes with functions {listed(BROADCAST_CODES)}"
 )
 UNIT_0 = "unit id 0 is the broadcast of serial lines, which has no response"
 

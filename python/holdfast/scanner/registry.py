@@ -233,7 +233,7 @@ class Registry:
                         else "at one address"
                     )
                     raise Refused(
-                        f"{key} of {place} is {_shown(known)} for {device.id} already, "
+                        f"{key} of {place} is already {_shown(known)} for {device.id}, "
                         f"not {_shown(settings[key])}; devices {at} have the same settings"
                     )
 
