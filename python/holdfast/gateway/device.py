@@ -84,18 +84,15 @@ class RequestedDevice:
         """The address of the device, for answers."""
         return {"host": self.host, "port": self.port, "unitId": self.unit}
 
-    async def ask(
-        self, call: Callable[[Client], Awaitable[Result]], *, repeat: bool = False
-    ) -> Result:
+    async def ask(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """Returns the result of a call, within the timeout of the request.
 
-        Set `repeat` only for reads: such a call is repeated if the connection was stale.
         Raises `Failed`, `BadRequest`, and `ModbusException` for exception responses.
         """
         if self.is_broadcast:
             call = broadcast(call)
         try:
-            return await self.attempt(call, repeat=repeat)
+            return await self.attempt(call)
         except ModbusException:
             raise
         except RequestTimeout:
@@ -107,9 +104,7 @@ class RequestedDevice:
         except InvalidResponse as error:
             raise Failed("invalid_reply", str(error)) from None
 
-    async def attempt(
-        self, call: Callable[[Client], Awaitable[Result]], *, repeat: bool = False
-    ) -> Result:
+    async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
         began = time.monotonic()
 
@@ -122,7 +117,7 @@ class RequestedDevice:
             async with asyncio.timeout(self.timeout):
                 route = await self._egress.route(self.transport, self.host, self.port, self._name)
                 self._waits = True
-                return await self._pool.run(route, self.timeout, turn, repeat=repeat)
+                return await self._pool.run(route, self.timeout, turn)
         except Refused as error:
             raise BadRequest("refused_target", str(error)) from None
         except NoSuchName as error:

@@ -26,10 +26,7 @@ _HEX = {"type": "string", "pattern": "^([0-9a-f]{2})*$"}
 
 async def _diagnostics(given: Given, device: RequestedDevice) -> Answer:
     number, words = given["subFunction"], given["data"]
-    found = await device.ask(
-        lambda client: client.diagnostics(number, words, unit=device.unit),
-        repeat=number in HARMLESS_DIAGNOSTICS,
-    )
+    found = await device.ask(lambda client: client.diagnostics(number, words, unit=device.unit))
     return {
         "success": True,
         **device.told,
@@ -40,7 +37,7 @@ async def _diagnostics(given: Given, device: RequestedDevice) -> Answer:
 
 
 async def _server_id(_: Given, device: RequestedDevice) -> Answer:
-    found = await device.ask(lambda client: client.report_server_id(unit=device.unit), repeat=True)
+    found = await device.ask(lambda client: client.report_server_id(unit=device.unit))
     return {
         "success": True,
         **device.told,
@@ -53,7 +50,7 @@ async def _server_id(_: Given, device: RequestedDevice) -> Answer:
 
 
 async def _identify(_: Given, device: RequestedDevice) -> Answer:
-    found = await device.ask(lambda client: client.identify(unit=device.unit), repeat=True)
+    found = await device.ask(lambda client: client.identify(unit=device.unit))
     names = {told: getattr(found, name) for name, told in _NAMES.items()}
     objects = {str(number): data.hex() for number, data in sorted(found.objects.items())}
     return {

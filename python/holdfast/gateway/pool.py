@@ -71,8 +71,6 @@ class _Entry:
     active: int = 0
     """The number of requests that use the client."""
     used: float = field(default_factory=time.monotonic)
-    proven: bool = False
-    """Whether the last request had a response."""
     doubtful: bool = False
     """Whether the last request had no response."""
 
@@ -111,13 +109,10 @@ class Pool:
         route: Route,
         timeout: float,
         call: Callable[[Client], Awaitable[Result]],
-        *,
-        repeat: bool,
     ) -> Result:
         """Runs a call on the connection to a device, trying its addresses in turn.
 
-        `timeout` is in seconds; the caller must cancel the call when it expires. With `repeat`, the
-        call is repeated if the peer had closed the connection since its last use. Raises `Full`,
+        `timeout` is in seconds; the caller must cancel the call when it expires. Raises `Full`,
         `Unusable`, `ValueError` for an invalid certificate name, and the exceptions of the call.
         """
         tls = NO_FILES if route.name is None else replace(self._tls, name=route.name)
@@ -125,19 +120,17 @@ class Pool:
         keys.sort(key=lambda key: key not in self._entries)
         for key in keys[:-1]:
             try:
-                return await self._run(key, timeout, call, repeat=repeat)
+                return await self._run(key, timeout, call)
             except ConnectionLost as error:
                 if error.maybe_sent:
                     raise
-        return await self._run(keys[-1], timeout, call, repeat=repeat)
+        return await self._run(keys[-1], timeout, call)
 
     async def _run(
         self,
         key: NetworkTarget,
         timeout: float,
         call: Callable[[Client], Awaitable[Result]],
-        *,
-        repeat: bool,
     ) -> Result:
         entry = await self._entry(key, timeout)
         entry.users += 1
@@ -146,29 +139,22 @@ class Pool:
                 entry.active += 1
                 try:
                     await self._refresh(key, entry, timeout)
-                    return await self._call(entry, call, repeat=repeat)
+                    return await self._call(entry, call)
                 finally:
                     entry.active -= 1
         finally:
             entry.users -= 1
             entry.used = time.monotonic()
 
-    async def _call(
-        self, entry: _Entry, call: Callable[[Client], Awaitable[Result]], *, repeat: bool
-    ) -> Result:
+    async def _call(self, entry: _Entry, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """Runs a call, and updates the state of the connection."""
-        before, entry.proven, entry.doubtful = entry.proven, False, True
+        entry.doubtful = True
         try:
-            try:
-                result = await call(entry.client)
-            except ConnectionLost as error:
-                if not (repeat and before and error.maybe_sent):
-                    raise
-                result = await call(entry.client)
+            result = await call(entry.client)
         except ModbusException:
-            entry.proven, entry.doubtful = True, False
+            entry.doubtful = False
             raise
-        entry.proven, entry.doubtful = True, False
+        entry.doubtful = False
         return result
 
     async def _entry(self, key: NetworkTarget, timeout: float) -> _Entry:
@@ -223,7 +209,7 @@ class Pool:
         if entry.active > 1:  # Another request uses it meanwhile.
             return
         old = entry.client
-        entry.proven = entry.doubtful = False
+        entry.doubtful = False
         entry.client, entry.timeout = made
         await old.close()
 

@@ -92,7 +92,7 @@ class Range:
 
     async def read(self, device: RequestedDevice) -> list[Any]:
         """Reads the values: booleans, or integers 0 to 65535."""
-        return await device.ask(self._call(device.unit), repeat=True)
+        return await device.ask(self._call(device.unit))
 
     def _call(self, unit: int) -> Callable[[Client], Awaitable[list[Any]]]:
         def call(client: Client) -> Awaitable[list[Any]]:
@@ -111,7 +111,7 @@ async def _connect(_: Given, device: RequestedDevice) -> Answer:
     answer = {"success": True, "message": "Modbus server reachable", **device.told}
     try:
         [register] = await device.ask(
-            lambda client: client.read_holding_registers(0, 1, unit=device.unit), repeat=True
+            lambda client: client.read_holding_registers(0, 1, unit=device.unit)
         )
     except ModbusException as error:
         answer["message"] += " (responded with exception)"

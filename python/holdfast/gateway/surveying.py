@@ -137,13 +137,13 @@ class _Reader:
         """Makes the first read. Raises the exceptions of `RequestedDevice.ask`."""
         kind = "bool" if area in BIT_AREAS else "uint16"
         await self._device.ask(
-            lambda client: client.read(area, address, kind, unit=self._device.unit), repeat=True
+            lambda client: client.read(area, address, kind, unit=self._device.unit)
         )
 
     async def read(self, area: Area, address: int, kind: str) -> Any:
         """Makes a read, with the request's timeout for each."""
         return await self._device.attempt(
-            lambda client: client.read(area, address, kind, unit=self._device.unit), repeat=True
+            lambda client: client.read(area, address, kind, unit=self._device.unit)
         )
 
 

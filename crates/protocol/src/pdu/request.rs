@@ -218,7 +218,10 @@ impl<'a> Request<'a> {
 
     /// Whether the request only reads: repeating it changes nothing.
     pub const fn is_read(&self) -> bool {
-        !self.function().is_write() && !matches!(self, Request::Diagnostics(_))
+        match self {
+            Request::Diagnostics(asked) => !asked.sub_function().changes_state(),
+            _ => !self.function().is_write(),
+        }
     }
 
     /// The function of the request.
