@@ -239,8 +239,13 @@ class Listener:
         tls: ServerTls | None = None,
     ) -> Listener: ...
     @staticmethod
-    def udp(name: str, bind: str, rules: Sequence[Rule]) -> Listener:
-        """A listener for Modbus over UDP."""
+    def udp(
+        name: str, bind: str, rules: Sequence[Rule], *, framing: Literal["mbap", "rtu"] = "mbap"
+    ) -> Listener:
+        """A listener for Modbus over UDP.
+
+        `framing` is `mbap` for Modbus UDP, `rtu` for RTU over UDP.
+        """
 
     @staticmethod
     def serial(

@@ -21,6 +21,7 @@ from holdfast.config import (
     ModbusAsciiListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
+    ModbusRtuOverUdpListener,
     ModbusTcpListener,
     ModbusUdpListener,
     MqttConfig,
@@ -184,6 +185,13 @@ def test_rtu_over_tcp_is_set_like_modbus_tcp(loaded: Callable[..., Config]) -> N
 def test_a_udp_listener_has_a_bind_and_rules(loaded: Callable[..., Config]) -> None:
     text = f"type: modbus-udp, bind: '127.0.0.1:1', rules: [{RULE}]"
     listener = listener_of(loaded, text, ModbusUdpListener)
+    assert (listener.bind.port, listener.rules[0].units) == (1, {1: "plant"})
+
+
+def test_rtu_over_udp_is_set_like_modbus_udp(loaded: Callable[..., Config]) -> None:
+    text = f"type: modbus-rtu-over-udp, bind: '127.0.0.1:1', rules: [{RULE}]"
+    listener = listener_of(loaded, text, ModbusRtuOverUdpListener)
+    assert not isinstance(listener, ModbusUdpListener)
     assert (listener.bind.port, listener.rules[0].units) == (1, {1: "plant"})
 
 
@@ -601,6 +609,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "ModbusAsciiListener": ["type", "serial", "rules"],
         "ModbusRtuListener": ["type", "serial", "rules"],
         "ModbusRtuOverTcpListener": ["type", "bind", "rules"],
+        "ModbusRtuOverUdpListener": ["type", "bind", "rules"],
         "ModbusTcpListener": ["type", "bind", "rules"],
         "ModbusTlsListener": ["type", "bind", "rules", "tls"],
         "ModbusUdpListener": ["type", "bind", "rules"],

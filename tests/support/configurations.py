@@ -105,7 +105,8 @@ def secure(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
 @st.composite
 def datagrams(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
     rules = draw(with_sources(modbus_rules(memories)))
-    return {"type": "modbus-udp", "bind": f"127.0.0.1:{port}", "rules": rules}
+    kind = draw(st.sampled_from(["modbus-udp", "modbus-rtu-over-udp"]))
+    return {"type": kind, "bind": f"127.0.0.1:{port}", "rules": rules}
 
 
 @st.composite

@@ -1,5 +1,5 @@
-"""Modbus over UDP, and RTU frames over TCP: simple clients as in `wire`, and appliances with one
-listener.
+"""Modbus over UDP, and RTU frames over TCP and UDP: simple clients as in `wire`, and appliances
+with one listener.
 """
 
 from __future__ import annotations
@@ -23,7 +23,12 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-TYPES = {"tcp": "modbus-tcp", "udp": "modbus-udp", "rtu": "modbus-rtu-over-tcp"}
+TYPES = {
+    "tcp": "modbus-tcp",
+    "udp": "modbus-udp",
+    "rtu": "modbus-rtu-over-tcp",
+    "rtu-udp": "modbus-rtu-over-udp",
+}
 """The listener types by the names in tests."""
 
 ALL: dict[str, Any] = dict.fromkeys(AREAS, 1000)
@@ -143,6 +148,20 @@ class Datagrams:
         return not select.select([self.socket], [], [], 0)[0]
 
 
+class RtuDatagrams(Datagrams):
+    """A UDP client of one server, with RTU frames."""
+
+    def receive(self) -> wire.Frame:
+        """Returns the frame of the next datagram, which must contain exactly one."""
+        return wire.Frame(0, *lines.from_rtu(self.socket.recv(65536)))
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes:
+        self.send(lines.rtu(pdu, unit))
+        reply = self.receive()
+        assert reply.unit == unit
+        return reply.pdu
+
+
 class RtuConnection(wire.Connection):
     """RTU frames over one TCP connection."""
 
@@ -181,9 +200,13 @@ Client = wire.Connection | Datagrams
 
 def client(kind: str, to: tuple[str, int], source: str | None = None) -> Client:
     """Creates a client of a transport; the caller closes it."""
-    if kind == "udp":
-        return Datagrams(to, source=source)
-    return (RtuConnection if kind == "rtu" else wire.Connection)(to, source=source)
+    make: dict[str, type[Client]] = {
+        "tcp": wire.Connection,
+        "udp": Datagrams,
+        "rtu": RtuConnection,
+        "rtu-udp": RtuDatagrams,
+    }
+    return make[kind](to, source=source)
 
 
 def is_stranger(kind: str, appliance: Appliance, to: tuple[str, int], source: str | None) -> bool:
@@ -192,6 +215,6 @@ def is_stranger(kind: str, appliance: Appliance, to: tuple[str, int], source: st
     refused = counters(appliance)["connections"]["refused_source"]
     with client(kind, to, source) as stranger:
         with contextlib.suppress(ConnectionResetError, BrokenPipeError):
-            stranger.send(lines.rtu(request, 1) if kind == "rtu" else wire.frame(request))
+            stranger.send(lines.rtu(request, 1) if kind.startswith("rtu") else wire.frame(request))
         await_count(appliance, "connections", "refused_source", refused + 1)
         return stranger.is_quiet() if isinstance(stranger, Datagrams) else stranger.rest() == b""

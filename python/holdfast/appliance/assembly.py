@@ -15,6 +15,7 @@ from holdfast.config import (
     ModbusAsciiListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
+    ModbusRtuOverUdpListener,
     ModbusTcpListener,
     ModbusTlsListener,
     ModbusUdpListener,
@@ -104,9 +105,14 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
             )
-        case ModbusUdpListener():
+        case ModbusUdpListener() | ModbusRtuOverUdpListener():
             rules = [_rule(rule, memories) for rule in settings.rules]
-            return _core.Listener.udp(name, str(settings.bind), rules)
+            return _core.Listener.udp(
+                name,
+                str(settings.bind),
+                rules,
+                framing="mbap" if isinstance(settings, ModbusUdpListener) else "rtu",
+            )
         case ModbusRtuListener() | ModbusAsciiListener():
             line = settings.serial
             return _core.Listener.serial(

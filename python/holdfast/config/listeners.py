@@ -166,6 +166,17 @@ class ModbusUdpListener(Model):
     """The first rule whose sources contain the sender applies."""
 
 
+class ModbusRtuOverUdpListener(Model):
+    """A server of Modbus RTU frames over UDP: one frame per datagram."""
+
+    type: Literal["modbus-rtu-over-udp"]
+    """The protocol."""
+    bind: BindAddress
+    """Where to listen: an IP address and a port."""
+    rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
+    """The first rule whose sources contain the sender applies."""
+
+
 def _stop_bits(data: dict[str, Any]) -> Literal[1, 2]:
     return 2 if data["parity"] == "none" else 1
 
@@ -263,13 +274,14 @@ Listener: TypeAlias = (
     | ModbusTlsListener
     | ModbusRtuOverTcpListener
     | ModbusUdpListener
+    | ModbusRtuOverUdpListener
     | ModbusRtuListener
     | ModbusAsciiListener
     | RawIngestListener
 )
 
 CONNECTION_TYPES = ("modbus-tcp", "modbus-tls", "modbus-rtu-over-tcp", "raw-ingest")
-DATAGRAM_TYPES = ("modbus-udp",)
+DATAGRAM_TYPES = ("modbus-udp", "modbus-rtu-over-udp")
 SERIAL_TYPES = ("modbus-rtu", "modbus-ascii")
 LISTENER_TYPES = (*CONNECTION_TYPES, *DATAGRAM_TYPES, *SERIAL_TYPES)
 """All values of `type`; the tuples above group them by TCP, UDP and serial port."""

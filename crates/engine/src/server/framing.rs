@@ -1,4 +1,4 @@
-//! The framings of a stream: Modbus TCP, or RTU over TCP.
+//! The framings of streams and datagrams: an MBAP header, or RTU frames.
 
 use holdfast_protocol::frame::{mbap, rtu};
 use holdfast_protocol::pdu;
@@ -45,6 +45,13 @@ pub(crate) trait Framing: Send + Sync + 'static {
     fn complete(frame: &mut [u8], tag: u16, unit_id: u8, pdu_len: usize) -> usize;
 }
 
+/// A framing whose frames are also sent one a datagram.
+pub(crate) trait Datagram: Framing {
+    /// The request that a datagram consists of. Anything else is never [`Next::Request`], nor
+    /// [`Next::Incomplete`]: nothing follows a datagram.
+    fn only(datagram: &[u8]) -> Next<'_>;
+}
+
 /// Frames with an MBAP header.
 pub(crate) struct Mbap;
 
@@ -73,7 +80,18 @@ impl Framing for Mbap {
     }
 }
 
-/// RTU frames in a stream.
+impl Datagram for Mbap {
+    #[inline]
+    fn only(datagram: &[u8]) -> Next<'_> {
+        match Mbap::next(datagram) {
+            Next::Request { len, .. } if len < datagram.len() => Next::Broken,
+            Next::Incomplete => Next::Broken,
+            next => next,
+        }
+    }
+}
+
+/// RTU frames.
 pub(crate) struct Rtu;
 
 impl Framing for Rtu {
@@ -104,5 +122,15 @@ impl Framing for Rtu {
         let crc = rtu::crc(&frame[..body]);
         frame[body..body + 2].copy_from_slice(&crc.to_le_bytes());
         body + 2
+    }
+}
+
+impl Datagram for Rtu {
+    /// The end of the datagram is the end of the frame, whatever its function code.
+    fn only(datagram: &[u8]) -> Next<'_> {
+        match rtu::decode(datagram) {
+            Ok((unit_id, pdu)) => Next::Request { tag: 0, unit_id, pdu, len: datagram.len() },
+            Err(_) => Next::Damaged { len: datagram.len() },
+        }
     }
 }
