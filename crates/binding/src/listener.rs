@@ -132,7 +132,11 @@ impl Listener {
         tls: Option<PyRef<'_, ServerTls>>,
     ) -> PyResult<Listener> {
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
-        let framings = [("mbap", StreamFraming::Mbap), ("rtu", StreamFraming::Rtu)];
+        let framings = [
+            ("mbap", StreamFraming::Mbap),
+            ("rtu", StreamFraming::Rtu),
+            ("ascii", StreamFraming::Ascii),
+        ];
         let kind = ListenerKind::ModbusStream(StreamSettings {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,

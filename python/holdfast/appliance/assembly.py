@@ -7,12 +7,13 @@ here. Gateway and scanner are imported only if they are configured.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING, Literal, assert_never
 
 from holdfast import _core
 from holdfast.client.endpoint import endpoint
 from holdfast.config import (
     ModbusAsciiListener,
+    ModbusAsciiOverTcpListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
     ModbusRtuOverUdpListener,
@@ -47,6 +48,14 @@ if TYPE_CHECKING:
     from holdfast.net.tls import Tls
     from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area
+
+_FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
+    "modbus-tcp": "mbap",
+    "modbus-tls": "mbap",
+    "modbus-rtu-over-tcp": "rtu",
+    "modbus-ascii-over-tcp": "ascii",
+}
+"""The framings of listeners for connections."""
 
 SPREAD = 10.0
 """Seconds over which the first polls of devices are spread; at most the polling interval."""
@@ -90,13 +99,18 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
     """Creates the native listener of that name."""
     settings: Listener = config.listeners[name]
     match settings:
-        case ModbusTcpListener() | ModbusTlsListener() | ModbusRtuOverTcpListener():
+        case (
+            ModbusTcpListener()
+            | ModbusTlsListener()
+            | ModbusRtuOverTcpListener()
+            | ModbusAsciiOverTcpListener()
+        ):
             rtu = settings if isinstance(settings, ModbusRtuOverTcpListener) else None
             return _core.Listener(
                 name,
                 str(settings.bind),
                 [_rule(rule, memories) for rule in settings.rules],
-                framing="mbap" if rtu is None else "rtu",
+                framing=_FRAMINGS[settings.type],
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
                 when_full=settings.when_full,

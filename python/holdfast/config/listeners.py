@@ -155,6 +155,13 @@ class ModbusRtuOverTcpListener(_ConnectionListener):
     """Seconds without a byte after which an incomplete request may be followed by the next one."""
 
 
+class ModbusAsciiOverTcpListener(_ConnectionListener):
+    """A server of Modbus ASCII frames over TCP connections, as serial gateways send them."""
+
+    type: Literal["modbus-ascii-over-tcp"]
+    """The protocol."""
+
+
 class ModbusUdpListener(Model):
     """A Modbus UDP server: one request per datagram."""
 
@@ -273,6 +280,7 @@ Listener: TypeAlias = (
     ModbusTcpListener
     | ModbusTlsListener
     | ModbusRtuOverTcpListener
+    | ModbusAsciiOverTcpListener
     | ModbusUdpListener
     | ModbusRtuOverUdpListener
     | ModbusRtuListener
@@ -280,7 +288,13 @@ Listener: TypeAlias = (
     | RawIngestListener
 )
 
-CONNECTION_TYPES = ("modbus-tcp", "modbus-tls", "modbus-rtu-over-tcp", "raw-ingest")
+CONNECTION_TYPES = (
+    "modbus-tcp",
+    "modbus-tls",
+    "modbus-rtu-over-tcp",
+    "modbus-ascii-over-tcp",
+    "raw-ingest",
+)
 DATAGRAM_TYPES = ("modbus-udp", "modbus-rtu-over-udp")
 SERIAL_TYPES = ("modbus-rtu", "modbus-ascii")
 LISTENER_TYPES = (*CONNECTION_TYPES, *DATAGRAM_TYPES, *SERIAL_TYPES)

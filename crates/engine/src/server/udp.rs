@@ -151,7 +151,7 @@ impl ModbusUdp {
                 frames.damaged.add();
                 return 0;
             }
-            Next::Broken | Next::Incomplete => {
+            Next::Broken | Next::Incomplete | Next::Stray { .. } => {
                 frames.broken.add();
                 return 0;
             }
