@@ -77,7 +77,9 @@ def with_sources(rules: st.SearchStrategy[dict[str, Any]]) -> st.SearchStrategy[
 @st.composite
 def connections(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
     return {
-        "type": draw(st.sampled_from(["modbus-tcp", "modbus-rtu-over-tcp"])),
+        "type": draw(
+            st.sampled_from(["modbus-tcp", "modbus-rtu-over-tcp", "modbus-ascii-over-tcp"])
+        ),
         "bind": f"127.0.0.1:{port}",
         "rules": draw(with_sources(modbus_rules(memories))),
         "max_connections": draw(CONNECTIONS),
