@@ -317,7 +317,7 @@ impl<F: Framing> Answering<F> {
         let is_doubtful = mem::take(&mut self.is_doubtful);
         let mut decoded = F::NOT_DECODED;
         loop {
-            match F::next(rest, self.unit_server.ascii_delimiter(), &mut decoded) {
+            match F::next(rest, || self.unit_server.ascii_delimiter(), &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
                     rest = &rest[len..];
                     answered.requests += 1;
@@ -356,7 +356,6 @@ impl<F: Framing> Answering<F> {
     /// Writes one framed reply at the start of `output`. Returns its length, 0 when there is none.
     #[inline]
     fn reply(&self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
-        let Some(output) = output.get_mut(..F::MAX_LEN) else { return 0 };
         let room = output.get_mut(F::HEADER_LEN..);
         let Some(buffer) = room.and_then(<[u8]>::first_chunk_mut::<{ pdu::MAX_LEN }>) else {
             return 0;

@@ -46,8 +46,12 @@ pub(crate) trait Framing: Send + Sync + 'static {
     const NOT_DECODED: Self::Decoded;
 
     /// Looks at the start of `bytes`. An incomplete frame is never longer than
-    /// [`Framing::MAX_LEN`]. `delimiter` is the last character of an ASCII frame.
-    fn next<'a>(bytes: &'a [u8], delimiter: u8, decoded: &'a mut Self::Decoded) -> Next<'a>;
+    /// [`Framing::MAX_LEN`]. `delimiter` returns the last character of an ASCII frame.
+    fn next<'a>(
+        bytes: &'a [u8],
+        delimiter: impl FnOnce() -> u8,
+        decoded: &'a mut Self::Decoded,
+    ) -> Next<'a>;
 
     /// Where the next request starts if an incomplete one before it never ends.
     fn resync(_bytes: &[u8]) -> Option<usize> {
@@ -81,7 +85,11 @@ impl Framing for Mbap {
     const NOT_DECODED: () = ();
 
     #[inline]
-    fn next<'a>(bytes: &'a [u8], _delimiter: u8, _decoded: &'a mut ()) -> Next<'a> {
+    fn next<'a>(
+        bytes: &'a [u8],
+        _delimiter: impl FnOnce() -> u8,
+        _decoded: &'a mut (),
+    ) -> Next<'a> {
         mbap_next(bytes)
     }
 
@@ -130,7 +138,11 @@ impl Framing for Rtu {
     type Decoded = ();
     const NOT_DECODED: () = ();
 
-    fn next<'a>(bytes: &'a [u8], _delimiter: u8, _decoded: &'a mut ()) -> Next<'a> {
+    fn next<'a>(
+        bytes: &'a [u8],
+        _delimiter: impl FnOnce() -> u8,
+        _decoded: &'a mut (),
+    ) -> Next<'a> {
         match rtu::next_request(bytes) {
             rtu::Next::Incomplete => Next::Incomplete,
             rtu::Next::Frame { unit_id, pdu, len } => Next::Request { tag: 0, unit_id, pdu, len },
@@ -182,12 +194,17 @@ impl Framing for Ascii {
     type Decoded = [u8; ascii::MAX_BODY_LEN];
     const NOT_DECODED: Self::Decoded = [0; ascii::MAX_BODY_LEN];
 
-    fn next<'a>(bytes: &'a [u8], delimiter: u8, decoded: &'a mut Self::Decoded) -> Next<'a> {
+    fn next<'a>(
+        bytes: &'a [u8],
+        delimiter: impl FnOnce() -> u8,
+        decoded: &'a mut Self::Decoded,
+    ) -> Next<'a> {
         match bytes.iter().position(|character| *character == b':') {
             Some(0) => {}
             None if bytes.is_empty() => return Next::Incomplete,
             start => return Next::Stray { len: start.unwrap_or(bytes.len()) },
         }
+        let delimiter = delimiter();
         let mut frame = [0; ascii::MAX_LEN];
         frame[0] = b':';
         for at in 1..ascii::MAX_LEN {
