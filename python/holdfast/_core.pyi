@@ -218,9 +218,9 @@ class ServerTls:
 class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
-    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP; `tls` enables TLS. Times are in
-    seconds; `idle_timeout` 0 is unlimited. Raises `ValueError` for an invalid address, limit or
-    time.
+    `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
+    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. Raises `ValueError` for an
+    invalid address, limit or time.
     """
 
     def __new__(
@@ -229,7 +229,7 @@ class Listener:
         bind: str,
         rules: Sequence[Rule],
         *,
-        framing: Literal["mbap", "rtu"] = "mbap",
+        framing: Literal["mbap", "rtu", "ascii"] = "mbap",
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
         when_full: WhenFull = "refuse",
@@ -239,8 +239,13 @@ class Listener:
         tls: ServerTls | None = None,
     ) -> Listener: ...
     @staticmethod
-    def udp(name: str, bind: str, rules: Sequence[Rule]) -> Listener:
-        """A listener for Modbus over UDP."""
+    def udp(
+        name: str, bind: str, rules: Sequence[Rule], *, framing: Literal["mbap", "rtu"] = "mbap"
+    ) -> Listener:
+        """A listener for Modbus over UDP.
+
+        `framing` is `mbap` for Modbus UDP, `rtu` for RTU over UDP.
+        """
 
     @staticmethod
     def serial(

@@ -19,8 +19,10 @@ from holdfast.config import (
     InitialRun,
     Listener,
     ModbusAsciiListener,
+    ModbusAsciiOverTcpListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
+    ModbusRtuOverUdpListener,
     ModbusTcpListener,
     ModbusUdpListener,
     MqttConfig,
@@ -170,9 +172,20 @@ def listener_of(loaded: Callable[..., Config], text: str, kind: type[L]) -> L:
     return listener
 
 
-def test_rtu_over_tcp_is_set_like_modbus_tcp(loaded: Callable[..., Config]) -> None:
-    text = f"type: modbus-rtu-over-tcp, bind: '127.0.0.1:1', rules: [{RULE}]"
-    listener = listener_of(loaded, text, ModbusRtuOverTcpListener)
+@pytest.mark.parametrize(
+    ("kind", "model"),
+    [
+        ("modbus-rtu-over-tcp", ModbusRtuOverTcpListener),
+        ("modbus-ascii-over-tcp", ModbusAsciiOverTcpListener),
+    ],
+)
+def test_serial_frames_over_tcp_are_set_like_modbus_tcp(
+    loaded: Callable[..., Config],
+    kind: str,
+    model: type[ModbusRtuOverTcpListener | ModbusAsciiOverTcpListener],
+) -> None:
+    text = f"type: {kind}, bind: '127.0.0.1:1', rules: [{RULE}]"
+    listener = listener_of(loaded, text, model)
     assert not isinstance(listener, ModbusTcpListener)
     assert (listener.max_connections, listener.idle_timeout, listener.when_full) == (
         256,
@@ -184,6 +197,13 @@ def test_rtu_over_tcp_is_set_like_modbus_tcp(loaded: Callable[..., Config]) -> N
 def test_a_udp_listener_has_a_bind_and_rules(loaded: Callable[..., Config]) -> None:
     text = f"type: modbus-udp, bind: '127.0.0.1:1', rules: [{RULE}]"
     listener = listener_of(loaded, text, ModbusUdpListener)
+    assert (listener.bind.port, listener.rules[0].units) == (1, {1: "plant"})
+
+
+def test_rtu_over_udp_is_set_like_modbus_udp(loaded: Callable[..., Config]) -> None:
+    text = f"type: modbus-rtu-over-udp, bind: '127.0.0.1:1', rules: [{RULE}]"
+    listener = listener_of(loaded, text, ModbusRtuOverUdpListener)
+    assert not isinstance(listener, ModbusUdpListener)
     assert (listener.bind.port, listener.rules[0].units) == (1, {1: "plant"})
 
 
@@ -574,6 +594,7 @@ def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:
         if {"type": "null"} in node.get("anyOf", ())
     ]
     assert sorted(nullable) == [
+        "ModbusAsciiOverTcpListener.max_connections_per_source",
         "ModbusRtuOverTcpListener.max_connections_per_source",
         "ModbusTcpListener.max_connections_per_source",
         "ModbusTlsListener.max_connections_per_source",
@@ -599,8 +620,10 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "MemoryConfig": None,
         "MetricsConfig": ["bind"],
         "ModbusAsciiListener": ["type", "serial", "rules"],
+        "ModbusAsciiOverTcpListener": ["type", "bind", "rules"],
         "ModbusRtuListener": ["type", "serial", "rules"],
         "ModbusRtuOverTcpListener": ["type", "bind", "rules"],
+        "ModbusRtuOverUdpListener": ["type", "bind", "rules"],
         "ModbusTcpListener": ["type", "bind", "rules"],
         "ModbusTlsListener": ["type", "bind", "rules", "tls"],
         "ModbusUdpListener": ["type", "bind", "rules"],

@@ -54,8 +54,8 @@ TOP = (
     "log, workers"
 )
 TYPES = (
-    "modbus-tcp, modbus-tls, modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or "
-    "modbus-ascii"
+    "modbus-tcp, modbus-tls, modbus-rtu-over-tcp, modbus-ascii-over-tcp, raw-ingest, modbus-udp, "
+    "modbus-rtu-over-udp, modbus-rtu or modbus-ascii"
 )
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
 RULE = "listeners.scada.rules[0]"

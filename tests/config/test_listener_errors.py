@@ -75,12 +75,13 @@ def changed(text: str, old: str, new: str) -> str:
 def test_a_listener_says_what_it_is(folder: Folder) -> None:
     text = MEMORIES + "  a: {bind: 127.0.0.1:1, rules: []}\n  b: 5\n  c: []\n"
     types = (
-        "modbus-ascii, modbus-rtu, modbus-rtu-over-tcp, modbus-tcp, modbus-tls, modbus-udp or "
-        "raw-ingest"
+        "modbus-ascii, modbus-ascii-over-tcp, modbus-rtu, modbus-rtu-over-tcp, "
+        "modbus-rtu-over-udp, modbus-tcp, modbus-tls, modbus-udp or raw-ingest"
     )
     assert folder.problems(text) == [
         "p.yaml:5: listeners.a.type: missing, allowed: modbus-tcp, modbus-tls, "
-        "modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii",
+        "modbus-rtu-over-tcp, modbus-ascii-over-tcp, raw-ingest, modbus-udp, "
+        "modbus-rtu-over-udp, modbus-rtu or modbus-ascii",
         f"p.yaml:6: listeners.b: found 5, allowed: a mapping with the type {types}",
         f"p.yaml:7: listeners.c: found an empty list, allowed: a mapping with the type {types}",
     ]
@@ -90,7 +91,8 @@ def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) 
     text = changed(UDP, "modbus-udp", "udp").replace("{1: plant}", "{1: plan}")
     assert folder.problems(text) == [
         "p.yaml:6: listeners.udp.type: found 'udp', allowed: modbus-tcp, modbus-tls, "
-        "modbus-rtu-over-tcp, raw-ingest, modbus-udp, modbus-rtu or modbus-ascii",
+        "modbus-rtu-over-tcp, modbus-ascii-over-tcp, raw-ingest, modbus-udp, "
+        "modbus-rtu-over-udp, modbus-rtu or modbus-ascii",
         "p.yaml:9: listeners.udp.rules[0].units.1: found 'plan', allowed: plant, other; "
         "did you mean 'plant'?",
     ]  # fmt: skip
@@ -319,7 +321,9 @@ def test_an_area_that_no_memory_of_a_rule_has_is_a_warning(
     ("one", "other"),
     [
         ("modbus-tcp", "modbus-rtu-over-tcp"),
+        ("modbus-tcp", "modbus-ascii-over-tcp"),
         ("modbus-udp", "modbus-udp"),
+        ("modbus-udp", "modbus-rtu-over-udp"),
         ("modbus-tcp", "raw-ingest"),
     ],
 )

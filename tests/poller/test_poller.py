@@ -676,7 +676,13 @@ def test_units_of_a_serial_line_are_polled_in_turn_with_a_dead_one(
 
 
 @pytest.mark.parametrize(
-    ("listener", "scheme"), [("modbus-udp", "udp"), ("modbus-rtu-over-tcp", "rtu+tcp")]
+    ("listener", "scheme"),
+    [
+        ("modbus-udp", "udp"),
+        ("modbus-rtu-over-tcp", "rtu+tcp"),
+        ("modbus-rtu-over-udp", "rtu+udp"),
+        ("modbus-ascii-over-tcp", "ascii+tcp"),
+    ],
 )
 def test_other_transports_arrive_fail_and_come_back(run: Run, listener: str, scheme: str) -> None:
     port = free_port()

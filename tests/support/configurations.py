@@ -77,7 +77,9 @@ def with_sources(rules: st.SearchStrategy[dict[str, Any]]) -> st.SearchStrategy[
 @st.composite
 def connections(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
     return {
-        "type": draw(st.sampled_from(["modbus-tcp", "modbus-rtu-over-tcp"])),
+        "type": draw(
+            st.sampled_from(["modbus-tcp", "modbus-rtu-over-tcp", "modbus-ascii-over-tcp"])
+        ),
         "bind": f"127.0.0.1:{port}",
         "rules": draw(with_sources(modbus_rules(memories))),
         "max_connections": draw(CONNECTIONS),
@@ -105,7 +107,8 @@ def secure(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
 @st.composite
 def datagrams(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any]:
     rules = draw(with_sources(modbus_rules(memories)))
-    return {"type": "modbus-udp", "bind": f"127.0.0.1:{port}", "rules": rules}
+    kind = draw(st.sampled_from(["modbus-udp", "modbus-rtu-over-udp"]))
+    return {"type": kind, "bind": f"127.0.0.1:{port}", "rules": rules}
 
 
 @st.composite

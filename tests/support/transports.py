@@ -1,5 +1,5 @@
-"""Modbus over UDP, and RTU frames over TCP: simple clients as in `wire`, and appliances with one
-listener.
+"""Modbus over UDP, RTU over TCP and UDP, ASCII over TCP: simple clients as in `wire`, and
+appliances with one listener.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import contextlib
 import select
 import socket
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from holdfast.appliance import Appliance
 from holdfast.config import load
@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-TYPES = {"tcp": "modbus-tcp", "udp": "modbus-udp", "rtu": "modbus-rtu-over-tcp"}
+TYPES = {
+    "tcp": "modbus-tcp",
+    "udp": "modbus-udp",
+    "rtu": "modbus-rtu-over-tcp",
+    "rtu-udp": "modbus-rtu-over-udp",
+    "ascii": "modbus-ascii-over-tcp",
+}
 """The listener types by the names in tests."""
 
 ALL: dict[str, Any] = dict.fromkeys(AREAS, 1000)
@@ -143,11 +149,27 @@ class Datagrams:
         return not select.select([self.socket], [], [], 0)[0]
 
 
-class RtuConnection(wire.Connection):
-    """RTU frames over one TCP connection."""
+class RtuDatagrams(Datagrams):
+    """A UDP client of one server, with RTU frames."""
+
+    def receive(self) -> wire.Frame:
+        """Returns the frame of the next datagram, which must contain exactly one."""
+        return wire.Frame(0, *lines.from_rtu(self.socket.recv(65536)))
 
     def ask(self, pdu: bytes, unit: int = 1) -> bytes:
         self.send(lines.rtu(pdu, unit))
+        reply = self.receive()
+        assert reply.unit == unit
+        return reply.pdu
+
+
+class FramedConnection(wire.Connection):
+    """The frames of a serial line over one TCP connection."""
+
+    mode: ClassVar[lines.Mode]
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes:
+        self.send(self.mode.frame(pdu, unit))
         [(answered, reply)] = self.replies(1)
         assert answered == unit
         return reply
@@ -157,9 +179,9 @@ class RtuConnection(wire.Connection):
         deadline = time.monotonic() + self.deadline
         got: list[tuple[int, bytes]] = []
         while len(got) < count:
-            if (end := lines.rtu_length(self._received)) is not None:
+            if (end := self.mode.length(self._received)) is not None:
                 frame, self._received = self._received[:end], self._received[end:]
-                got.append(lines.from_rtu(frame))
+                got.append(self.mode.unframe(frame))
                 continue
             patience = deadline - time.monotonic()
             if patience <= 0:
@@ -176,22 +198,40 @@ class RtuConnection(wire.Connection):
         return not self._received and not select.select([self.socket], [], [], 0)[0]
 
 
+class RtuConnection(FramedConnection):
+    """RTU frames over one TCP connection."""
+
+    mode = lines.RTU
+
+
+class AsciiConnection(FramedConnection):
+    """ASCII frames over one TCP connection."""
+
+    mode = lines.ASCII
+
+
 Client = wire.Connection | Datagrams
 
 
 def client(kind: str, to: tuple[str, int], source: str | None = None) -> Client:
     """Creates a client of a transport; the caller closes it."""
-    if kind == "udp":
-        return Datagrams(to, source=source)
-    return (RtuConnection if kind == "rtu" else wire.Connection)(to, source=source)
+    make: dict[str, type[Client]] = {
+        "tcp": wire.Connection,
+        "udp": Datagrams,
+        "rtu": RtuConnection,
+        "rtu-udp": RtuDatagrams,
+        "ascii": AsciiConnection,
+    }
+    return make[kind](to, source=source)
 
 
 def is_stranger(kind: str, appliance: Appliance, to: tuple[str, int], source: str | None) -> bool:
     """Returns whether a peer gets no reply and is counted as not allowed by any rule."""
     request = bytes.fromhex("0300000001")
+    frames = {"rtu": lines.rtu, "rtu-udp": lines.rtu, "ascii": lines.ascii_frame}
     refused = counters(appliance)["connections"]["refused_source"]
     with client(kind, to, source) as stranger:
         with contextlib.suppress(ConnectionResetError, BrokenPipeError):
-            stranger.send(lines.rtu(request, 1) if kind == "rtu" else wire.frame(request))
+            stranger.send(frames.get(kind, wire.frame)(request, 1))
         await_count(appliance, "connections", "refused_source", refused + 1)
         return stranger.is_quiet() if isinstance(stranger, Datagrams) else stranger.rest() == b""

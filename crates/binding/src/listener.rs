@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use holdfast_engine::server::policy::{AccessMode, Functions, Rule as CoreRule};
 use holdfast_engine::server::{
-    ConnectionLimits, ListenerKind, ListenerSettings, RawRule as CoreRawRule, RawSettings,
-    SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
+    ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, RawRule as CoreRawRule,
+    RawSettings, SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
@@ -132,7 +132,11 @@ impl Listener {
         tls: Option<PyRef<'_, ServerTls>>,
     ) -> PyResult<Listener> {
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
-        let framings = [("mbap", StreamFraming::Mbap), ("rtu", StreamFraming::Rtu)];
+        let framings = [
+            ("mbap", StreamFraming::Mbap),
+            ("rtu", StreamFraming::Rtu),
+            ("ascii", StreamFraming::Ascii),
+        ];
         let kind = ListenerKind::ModbusStream(StreamSettings {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
@@ -149,8 +153,19 @@ impl Listener {
     }
 
     #[staticmethod]
-    fn udp(name: String, bind: &str, rules: Vec<PyRef<'_, Rule>>) -> PyResult<Listener> {
-        let udp = UdpSettings { bind: address(bind)?, rules: cores(&rules) };
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap"))]
+    fn udp(
+        name: String,
+        bind: &str,
+        rules: Vec<PyRef<'_, Rule>>,
+        framing: &str,
+    ) -> PyResult<Listener> {
+        let framings = [("mbap", DatagramFraming::Mbap), ("rtu", DatagramFraming::Rtu)];
+        let udp = UdpSettings {
+            bind: address(bind)?,
+            framing: word("framing", framing, &framings)?,
+            rules: cores(&rules),
+        };
         Ok(Listener { core: ListenerSettings { name, kind: ListenerKind::ModbusUdp(udp) } })
     }
 

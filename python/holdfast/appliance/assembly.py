@@ -7,14 +7,16 @@ here. Gateway and scanner are imported only if they are configured.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING, Literal, assert_never
 
 from holdfast import _core
 from holdfast.client.endpoint import endpoint
 from holdfast.config import (
     ModbusAsciiListener,
+    ModbusAsciiOverTcpListener,
     ModbusRtuListener,
     ModbusRtuOverTcpListener,
+    ModbusRtuOverUdpListener,
     ModbusTcpListener,
     ModbusTlsListener,
     ModbusUdpListener,
@@ -46,6 +48,14 @@ if TYPE_CHECKING:
     from holdfast.net.tls import Tls
     from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area
+
+_FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
+    "modbus-tcp": "mbap",
+    "modbus-tls": "mbap",
+    "modbus-rtu-over-tcp": "rtu",
+    "modbus-ascii-over-tcp": "ascii",
+}
+"""The framings of listeners for connections."""
 
 SPREAD = 10.0
 """Seconds over which the first polls of devices are spread; at most the polling interval."""
@@ -89,13 +99,18 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
     """Creates the native listener of that name."""
     settings: Listener = config.listeners[name]
     match settings:
-        case ModbusTcpListener() | ModbusTlsListener() | ModbusRtuOverTcpListener():
+        case (
+            ModbusTcpListener()
+            | ModbusTlsListener()
+            | ModbusRtuOverTcpListener()
+            | ModbusAsciiOverTcpListener()
+        ):
             rtu = settings if isinstance(settings, ModbusRtuOverTcpListener) else None
             return _core.Listener(
                 name,
                 str(settings.bind),
                 [_rule(rule, memories) for rule in settings.rules],
-                framing="mbap" if rtu is None else "rtu",
+                framing=_FRAMINGS[settings.type],
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
                 when_full=settings.when_full,
@@ -104,9 +119,14 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
             )
-        case ModbusUdpListener():
+        case ModbusUdpListener() | ModbusRtuOverUdpListener():
             rules = [_rule(rule, memories) for rule in settings.rules]
-            return _core.Listener.udp(name, str(settings.bind), rules)
+            return _core.Listener.udp(
+                name,
+                str(settings.bind),
+                rules,
+                framing="mbap" if isinstance(settings, ModbusUdpListener) else "rtu",
+            )
         case ModbusRtuListener() | ModbusAsciiListener():
             line = settings.serial
             return _core.Listener.serial(

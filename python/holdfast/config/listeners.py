@@ -155,10 +155,28 @@ class ModbusRtuOverTcpListener(_ConnectionListener):
     """Seconds without a byte after which an incomplete request may be followed by the next one."""
 
 
+class ModbusAsciiOverTcpListener(_ConnectionListener):
+    """A server of Modbus ASCII frames over TCP connections, as serial gateways send them."""
+
+    type: Literal["modbus-ascii-over-tcp"]
+    """The protocol."""
+
+
 class ModbusUdpListener(Model):
     """A Modbus UDP server: one request per datagram."""
 
     type: Literal["modbus-udp"]
+    """The protocol."""
+    bind: BindAddress
+    """Where to listen: an IP address and a port."""
+    rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
+    """The first rule whose sources contain the sender applies."""
+
+
+class ModbusRtuOverUdpListener(Model):
+    """A server of Modbus RTU frames over UDP: one frame per datagram."""
+
+    type: Literal["modbus-rtu-over-udp"]
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
@@ -262,14 +280,22 @@ Listener: TypeAlias = (
     ModbusTcpListener
     | ModbusTlsListener
     | ModbusRtuOverTcpListener
+    | ModbusAsciiOverTcpListener
     | ModbusUdpListener
+    | ModbusRtuOverUdpListener
     | ModbusRtuListener
     | ModbusAsciiListener
     | RawIngestListener
 )
 
-CONNECTION_TYPES = ("modbus-tcp", "modbus-tls", "modbus-rtu-over-tcp", "raw-ingest")
-DATAGRAM_TYPES = ("modbus-udp",)
+CONNECTION_TYPES = (
+    "modbus-tcp",
+    "modbus-tls",
+    "modbus-rtu-over-tcp",
+    "modbus-ascii-over-tcp",
+    "raw-ingest",
+)
+DATAGRAM_TYPES = ("modbus-udp", "modbus-rtu-over-udp")
 SERIAL_TYPES = ("modbus-rtu", "modbus-ascii")
 LISTENER_TYPES = (*CONNECTION_TYPES, *DATAGRAM_TYPES, *SERIAL_TYPES)
 """All values of `type`; the tuples above group them by TCP, UDP and serial port."""

@@ -9,7 +9,6 @@
 use std::cell::RefCell;
 use std::future::poll_fn;
 use std::io;
-use std::marker::PhantomData;
 use std::mem;
 use std::net::SocketAddr;
 use std::pin::{Pin, pin};
@@ -17,7 +16,6 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
 use tokio::sync::watch;
 use tokio::task::yield_now;
@@ -25,7 +23,7 @@ use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::admission::Ticket;
 use super::event::Kind;
-use super::framing::{Framing, Mbap, Next, Rtu};
+use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::policy::PeerRights;
 use super::stream::{self, Stream};
@@ -34,14 +32,13 @@ use super::unit_server::UnitServer;
 /// Bytes per read of a socket.
 const INPUT: usize = 4096;
 
-/// The longest frame of any framing.
-const MAX_REQUEST_LEN: usize = mbap::MAX_LEN;
-
 /// Room for the replies to all requests of one read.
-const OUTPUT: usize = output::<Mbap>(output::<Rtu>(0));
+const OUTPUT: usize = output::<Mbap>(output::<Rtu>(output::<Ascii>(0)));
 
 const fn output<F: Framing>(least: usize) -> usize {
-    assert!(F::MAX_LEN <= MAX_REQUEST_LEN);
+    // A read has room for at least one byte.
+    assert!(F::MAX_LEN < INPUT);
+    assert!(F::HEADER_LEN + pdu::MAX_LEN <= F::MAX_LEN);
     let len = (INPUT / F::SHORTEST + 1) * F::MAX_LEN;
     if len > least { len } else { least }
 }
@@ -79,7 +76,7 @@ pub(crate) struct Timeouts {
     pub(crate) frame: Option<Duration>,
 }
 
-pub(crate) struct Connection<F, S> {
+pub(crate) struct Connection<F: Framing, S> {
     stream: S,
     answering: Answering<F>,
     timeouts: Timeouts,
@@ -96,17 +93,16 @@ pub(crate) struct Connection<F, S> {
 }
 
 /// The state that replies depend on.
-struct Answering<F> {
+struct Answering<F: Framing> {
     context: Arc<ListenerContext>,
     peer: SocketAddr,
     unit_server: Arc<UnitServer>,
     rights: Arc<PeerRights>,
     /// The beginning of an incomplete request.
-    partial: [u8; MAX_REQUEST_LEN],
+    partial: F::Partial,
     partial_len: usize,
     /// Nothing followed that beginning for [`Timeouts::frame`]: it may be all of it.
     is_doubtful: bool,
-    framing: PhantomData<F>,
 }
 
 /// The result of answering some input.
@@ -296,22 +292,21 @@ impl<F: Framing> Answering<F> {
         unit_server: Arc<UnitServer>,
         rights: Arc<PeerRights>,
     ) -> Answering<F> {
-        let partial = [0; MAX_REQUEST_LEN];
         Answering {
             context,
             peer,
             unit_server,
             rights,
-            partial,
+            partial: F::NO_PARTIAL,
             partial_len: 0,
             is_doubtful: false,
-            framing: PhantomData,
         }
     }
 
     /// Copies the beginning of a request to the start of `input`. Returns its length.
     fn restore(&self, input: &mut [u8]) -> usize {
-        input[..self.partial_len].copy_from_slice(&self.partial[..self.partial_len]);
+        let partial = &self.partial.as_ref()[..self.partial_len];
+        input[..partial.len()].copy_from_slice(partial);
         self.partial_len
     }
 
@@ -320,8 +315,9 @@ impl<F: Framing> Answering<F> {
         let mut answered = Answered { len: 0, requests: 0, consumed: 0, broken: false };
         let mut rest = input;
         let is_doubtful = mem::take(&mut self.is_doubtful);
+        let mut decoded = F::NOT_DECODED;
         loop {
-            match F::next(rest) {
+            match F::next(rest, || self.unit_server.ascii_delimiter(), &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
                     rest = &rest[len..];
                     answered.requests += 1;
@@ -335,6 +331,7 @@ impl<F: Framing> Answering<F> {
                     rest = &rest[len..];
                     self.unit_server.counters.frames.damaged.add();
                 }
+                Next::Stray { len } => rest = &rest[len..],
                 Next::Broken => {
                     self.unit_server.counters.frames.broken.add();
                     answered.broken = true;
@@ -349,8 +346,9 @@ impl<F: Framing> Answering<F> {
         }
         answered.consumed = input.len() - rest.len();
         // An incomplete frame is shorter than the longest one.
-        let kept = rest.len().min(self.partial.len());
-        self.partial[..kept].copy_from_slice(&rest[..kept]);
+        let partial = self.partial.as_mut();
+        let kept = rest.len().min(partial.len());
+        partial[..kept].copy_from_slice(&rest[..kept]);
         self.partial_len = kept;
         answered
     }
@@ -395,12 +393,13 @@ impl<F: Framing> Answering<F> {
 #[cfg(test)]
 mod tests {
     use holdfast_memory::{Area, Layout, Memory, Span};
+    use holdfast_protocol::frame::{ascii, mbap};
 
     use super::*;
     use crate::server::identity::Identity;
     use crate::server::policy::{AccessMode, Functions, Rule};
 
-    fn answering() -> Answering<Mbap> {
+    fn answering<F: Framing>() -> Answering<F> {
         let span = Span::new(0, 2000).unwrap();
         let layout =
             Area::ALL.into_iter().fold(Layout::default(), |layout, area| layout.with(area, span));
@@ -424,8 +423,14 @@ mod tests {
         [&mbap::header(7, unit_id, pdu.len())[..], pdu].concat()
     }
 
+    fn ascii_frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = [0; ascii::MAX_LEN];
+        let len = ascii::encode(unit_id, pdu, &mut frame).unwrap();
+        frame[..len].to_vec()
+    }
+
     /// One request of each function, and some that are refused.
-    fn requests() -> Vec<u8> {
+    fn requests(frame: fn(u8, &[u8]) -> Vec<u8>) -> Vec<u8> {
         let write = [&[16, 0, 0, 0, 123, 246][..], &[0; 246]].concat();
         let pdus: [&[u8]; 17] = [
             &[1, 0, 3, 7, 0xD0 - 3],
@@ -451,11 +456,16 @@ mod tests {
 
     #[test]
     fn answering_requests_allocates_nothing() {
-        let (mut answering, input, mut output) = (answering(), requests(), vec![0; OUTPUT]);
-        answering.answer(&input, &mut output);
+        allocates_nothing::<Mbap>(&requests(frame));
+        allocates_nothing::<Ascii>(&requests(ascii_frame));
+    }
+
+    fn allocates_nothing<F: Framing>(input: &[u8]) {
+        let (mut answering, mut output) = (answering::<F>(), vec![0; OUTPUT]);
+        answering.answer(input, &mut output);
         let mut requests = 0;
         let allocations = allocation_counter::measure(|| {
-            requests = answering.answer(&input, &mut output).requests;
+            requests = answering.answer(input, &mut output).requests;
         });
         assert_eq!(requests, 17);
         assert_eq!(allocations.count_total, 0);
@@ -463,12 +473,21 @@ mod tests {
 
     #[test]
     fn requests_split_anywhere_get_the_same_replies() {
-        let input = requests();
+        get_the_same_replies::<Mbap>(&requests(frame));
+        get_the_same_replies::<Ascii>(&requests(ascii_frame));
+        // Characters between frames, a frame cut short, a wrong checksum, and a line without end.
+        let disturbed = [b"\r\nx\0".to_vec(), ascii_frame(1, &[17]), b":0111:0111EF\r\n".to_vec()];
+        let endless = [b":".to_vec(), vec![b'0'; 2 * ascii::MAX_LEN], ascii_frame(1, &[17])];
+        get_the_same_replies::<Ascii>(&[disturbed.concat(), endless.concat()].concat());
+    }
+
+    fn get_the_same_replies<F: Framing>(input: &[u8]) {
         let mut whole = vec![0; OUTPUT];
-        let len = answering().answer(&input, &mut whole).len;
+        let len = answering::<F>().answer(input, &mut whole).len;
+        assert!(len > 0);
         for cut in 0..input.len() {
             let (mut answering, mut buffer, mut output) =
-                (answering(), vec![0; INPUT], vec![0; OUTPUT]);
+                (answering::<F>(), vec![0; INPUT], vec![0; OUTPUT]);
             let mut replies = Vec::new();
             for part in [&input[..cut], &input[cut..]] {
                 let kept = answering.restore(&mut buffer);
@@ -484,15 +503,44 @@ mod tests {
     fn the_output_has_room_for_the_replies_to_any_input() {
         let shortest = frame(1, &[17]);
         let input = shortest.repeat(INPUT / shortest.len());
-        let answered = answering().answer(&input, &mut vec![0; OUTPUT]);
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
         assert_eq!(answered.requests, INPUT / Mbap::SHORTEST);
         assert!(answered.requests * mbap::MAX_LEN <= OUTPUT);
+
+        let shortest = ascii_frame(1, &[17]);
+        let input = shortest.repeat(INPUT / shortest.len());
+        let answered = answering::<Ascii>().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!(answered.requests, INPUT / Ascii::SHORTEST);
+        assert!(answered.requests * ascii::MAX_LEN <= OUTPUT);
+    }
+
+    #[test]
+    fn the_longest_ascii_reply_is_encoded_in_place() {
+        let longest = [&[8, 0, 0][..], &[0xA5; 250]].concat();
+        let mut output = vec![0; OUTPUT];
+        let answered = answering::<Ascii>().answer(&ascii_frame(1, &longest), &mut output);
+        assert_eq!(output[..answered.len], ascii_frame(1, &longest));
+        assert_eq!(answered.len, ascii::MAX_LEN);
+    }
+
+    #[test]
+    fn an_ascii_line_without_end_leaves_nothing_behind() {
+        let mut answering = answering::<Ascii>();
+        let damaged =
+            |answering: &Answering<Ascii>| answering.unit_server.counters.frames.damaged.get();
+        let line = [b":".to_vec(), vec![b'0'; INPUT - 1]].concat();
+        let answered = answering.answer(&line, &mut vec![0; OUTPUT]);
+        assert_eq!((answered.consumed, answering.partial_len), (INPUT, 0));
+        assert_eq!(damaged(&answering), 1);
+
+        answering.answer(&line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT]);
+        assert_eq!((answering.partial_len, damaged(&answering)), (ascii::MAX_LEN - 1, 1));
     }
 
     #[test]
     fn requests_before_a_broken_frame_are_answered_and_none_after_it() {
         let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
-        let answered = answering().answer(&input, &mut vec![0; OUTPUT]);
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
         assert_eq!((answered.requests, answered.broken), (1, true));
     }
 }

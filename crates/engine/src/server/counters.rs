@@ -27,7 +27,7 @@ pub struct FrameCounters {
     pub foreign: Counter,
     /// Invalid length: the connection is closed, or the datagram is discarded.
     pub broken: Counter,
-    /// Wrong CRC or LRC, incomplete, or invalid characters: discarded.
+    /// Wrong CRC or LRC, incomplete, too long, or invalid characters: discarded.
     pub damaged: Counter,
     /// On a serial line, for a unit that is not served here: ignored.
     pub other_unit: Counter,

@@ -26,4 +26,4 @@ pub use engine::{
 pub use raw_ingest::{RawRule, RawSettings};
 pub use serial::SerialSettings;
 pub use tcp::{StreamFraming, StreamSettings};
-pub use udp::UdpSettings;
+pub use udp::{DatagramFraming, UdpSettings};

@@ -1,4 +1,4 @@
-//! Listeners for Modbus TCP, with or without TLS, and RTU over TCP.
+//! Listeners for Modbus TCP, with or without TLS, RTU over TCP and ASCII over TCP.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use super::admission::ConnectionLimits;
 use super::admission::Ticket;
 use super::connection::{Connection, Timeouts};
 use super::event::Kind;
-use super::framing::{Framing, Mbap, Rtu};
+use super::framing::{Ascii, Framing, Mbap, Rtu};
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::policy::{PeerRights, Policy, Rule};
 use super::stream::Stream;
@@ -27,6 +27,8 @@ pub enum StreamFraming {
     Mbap,
     /// RTU over TCP: RTU frames, one after another.
     Rtu,
+    /// ASCII over TCP: ASCII frames, one after another.
+    Ascii,
 }
 
 /// A listener for Modbus over TCP connections.
@@ -164,6 +166,7 @@ impl Service for ModbusStream {
         match self.framing {
             StreamFraming::Mbap => self.connection::<Mbap>(context, connection, stop).await,
             StreamFraming::Rtu => self.connection::<Rtu>(context, connection, stop).await,
+            StreamFraming::Ascii => self.connection::<Ascii>(context, connection, stop).await,
         }
     }
 }

@@ -1,11 +1,11 @@
-//! Modbus over UDP: one request per datagram. The reply comes from the address that received the
-//! request.
+//! Modbus over UDP and RTU over UDP: one request per datagram. The reply comes from the address that
+//! received the request.
 
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use holdfast_protocol::frame::mbap;
+use holdfast_protocol::frame::{mbap, rtu};
 use holdfast_protocol::pdu;
 use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
 use socket2::SockRef;
@@ -13,7 +13,7 @@ use tokio::io::Interest;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
 
-use super::framing::{Framing, Mbap, Next};
+use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::policy::{PeerRights, Policy, Rule};
 use super::unit_server::UnitServer;
@@ -24,28 +24,57 @@ const INPUT: usize = 64 * 1024;
 /// The most reads of the remaining input when the listener stops.
 const LAST_READS: usize = 1024;
 
+/// The longest frame of any framing of datagrams.
+const MAX_FRAME_LEN: usize = mbap::MAX_LEN;
+
+const _: () = assert!(rtu::MAX_LEN <= MAX_FRAME_LEN);
+
+/// The framing of Modbus in a datagram.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DatagramFraming {
+    /// Modbus UDP: an MBAP header before the PDU.
+    Mbap,
+    /// RTU over UDP: an RTU frame.
+    Rtu,
+}
+
 /// A listener for Modbus datagrams.
 #[derive(Debug, Clone)]
 pub struct UdpSettings {
     /// With port 0, the system picks a port. `[::]` also accepts IPv4 datagrams.
     pub bind: SocketAddr,
+    pub framing: DatagramFraming,
     pub rules: Vec<Rule>,
 }
 
 pub(crate) struct ModbusUdp {
     unit_server: Arc<UnitServer>,
     policy: Policy<PeerRights>,
+    framing: DatagramFraming,
 }
 
 impl ModbusUdp {
     pub(crate) fn new(settings: &UdpSettings, unit_server: Arc<UnitServer>) -> ModbusUdp {
-        ModbusUdp { unit_server, policy: Policy::of(&settings.rules) }
+        let policy = Policy::of(&settings.rules);
+        ModbusUdp { unit_server, policy, framing: settings.framing }
     }
 
     /// Answers datagrams until `stop`, then those that the system has already received.
     pub(crate) async fn serve(
         self,
         context: Arc<ListenerContext>,
+        socket: std::net::UdpSocket,
+        stop: watch::Receiver<bool>,
+    ) {
+        match self.framing {
+            DatagramFraming::Mbap => self.serve_framed::<Mbap>(&context, socket, stop).await,
+            DatagramFraming::Rtu => self.serve_framed::<Rtu>(&context, socket, stop).await,
+        }
+    }
+
+    async fn serve_framed<D: Datagram>(
+        &self,
+        context: &ListenerContext,
         socket: std::net::UdpSocket,
         mut stop: watch::Receiver<bool>,
     ) {
@@ -64,12 +93,12 @@ impl ModbusUdp {
                 socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
             });
             if let Ok(meta) = received {
-                self.take(&context, &socket, &meta, &input);
+                self.take::<D>(context, &socket, &meta, &input);
             }
         }
         for _ in 0..LAST_READS {
             match socket.receive(&mut input) {
-                Ok(meta) => self.take(&context, &socket, &meta, &input),
+                Ok(meta) => self.take::<D>(context, &socket, &meta, &input),
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
                 Err(_) => {}
             }
@@ -77,12 +106,18 @@ impl ModbusUdp {
     }
 
     /// Answers all datagrams of one read. All have the same length, except the last.
-    fn take(&self, context: &ListenerContext, socket: &Datagrams, meta: &RecvMeta, input: &[u8]) {
-        let mut output = [0; mbap::MAX_LEN];
+    fn take<D: Datagram>(
+        &self,
+        context: &ListenerContext,
+        socket: &Datagrams,
+        meta: &RecvMeta,
+        input: &[u8],
+    ) {
+        let mut output = [0; MAX_FRAME_LEN];
         let mut rest = &input[..meta.len];
         loop {
             let (datagram, more) = rest.split_at(meta.stride.min(rest.len()));
-            let len = self.answer(context, meta.addr, datagram, &mut output);
+            let len = self.answer::<D>(context, meta.addr, datagram, &mut output);
             if len > 0 {
                 socket.send(&output[..len], meta);
             }
@@ -94,32 +129,34 @@ impl ModbusUdp {
     }
 
     /// Returns the length of the reply, 0 when there is none.
-    fn answer(
+    fn answer<D: Datagram>(
         &self,
         context: &ListenerContext,
         peer: SocketAddr,
         datagram: &[u8],
-        output: &mut [u8; mbap::MAX_LEN],
+        output: &mut [u8; MAX_FRAME_LEN],
     ) -> usize {
         let Some(rights) = self.policy.rights(peer.ip()) else {
             context.refuse_source(peer);
             return 0;
         };
         let frames = &self.unit_server.counters.frames;
-        let (tag, unit_id, request) = match Mbap::next(datagram) {
-            Next::Request { tag, unit_id, pdu, len } if len == datagram.len() => {
-                (tag, unit_id, pdu)
-            }
+        let (tag, unit_id, request) = match D::only(datagram) {
+            Next::Request { tag, unit_id, pdu, .. } => (tag, unit_id, pdu),
             Next::Foreign { .. } => {
                 frames.foreign.add();
                 return 0;
             }
-            _ => {
+            Next::Damaged { .. } => {
+                frames.damaged.add();
+                return 0;
+            }
+            Next::Broken | Next::Incomplete | Next::Stray { .. } => {
                 frames.broken.add();
                 return 0;
             }
         };
-        let Some(buffer) = output[Mbap::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
+        let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
         let len = self.unit_server.answer(rights, unit_id, request, buffer);
@@ -127,7 +164,7 @@ impl ModbusUdp {
             let reply = &buffer[..len.unwrap_or_default()];
             auditor.note(&context.name, Some(peer), unit_id, request, reply);
         }
-        len.map_or(0, |len| Mbap::complete(output, tag, unit_id, len))
+        len.map_or(0, |len| D::complete(output, tag, unit_id, len))
     }
 }
 
