@@ -157,11 +157,10 @@ impl TcpLink {
             if self.open.borrow().is_none() {
                 self.connect(deadline, priority).await?;
             }
-            let began = Instant::now();
+            let began = self.pace.began();
             let (answer, again) = self.carry_out(unit_id, request, deadline, attempt).await?;
-            match answer {
-                Err(Fault::Timeout) => self.pace.timed_out(Instant::now()),
-                _ => self.pace.answered(began.elapsed(), Instant::now()),
+            if let Some(began) = began {
+                self.pace.ended(began, answer == Err(Fault::Timeout));
             }
             let Some(next) = again else { return answer };
             sleep(next.pause()).await;
@@ -183,7 +182,10 @@ impl TcpLink {
         let mut sent = self.send(unit_id, request, deadline, attempt)?;
         loop {
             match timeout_at(self.due(), &mut sent.outcome).await {
-                Ok(outcome) => return outcome.or(Err(Fault::Reset)),
+                Ok(outcome) => {
+                    sent.is_over = true;
+                    return outcome.or(Err(Fault::Reset));
+                }
                 Err(_) => self.advance(),
             }
         }
@@ -266,7 +268,7 @@ impl TcpLink {
             Ok(ticket) if found.write() => {
                 let (sender, outcome) = oneshot::channel();
                 found.waiting.insert(ticket, sender);
-                Ok(Sent { link: self, ticket, outcome })
+                Ok(Sent { link: self, ticket, outcome, is_over: false })
             }
             _ => {
                 *open = None;
@@ -300,10 +302,14 @@ struct Sent<'l> {
     link: &'l TcpLink,
     ticket: Ticket,
     outcome: oneshot::Receiver<Outcome>,
+    is_over: bool,
 }
 
 impl Drop for Sent<'_> {
     fn drop(&mut self) {
+        if self.is_over {
+            return;
+        }
         self.outcome.close();
         if let Some(open) = self.link.open.borrow_mut().as_mut()
             // A new connection counts its tickets anew: this one may be of another request.

@@ -98,8 +98,18 @@ impl Pace {
         (place, doubtful)
     }
 
-    /// A request was answered after this time.
-    pub(super) fn answered(&self, took: Duration, now: Instant) {
+    /// The time, if the round trips of requests matter.
+    pub(super) fn began(&self) -> Option<Instant> {
+        self.auto.as_ref().map(|_| Instant::now())
+    }
+
+    /// A request that began then has ended.
+    pub(super) fn ended(&self, began: Instant, timed_out: bool) {
+        let now = Instant::now();
+        if timed_out { self.timed_out(now) } else { self.answered(now - began, now) }
+    }
+
+    fn answered(&self, took: Duration, now: Instant) {
         let Some(auto) = &self.auto else { return };
         let was_full = self.places.free.get() == 0;
         match auto.borrow_mut().answered(took, was_full, now) {
@@ -109,8 +119,7 @@ impl Pace {
         }
     }
 
-    /// A request was not answered in time.
-    pub(super) fn timed_out(&self, now: Instant) {
+    fn timed_out(&self, now: Instant) {
         if let Some(auto) = &self.auto {
             let fewer = auto.borrow_mut().back_to(1, now);
             self.take_away(fewer);
