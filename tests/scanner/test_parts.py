@@ -17,6 +17,7 @@ from holdfast.scanner.decoding import decoder
 from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.groups import Group, grouped
 from holdfast.scanner.health import Health
+from holdfast.scanner.heartbeat import Heart
 from holdfast.scanner.messages import BrowseRequest, ServiceReport
 from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.publishing import Publisher
@@ -491,3 +492,36 @@ def test_blocks_that_a_scan_did_not_come_to_stay_as_they_were() -> None:
     assert sorted(block[1] for block in health.blocks) == [0, 4, 9]
     health.judge(poll((0, 0, 4.0)))
     assert [block[1] for block in health.blocks] == [0]
+
+
+def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A stop does not wait longer for JetStream than the scanner does."""
+
+    class Jetstream:
+        def __init__(self) -> None:
+            self.asked, self.answer = asyncio.Event(), asyncio.Event()
+
+        def jetstream(self, **_: object) -> Jetstream:
+            return self
+
+        async def key_value(self, _: str) -> object:
+            self.asked.set()
+            await self.answer.wait()
+            raise TimeoutError
+
+    async def beaten(*, stopped: bool) -> list[str]:
+        caplog.clear()
+        heart, server = Heart("plant"), Jetstream()
+        client = cast("Client", server)
+        beating = asyncio.create_task(heart.beat(client))
+        await server.asked.wait()
+        if stopped:
+            await heart.stop(client)
+        server.answer.set()
+        await beating
+        return [record.getMessage() for record in caplog.records]
+
+    assert asyncio.run(beaten(stopped=False)) == ["no_heartbeat"]
+    assert asyncio.run(beaten(stopped=True)) == []

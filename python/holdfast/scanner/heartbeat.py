@@ -39,6 +39,7 @@ class Heart:
         """Milliseconds since 1970."""
         self._works: bool | None = None
         self._checked = False
+        self._stopped = False
 
     async def beat(self, client: Client | None) -> None:
         """Renews the heartbeat. Logs only the first of consecutive failures."""
@@ -70,7 +71,8 @@ class Heart:
         logs.write(logging.WARNING, "heartbeat_has_no_end", bucket=BUCKET, todo=todo)
 
     async def stop(self, client: Client | None) -> None:
-        """Deletes the heartbeat."""
+        """Deletes the heartbeat. A heartbeat that is still being renewed is not logged any more."""
+        self._stopped = True
         if client is None or not self._works:
             return
         with contextlib.suppress(Exception):
@@ -78,7 +80,7 @@ class Heart:
                 await (await _bucket(client)).delete(self._key)
 
     def _told(self, works: bool, reason: str) -> None:
-        if works is self._works:
+        if self._stopped or works is self._works:
             return
         if works:
             logs.write(logging.INFO, "heartbeat", bucket=BUCKET, key=self._key)
