@@ -5,6 +5,7 @@ option that tolerates what the device does.
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -118,10 +119,17 @@ def test_a_late_reply_of_such_a_device_is_not_taken_for_the_next(
 def test_a_second_reply_of_such_a_device_is_not_taken_for_the_next(
     kind: str, make: Make, dial: Dial
 ) -> None:
-    device = make(kind, lambda asked: asked.send(asked.frame(), asked.frame()))
+    sent = threading.Event()
+
+    def twice(asked: Asked) -> None:
+        asked.send(asked.frame(), asked.frame())
+        sent.set()
+
+    device = make(kind, twice)
     client = dial(device.url)
 
     assert client.read_holding_registers(7, 1) == [7]
+    assert sent.wait(wire.DEADLINE)
     # Whatever the device sends unasked comes before the reply that it sends next.
     assert client.read_holding_registers(8, 1) == [8]
 
