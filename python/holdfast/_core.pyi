@@ -165,7 +165,7 @@ def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> i
 class Rule:
     """What the peers of some networks may do.
 
-    `units` maps unit ids, 0 to 255, to memories. `sources` are networks or addresses, IPv4 or IPv6;
+    `units` maps unit ids, 0 to 255, to memories and routes. `sources` are networks or addresses, IPv4 or IPv6;
     an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
     codes, or `deny`, the codes that are not allowed, but not both. `roles`, only with TLS, are the
     allowed roles of the peer's certificate: "" is a certificate without a role, `None` is any role.
@@ -175,7 +175,7 @@ class Rule:
 
     def __new__(
         cls,
-        units: Mapping[int, Memory],
+        units: Mapping[int, Memory | Route],
         *,
         sources: Sequence[str],
         access: Access,
@@ -563,6 +563,28 @@ class PolledDevice:
     ) -> PolledDevice: ...
 
 @final
+class Link:
+    """A connection or serial line to devices, shared by all that ask them."""
+
+    @property
+    def name(self) -> str:
+        """The name that it was created with."""
+
+    def route(self, name: str, *, unit: int | None = None, timeout: float = 1.0) -> Route:
+        """A target for the units of a `Rule`: their requests go to `unit` of this link.
+
+        Without `unit`, they keep their unit id. `timeout` is in seconds, from the moment when a
+        request is sent.
+        """
+
+    def counters(self) -> dict[str, int]:
+        """The requests of listeners by their fate, and how many wait now."""
+
+@final
+class Route:
+    """Where a listener passes on the requests to a unit."""
+
+@final
 class Poller:
     """Polls devices on a native thread, from construction to `stop`.
 
@@ -590,6 +612,26 @@ class Poller:
 
         Returns the number of the write in `results`. Raises `ValueError` for an unknown device or a
         request that does not write, `RuntimeError` after `stop`.
+        """
+
+    def link(
+        self,
+        name: str,
+        endpoint: Endpoint,
+        *,
+        in_flight: int | None = 1,
+        queue: int = 256,
+        coalesce: bool = True,
+        cache: float = 0.0,
+        preferred: Sequence[str] = (),
+    ) -> Link:
+        """The connection or serial line to an address, for the requests of listeners.
+
+        Devices at the same address share it. The first call for an address decides its settings:
+        `queue` is the most requests of listeners that wait, with `coalesce` one request answers
+        equal reads that wait at the same time, for `cache` seconds a reply answers equal reads, and
+        reads of the addresses in `preferred` go before those of others. Raises `ValueError`, and
+        `RuntimeError` after `stop`.
         """
 
     def remove(self, name: str) -> bool:

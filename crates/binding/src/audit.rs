@@ -14,10 +14,13 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
     line.set_item("listener", &*record.listener)?;
     line.set_item("peer", record.peer.map(peer::text))?;
     match &record.write {
-        Written::Modbus { unit_id, pdu, refused } => {
+        Written::Modbus { unit_id, pdu, refused, route } => {
             line.set_item("unit", unit_id)?;
+            if let Some(route) = route {
+                line.set_item("route", &**route)?;
+            }
             line.set_item("function", pdu.first())?;
-            request(&line, pdu)?;
+            request(&line, pdu, route.is_some())?;
             line.set_item("outcome", refused.map_or_else(|| "done".into(), exception))?;
         }
         Written::Packet { format, header, payload, refused } => {
@@ -31,8 +34,9 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
     Ok(line)
 }
 
-/// Adds area, address and values of a Modbus request. A request that does not parse adds nothing.
-fn request(line: &Bound<'_, PyDict>, pdu: &[u8]) -> PyResult<()> {
+/// Adds area, address and values of a Modbus request. A request that memories do not know adds its PDU
+/// if it was passed on to a device, otherwise nothing.
+fn request(line: &Bound<'_, PyDict>, pdu: &[u8], passed_on: bool) -> PyResult<()> {
     let (area, address, values) = match Request::parse(pdu) {
         Ok(Request::WriteSingleCoil { address, value }) => {
             (Area::Coils, address, vec![u16::from(value)])
@@ -54,6 +58,10 @@ fn request(line: &Bound<'_, PyDict>, pdu: &[u8]) -> PyResult<()> {
             line.set_item("address", address)?;
             line.set_item("and_mask", and_mask)?;
             return line.set_item("or_mask", or_mask);
+        }
+        _ if passed_on => {
+            let hex: String = pdu.iter().map(|byte| format!("{byte:02x}")).collect();
+            return line.set_item("pdu", hex);
         }
         _ => return Ok(()),
     };
@@ -90,6 +98,10 @@ fn registers(packed: &[u8]) -> Vec<u16> {
 }
 
 /// The name of an exception in snake case, such as `illegal_data_address`.
-fn exception(code: ExceptionCode) -> String {
-    code.name().to_lowercase().replace(' ', "_")
+fn exception(code: u8) -> String {
+    let known = ExceptionCode::from_code(code);
+    known.map_or_else(
+        || format!("exception_{code:02x}"),
+        |known| known.name().to_lowercase().replace(' ', "_"),
+    )
 }

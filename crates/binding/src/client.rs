@@ -295,7 +295,9 @@ impl BlockingClient {
     ) -> PyResult<Bound<'py, PyAny>> {
         let unit = byte("unit", unit)?;
         let timeout = seconds("timeout", timeout)?;
-        let result = py.detach(|| self.core.call(unit, &request.encoded, timeout, Reply::new));
+        let result = py.detach(|| {
+            self.core.call(unit, &request.encoded, timeout, |response, _| Reply::new(response))
+        });
         result.map_err(raised)?.into_python(py)
     }
 
@@ -367,7 +369,9 @@ impl Reply {
             Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec(), bits.quantity().into()),
             Response::Registers(registers) => Reply::Registers(registers.as_bytes().to_vec()),
             Response::Written => Reply::Written,
-            Response::Diagnostics(data) | Response::ServerId(data) => Reply::Bytes(data.to_vec()),
+            Response::Diagnostics(data) | Response::ServerId(data) | Response::Opaque(data) => {
+                Reply::Bytes(data.to_vec())
+            }
             Response::EventCounter { busy, events } => Reply::EventCounter(busy, events),
             Response::Identification(answer) => {
                 let objects = answer.iter().map(|(id, value)| (id, value.to_vec())).collect();

@@ -10,6 +10,7 @@ mod client;
 mod connection;
 mod engine;
 mod limits;
+mod link;
 mod listener;
 mod memory;
 mod peer;
@@ -30,6 +31,8 @@ mod _core {
     use super::connection::{Attempt, Connection};
     #[pymodule_export]
     use super::engine::Engine;
+    #[pymodule_export]
+    use super::link::{Link, Route};
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule, ServerTls};
     #[pymodule_export]

@@ -1,7 +1,7 @@
 //! Constants of the module: areas, functions and their limits, names of exceptions, device faults.
 //! Python takes them from here and keeps no list of its own.
 
-use holdfast_engine::poller::Fault;
+use holdfast_engine::link::Fault;
 use holdfast_memory::{Area, Span};
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
 use pyo3::prelude::*;

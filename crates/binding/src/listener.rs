@@ -19,6 +19,7 @@ use pyo3::types::PyMapping;
 
 use crate::arguments::{address, byte, network, seconds, within, word};
 use crate::client::line;
+use crate::link::Route;
 use crate::memory::{Memory, named};
 
 #[pyclass(frozen, module = "holdfast")]
@@ -55,11 +56,19 @@ impl Rule {
                 ));
             }
         };
-        let units = targets(units)?;
-        let units = units.into_iter().map(|(unit, memory)| Ok((byte("unit id", unit)?, memory)));
-        let units = units.collect::<PyResult<_>>()?;
-        let sources = networks(&sources)?;
-        Ok(Rule { core: CoreRule { sources, roles, units, access, functions } })
+        let (mut memories, mut routes) = (Vec::new(), Vec::new());
+        for item in units.items()?.iter() {
+            let (unit, target): (i128, Bound<'_, PyAny>) = item.extract()?;
+            let unit = byte("unit id", unit)?;
+            if let Ok(route) = target.extract::<PyRef<'_, Route>>() {
+                routes.push((unit, route.core.clone()));
+            } else {
+                let memory: PyRef<'_, Memory> = target.extract()?;
+                memories.push((unit, Arc::clone(&memory.core)));
+            }
+        }
+        let (sources, units) = (networks(&sources)?, memories);
+        Ok(Rule { core: CoreRule { sources, roles, units, routes, access, functions } })
     }
 }
 

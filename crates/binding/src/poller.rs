@@ -3,10 +3,11 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
+use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    Batch, Destination, DeviceSettings, DeviceState, Fault, ForwardSettings, InFlight, Poll,
-    Poller as Core, PollerError, ReadSettings, StatusSettings,
+    Batch, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll, Poller as Core,
+    PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
@@ -15,10 +16,8 @@ use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, seconds, within, word};
 use crate::client::{Endpoint, Request};
+use crate::link::{self, Link};
 use crate::memory::{Memory, named};
-
-/// The most requests in flight at one address.
-const MAX_IN_FLIGHT: usize = 1024;
 
 /// An area, its first address, and the one behind its last.
 type Range = (String, u32, u32);
@@ -82,12 +81,7 @@ impl PolledDevice {
         let core = DeviceSettings {
             name,
             endpoint: endpoint.core.clone(),
-            in_flight: match in_flight {
-                Some(number) => {
-                    InFlight::Fixed(within("in_flight", number, 1..=MAX_IN_FLIGHT)? as u16)
-                }
-                None => InFlight::Auto,
-            },
+            in_flight: link::in_flight(in_flight)?,
             unit_id: byte("unit", unit)?,
             interval: seconds("interval", interval)?,
             timeout: seconds("timeout", timeout)?,
@@ -131,6 +125,23 @@ impl Poller {
 
     fn write(&self, name: &str, request: PyRef<'_, Request>) -> PyResult<u64> {
         self.core.write(name, Box::new(request.encoded.clone())).map_err(raised)
+    }
+
+    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=Vec::new()))]
+    #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+    fn link(
+        &self,
+        name: String,
+        endpoint: PyRef<'_, Endpoint>,
+        in_flight: Option<i128>,
+        queue: i128,
+        coalesce: bool,
+        cache: f64,
+        preferred: Vec<String>,
+    ) -> PyResult<Link> {
+        let settings =
+            link::settings(name, &endpoint, in_flight, queue, coalesce, cache, preferred)?;
+        Ok(Link { core: self.core.link(settings).map_err(raised)? })
     }
 
     fn remove(&self, name: &str) -> bool {

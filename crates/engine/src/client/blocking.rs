@@ -66,8 +66,8 @@ impl BlockingClient {
         }
     }
 
-    /// Sends a request when it is the caller's turn, and passes its response to `take`. `timeout`
-    /// does not include the wait for the turn. On a serial line, unit id 0 is a broadcast: no unit
+    /// Sends a request when it is the caller's turn, and passes its response and the PDU of that to
+    /// `take`. `timeout` does not include the wait for the turn. On a serial line, unit id 0 is a broadcast: no unit
     /// replies, and a write counts as done when it is sent.
     ///
     /// # Errors
@@ -77,7 +77,7 @@ impl BlockingClient {
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
-        take: impl FnOnce(Response<'_>) -> T,
+        take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Result<T, ClientError> {
         let _turn = self.turns.take();
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
@@ -96,7 +96,7 @@ impl BlockingClient {
                     return;
                 };
                 result = Some(match done.outcome {
-                    Ok(response) => Ok(take(response)),
+                    Ok(response) => Ok(take(response, done.pdu)),
                     Err(failure) => Err(ClientError::new(failure, timeout)),
                 });
             });

@@ -23,20 +23,21 @@ use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
-use super::backoff;
 use super::caught::{Panicked, caught};
 use super::cost::Samples;
 use super::forward::{Forward, ForwardSettings};
 use super::learned::{Learned, Unreadable};
-use super::link::Link;
-use super::pace::{InFlight, Priority};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
 use super::results::{BlockResult, Poll, Results};
 use super::search;
 use super::sink::Destination;
 use super::state::DeviceState;
-use super::status::{Fault, StatusSettings};
+use super::status::StatusSettings;
 use crate::client::Endpoint;
+use crate::link::Fault;
+use crate::link::Link;
+use crate::link::backoff;
+use crate::link::{InFlight, Priority};
 
 /// The longest interval between writes of the status block.
 const TELLING: Duration = Duration::from_secs(1);
@@ -553,7 +554,7 @@ impl Device {
         let began = Instant::now();
         let priority = if self.silent.get() > 0 { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
-        let answer = self.link.call(*unit_id, &request, *timeout, priority).await;
+        let answer = self.link.call(*unit_id, &request, *timeout, priority).await.map(data);
         match &answer {
             Ok(bytes) => {
                 debug_assert_eq!(bytes.len(), block.area.byte_len(block.count.into()));
@@ -622,6 +623,12 @@ impl Device {
         self.state.counters.unstored.add();
         self.unstored.set(true);
     }
+}
+
+/// The data of the reply to a read: what follows function code and byte count.
+fn data(mut pdu: Vec<u8>) -> Vec<u8> {
+    pdu.drain(..2.min(pdu.len()));
+    pdu
 }
 
 /// The first due time that is not before `now`, and the number of due times before it.

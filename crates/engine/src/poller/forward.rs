@@ -16,8 +16,8 @@ use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
 
-use super::backoff;
 use crate::counter::Counter;
+use crate::link::backoff;
 use crate::packet_area::in_packet;
 
 /// The longest pause before a target that is down is tried again.

@@ -7,7 +7,7 @@ use holdfast_memory::Area;
 use tokio::time::Instant;
 
 use super::plan::{Block, Cut, Field, PlanLimits};
-use super::status::Fault;
+use crate::link::Fault;
 
 /// How long the limits are remembered.
 const REMEMBERED: Duration = Duration::from_secs(600);

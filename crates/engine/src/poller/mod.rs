@@ -1,21 +1,17 @@
 //! The poller: reads devices on schedule, and passes the results to memory and to other receivers.
 //!
 //! * A device is a task with its schedule, plan, counters and status ([`device`]).
-//! * Devices behind the same address share a link. A link does not know its devices ([`link`]).
+//! * Devices behind the same address share a link. A link does not know its devices ([`crate::link`]).
 //! * A read is written to memory unchanged and atomically. A failed read writes nothing ([`sink`]).
 //!
 //! All tasks of a poller run on one thread, so that they share state without locks.
 
-mod backoff;
 mod caught;
 mod cost;
 mod device;
 mod forward;
-mod handshake;
 mod health;
 mod learned;
-mod link;
-mod pace;
 pub mod plan;
 mod results;
 mod search;
@@ -26,9 +22,8 @@ mod thread;
 
 pub use device::{DeviceSettings, ReadSettings};
 pub use forward::{ForwardCounters, ForwardSettings};
-pub use pace::InFlight;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};
-pub use status::{Fault, StatusSettings};
+pub use status::StatusSettings;
 pub use thread::{Polled, Poller, PollerError};

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use holdfast_memory::Area;
 
-use super::status::Fault;
+use crate::link::Fault;
 
 /// The most polls in the queue.
 const CAPACITY: usize = 16_384;

@@ -5,7 +5,7 @@ use std::cell::RefMut;
 
 use super::learned::Learned;
 use super::plan::{self, Block, Field};
-use super::status::Fault;
+use crate::link::Fault;
 
 /// Exceptions that depend on the request, not on the state of the device.
 const ILLEGAL: [u8; 2] = [2, ILLEGAL_VALUE];

@@ -5,8 +5,9 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::health::Health;
-use super::status::{Fault, Status};
+use super::status::Status;
 use crate::counter::Counter;
+use crate::link::Fault;
 
 /// Counters and health of a device.
 #[derive(Debug, Default)]

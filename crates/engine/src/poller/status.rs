@@ -12,9 +12,6 @@ pub const STATUS_BLOCK_LEN: u16 = 30;
 /// The size of the device name, in bytes.
 const NAME: usize = 16;
 
-/// Errors from this code on are not exceptions.
-const NO_EXCEPTION: u16 = 0x8000;
-
 /// The place of the block of a device: at `slot` × 30 of an area of registers.
 #[derive(Debug, Clone)]
 pub struct StatusSettings {
@@ -34,45 +31,6 @@ impl StatusSettings {
         let span = self.memory.span(self.area);
         let inside = |address| span.holds(address, usize::from(STATUS_BLOCK_LEN));
         !self.area.is_bits() && self.address().is_some_and(inside)
-    }
-}
-
-/// Why a request or a poll failed, as in the status block.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fault {
-    Exception(u8),
-    Timeout,
-    Refused,
-    Reset,
-    Invalid,
-    /// The device has no plan, so no request is sent.
-    Unplanned,
-    /// Memory refused the read or the status block.
-    Unstored,
-    /// A task of the device has panicked.
-    Internal,
-}
-
-/// Exceptions of a gateway that could not reach the unit.
-const UNREACHED: [u8; 2] = [0x0A, 0x0B];
-
-impl Fault {
-    /// Whether the device has answered, even if only with an exception.
-    pub(super) fn is_answer(self) -> bool {
-        matches!(self, Fault::Exception(code) if !UNREACHED.contains(&code))
-    }
-
-    pub const fn code(self) -> u16 {
-        match self {
-            Fault::Exception(code) => code as u16,
-            Fault::Timeout => NO_EXCEPTION + 1,
-            Fault::Refused => NO_EXCEPTION + 2,
-            Fault::Reset => NO_EXCEPTION + 3,
-            Fault::Invalid => NO_EXCEPTION + 4,
-            Fault::Unplanned => NO_EXCEPTION + 5,
-            Fault::Unstored => NO_EXCEPTION + 6,
-            Fault::Internal => NO_EXCEPTION + 7,
-        }
     }
 }
 
@@ -132,6 +90,7 @@ impl Status {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::link::Fault;
 
     #[test]
     fn the_block_has_the_documented_layout() {

@@ -2,9 +2,9 @@
 
 use std::collections::HashMap;
 use std::io;
-use std::rc::{Rc, Weak};
+use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -17,13 +17,11 @@ use tokio::task::{AbortHandle, LocalSet, spawn_local};
 use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned, Turn};
 use super::forward::{Forward, ForwardCounters};
-use super::link::Link;
-use super::pace::Priority;
 use super::plan::{PlanError, PlanLimits};
 use super::results::{Results, Written};
 use super::state::DeviceState;
-use super::status::Fault;
 use crate::client::{Endpoint, Place};
+use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, SharedLink, serve};
 use crate::tls::client::Identity;
 
 #[derive(Debug, Error)]
@@ -74,6 +72,8 @@ pub struct Poller {
     orders: mpsc::UnboundedSender<Order>,
     results: Arc<Results>,
     tickets: AtomicU64,
+    /// The links that listeners use.
+    shared: Mutex<Vec<(Address, Weak<SharedLink>)>>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -88,6 +88,8 @@ enum Order {
         at_once: bool,
     },
     Remove(String),
+    /// Serves a link that listeners use.
+    Serve(Box<LinkSettings>, Weak<SharedLink>, mpsc::UnboundedReceiver<Call>),
     Write {
         device: String,
         ticket: u64,
@@ -126,6 +128,7 @@ impl Poller {
             orders,
             results,
             tickets: AtomicU64::default(),
+            shared: Mutex::default(),
             thread: Mutex::new(Some(thread)),
         };
         for device in devices {
@@ -186,18 +189,35 @@ impl Poller {
         Ok(())
     }
 
+    /// A link for listeners. It is the link of all devices at this address too, and the first that
+    /// asks for it decides its settings.
+    ///
+    /// # Errors
+    /// [`PollerError::Stopped`].
+    pub fn link(&self, settings: LinkSettings) -> Result<Arc<SharedLink>, PollerError> {
+        let address = address(&settings.endpoint);
+        let mut all = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = all.iter().find(|(other, _)| *other == address);
+        if let Some(known) = known.and_then(|(_, link)| link.upgrade()) {
+            return Ok(known);
+        }
+        let (calls, called) = mpsc::unbounded_channel();
+        let link = Arc::new(SharedLink::new(&settings, calls));
+        self.order(Order::Serve(Box::new(settings), Arc::downgrade(&link), called))?;
+        all.retain(|(_, link)| link.strong_count() > 0);
+        all.push((address, Arc::downgrade(&link)));
+        Ok(link)
+    }
+
     /// Sends a write over the connection of a device. Returns a number; [`Poller::results`] reports
     /// the result under this number.
     ///
     /// # Errors
     /// [`PollerError`] if there is no such device, or the request is not a write.
     pub fn write(&self, name: &str, request: Box<EncodedRequest>) -> Result<u64, PollerError> {
-        let function = request.request().function();
-        if !function.is_write() {
-            return Err(PollerError::NoWrite {
-                device: name.to_owned(),
-                function: function.code(),
-            });
+        if !request.request().is_some_and(|request| request.function().is_write()) {
+            let function = request.pdu()[0];
+            return Err(PollerError::NoWrite { device: name.to_owned(), function });
         }
         if !self.polled().iter().any(|device| device.name == name) {
             return Err(PollerError::Unknown { device: name.to_owned() });
@@ -277,12 +297,16 @@ const IN_ORDER: &str = "the running devices are those in the list";
 
 /// Starts and stops the tasks of devices, until `Order::Stop`.
 async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
-    let mut links: HashMap<Address, Weak<Link>> = HashMap::new();
+    let mut links: HashMap<Address, rc::Weak<Link>> = HashMap::new();
     let mut running: HashMap<String, Running> = HashMap::new();
     let mut started = 0;
     while let Some(order) = orders.recv().await {
         match order {
             Order::Stop => return,
+            Order::Serve(settings, shared, calls) => {
+                let link = link_to(&settings.endpoint, settings.in_flight, &mut links);
+                spawn_local(serve(link, *settings, shared, calls));
+            }
             Order::Remove(name) => {
                 let removed = running.remove(&name);
                 debug_assert!(removed.is_some(), "{IN_ORDER}");
@@ -293,13 +317,15 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                 let phase = spread(planned.settings.start_within, started);
                 started += 1;
                 let name = planned.settings.name.clone();
-                let link = link_to(&planned.settings, &mut links);
+                let DeviceSettings { endpoint, in_flight, .. } = &planned.settings;
+                let link = link_to(endpoint, *in_flight, &mut links);
                 let device = Running::start(*planned, polled, link, phase, &results);
                 let before = running.insert(name, device);
                 debug_assert!(before.is_none(), "{IN_ORDER}");
             }
             Order::Replace { name, device: planned, polled, at_once } => {
-                let link = link_to(&planned.settings, &mut links);
+                let DeviceSettings { endpoint, in_flight, .. } = &planned.settings;
+                let link = link_to(endpoint, *in_flight, &mut links);
                 let before = running.remove(&name);
                 debug_assert!(before.is_some(), "{IN_ORDER}");
                 let name = planned.settings.name.clone();
@@ -419,12 +445,15 @@ fn made(
     (Device::new(planned, polled.state, to, forwards, report), tasks)
 }
 
-/// The link to a device, shared with all other devices at the same address.
-fn link_to(device: &DeviceSettings, links: &mut HashMap<Address, Weak<Link>>) -> Rc<Link> {
-    let DeviceSettings { endpoint, in_flight, .. } = device;
+/// The link to an address, shared by all that ask for it.
+fn link_to(
+    endpoint: &Endpoint,
+    in_flight: InFlight,
+    links: &mut HashMap<Address, rc::Weak<Link>>,
+) -> Rc<Link> {
     let known = links.entry(address(endpoint)).or_default();
     known.upgrade().unwrap_or_else(|| {
-        let link = Link::new(endpoint.clone(), *in_flight);
+        let link = Link::new(endpoint.clone(), in_flight);
         *known = Rc::downgrade(&link);
         link
     })
@@ -490,7 +519,6 @@ mod tests {
     use holdfast_protocol::pdu::{Range, Request};
 
     use super::*;
-    use crate::poller::InFlight;
     use crate::poller::plan::Strategy;
     use crate::poller::{Destination, ReadSettings, StatusSettings};
 

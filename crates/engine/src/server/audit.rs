@@ -7,8 +7,10 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use holdfast_protocol::pdu::{ExceptionCode, Function};
+use holdfast_protocol::pdu::{Function, Request};
 use holdfast_protocol::raw_ingest;
+
+use super::policy::OTHER_READS;
 
 /// The most bytes in the queue.
 const CAPACITY: usize = 32 << 20;
@@ -27,8 +29,9 @@ pub struct Record {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Written {
-    /// A request, unchanged.
-    Modbus { unit_id: u8, pdu: Vec<u8>, refused: Option<ExceptionCode> },
+    /// A request, unchanged, and the code of the exception that it was refused with. `route` is the
+    /// name of what it was passed on to.
+    Modbus { unit_id: u8, pdu: Vec<u8>, refused: Option<u8>, route: Option<Arc<str>> },
     /// A packet: its header, if it has a valid one, and the payload if it was written.
     Packet {
         format: raw_ingest::Format,
@@ -76,15 +79,23 @@ impl Auditor {
         reply: &[u8],
     ) {
         let function = request.first().copied().and_then(Function::from_code);
-        if !function.is_some_and(Function::is_write) {
-            return;
+        if function.is_some_and(Function::is_write) {
+            self.send(record(listener, peer, unit_id, request, reply, None));
         }
-        let refused = match reply {
-            [code, exception, ..] if code & 0x80 != 0 => ExceptionCode::from_code(*exception),
-            _ => None,
-        };
-        let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused };
-        self.send(Record { listener: Arc::clone(listener), peer, write });
+    }
+
+    /// Records a request to a device, unless it is known to only read. `reply` is what the device
+    /// answered, or what was answered in its place.
+    pub(crate) fn note_forwarded(
+        &self,
+        listener: &Arc<str>,
+        peer: Option<SocketAddr>,
+        unit_id: u8,
+        (route, request, reply): (&Arc<str>, &[u8], &[u8]),
+    ) {
+        if !only_reads(request) {
+            self.send(record(listener, peer, unit_id, request, reply, Some(Arc::clone(route))));
+        }
     }
 
     pub(crate) fn send(&self, record: Record) {
@@ -96,6 +107,34 @@ impl Auditor {
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
         }
     }
+}
+
+/// Whether a request is known to change nothing in a device.
+fn only_reads(request: &[u8]) -> bool {
+    let code = request.first().copied().unwrap_or_default();
+    match Function::from_code(code) {
+        Some(Function::Diagnostics | Function::EncapsulatedInterface) => {
+            Request::parse(request).is_ok_and(|request| request.is_read())
+        }
+        Some(function) => !function.is_write(),
+        None => OTHER_READS.contains(&code),
+    }
+}
+
+fn record(
+    listener: &Arc<str>,
+    peer: Option<SocketAddr>,
+    unit_id: u8,
+    request: &[u8],
+    reply: &[u8],
+    route: Option<Arc<str>>,
+) -> Record {
+    let refused = match reply {
+        [code, exception, ..] if code & 0x80 != 0 => Some(*exception),
+        _ => None,
+    };
+    let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route };
+    Record { listener: Arc::clone(listener), peer, write }
 }
 
 impl Record {

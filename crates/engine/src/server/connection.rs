@@ -4,7 +4,7 @@
 //! All connections of a worker thread share one pair of buffers ([`Scratch`]): nothing is awaited
 //! between a read and the write that answers it. A connection keeps only what is left over: the
 //! beginning of a request, or replies that a slow peer has not read. While replies wait, no more
-//! requests are read.
+//! requests are read. Requests to devices are answered later ([`super::deferred`]).
 
 use std::cell::RefCell;
 use std::future::poll_fn;
@@ -22,6 +22,7 @@ use tokio::task::yield_now;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::admission::Ticket;
+use super::deferred::{Completed, Deferral, Deferred, MAX_WAITING};
 use super::event::Kind;
 use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
@@ -32,8 +33,9 @@ use super::unit_server::UnitServer;
 /// Bytes per read of a socket.
 const INPUT: usize = 4096;
 
-/// Room for the replies to all requests of one read.
-const OUTPUT: usize = output::<Mbap>(output::<Rtu>(output::<Ascii>(0)));
+/// Room for the replies to all requests of one read, and for those that come later.
+const OUTPUT: usize =
+    output::<Mbap>(output::<Rtu>(output::<Ascii>(0))) + MAX_WAITING * Ascii::MAX_LEN;
 
 const fn output<F: Framing>(least: usize) -> usize {
     // A read has room for at least one byte.
@@ -103,6 +105,8 @@ struct Answering<F: Framing> {
     partial_len: usize,
     /// Nothing followed that beginning for [`Timeouts::frame`]: it may be all of it.
     is_doubtful: bool,
+    /// `None` until a request is answered later.
+    deferred: Option<Box<Deferred>>,
 }
 
 /// The result of answering some input.
@@ -189,8 +193,16 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Reads once, answers all complete requests, and writes once.
+    /// Reads once, answers all complete requests, and writes once. Or writes replies that have come.
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        if self.answering.is_waiting() {
+            if let Poll::Ready(step) = self.poll_deferred(context) {
+                return Poll::Ready(step);
+            }
+            if self.answering.is_full() {
+                return Poll::Pending;
+            }
+        }
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let kept = self.answering.restore(input);
             let read = self.stream.poll_read(context, &mut input[kept..], &mut self.unsent);
@@ -206,6 +218,31 @@ impl<F: Framing, S: Stream> Connection<F, S> {
                 self.stream.send(output, &mut self.unsent)?;
             }
             Poll::Ready(if answered.broken { Err(Kind::BrokenFrame) } else { Ok(()) })
+        })
+    }
+
+    /// Writes replies that have come, and answers what waited for them.
+    fn poll_deferred(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
+        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+            let Some(mut len) = self.answering.collect(context, output) else {
+                self.turns = 0;
+                return Poll::Pending;
+            };
+            self.turns += 1;
+            let mut broken = false;
+            let behind = self.answering.resume(input);
+            if behind > 0 {
+                let answered = self.answering.answer(&input[..behind], &mut output[len..]);
+                len += answered.len;
+                broken = answered.broken;
+                self.note(&answered);
+            } else {
+                self.last_request = Instant::now();
+            }
+            if len > 0 {
+                self.stream.send(&output[..len], &mut self.unsent)?;
+            }
+            Poll::Ready(if broken { Err(Kind::BrokenFrame) } else { Ok(()) })
         })
     }
 
@@ -244,8 +281,10 @@ impl<F: Framing, S: Stream> Connection<F, S> {
                 let silent = self.timeouts.frame.map(|frame| self.last_read + frame);
                 (silent.map_or(deadline, |silent| silent.min(deadline)), Kind::RequestTimeout)
             }
-            (None, Some(idle)) => (self.last_request + idle, Kind::Idle),
-            (None, None) => (self.last_request + FAR, Kind::Idle),
+            (None, Some(idle)) if !self.answering.is_waiting() => {
+                (self.last_request + idle, Kind::Idle)
+            }
+            (None, _) => (self.last_request + FAR, Kind::Idle),
         }
     }
 
@@ -300,6 +339,7 @@ impl<F: Framing> Answering<F> {
             partial: F::NO_PARTIAL,
             partial_len: 0,
             is_doubtful: false,
+            deferred: None,
         }
     }
 
@@ -319,6 +359,25 @@ impl<F: Framing> Answering<F> {
         loop {
             match F::next(rest, || self.unit_server.ascii_delimiter(), &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
+                    let route = self.rights.route(unit_id);
+                    if route.is_some() || self.deferred.is_some() {
+                        let deferred = self.deferred.get_or_insert_default();
+                        let ours = (&*self.unit_server, &*self.rights);
+                        let request = (tag, unit_id, pdu);
+                        match deferred.defer(ours, route, self.peer.ip(), request) {
+                            Deferral::Later => {
+                                rest = &rest[len..];
+                                answered.requests += 1;
+                                continue;
+                            }
+                            Deferral::Wait => {
+                                deferred.leave(rest);
+                                rest = &[];
+                                break;
+                            }
+                            Deferral::Now => {}
+                        }
+                    }
                     rest = &rest[len..];
                     answered.requests += 1;
                     answered.len += self.reply(tag, unit_id, pdu, &mut output[answered.len..]);
@@ -353,6 +412,43 @@ impl<F: Framing> Answering<F> {
         answered
     }
 
+    /// Whether replies come later.
+    #[inline]
+    fn is_waiting(&self) -> bool {
+        self.deferred.as_ref().is_some_and(|deferred| !deferred.is_empty())
+    }
+
+    /// Whether nothing more may be read before a reply has come.
+    fn is_full(&self) -> bool {
+        self.deferred.as_ref().is_some_and(|deferred| deferred.is_full())
+    }
+
+    /// Writes the replies that have come at the start of `output`, framed. Returns their length; `None`
+    /// while there is none.
+    fn collect(&mut self, context: &mut Context<'_>, output: &mut [u8]) -> Option<usize> {
+        let deferred = self.deferred.as_mut()?;
+        let mut len = None;
+        while let Poll::Ready(completed) = deferred.poll_next(&self.unit_server, context) {
+            let Completed { tag, unit_id, route, request, reply } = completed;
+            if let Some(auditor) = &self.context.auditor {
+                let (name, passed) = (&self.context.name, (&route, &request[..], &reply[..]));
+                auditor.note_forwarded(name, Some(self.peer), unit_id, passed);
+            }
+            let at = len.get_or_insert(0);
+            let frame = &mut output[*at..];
+            if !reply.is_empty() {
+                frame[F::HEADER_LEN..][..reply.len()].copy_from_slice(&reply);
+                *at += F::complete(frame, tag, unit_id, reply.len());
+            }
+        }
+        len
+    }
+
+    /// Copies what waited for replies to the start of `input`. Returns its length.
+    fn resume(&mut self, input: &mut [u8]) -> usize {
+        self.deferred.as_mut().map_or(0, |deferred| deferred.resume(input))
+    }
+
     /// Writes one framed reply at the start of `output`. Returns its length, 0 when there is none.
     #[inline]
     fn reply(&self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
@@ -373,6 +469,10 @@ impl<F: Framing> Answering<F> {
         stream::write(stream.socket(), unsent)?;
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             for _ in 0..LAST_READS {
+                // Who waits for a device is not answered any more.
+                if self.is_waiting() {
+                    break;
+                }
                 let kept = self.restore(input);
                 let Some(len) = stream.read_now(&mut input[kept..], unsent) else { break };
                 let answered = self.answer(&input[..kept + len], output);
@@ -407,6 +507,7 @@ mod tests {
             sources: Vec::new(),
             roles: None,
             units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
+            routes: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
         };

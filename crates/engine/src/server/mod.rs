@@ -4,6 +4,7 @@ mod admission;
 pub mod audit;
 mod connection;
 pub mod counters;
+mod deferred;
 mod engine;
 pub mod event;
 mod framing;

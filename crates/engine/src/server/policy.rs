@@ -4,8 +4,17 @@ use std::net::IpAddr;
 use std::sync::Arc;
 
 use holdfast_memory::Memory;
-use holdfast_protocol::pdu::Function;
+use holdfast_protocol::pdu::{Function, Request};
 use ipnet::IpNet;
+
+use crate::link::Route;
+
+/// Functions of the standard that only read, and that memories do not know (V1.1b3, 6): exception
+/// status, event log, file records, FIFO queue.
+pub(super) const OTHER_READS: [u8; 4] = [7, 12, 20, 24];
+
+/// The function of the standard that writes file records (V1.1b3, 6.15).
+const WRITE_FILE_RECORD: u8 = 21;
 
 /// What a rule allows its peers to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,6 +39,8 @@ pub struct Rule {
     /// has roles.
     pub roles: Option<Vec<String>>,
     pub units: Vec<(u8, Arc<Memory>)>,
+    /// Units whose requests go to devices. They are none of `units`.
+    pub routes: Vec<(u8, Route)>,
     pub access: AccessMode,
     pub functions: Functions,
 }
@@ -94,6 +105,8 @@ impl Policy<PeerRights> {
 #[derive(Debug)]
 pub struct PeerRights {
     units: [Option<Arc<Memory>>; 256],
+    /// `None` when no unit is a device.
+    routes: Option<Box<[Option<Route>; 256]>>,
     functions: [bool; 256],
     access: AccessMode,
 }
@@ -104,25 +117,51 @@ impl PeerRights {
         for (unit, memory) in &rule.units {
             units[usize::from(*unit)] = Some(Arc::clone(memory));
         }
+        let mut routes = None;
+        for (unit, route) in &rule.routes {
+            let routes = routes.get_or_insert_with(|| Box::new([const { None }; 256]));
+            routes[usize::from(*unit)] = Some(route.clone());
+        }
         let functions = std::array::from_fn(|code| {
             let code = code as u8;
-            let known = Function::from_code(code);
-            let named = match &rule.functions {
-                Functions::All => true,
-                Functions::Only(codes) => codes.contains(&code),
-                Functions::Except(codes) => !codes.contains(&code),
+            let (named, listed) = match &rule.functions {
+                Functions::All => (true, false),
+                Functions::Only(codes) => (codes.contains(&code), true),
+                Functions::Except(codes) => (!codes.contains(&code), false),
             };
-            known.is_some_and(|function| {
-                named && (rule.access == AccessMode::ReadWrite || !function.is_write())
-            })
+            let writes = rule.access == AccessMode::ReadWrite;
+            named
+                && match Function::from_code(code) {
+                    Some(function) => writes || !function.is_write(),
+                    // Only devices know other functions.
+                    None if routes.is_none() || code & 0x80 != 0 => false,
+                    None if OTHER_READS.contains(&code) => true,
+                    None => writes && (listed || code == WRITE_FILE_RECORD),
+                }
         });
-        PeerRights { units, functions, access: rule.access }
+        PeerRights { units, routes, functions, access: rule.access }
     }
 
     /// The memory of a unit id.
     #[inline]
     pub fn memory(&self, unit_id: u8) -> Option<&Memory> {
         self.units[usize::from(unit_id)].as_deref()
+    }
+
+    /// Where requests to a unit id go, if it is a device.
+    #[inline]
+    pub(crate) fn route(&self, unit_id: u8) -> Option<&Route> {
+        self.routes.as_ref()?[usize::from(unit_id)].as_ref()
+    }
+
+    /// Whether a request to a device is denied for what follows its function code: a read-only peer may
+    /// send only sub-functions that are known to change nothing.
+    pub(crate) fn denies(&self, request: &[u8]) -> bool {
+        let with_sub_functions = [Function::Diagnostics, Function::EncapsulatedInterface];
+        let code = request.first().copied().unwrap_or_default();
+        self.read_only()
+            && with_sub_functions.iter().any(|function| function.code() == code)
+            && !Request::parse(request).is_ok_and(|request| request.is_read())
     }
 
     /// One unit id per memory, chosen among the `wanted` unit ids.

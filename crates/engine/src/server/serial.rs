@@ -14,11 +14,13 @@ use serial2_tokio::SerialPort;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
+use super::deferred::{come, exception, source};
 use super::event::Kind;
 use super::framing::{Framing, Rtu};
 use super::listener::ListenerContext;
 use super::policy::{PeerRights, Rule};
 use super::unit_server::UnitServer;
+use crate::link::Asker;
 use crate::serial_line::{LineMode, SerialLine};
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
@@ -45,11 +47,14 @@ pub(crate) struct ModbusSerial {
     unit_server: Arc<UnitServer>,
     rights: PeerRights,
     line: SerialLine,
+    /// The number of the line as a source of requests to devices.
+    source: u64,
 }
 
 impl ModbusSerial {
     pub(crate) fn new(settings: SerialSettings, unit_server: Arc<UnitServer>) -> ModbusSerial {
-        ModbusSerial { unit_server, rights: PeerRights::new(&settings.rule), line: settings.line }
+        let rights = PeerRights::new(&settings.rule);
+        ModbusSerial { unit_server, rights, line: settings.line, source: source() }
     }
 
     /// Serves the line until `stop`.
@@ -129,7 +134,7 @@ impl ModbusSerial {
         let Some(buffer) = reply[Rtu::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return Ok(());
         };
-        match self.answer(context, unit_id, request, buffer) {
+        match self.answer(context, unit_id, request, buffer).await {
             None => Ok(()),
             Some(len) => {
                 let len = Rtu::complete(&mut reply, 0, unit_id, len);
@@ -203,7 +208,7 @@ impl ModbusSerial {
             return Ok(());
         };
         let mut buffer = [0; pdu::MAX_LEN];
-        let Some(len) = self.answer(context, unit_id, request, &mut buffer) else {
+        let Some(len) = self.answer(context, unit_id, request, &mut buffer).await else {
             return Ok(());
         };
         let mut reply = [0; ascii::MAX_LEN];
@@ -214,7 +219,7 @@ impl ModbusSerial {
     }
 
     /// Returns the length of the reply, if there is one.
-    fn answer(
+    async fn answer(
         &self,
         context: &ListenerContext,
         unit_id: u8,
@@ -224,6 +229,20 @@ impl ModbusSerial {
         if unit_id == BROADCAST {
             self.broadcast(context, request);
             return None;
+        }
+        if let Some(route) = self.rights.route(unit_id) {
+            let asker = Asker { source: self.source, peer: None, waiting: 0 };
+            let sent = self.unit_server.forward(&self.rights, route, &asker, unit_id, request);
+            let answered = match sent {
+                Ok(coming) => come(&self.unit_server, request, coming.await.ok()),
+                Err(code) => exception(request, code),
+            };
+            if let Some(auditor) = &context.auditor {
+                let passed = (&route.name, request, &answered[..]);
+                auditor.note_forwarded(&context.name, None, unit_id, passed);
+            }
+            reply[..answered.len()].copy_from_slice(&answered);
+            return (!answered.is_empty()).then_some(answered.len());
         }
         if self.rights.memory(unit_id).is_none() {
             self.unit_server.counters.frames.other_unit.add();

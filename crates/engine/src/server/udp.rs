@@ -6,23 +6,29 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use holdfast_protocol::frame::{mbap, rtu};
-use holdfast_protocol::pdu;
+use holdfast_protocol::pdu::{self, ExceptionCode, reply};
 use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
 use socket2::SockRef;
 use tokio::io::Interest;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
+use tokio::task::JoinSet;
 
+use super::deferred::{come, source};
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::policy::{PeerRights, Policy, Rule};
 use super::unit_server::UnitServer;
+use crate::link::Asker;
 
 /// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
 const INPUT: usize = 64 * 1024;
 
 /// The most reads of the remaining input when the listener stops.
 const LAST_READS: usize = 1024;
+
+/// The most requests of a listener that wait for devices.
+const MAX_LATER: usize = 1024;
 
 /// The longest frame of any framing of datagrams.
 const MAX_FRAME_LEN: usize = mbap::MAX_LEN;
@@ -82,10 +88,15 @@ impl ModbusUdp {
         let Ok(socket) = UdpSocket::from_std(socket) else { return };
         let socket = Datagrams { socket, state };
         let mut input = vec![0; INPUT].into_boxed_slice();
+        let mut later = Later { source: source(), replies: JoinSet::new() };
         loop {
             let ready = tokio::select! {
                 biased;
                 _ = stop.wait_for(|stop| *stop) => break,
+                Some(Ok(completed)) = later.replies.join_next(), if !later.replies.is_empty() => {
+                    self.complete::<D>(context, &socket, completed);
+                    continue;
+                }
                 ready = socket.socket.readable() => ready,
             };
             // An error reports that an earlier reply was not delivered.
@@ -93,12 +104,12 @@ impl ModbusUdp {
                 socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
             });
             if let Ok(meta) = received {
-                self.take::<D>(context, &socket, &meta, &input);
+                self.take::<D>(context, &socket, &meta, &input, &mut later);
             }
         }
         for _ in 0..LAST_READS {
             match socket.receive(&mut input) {
-                Ok(meta) => self.take::<D>(context, &socket, &meta, &input),
+                Ok(meta) => self.take::<D>(context, &socket, &meta, &input, &mut later),
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
                 Err(_) => {}
             }
@@ -112,12 +123,13 @@ impl ModbusUdp {
         socket: &Datagrams,
         meta: &RecvMeta,
         input: &[u8],
+        later: &mut Later,
     ) {
         let mut output = [0; MAX_FRAME_LEN];
         let mut rest = &input[..meta.len];
         loop {
             let (datagram, more) = rest.split_at(meta.stride.min(rest.len()));
-            let len = self.answer::<D>(context, meta.addr, datagram, &mut output);
+            let len = self.answer::<D>(context, meta, datagram, &mut output, later);
             if len > 0 {
                 socket.send(&output[..len], meta);
             }
@@ -128,14 +140,36 @@ impl ModbusUdp {
         }
     }
 
-    /// Returns the length of the reply, 0 when there is none.
+    /// Sends the reply of a device.
+    fn complete<D: Datagram>(
+        &self,
+        context: &ListenerContext,
+        socket: &Datagrams,
+        Completed { tag, unit_id, meta, route, request, reply }: Completed,
+    ) {
+        let reply = come(&self.unit_server, &request, reply);
+        if let Some(auditor) = &context.auditor {
+            let passed = (&route, &request[..], &reply[..]);
+            auditor.note_forwarded(&context.name, Some(meta.addr), unit_id, passed);
+        }
+        if !reply.is_empty() {
+            let mut frame = [0; MAX_FRAME_LEN];
+            frame[D::HEADER_LEN..][..reply.len()].copy_from_slice(&reply);
+            let len = D::complete(&mut frame, tag, unit_id, reply.len());
+            socket.send(&frame[..len], &meta);
+        }
+    }
+
+    /// Returns the length of the reply, 0 when there is none, or none yet.
     fn answer<D: Datagram>(
         &self,
         context: &ListenerContext,
-        peer: SocketAddr,
+        meta: &RecvMeta,
         datagram: &[u8],
         output: &mut [u8; MAX_FRAME_LEN],
+        later: &mut Later,
     ) -> usize {
+        let peer = meta.addr;
         let Some(rights) = self.policy.rights(peer.ip()) else {
             context.refuse_source(peer);
             return 0;
@@ -159,6 +193,31 @@ impl ModbusUdp {
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
+        if let Some(route) = rights.route(unit_id) {
+            let waiting = later.replies.len();
+            let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
+            let coming = if waiting < MAX_LATER {
+                self.unit_server.forward(rights, route, &asker, unit_id, request)
+            } else {
+                Err(ExceptionCode::ServerDeviceBusy)
+            };
+            return match coming {
+                Ok(coming) => {
+                    let (meta, route) = (*meta, Arc::clone(&route.name));
+                    let request = request.to_vec();
+                    later.replies.spawn(async move {
+                        let reply = coming.await.ok();
+                        Completed { tag, unit_id, meta, route, request, reply }
+                    });
+                    0
+                }
+                Err(code) => {
+                    let function_code = request.first().copied().unwrap_or_default();
+                    let len = reply::exception(function_code, code, buffer);
+                    D::complete(output, tag, unit_id, len)
+                }
+            };
+        }
         let len = self.unit_server.answer(rights, unit_id, request, buffer);
         if let Some(auditor) = &context.auditor {
             let reply = &buffer[..len.unwrap_or_default()];
@@ -166,6 +225,22 @@ impl ModbusUdp {
         }
         len.map_or(0, |len| D::complete(output, tag, unit_id, len))
     }
+}
+
+/// Requests to devices, whose replies come later.
+struct Later {
+    source: u64,
+    replies: JoinSet<Completed>,
+}
+
+/// A request to a device, with its reply; `None` when the link has ended.
+struct Completed {
+    tag: u16,
+    unit_id: u8,
+    meta: RecvMeta,
+    route: Arc<str>,
+    request: Vec<u8>,
+    reply: Option<Vec<u8>>,
 }
 
 /// A socket that reports the local address of each datagram.

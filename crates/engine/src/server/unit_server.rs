@@ -16,6 +16,7 @@ use holdfast_protocol::pdu::{
 use super::counters::{Bus, Counters};
 use super::identity::Identity;
 use super::policy::PeerRights;
+use crate::link::{Asker, Coming, Route};
 
 /// The units of one listener.
 #[derive(Debug)]
@@ -67,6 +68,44 @@ impl UnitServer {
                 self.counters.exception(code);
                 Some(reply::exception(function_code, code, reply))
             }
+        }
+    }
+
+    /// Sends a request to a device on its way.
+    ///
+    /// # Errors
+    /// The exception to answer it with.
+    pub(crate) fn forward(
+        &self,
+        rights: &PeerRights,
+        route: &Route,
+        asker: &Asker,
+        unit_id: u8,
+        request: &[u8],
+    ) -> Result<Coming, ExceptionCode> {
+        let function_code = request.first().copied().unwrap_or_default();
+        self.counters.request(function_code);
+        let sent = if rights.allows(function_code) && !rights.denies(request) {
+            route.ask(asker, unit_id, request)
+        } else {
+            Err(ExceptionCode::IllegalFunction)
+        };
+        sent.inspect_err(|code| self.counters.exception(*code))
+    }
+
+    /// Counts what a device has answered, or what was answered in its place.
+    pub(crate) fn forwarded(&self, request: &[u8], reply: &[u8]) {
+        match reply {
+            [] => self.counters.unanswered.add(),
+            [code, exception, ..] if code & 0x80 != 0 => {
+                if let Some(code) = ExceptionCode::from_code(*exception) {
+                    self.counters.exception(code);
+                }
+            }
+            _ if request.first() != Some(&Function::GetCommEventCounter.code()) => {
+                self.counters.events.add();
+            }
+            _ => {}
         }
     }
 

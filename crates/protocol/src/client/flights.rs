@@ -21,6 +21,8 @@ pub struct Done<'d> {
     pub timeout: Duration,
     /// The response, or why the request failed.
     pub outcome: Result<Response<'d>, Failure>,
+    /// The PDU of the reply; empty without one, as after a broadcast.
+    pub pdu: &'d [u8],
     /// The request may be sent again: give this to [`super::Connection::send_again`].
     pub again: Option<Attempt>,
 }
@@ -160,7 +162,8 @@ impl Flights {
         self.restart_after(flight.ticket, now);
         self.answered += 1;
         self.reply_begun = false;
-        let outcome = flight.request.request().response(self.without_padding(&flight, pdu));
+        let pdu = self.without_padding(&flight, pdu);
+        let outcome = flight.request.response(pdu);
         let (outcome, invalid) = match outcome {
             Ok(response) => (Ok(response), None),
             Err(ResponseError::Exception(code)) => (Err(Failure::Exception(code.code())), None),
@@ -170,7 +173,7 @@ impl Flights {
                 (Err(Failure::Invalid(invalid)), Some(invalid))
             }
         };
-        self.end(flight, outcome, sink);
+        self.end_with(flight, outcome, pdu, sink);
         invalid
     }
 
@@ -190,11 +193,22 @@ impl Flights {
         len.ok().flatten().and_then(|len| pdu.get(..len)).unwrap_or(pdu)
     }
 
-    /// Hands a result on, unless nobody wants it any more.
+    /// Hands a result on that is no reply.
     pub(super) fn end(
         &self,
         flight: Flight,
         outcome: Result<Response<'_>, Failure>,
+        sink: &mut impl FnMut(Done<'_>),
+    ) {
+        self.end_with(flight, outcome, &[], sink);
+    }
+
+    /// Hands a result on, unless nobody wants it any more.
+    fn end_with(
+        &self,
+        flight: Flight,
+        outcome: Result<Response<'_>, Failure>,
+        pdu: &[u8],
         sink: &mut impl FnMut(Done<'_>),
     ) {
         let Flight { ticket, timeout, attempt, request, abandoned, .. } = flight;
@@ -203,7 +217,7 @@ impl Flights {
             let failed = outcome.as_ref().err();
             let again =
                 failed.and_then(|error| attempt.next(&request, *error, stale, &self.tolerance));
-            sink(Done { ticket, timeout, outcome, again });
+            sink(Done { ticket, timeout, outcome, pdu, again });
         }
     }
 

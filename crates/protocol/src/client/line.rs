@@ -9,7 +9,7 @@ use core::time::Duration;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::{Closed, Failure, InvalidResponse, TURNAROUND, Time};
 use crate::frame::{FrameError, ascii, rtu};
-use crate::pdu::{self, Response};
+use crate::pdu::{self, EncodedRequest, Response};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Framing {
@@ -252,7 +252,7 @@ impl OneAtATime {
             if start > 0 && !fits {
                 continue;
             }
-            match rtu::response_len(bytes, request.len()) {
+            match response_len(bytes, &flight.request) {
                 Ok(Some(len)) if len <= bytes.len() => match rtu::decode(&bytes[..len]) {
                     Ok(reply) => return Ok(Some(Reply::new(reply))),
                     Err(error) if fits => failure = failure.or(Some(error)),
@@ -290,10 +290,20 @@ impl OneAtATime {
     }
 }
 
+/// The length of the reply that `bytes` begin with; `None` while more are needed. The reply to a
+/// request that is passed on as it came ends with what has arrived, as soon as the CRC fits.
+fn response_len(bytes: &[u8], request: &EncodedRequest) -> Result<Option<usize>, FrameError> {
+    let pdu = request.pdu();
+    if request.request().is_none() && bytes.get(1) == pdu.first() && bytes.len() <= rtu::MAX_LEN {
+        return Ok(rtu::decode(bytes).is_ok().then_some(bytes.len()));
+    }
+    rtu::response_len(bytes, pdu.len())
+}
+
 /// Whether the request itself, sent back, can't be taken for its reply.
 fn is_no_reply(flight: &Flight) -> bool {
-    let request = flight.request.request();
-    request.is_read() && request.response(flight.request.pdu()).is_err()
+    let request = &flight.request;
+    request.is_read() && request.response(request.pdu()).is_err()
 }
 
 /// A reply that was taken out of its frame.

@@ -81,7 +81,7 @@ impl Attempt {
         stale: bool,
         tolerance: &Tolerance,
     ) -> Option<Attempt> {
-        if !request.request().is_read() {
+        if !request.is_read() {
             return None;
         }
         if failure == Failure::Closed(Closed::ByPeer) && stale && !self.reconnected {

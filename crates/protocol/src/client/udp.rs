@@ -26,7 +26,7 @@ impl Datagrams {
         let id = self.next_id;
         self.next_id = id.wrapping_add(1);
         let every = call.timeout / UDP_ATTEMPTS;
-        let left = if call.request.request().is_read() { UDP_ATTEMPTS - 1 } else { 0 };
+        let left = if call.request.is_read() { UDP_ATTEMPTS - 1 } else { 0 };
         self.repeat = (left > 0).then_some(Repeat { at: now + every, every, left });
         let ticket = flights.push(call, id, now);
         write(flights);

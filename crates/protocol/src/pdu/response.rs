@@ -31,6 +31,8 @@ pub enum Response<'a> {
     ServerId(&'a [u8]),
     /// Identification objects (function 43 with MEI type 14).
     Identification(Answer<'a>),
+    /// What follows the function code, in the answer to a request that was passed on as it came.
+    Opaque(&'a [u8]),
 }
 
 /// Why a PDU is not a response to the request, or its exception.
@@ -59,6 +61,14 @@ pub enum ResponseError {
     Echo,
 }
 
+impl ResponseError {
+    /// An exception with this code.
+    pub(super) fn exception(code: u8) -> ResponseError {
+        ExceptionCode::from_code(code)
+            .map_or(ResponseError::UnknownException(code), ResponseError::Exception)
+    }
+}
+
 impl Request<'_> {
     /// Parses the PDU that answers this request.
     ///
@@ -82,8 +92,7 @@ impl Request<'_> {
         let body = match pdu {
             [found, body @ ..] if *found == expected => body,
             [found, code] if *found == expected | 0x80 => {
-                return Err(ExceptionCode::from_code(*code)
-                    .map_or(ResponseError::UnknownException(*code), ResponseError::Exception));
+                return Err(ResponseError::exception(*code));
             }
             [found, ..] if *found | 0x80 != expected | 0x80 => {
                 return Err(ResponseError::Function { expected, found: *found });

@@ -1,12 +1,13 @@
 //! How many requests are in flight on a link.
 
 use std::cell::{Cell, RefCell};
-use std::collections::VecDeque;
 use std::rc::Rc;
 use std::time::Duration;
 
 use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
 use tokio::time::Instant;
+
+use super::queue::{Priority, Queue};
 
 /// The most requests that `auto` has in flight.
 const MAX_AUTO: usize = 16;
@@ -21,17 +22,6 @@ const FLAT: f64 = 1.25;
 /// `auto` tries more requests in flight again after this time.
 const RETRY_AFTER: Duration = Duration::from_secs(300);
 
-/// How much a request matters beside others.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Priority {
-    Usual,
-    /// To a unit that was silent the last time: it leaves room for the others.
-    Doubtful,
-    /// Somebody waits for it: it goes first where requests go one at a time, and tries an address
-    /// whose pause is not over.
-    Urgent,
-}
-
 /// How many requests may be in flight on a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InFlight {
@@ -40,7 +30,7 @@ pub enum InFlight {
     Auto,
 }
 
-/// Hands out the places of a link: to urgent requests first, otherwise in the order of asking.
+/// Hands out the places of a link.
 pub(super) struct Pace {
     places: Rc<Places>,
     doubtful: Semaphore,
@@ -50,14 +40,16 @@ pub(super) struct Pace {
 #[derive(Default)]
 struct Places {
     free: Cell<usize>,
-    urgent: RefCell<VecDeque<oneshot::Sender<Place>>>,
-    usual: RefCell<VecDeque<oneshot::Sender<Place>>>,
+    waiting: RefCell<Queue<oneshot::Sender<Free>>>,
     /// Places that are taken away as soon as they are given back.
     owed: Cell<usize>,
 }
 
 /// A request may be in flight while it lasts.
-pub(super) struct Place(Option<Rc<Places>>);
+pub(super) type Place<'p> = (Free, Option<SemaphorePermit<'p>>);
+
+/// A place, which is given back when it is dropped.
+pub(super) struct Free(Option<Rc<Places>>);
 
 struct Auto {
     limit: usize,
@@ -82,16 +74,16 @@ impl Pace {
 
     /// Waits for a place, which is taken while the result lasts. Doubtful requests leave room for the
     /// others.
-    pub(super) async fn place(&self, priority: Priority) -> (Place, Option<SemaphorePermit<'_>>) {
+    pub(super) async fn place(&self, source: u64, priority: Priority) -> Place<'_> {
         let doubtful = match priority {
             Priority::Doubtful => Some(self.doubtful.acquire().await.expect("it is never closed")),
-            Priority::Usual | Priority::Urgent => None,
+            _ => None,
         };
         let place = match self.places.take() {
             Some(place) => place,
             None => {
                 let (sender, place) = oneshot::channel();
-                self.places.queue(priority).borrow_mut().push_back(sender);
+                self.places.waiting.borrow_mut().push(source, priority, sender);
                 place.await.expect("places outlive those who wait for one")
             }
         };
@@ -134,33 +126,27 @@ impl Pace {
 }
 
 impl Places {
-    fn take(self: &Rc<Places>) -> Option<Place> {
+    fn take(self: &Rc<Places>) -> Option<Free> {
         let free = self.free.get().checked_sub(1)?;
         self.free.set(free);
-        Some(Place(Some(Rc::clone(self))))
+        Some(Free(Some(Rc::clone(self))))
     }
 
-    fn queue(&self, priority: Priority) -> &RefCell<VecDeque<oneshot::Sender<Place>>> {
-        if priority == Priority::Urgent { &self.urgent } else { &self.usual }
-    }
-
-    /// Gives a place to whoever has waited longest, urgent requests first.
+    /// Gives a place to whoever is next.
     fn give(self: &Rc<Places>) {
-        for queue in [&self.urgent, &self.usual] {
-            loop {
-                let Some(next) = queue.borrow_mut().pop_front() else { break };
-                match next.send(Place(Some(Rc::clone(self)))) {
-                    Ok(()) => return,
-                    // Who waited was stopped. The place is not given back: it is still here.
-                    Err(mut place) => place.0 = None,
-                }
+        loop {
+            let Some(next) = self.waiting.borrow_mut().pop() else { break };
+            match next.send(Free(Some(Rc::clone(self)))) {
+                Ok(()) => return,
+                // Who waited was stopped. The place is not given back: it is still here.
+                Err(mut place) => place.0 = None,
             }
         }
         self.free.set(self.free.get() + 1);
     }
 }
 
-impl Drop for Place {
+impl Drop for Free {
     fn drop(&mut self) {
         let Some(places) = self.0.take() else { return };
         match places.owed.get().checked_sub(1) {
@@ -261,12 +247,12 @@ mod tests {
     #[tokio::test]
     async fn a_timeout_takes_all_places_but_one_even_those_that_are_taken() {
         let (pace, now) = (Pace::new(InFlight::Auto), Instant::now());
-        let mut taken = vec![pace.place(Priority::Usual).await];
+        let mut taken = vec![pace.place(0, Priority::Usual).await];
         for _ in 0..3 {
             for _ in 0..ANSWERS {
                 pace.answered(10 * MS, now);
             }
-            taken.push(pace.place(Priority::Usual).await);
+            taken.push(pace.place(0, Priority::Usual).await);
         }
         pace.timed_out(now);
         drop(taken);
@@ -276,10 +262,10 @@ mod tests {
     #[tokio::test]
     async fn urgent_requests_go_first_and_who_was_stopped_takes_no_place() {
         let pace = Pace::new(InFlight::Fixed(1));
-        let taken = pace.place(Priority::Usual).await;
-        let mut usual = Box::pin(pace.place(Priority::Usual));
-        let mut stopped = Box::pin(pace.place(Priority::Urgent));
-        let mut urgent = Box::pin(pace.place(Priority::Urgent));
+        let taken = pace.place(0, Priority::Usual).await;
+        let mut usual = Box::pin(pace.place(0, Priority::Usual));
+        let mut stopped = Box::pin(pace.place(0, Priority::Urgent));
+        let mut urgent = Box::pin(pace.place(0, Priority::Urgent));
         assert!(is_pending(&mut usual) && is_pending(&mut stopped));
         assert!(is_pending(&mut urgent));
         drop(stopped);

@@ -6,11 +6,11 @@ use std::time::Duration;
 const FIRST: Duration = Duration::from_secs(1);
 
 /// The longest pause before a device is asked again.
-pub(super) const MAX_PAUSE: Duration = Duration::from_secs(60);
+pub(crate) const MAX_PAUSE: Duration = Duration::from_secs(60);
 
 /// The pause after `failures` consecutive failures, at least one. It is up to a quarter shorter at
 /// random, so that devices that failed together are not retried together.
-pub(super) fn pause(failures: u32, longest: Duration) -> Duration {
+pub(crate) fn pause(failures: u32, longest: Duration) -> Duration {
     let doubled = FIRST.saturating_mul(1u32 << failures.saturating_sub(1).min(6)).min(longest);
     // The keys of a hasher are random, which suffices here.
     let chance = RandomState::new().hash_one(failures) as u32;

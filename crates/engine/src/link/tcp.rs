@@ -1,121 +1,34 @@
-//! A link: one connection or one serial line, shared by all devices behind it.
-//!
-//! Over Modbus TCP, several requests can be in flight, if the settings of the devices allow it. Other
-//! transports carry one request at a time, in a thread of their own. After a failed connect, requests
-//! fail immediately until the backoff is over. [`Connection`] decides when a connection ends. The next
-//! request opens a new one.
+//! A TCP connection to a device: several requests in flight, if the settings allow it.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
 use std::io::{self, ErrorKind};
 use std::rc::Rc;
-use std::sync::{Arc, mpsc};
+use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_protocol::client::{
-    Attempt, Closed, Connection, Done, Failure, Ticket, Tolerance, Transport,
-};
-use holdfast_protocol::pdu::{EncodedRequest, Response};
+use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Ticket, Tolerance, Transport};
+use holdfast_protocol::pdu::EncodedRequest;
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
-use super::backoff;
 use super::handshake;
-use super::pace::{InFlight, Pace, Priority};
-use super::status::Fault;
-use crate::client::{BlockingClient, ClientError, Endpoint, Place};
+use super::pace::Pace;
+use super::{Answer, Fault, backoff, fault};
 use crate::tls::Channel;
 use crate::tls::client::ClientTls;
 
 /// Bytes per read of a socket.
 const CHUNK: usize = 16 * 1024;
 
-/// The bytes of a read, empty for a write; or the fault.
-pub(super) type Answer = Result<Vec<u8>, Fault>;
-
-pub(super) enum Link {
-    Tcp(Box<TcpLink>),
-    Blocking(BlockingLink),
-}
-
-impl Link {
-    /// Must be called in the context of a `LocalSet`.
-    pub(super) fn new(endpoint: Endpoint, in_flight: InFlight) -> Rc<Link> {
-        let Endpoint { place, tolerance } = endpoint;
-        Rc::new(match place {
-            Place::Tcp { host, port, tls } => {
-                let one = tolerance.is_one_at_a_time();
-                let in_flight = if one { InFlight::Fixed(1) } else { in_flight };
-                let (failures, failed) = Default::default();
-                let (pace, connecting) = (Pace::new(in_flight), Mutex::default());
-                let (ended, open) = Default::default();
-                Link::Tcp(Box::new(TcpLink {
-                    host,
-                    port,
-                    tls,
-                    tolerance,
-                    pace,
-                    connecting,
-                    failures,
-                    failed,
-                    ended,
-                    open,
-                }))
-            }
-            place => Link::Blocking(BlockingLink::new(Endpoint { place, tolerance })),
-        })
-    }
-
-    /// Sends a read or a write and waits for the answer.
-    pub(super) async fn call(
-        &self,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
-        priority: Priority,
-    ) -> Answer {
-        match self {
-            Link::Tcp(link) => link.call(unit_id, request, timeout, priority).await,
-            Link::Blocking(link) => link.call(unit_id, request, timeout, priority).await,
-        }
-    }
-}
-
-impl Link {
-    /// When an unreachable address is tried again. Until then polls fail immediately.
-    pub(super) fn retry_at(&self) -> Option<Instant> {
-        let failed = match self {
-            Link::Tcp(link) => link.failed.get().map(|(until, _)| until),
-            Link::Blocking(link) => link.retry_at.get(),
-        };
-        failed.filter(|until| Instant::now() < *until)
-    }
-
-    /// Closes the connection if no request is in flight. The next request opens a new one.
-    pub(super) fn release(&self) {
-        match self {
-            Link::Tcp(link) => {
-                let mut open = link.open.borrow_mut();
-                if open.as_ref().is_some_and(|open| open.waiting.is_empty()) {
-                    *open = None;
-                }
-            }
-            Link::Blocking(link) => {
-                let _ = link.jobs.send(Job::Release);
-            }
-        }
-    }
-}
-
 pub(super) struct TcpLink {
     host: String,
     port: u16,
     tls: Option<Arc<ClientTls>>,
     tolerance: Tolerance,
-    pace: Pace,
     connecting: Mutex<()>,
     failures: Cell<u32>,
     /// The earliest time of the next attempt after a failed one, and the fault.
@@ -143,24 +56,42 @@ struct Open {
 }
 
 impl TcpLink {
-    async fn call(
+    pub(super) fn new(
+        (host, port): (String, u16),
+        tls: Option<Arc<ClientTls>>,
+        tolerance: Tolerance,
+    ) -> TcpLink {
+        TcpLink {
+            host,
+            port,
+            tls,
+            tolerance,
+            connecting: Mutex::default(),
+            failures: Cell::default(),
+            failed: Cell::default(),
+            ended: Rc::default(),
+            open: Rc::default(),
+        }
+    }
+
+    pub(super) async fn exchange(
         &self,
+        pace: &Pace,
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
-        priority: Priority,
+        eager: bool,
     ) -> Answer {
-        let _place = self.pace.place(priority).await;
         let mut deadline = Instant::now() + timeout;
         let mut attempt = Attempt::default();
         loop {
             if self.open.borrow().is_none() {
-                self.connect(deadline, priority).await?;
+                self.connect(deadline, eager).await?;
             }
-            let began = self.pace.began();
+            let began = pace.began();
             let (answer, again) = self.carry_out(unit_id, request, deadline, attempt).await?;
             if let Some(began) = began {
-                self.pace.ended(began, answer == Err(Fault::Timeout));
+                pace.ended(began, answer == Err(Fault::Timeout));
             }
             let Some(next) = again else { return answer };
             sleep(next.pause()).await;
@@ -192,14 +123,14 @@ impl TcpLink {
     }
 
     /// Opens the connection, once for all requests that wait for it.
-    async fn connect(&self, deadline: Instant, priority: Priority) -> Result<(), Fault> {
+    async fn connect(&self, deadline: Instant, eager: bool) -> Result<(), Fault> {
         let _alone = timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
         if self.open.borrow().is_some() {
             return Ok(());
         }
         if let Some((until, fault)) = self.failed.get()
             && Instant::now() < until
-            && priority != Priority::Urgent
+            && !eager
         {
             return Err(fault);
         }
@@ -277,6 +208,19 @@ impl TcpLink {
         }
     }
 
+    /// The end of the pause after the last failed attempt to connect.
+    pub(super) fn retry_at(&self) -> Option<Instant> {
+        self.failed.get().map(|(until, _)| until)
+    }
+
+    /// Closes the connection if no request is in flight.
+    pub(super) fn release(&self) {
+        let mut open = self.open.borrow_mut();
+        if open.as_ref().is_some_and(|open| open.waiting.is_empty()) {
+            *open = None;
+        }
+    }
+
     /// When something is due on the connection.
     fn due(&self) -> Instant {
         let open = self.open.borrow();
@@ -325,7 +269,8 @@ impl Drop for Sent<'_> {
 fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Outcome>>, done: &Done<'_>) {
     if let Some(sender) = waiting.remove(&done.ticket) {
         // A device that was stopped does not wait.
-        let _ = sender.send((answer(done.outcome), done.again));
+        let answer = done.outcome.map(|_| done.pdu.to_vec()).map_err(fault);
+        let _ = sender.send((answer, done.again));
     }
 }
 
@@ -416,125 +361,6 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
     }
 }
 
-/// The bytes of a response; empty for a write, whose echo has been checked.
-fn bytes(response: Response<'_>) -> Vec<u8> {
-    match response {
-        Response::Bits(bits) => bits.as_bytes().to_vec(),
-        Response::Registers(registers) => registers.as_bytes().to_vec(),
-        _ => Vec::new(),
-    }
-}
-
-fn answer(outcome: Result<Response<'_>, Failure>) -> Answer {
-    outcome.map(bytes).map_err(|failure| match failure {
-        Failure::Exception(code) => Fault::Exception(code),
-        Failure::Timeout => Fault::Timeout,
-        Failure::Invalid(_) => Fault::Invalid,
-        _ => Fault::Reset,
-    })
-}
-
-/// A link that sends one request at a time, by blocking calls in a thread that ends with the link.
-pub(super) struct BlockingLink {
-    jobs: mpsc::Sender<Job>,
-    /// Calls that precede all jobs.
-    urgent: mpsc::Sender<Call>,
-    retry_at: Cell<Option<Instant>>,
-}
-
-enum Job {
-    Call(Call),
-    /// An urgent call is waiting.
-    Look,
-    Release,
-}
-
-struct Call {
-    unit_id: u8,
-    request: Box<EncodedRequest>,
-    timeout: Duration,
-    urgent: bool,
-    /// The result, and when an endpoint that could not be opened is tried again.
-    answer: oneshot::Sender<(Answer, Option<Instant>)>,
-}
-
-impl BlockingLink {
-    fn new(endpoint: Endpoint) -> BlockingLink {
-        let (jobs, queue) = mpsc::channel::<Job>();
-        let (urgent, first) = mpsc::channel::<Call>();
-        let client = BlockingClient::new(endpoint);
-        let work = move || {
-            let (mut failures, mut retry_at) = (0, None);
-            let mut carry_out = |call: Call| {
-                // A stopped device no longer waits for its read.
-                if !call.answer.is_closed() {
-                    let answer = carried_out(&client, &call, &mut failures, &mut retry_at);
-                    let _ = call.answer.send((answer, retry_at));
-                }
-            };
-            for job in queue {
-                first.try_iter().for_each(&mut carry_out);
-                match job {
-                    Job::Call(call) => carry_out(call),
-                    Job::Look => {}
-                    Job::Release => client.close(),
-                }
-            }
-        };
-        // If the thread does not start, every job fails, and the device reports the fault.
-        let _ = std::thread::Builder::new().name("holdfast-line".into()).spawn(work);
-        BlockingLink { jobs, urgent, retry_at: Cell::new(None) }
-    }
-
-    async fn call(
-        &self,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
-        priority: Priority,
-    ) -> Answer {
-        let (answer, answered) = oneshot::channel();
-        let urgent = priority == Priority::Urgent;
-        let request = Box::new(request.clone());
-        let call = Call { unit_id, request, timeout, urgent, answer };
-        let job = if urgent {
-            self.urgent.send(call).or(Err(Fault::Reset))?;
-            Job::Look
-        } else {
-            Job::Call(call)
-        };
-        self.jobs.send(job).or(Err(Fault::Reset))?;
-        let (answer, retry_at) = answered.await.unwrap_or((Err(Fault::Reset), None));
-        self.retry_at.set(retry_at);
-        answer
-    }
-}
-
-fn carried_out(
-    client: &BlockingClient,
-    call: &Call,
-    failures: &mut u32,
-    retry_at: &mut Option<Instant>,
-) -> Answer {
-    if !call.urgent && retry_at.is_some_and(|time| Instant::now() < time) {
-        return Err(Fault::Refused);
-    }
-    let answer = client.call(call.unit_id, &call.request, call.timeout, bytes);
-    let fault = match &answer {
-        Err(ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. }) => {
-            *failures = failures.saturating_add(1);
-            *retry_at = Some(Instant::now() + backoff::pause(*failures, backoff::MAX_PAUSE));
-            return Err(Fault::Refused);
-        }
-        Err(ClientError::Exception(code)) => Fault::Exception(*code),
-        Err(ClientError::Timeout(_) | ClientError::ConnectTimeout { .. }) => Fault::Timeout,
-        Err(ClientError::Invalid(_)) => Fault::Invalid,
-        Ok(_) | Err(ClientError::Lost(_) | ClientError::Tls { .. }) => Fault::Reset,
-    };
-    (*failures, *retry_at) = (0, None);
-    answer.or(Err(fault))
-}
-
 #[cfg(test)]
 mod tests {
     use holdfast_protocol::pdu::{Range, Request};
@@ -544,6 +370,8 @@ mod tests {
     use tokio::task::{LocalSet, spawn_local};
 
     use super::*;
+    use crate::client::Place;
+    use crate::link::{Endpoint, InFlight, Link, Priority};
 
     const TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -575,7 +403,7 @@ mod tests {
             device.read_exact(&mut request).await.unwrap();
             let reply = [request[0], request[1], 0, 0, 0, 5, 1, 3, 2, 0, 7];
             device.write_all(&reply).await.unwrap();
-            assert_eq!(next.await.unwrap(), Ok(vec![0, 7]));
+            assert_eq!(next.await.unwrap(), Ok(vec![3, 2, 0, 7]));
         });
     }
 }

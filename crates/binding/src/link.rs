@@ -1,0 +1,101 @@
+//! `Link` and `Route`: devices that listeners pass requests on to.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use holdfast_engine::link::{InFlight, LinkSettings, Route as CoreRoute, SharedLink};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arguments::{byte, seconds, within};
+use crate::client::Endpoint;
+
+/// The most requests in flight at one address.
+const MAX_IN_FLIGHT: usize = 1024;
+
+/// The most requests that wait for one address.
+const MAX_QUEUE: usize = 65_535;
+
+/// The number of requests in flight; `None` is `auto`.
+pub(crate) fn in_flight(number: Option<i128>) -> PyResult<InFlight> {
+    Ok(match number {
+        Some(number) => InFlight::Fixed(within("in_flight", number, 1..=MAX_IN_FLIGHT)? as u16),
+        None => InFlight::Auto,
+    })
+}
+
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+pub(crate) fn settings(
+    name: String,
+    endpoint: &Endpoint,
+    number: Option<i128>,
+    queue: i128,
+    coalesce: bool,
+    cache: f64,
+    preferred: Vec<String>,
+) -> PyResult<LinkSettings> {
+    let parsed = |text: String| {
+        let invalid = || PyValueError::new_err(format!("preferred: {text} is not an IP address"));
+        text.parse::<IpAddr>().map(|peer| peer.to_canonical()).map_err(|_| invalid())
+    };
+    Ok(LinkSettings {
+        name,
+        endpoint: endpoint.core.clone(),
+        in_flight: in_flight(number)?,
+        queue: within("queue", queue, 1..=MAX_QUEUE)?,
+        coalesce,
+        cache: seconds("cache", cache)?,
+        preferred: preferred.into_iter().map(parsed).collect::<PyResult<_>>()?,
+    })
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Link {
+    pub(crate) core: Arc<SharedLink>,
+}
+
+#[pymethods]
+impl Link {
+    #[pyo3(signature = (name, *, unit=None, timeout=1.0))]
+    fn route(&self, name: &str, unit: Option<i128>, timeout: f64) -> PyResult<Route> {
+        let core = CoreRoute {
+            name: name.into(),
+            link: Arc::clone(&self.core),
+            unit_id: unit.map(|unit| byte("unit", unit)).transpose()?,
+            timeout: seconds("timeout", timeout)?,
+        };
+        Ok(Route { core })
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.core.name
+    }
+
+    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let counters = &self.core.counters;
+        let all = PyDict::new(py);
+        for (name, counter) in [
+            ("requests", &counters.requests),
+            ("replies", &counters.replies),
+            ("exceptions", &counters.exceptions),
+            ("timeouts", &counters.timeouts),
+            ("failures", &counters.failures),
+            ("refused_full", &counters.refused_full),
+            ("refused_down", &counters.refused_down),
+            ("coalesced", &counters.coalesced),
+            ("cached", &counters.cached),
+            ("withdrawn", &counters.withdrawn),
+        ] {
+            all.set_item(name, counter.get())?;
+        }
+        all.set_item("waiting", self.core.waiting())?;
+        Ok(all)
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Route {
+    pub(crate) core: CoreRoute,
+}

@@ -1,0 +1,43 @@
+//! Why a request to a device failed.
+
+/// Errors from this code on are not exceptions.
+const NO_EXCEPTION: u16 = 0x8000;
+
+/// Why a request or a poll failed, as in the status block.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    Exception(u8),
+    Timeout,
+    Refused,
+    Reset,
+    Invalid,
+    /// The device has no plan, so no request is sent.
+    Unplanned,
+    /// Memory refused the read or the status block.
+    Unstored,
+    /// A task of the device has panicked.
+    Internal,
+}
+
+/// Exceptions of a gateway that could not reach the unit.
+const UNREACHED: [u8; 2] = [0x0A, 0x0B];
+
+impl Fault {
+    /// Whether the device has answered, even if only with an exception.
+    pub(crate) fn is_answer(self) -> bool {
+        matches!(self, Fault::Exception(code) if !UNREACHED.contains(&code))
+    }
+
+    pub const fn code(self) -> u16 {
+        match self {
+            Fault::Exception(code) => code as u16,
+            Fault::Timeout => NO_EXCEPTION + 1,
+            Fault::Refused => NO_EXCEPTION + 2,
+            Fault::Reset => NO_EXCEPTION + 3,
+            Fault::Invalid => NO_EXCEPTION + 4,
+            Fault::Unplanned => NO_EXCEPTION + 5,
+            Fault::Unstored => NO_EXCEPTION + 6,
+            Fault::Internal => NO_EXCEPTION + 7,
+        }
+    }
+}

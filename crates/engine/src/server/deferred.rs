@@ -1,0 +1,159 @@
+//! Requests of a connection whose replies come later. Replies keep the order of their requests, and
+//! only requests that are answered elsewhere overtake each other on their way.
+//!
+//! A request that can be answered here waits until all before it are answered: its client expects the
+//! effects of those. Who asks too much at once is not read for a while.
+
+use std::collections::VecDeque;
+use std::net::IpAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::task::{Context, Poll};
+
+use holdfast_protocol::pdu::{self, ExceptionCode, reply};
+
+use super::policy::PeerRights;
+use super::unit_server::UnitServer;
+use crate::link::{Asker, Coming, Route};
+
+/// The most requests of a connection that wait for replies.
+pub(super) const MAX_WAITING: usize = 16;
+
+/// Numbers the sources of requests. 0 is none of them.
+static SOURCES: AtomicU64 = AtomicU64::new(1);
+
+pub(super) struct Deferred {
+    source: u64,
+    waiting: VecDeque<Waiting>,
+    /// Received bytes that are looked at when there is room again.
+    behind: Vec<u8>,
+}
+
+/// A request without its reply.
+struct Waiting {
+    tag: u16,
+    unit_id: u8,
+    route: Arc<str>,
+    request: Vec<u8>,
+    reply: Expected,
+}
+
+enum Expected {
+    Coming(Coming),
+    Known(Vec<u8>),
+}
+
+/// A request with its reply.
+pub(super) struct Completed {
+    pub(super) tag: u16,
+    pub(super) unit_id: u8,
+    /// What the request was passed on to.
+    pub(super) route: Arc<str>,
+    pub(super) request: Vec<u8>,
+    /// A PDU; empty when there is no reply.
+    pub(super) reply: Vec<u8>,
+}
+
+/// What becomes of a request.
+pub(super) enum Deferral {
+    /// Its reply comes later.
+    Later,
+    /// It must wait until others are answered.
+    Wait,
+    /// It can be answered now.
+    Now,
+}
+
+impl Default for Deferred {
+    fn default() -> Deferred {
+        Deferred { source: source(), waiting: VecDeque::new(), behind: Vec::new() }
+    }
+}
+
+/// A number of a new source of requests.
+pub(super) fn source() -> u64 {
+    SOURCES.fetch_add(1, Ordering::Relaxed)
+}
+
+impl Deferred {
+    pub(super) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    /// Whether received bytes wait until there is room.
+    pub(super) fn is_full(&self) -> bool {
+        !self.behind.is_empty()
+    }
+
+    /// Sends a request on its way, if its unit is elsewhere and there is room.
+    pub(super) fn defer(
+        &mut self,
+        (unit_server, rights): (&UnitServer, &PeerRights),
+        route: Option<&Route>,
+        peer: IpAddr,
+        (tag, unit_id, request): (u16, u8, &[u8]),
+    ) -> Deferral {
+        let Some(route) = route else {
+            return if self.is_empty() { Deferral::Now } else { Deferral::Wait };
+        };
+        if self.waiting.len() == MAX_WAITING {
+            return Deferral::Wait;
+        }
+        let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
+        let reply = match unit_server.forward(rights, route, &asker, unit_id, request) {
+            Ok(coming) => Expected::Coming(coming),
+            Err(code) => Expected::Known(exception(request, code)),
+        };
+        let (route, request) = (Arc::clone(&route.name), request.to_vec());
+        self.waiting.push_back(Waiting { tag, unit_id, route, request, reply });
+        Deferral::Later
+    }
+
+    /// Keeps received bytes until there is room.
+    pub(super) fn leave(&mut self, bytes: &[u8]) {
+        debug_assert!(self.behind.is_empty() && !bytes.is_empty());
+        self.behind.extend_from_slice(bytes);
+    }
+
+    /// Moves those bytes to the start of `input`, and returns their length.
+    pub(super) fn resume(&mut self, input: &mut [u8]) -> usize {
+        let behind = std::mem::take(&mut self.behind);
+        input[..behind.len()].copy_from_slice(&behind);
+        behind.len()
+    }
+
+    /// The next reply, once it is there.
+    pub(super) fn poll_next(
+        &mut self,
+        unit_server: &UnitServer,
+        context: &mut Context<'_>,
+    ) -> Poll<Completed> {
+        let Some(first) = self.waiting.front_mut() else { return Poll::Pending };
+        if let Expected::Coming(coming) = &mut first.reply {
+            let Poll::Ready(reply) = Pin::new(coming).poll(context) else { return Poll::Pending };
+            first.reply = Expected::Known(come(unit_server, &first.request, reply.ok()));
+        }
+        let Some(Waiting { tag, unit_id, route, request, reply: Expected::Known(reply) }) =
+            self.waiting.pop_front()
+        else {
+            unreachable!("the first reply is known")
+        };
+        Poll::Ready(Completed { tag, unit_id, route, request, reply })
+    }
+}
+
+/// The reply that came, and counts it. `None` means that the link has ended.
+pub(super) fn come(unit_server: &UnitServer, request: &[u8], reply: Option<Vec<u8>>) -> Vec<u8> {
+    let ended = || exception(request, ExceptionCode::GatewayPathUnavailable);
+    let reply = reply.unwrap_or_else(ended);
+    unit_server.forwarded(request, &reply);
+    reply
+}
+
+pub(super) fn exception(request: &[u8], code: ExceptionCode) -> Vec<u8> {
+    let mut buffer = [0; pdu::MAX_LEN];
+    let function_code = request.first().copied().unwrap_or_default();
+    let len = reply::exception(function_code, code, &mut buffer);
+    buffer[..len].to_vec()
+}
