@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Ticket, Tolerance, Transport};
 use holdfast_protocol::pdu::EncodedRequest;
+use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
@@ -317,19 +318,15 @@ impl Drop for Open {
 }
 
 /// Reads replies until the connection ends.
-async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
+async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
     let mut chunk = vec![0; CHUNK].into_boxed_slice();
     let mut plain = Vec::new();
     loop {
-        let read = match reader.readable().await {
-            Ok(()) => reader.try_read(&mut chunk),
-            Err(error) => Err(error),
-        };
+        let read = reader.read(&mut chunk).await;
         let mut open = link.borrow_mut();
         let Some(found) = open.as_mut() else { return };
         let Open { connection, waiting, tls, unsent, .. } = found;
         let intact = match read {
-            Err(error) if error.kind() == ErrorKind::WouldBlock => continue,
             Ok(0) | Err(_) => false,
             Ok(len) => {
                 let (received, lasts) = match tls {
@@ -364,7 +361,7 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, reader: OwnedReadHalf) {
 #[cfg(test)]
 mod tests {
     use holdfast_protocol::pdu::{Range, Request};
-    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::io::AsyncWriteExt;
     use tokio::net::TcpListener;
     use tokio::runtime::Builder;
     use tokio::task::{LocalSet, spawn_local};

@@ -1,0 +1,24 @@
+"""Passes requests on to a device: URL, requests in flight, and whether equal reads go `together`."""
+
+from __future__ import annotations
+
+import sys
+
+from holdfast import _core
+from holdfast.client.endpoint import endpoint
+from holdfast.client.target import parse
+
+poller = _core.Poller([])
+url, in_flight, reads = sys.argv[1:]
+coalesce = reads == "together"
+link = poller.link("device", endpoint(parse(url)), in_flight=int(in_flight), coalesce=coalesce)
+rule = _core.Rule({1: link.route("device")}, sources=["127.0.0.1"], access="read-write")
+engine = _core.Engine(
+    [_core.Listener("front", "127.0.0.1:0", [rule])],
+    identity=[(0, "Holdfast"), (1, "HF"), (2, "1")],
+    unit_names=[],
+    workers=1,
+)
+((host, port),) = filter(None, engine.addresses)
+print(f"listening {host}:{port}", flush=True)
+sys.stdin.read()
