@@ -165,7 +165,7 @@ def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> i
 class Rule:
     """What the peers of some networks may do.
 
-    `units` maps unit ids, 0 to 255, to memories and routes. `sources` are networks or addresses, IPv4 or IPv6;
+    `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or addresses, IPv4 or IPv6;
     an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
     codes, or `deny`, the codes that are not allowed, but not both. `roles`, only with TLS, are the
     allowed roles of the peer's certificate: "" is a certificate without a role, `None` is any role.
@@ -175,7 +175,7 @@ class Rule:
 
     def __new__(
         cls,
-        units: Mapping[int, Memory | Route],
+        units: Mapping[int, Memory | Route | Passage],
         *,
         sources: Sequence[str],
         access: Access,
@@ -581,6 +581,10 @@ class Link:
         """The requests of listeners by their fate, and how many wait now."""
 
 @final
+class Passage:
+    """A memory, some of whose ranges are written through to devices."""
+
+@final
 class Route:
     """Where a listener passes on the requests to a unit."""
 
@@ -632,6 +636,18 @@ class Poller:
         equal reads that wait at the same time, for `cache` seconds a reply answers equal reads, and
         reads of the addresses in `preferred` go before those of others. Raises `ValueError`, and
         `RuntimeError` after `stop`.
+        """
+
+    def passage(
+        self,
+        memory: Memory,
+        ranges: Sequence[tuple[Area, int, int, str, int, bool]],
+    ) -> Passage:
+        """A memory whose clients write to devices, as a target for the units of a `Rule`.
+
+        Each range is an area of the memory, its first address, how many items, the device that they
+        are read from, their first address there, and whether function 22 is sent as a read and
+        function 6. Raises `ValueError` for a range that the memory or the device does not have.
         """
 
     def remove(self, name: str) -> bool:

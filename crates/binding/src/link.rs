@@ -1,15 +1,17 @@
-//! `Link` and `Route`: devices that listeners pass requests on to.
+//! `Link`, `Route` and `Passage`: devices that listeners pass requests on to.
 
 use std::net::IpAddr;
 use std::sync::Arc;
 
 use holdfast_engine::link::{InFlight, LinkSettings, Route as CoreRoute, SharedLink};
+use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arguments::{byte, seconds, within};
 use crate::client::Endpoint;
+use crate::memory::named;
 
 /// The most requests in flight at one address.
 const MAX_IN_FLIGHT: usize = 1024;
@@ -93,6 +95,24 @@ impl Link {
         all.set_item("waiting", self.core.waiting())?;
         Ok(all)
     }
+}
+
+/// Area, address, count, device, first address of the device, and whether function 22 is emulated.
+type Passed = (String, u16, u32, String, u16, bool);
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Passage {
+    pub(crate) core: Arc<CorePassage>,
+}
+
+/// The ranges of a memory whose writes go to devices.
+pub(crate) fn passed(ranges: Vec<Passed>) -> PyResult<Vec<PassedRange>> {
+    let ranges =
+        ranges.into_iter().map(|(area, address, count, device, device_address, emulate)| {
+            let (area, device) = (named(&area)?, device.into());
+            Ok(PassedRange { area, address, count, device, device_address, emulate })
+        });
+    ranges.collect()
 }
 
 #[pyclass(frozen, module = "holdfast")]

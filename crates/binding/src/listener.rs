@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_engine::server::policy::{AccessMode, Functions, Rule as CoreRule};
+use holdfast_engine::server::policy::{AccessMode, Elsewhere, Functions, Rule as CoreRule};
 use holdfast_engine::server::{
     ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, RawRule as CoreRawRule,
     RawSettings, SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
@@ -19,7 +19,7 @@ use pyo3::types::PyMapping;
 
 use crate::arguments::{address, byte, network, seconds, within, word};
 use crate::client::line;
-use crate::link::Route;
+use crate::link::{Passage, Route};
 use crate::memory::{Memory, named};
 
 #[pyclass(frozen, module = "holdfast")]
@@ -56,19 +56,22 @@ impl Rule {
                 ));
             }
         };
-        let (mut memories, mut routes) = (Vec::new(), Vec::new());
+        let (mut memories, mut elsewhere) = (Vec::new(), Vec::new());
         for item in units.items()?.iter() {
             let (unit, target): (i128, Bound<'_, PyAny>) = item.extract()?;
             let unit = byte("unit id", unit)?;
             if let Ok(route) = target.extract::<PyRef<'_, Route>>() {
-                routes.push((unit, route.core.clone()));
+                elsewhere.push((unit, Elsewhere::Device(route.core.clone())));
+            } else if let Ok(passage) = target.extract::<PyRef<'_, Passage>>() {
+                memories.push((unit, Arc::clone(&passage.core.memory)));
+                elsewhere.push((unit, Elsewhere::Mirror(Arc::clone(&passage.core))));
             } else {
                 let memory: PyRef<'_, Memory> = target.extract()?;
                 memories.push((unit, Arc::clone(&memory.core)));
             }
         }
         let (sources, units) = (networks(&sources)?, memories);
-        Ok(Rule { core: CoreRule { sources, roles, units, routes, access, functions } })
+        Ok(Rule { core: CoreRule { sources, roles, units, elsewhere, access, functions } })
     }
 }
 

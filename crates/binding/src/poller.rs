@@ -16,7 +16,7 @@ use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, seconds, within, word};
 use crate::client::{Endpoint, Request};
-use crate::link::{self, Link};
+use crate::link::{self, Link, Passage};
 use crate::memory::{Memory, named};
 
 /// An area, its first address, and the one behind its last.
@@ -142,6 +142,15 @@ impl Poller {
         let settings =
             link::settings(name, &endpoint, in_flight, queue, coalesce, cache, preferred)?;
         Ok(Link { core: self.core.link(settings).map_err(raised)? })
+    }
+
+    fn passage(
+        &self,
+        memory: PyRef<'_, Memory>,
+        ranges: Vec<(String, u16, u32, String, u16, bool)>,
+    ) -> PyResult<Passage> {
+        let passage = self.core.passage(Arc::clone(&memory.core), link::passed(ranges)?);
+        Ok(Passage { core: Arc::new(passage.map_err(raised)?) })
     }
 
     fn remove(&self, name: &str) -> bool {

@@ -25,7 +25,7 @@ fn rights(units: &[(u8, &Arc<Memory>)], rights: AccessMode) -> PeerRights {
         sources: Vec::new(),
         roles: None,
         units,
-        routes: Vec::new(),
+        elsewhere: Vec::new(),
         access: rights,
         functions: Functions::All,
     })

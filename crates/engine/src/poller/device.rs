@@ -33,6 +33,7 @@ use super::search;
 use super::sink::Destination;
 use super::state::DeviceState;
 use super::status::StatusSettings;
+use super::turn::Turn;
 use crate::client::Endpoint;
 use crate::link::Fault;
 use crate::link::Link;
@@ -117,9 +118,6 @@ pub(super) struct Device {
     off_schedule: Cell<Option<Instant>>,
     last_off_schedule: Cell<Option<Instant>>,
 }
-
-/// Held during a request: a device gets one request at a time, from polls and writes alike.
-pub(super) type Turn = tokio::sync::Mutex<()>;
 
 /// Messages to a device that waits for its next poll.
 #[derive(Default)]
@@ -294,7 +292,9 @@ impl Device {
             } else {
                 due += interval;
             }
+            self.turn.polls(true);
             self.poll(began).await;
+            self.turn.polls(false);
             self.tell();
             let (mut due, missed) = first_from(Instant::now(), due, interval);
             self.state.counters.missed.add_many(missed);
@@ -548,7 +548,7 @@ impl Device {
         };
         // The limits of a device are at most those of a request, and every block is within them.
         let request = EncodedRequest::new(&request.expect("a block is a valid request"));
-        let _turn = self.turn.lock().await;
+        let _turn = self.turn.take().await;
         let counters = &self.state.counters;
         counters.requests.add();
         let began = Instant::now();
@@ -583,7 +583,8 @@ impl Device {
             if whole && !field.area.is_bits() {
                 let end = offset + usize::from(field.count);
                 self.hand_on(read, &bytes[offset * 2..end * 2]);
-            } else if let Some(bytes) = gathered.put(settings, read, at, field, bytes, offset) {
+            } else if let Some(mut bytes) = gathered.put(settings, read, at, field, bytes, offset) {
+                self.turn.amend(settings.area, settings.address, settings.count, &mut bytes);
                 self.hand_on(read, &bytes);
             }
         }

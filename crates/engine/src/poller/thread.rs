@@ -8,18 +8,21 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use holdfast_protocol::pdu::{EncodedRequest, limit};
+use holdfast_memory::Memory;
+use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::caught::spawn_watched;
-use super::device::{Device, DeviceSettings, Inbox, Planned, Turn};
+use super::device::{Device, DeviceSettings, Inbox, Planned};
 use super::forward::{Forward, ForwardCounters};
+use super::passage::{Passage, PassedRange, PassedWrite};
 use super::plan::{PlanError, PlanLimits};
 use super::results::{Results, Written};
 use super::state::DeviceState;
+use super::turn::Turn;
 use crate::client::{Endpoint, Place};
 use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, SharedLink, serve};
 use crate::tls::client::Identity;
@@ -78,7 +81,7 @@ pub struct Poller {
 }
 
 /// Orders to the thread of the poller. The thread ends when all senders are dropped.
-enum Order {
+pub(super) enum Order {
     Add(Box<Planned>, Polled),
     /// Replaces the device of that name.
     Replace {
@@ -95,6 +98,8 @@ enum Order {
         ticket: u64,
         request: Box<EncodedRequest>,
     },
+    /// A write of a Modbus client into what is read from a device.
+    Pass(Box<PassedWrite>),
     Stop,
 }
 
@@ -207,6 +212,24 @@ impl Poller {
         all.retain(|(_, link)| link.strong_count() > 0);
         all.push((address, Arc::downgrade(&link)));
         Ok(link)
+    }
+
+    /// Passes writes into ranges of a memory on to the devices that they are read from.
+    ///
+    /// # Errors
+    /// [`PollerError::Beyond`] for a range that the memory or the device does not have.
+    pub fn passage(
+        &self,
+        memory: Arc<Memory>,
+        ranges: Vec<PassedRange>,
+    ) -> Result<Passage, PollerError> {
+        for (read, range) in ranges.iter().enumerate() {
+            let inside = memory.span(range.area).holds(range.address, range.count as usize);
+            if !inside || u32::from(range.device_address) + range.count > 65_536 {
+                return Err(PollerError::Beyond { device: range.device.to_string(), read });
+            }
+        }
+        Ok(Passage::new(memory, ranges, self.orders.clone()))
     }
 
     /// Sends a write over the connection of a device. Returns a number; [`Poller::results`] reports
@@ -344,6 +367,10 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
                 Some(device) => device.write(ticket, request, &results),
                 None => results.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
             },
+            Order::Pass(write) => match running.get(write.device()) {
+                Some(device) => device.pass(*write),
+                None => write.refuse(ExceptionCode::GatewayPathUnavailable),
+            },
         }
     }
 }
@@ -400,7 +427,7 @@ impl Running {
         let results = Arc::clone(results);
         let Running { unit_id, timeout, release, .. } = *self;
         spawn_local(async move {
-            let turn = turn.lock().await;
+            let turn = turn.take().await;
             let answer = link.call(unit_id, &request, timeout, Priority::Urgent).await;
             drop(turn);
             if release {
@@ -410,6 +437,24 @@ impl Running {
                 inbox.wake();
             }
             results.push_write(Written { ticket, outcome: answer.map(drop) });
+        });
+    }
+
+    /// Carries out a write of a Modbus client, between two reads.
+    fn pass(&self, write: PassedWrite) {
+        let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
+        let inbox = Rc::clone(&self.inbox);
+        let Running { unit_id, timeout, release, .. } = *self;
+        spawn_local(async move {
+            let taken = turn.take().await;
+            if let Some(change) = write.carry_out(&link, unit_id, timeout).await {
+                turn.note(change);
+                inbox.wake();
+            }
+            drop(taken);
+            if release {
+                link.release();
+            }
         });
     }
 

@@ -91,10 +91,10 @@ impl Auditor {
         listener: &Arc<str>,
         peer: Option<SocketAddr>,
         unit_id: u8,
-        (route, request, reply): (&Arc<str>, &[u8], &[u8]),
+        (route, request, reply): (Option<&Arc<str>>, &[u8], &[u8]),
     ) {
         if !only_reads(request) {
-            self.send(record(listener, peer, unit_id, request, reply, Some(Arc::clone(route))));
+            self.send(record(listener, peer, unit_id, request, reply, route.cloned()));
         }
     }
 

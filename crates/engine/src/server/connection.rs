@@ -359,12 +359,12 @@ impl<F: Framing> Answering<F> {
         loop {
             match F::next(rest, || self.unit_server.ascii_delimiter(), &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
-                    let route = self.rights.route(unit_id);
-                    if route.is_some() || self.deferred.is_some() {
+                    let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
+                    if place.is_some() || self.deferred.is_some() {
                         let deferred = self.deferred.get_or_insert_default();
                         let ours = (&*self.unit_server, &*self.rights);
                         let request = (tag, unit_id, pdu);
-                        match deferred.defer(ours, route, self.peer.ip(), request) {
+                        match deferred.defer(ours, place, self.peer.ip(), request) {
                             Deferral::Later => {
                                 rest = &rest[len..];
                                 answered.requests += 1;
@@ -431,7 +431,8 @@ impl<F: Framing> Answering<F> {
         while let Poll::Ready(completed) = deferred.poll_next(&self.unit_server, context) {
             let Completed { tag, unit_id, route, request, reply } = completed;
             if let Some(auditor) = &self.context.auditor {
-                let (name, passed) = (&self.context.name, (&route, &request[..], &reply[..]));
+                let (name, passed) =
+                    (&self.context.name, (route.as_ref(), &request[..], &reply[..]));
                 auditor.note_forwarded(name, Some(self.peer), unit_id, passed);
             }
             let at = len.get_or_insert(0);
@@ -507,7 +508,7 @@ mod tests {
             sources: Vec::new(),
             roles: None,
             units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
-            routes: Vec::new(),
+            elsewhere: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
         };

@@ -13,9 +13,9 @@ use std::task::{Context, Poll};
 
 use holdfast_protocol::pdu::{self, ExceptionCode, reply};
 
-use super::policy::PeerRights;
+use super::policy::{Elsewhere, PeerRights};
 use super::unit_server::UnitServer;
-use crate::link::{Asker, Coming, Route};
+use crate::link::{Asker, Coming};
 
 /// The most requests of a connection that wait for replies.
 pub(super) const MAX_WAITING: usize = 16;
@@ -34,7 +34,7 @@ pub(super) struct Deferred {
 struct Waiting {
     tag: u16,
     unit_id: u8,
-    route: Arc<str>,
+    route: Option<Arc<str>>,
     request: Vec<u8>,
     reply: Expected,
 }
@@ -48,8 +48,8 @@ enum Expected {
 pub(super) struct Completed {
     pub(super) tag: u16,
     pub(super) unit_id: u8,
-    /// What the request was passed on to.
-    pub(super) route: Arc<str>,
+    /// What the request was passed on to; `None` if it was refused.
+    pub(super) route: Option<Arc<str>>,
     pub(super) request: Vec<u8>,
     /// A PDU; empty when there is no reply.
     pub(super) reply: Vec<u8>,
@@ -90,22 +90,23 @@ impl Deferred {
     pub(super) fn defer(
         &mut self,
         (unit_server, rights): (&UnitServer, &PeerRights),
-        route: Option<&Route>,
+        place: Option<&Elsewhere>,
         peer: IpAddr,
         (tag, unit_id, request): (u16, u8, &[u8]),
     ) -> Deferral {
-        let Some(route) = route else {
-            return if self.is_empty() { Deferral::Now } else { Deferral::Wait };
-        };
-        if self.waiting.len() == MAX_WAITING {
-            return Deferral::Wait;
+        match place {
+            None if self.is_empty() => return Deferral::Now,
+            Some(Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => {}
+            Some(Elsewhere::Mirror(_)) if self.is_empty() => {}
+            _ => return Deferral::Wait,
         }
+        let Some(place) = place else { return Deferral::Now };
         let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
-        let reply = match unit_server.forward(rights, route, &asker, unit_id, request) {
-            Ok(coming) => Expected::Coming(coming),
-            Err(code) => Expected::Known(exception(request, code)),
+        let (route, reply) = match unit_server.forward(rights, place, &asker, unit_id, request) {
+            Ok((route, coming)) => (Some(route), Expected::Coming(coming)),
+            Err(code) => (None, Expected::Known(exception(request, code))),
         };
-        let (route, request) = (Arc::clone(&route.name), request.to_vec());
+        let request = request.to_vec();
         self.waiting.push_back(Waiting { tag, unit_id, route, request, reply });
         Deferral::Later
     }

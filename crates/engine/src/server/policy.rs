@@ -8,6 +8,7 @@ use holdfast_protocol::pdu::{Function, Request};
 use ipnet::IpNet;
 
 use crate::link::Route;
+use crate::poller::Passage;
 
 /// Functions of the standard that only read, and that memories do not know (V1.1b3, 6): exception
 /// status, event log, file records, FIFO queue.
@@ -39,10 +40,19 @@ pub struct Rule {
     /// has roles.
     pub roles: Option<Vec<String>>,
     pub units: Vec<(u8, Arc<Memory>)>,
-    /// Units whose requests go to devices. They are none of `units`.
-    pub routes: Vec<(u8, Route)>,
+    /// Units whose requests, or some of them, go to devices.
+    pub elsewhere: Vec<(u8, Elsewhere)>,
     pub access: AccessMode,
     pub functions: Functions,
+}
+
+/// Where requests to a unit go that its memory does not answer.
+#[derive(Debug, Clone)]
+pub enum Elsewhere {
+    /// All go to a device. The unit has no memory.
+    Device(Route),
+    /// Writes into some ranges of its memory are passed on.
+    Mirror(Arc<Passage>),
 }
 
 /// The rules of a listener. The first rule that matches a peer applies.
@@ -105,8 +115,8 @@ impl Policy<PeerRights> {
 #[derive(Debug)]
 pub struct PeerRights {
     units: [Option<Arc<Memory>>; 256],
-    /// `None` when no unit is a device.
-    routes: Option<Box<[Option<Route>; 256]>>,
+    /// `None` when memories answer everything.
+    elsewhere: Option<Box<[Option<Elsewhere>; 256]>>,
     functions: [bool; 256],
     access: AccessMode,
 }
@@ -117,11 +127,13 @@ impl PeerRights {
         for (unit, memory) in &rule.units {
             units[usize::from(*unit)] = Some(Arc::clone(memory));
         }
-        let mut routes = None;
-        for (unit, route) in &rule.routes {
-            let routes = routes.get_or_insert_with(|| Box::new([const { None }; 256]));
-            routes[usize::from(*unit)] = Some(route.clone());
+        let mut elsewhere = None;
+        for (unit, place) in &rule.elsewhere {
+            let units = elsewhere.get_or_insert_with(|| Box::new([const { None }; 256]));
+            units[usize::from(*unit)] = Some(place.clone());
         }
+        let is_device = |(_, place): &(u8, Elsewhere)| matches!(place, Elsewhere::Device(_));
+        let has_devices = rule.elsewhere.iter().any(is_device);
         let functions = std::array::from_fn(|code| {
             let code = code as u8;
             let (named, listed) = match &rule.functions {
@@ -134,12 +146,12 @@ impl PeerRights {
                 && match Function::from_code(code) {
                     Some(function) => writes || !function.is_write(),
                     // Only devices know other functions.
-                    None if routes.is_none() || code & 0x80 != 0 => false,
+                    None if !has_devices || code & 0x80 != 0 => false,
                     None if OTHER_READS.contains(&code) => true,
                     None => writes && (listed || code == WRITE_FILE_RECORD),
                 }
         });
-        PeerRights { units, routes, functions, access: rule.access }
+        PeerRights { units, elsewhere, functions, access: rule.access }
     }
 
     /// The memory of a unit id.
@@ -148,10 +160,10 @@ impl PeerRights {
         self.units[usize::from(unit_id)].as_deref()
     }
 
-    /// Where requests to a unit id go, if it is a device.
+    /// Where requests to a unit id go, or some of them.
     #[inline]
-    pub(crate) fn route(&self, unit_id: u8) -> Option<&Route> {
-        self.routes.as_ref()?[usize::from(unit_id)].as_ref()
+    pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&Elsewhere> {
+        self.elsewhere.as_ref()?[usize::from(unit_id)].as_ref()
     }
 
     /// Whether a request to a device is denied for what follows its function code: a read-only peer may

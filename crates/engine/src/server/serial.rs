@@ -230,15 +230,17 @@ impl ModbusSerial {
             self.broadcast(context, request);
             return None;
         }
-        if let Some(route) = self.rights.route(unit_id) {
+        if let Some(place) = self.unit_server.elsewhere(&self.rights, unit_id, request) {
             let asker = Asker { source: self.source, peer: None, waiting: 0 };
-            let sent = self.unit_server.forward(&self.rights, route, &asker, unit_id, request);
-            let answered = match sent {
-                Ok(coming) => come(&self.unit_server, request, coming.await.ok()),
-                Err(code) => exception(request, code),
+            let sent = self.unit_server.forward(&self.rights, place, &asker, unit_id, request);
+            let (route, answered) = match sent {
+                Ok((route, coming)) => {
+                    (Some(route), come(&self.unit_server, request, coming.await.ok()))
+                }
+                Err(code) => (None, exception(request, code)),
             };
             if let Some(auditor) = &context.auditor {
-                let passed = (&route.name, request, &answered[..]);
+                let passed = (route.as_ref(), request, &answered[..]);
                 auditor.note_forwarded(&context.name, None, unit_id, passed);
             }
             reply[..answered.len()].copy_from_slice(&answered);

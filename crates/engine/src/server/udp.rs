@@ -149,7 +149,7 @@ impl ModbusUdp {
     ) {
         let reply = come(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
-            let passed = (&route, &request[..], &reply[..]);
+            let passed = (Some(&route), &request[..], &reply[..]);
             auditor.note_forwarded(&context.name, Some(meta.addr), unit_id, passed);
         }
         if !reply.is_empty() {
@@ -193,18 +193,17 @@ impl ModbusUdp {
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
-        if let Some(route) = rights.route(unit_id) {
+        if let Some(place) = self.unit_server.elsewhere(rights, unit_id, request) {
             let waiting = later.replies.len();
             let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
             let coming = if waiting < MAX_LATER {
-                self.unit_server.forward(rights, route, &asker, unit_id, request)
+                self.unit_server.forward(rights, place, &asker, unit_id, request)
             } else {
                 Err(ExceptionCode::ServerDeviceBusy)
             };
             return match coming {
-                Ok(coming) => {
-                    let (meta, route) = (*meta, Arc::clone(&route.name));
-                    let request = request.to_vec();
+                Ok((route, coming)) => {
+                    let (meta, request) = (*meta, request.to_vec());
                     later.replies.spawn(async move {
                         let reply = coming.await.ok();
                         Completed { tag, unit_id, meta, route, request, reply }

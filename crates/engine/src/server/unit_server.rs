@@ -6,6 +6,7 @@
 //! is inside its area (02). A denied function is refused before the unit is looked up, so that a
 //! peer without rights cannot discover units. A unit in listen only mode never answers.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use holdfast_memory::{Access, Area, Memory, Read, Refusal, Write};
@@ -15,8 +16,8 @@ use holdfast_protocol::pdu::{
 
 use super::counters::{Bus, Counters};
 use super::identity::Identity;
-use super::policy::PeerRights;
-use crate::link::{Asker, Coming, Route};
+use super::policy::{Elsewhere, PeerRights};
+use crate::link::{Asker, Coming};
 
 /// The units of one listener.
 #[derive(Debug)]
@@ -71,24 +72,41 @@ impl UnitServer {
         }
     }
 
-    /// Sends a request to a device on its way.
+    /// Where a request goes that is not answered here.
+    #[inline]
+    pub(crate) fn elsewhere<'r>(
+        &self,
+        rights: &'r PeerRights,
+        unit_id: u8,
+        request: &[u8],
+    ) -> Option<&'r Elsewhere> {
+        rights.elsewhere(unit_id).filter(|place| match place {
+            Elsewhere::Device(_) => true,
+            Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.takes(request),
+        })
+    }
+
+    /// Sends a request on its way to a device. Returns also the name of what it was passed on to.
     ///
     /// # Errors
     /// The exception to answer it with.
     pub(crate) fn forward(
         &self,
         rights: &PeerRights,
-        route: &Route,
+        place: &Elsewhere,
         asker: &Asker,
         unit_id: u8,
         request: &[u8],
-    ) -> Result<Coming, ExceptionCode> {
+    ) -> Result<(Arc<str>, Coming), ExceptionCode> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
-        let sent = if rights.allows(function_code) && !rights.denies(request) {
-            route.ask(asker, unit_id, request)
-        } else {
-            Err(ExceptionCode::IllegalFunction)
+        let sent = match place {
+            _ if !rights.allows(function_code) => Err(ExceptionCode::IllegalFunction),
+            Elsewhere::Device(_) if rights.denies(request) => Err(ExceptionCode::IllegalFunction),
+            Elsewhere::Device(route) => {
+                route.ask(asker, unit_id, request).map(|coming| (Arc::clone(&route.name), coming))
+            }
+            Elsewhere::Mirror(passage) => passage.ask(request),
         };
         sent.inspect_err(|code| self.counters.exception(*code))
     }

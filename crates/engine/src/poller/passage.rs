@@ -1,0 +1,342 @@
+//! Writes of Modbus clients into ranges that devices are read into: they are passed on to the device.
+//!
+//! A request must touch one such range and nothing else. It is sent with the area and the address of
+//! the device; the client gets the device's answer. When the device has confirmed it, the memory holds
+//! the new value before the client has its reply.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use holdfast_memory::{Access, Area, Memory, Write};
+use holdfast_protocol::pdu::{
+    self, EncodedRequest, ExceptionCode, Function, Range, Request, reply,
+};
+use tokio::sync::{mpsc, oneshot};
+
+use super::thread::Order;
+use crate::link::{Coming, Fault, Link, Priority};
+
+/// The most writes into one memory that wait for devices.
+const MAX_WAITING: usize = 256;
+
+/// A range of a memory, and where it comes from.
+#[derive(Debug, Clone)]
+pub struct PassedRange {
+    /// Coils or holding registers.
+    pub area: Area,
+    pub address: u16,
+    pub count: u32,
+    pub device: Arc<str>,
+    /// The first address in the same area of the device.
+    pub device_address: u16,
+    /// Whether function 22 is carried out as a read and function 6.
+    pub emulate: bool,
+}
+
+/// The ranges of a memory whose writes are passed on.
+#[derive(Debug)]
+pub struct Passage {
+    pub memory: Arc<Memory>,
+    ranges: Vec<PassedRange>,
+    orders: mpsc::UnboundedSender<Order>,
+    waiting: Arc<AtomicUsize>,
+}
+
+/// Items of a memory.
+#[derive(Debug, Clone, Copy)]
+struct Items {
+    area: Area,
+    address: u16,
+    count: u32,
+}
+
+/// A write on its way to a device.
+pub(super) struct PassedWrite {
+    memory: Arc<Memory>,
+    range: PassedRange,
+    /// As the client sent it.
+    pdu: Vec<u8>,
+    /// As the device gets it.
+    request: EncodedRequest,
+    reply: oneshot::Sender<Vec<u8>>,
+    _place: Place,
+}
+
+/// What a device has taken over, in its own addresses.
+pub(super) struct Change {
+    pub(super) area: Area,
+    pub(super) address: u16,
+    pub(super) count: u32,
+    /// As in a [`Write`].
+    pub(super) bytes: Vec<u8>,
+}
+
+/// A place among those who wait.
+struct Place(Arc<AtomicUsize>);
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Items {
+    fn end(self) -> u32 {
+        u32::from(self.address) + self.count
+    }
+
+    fn overlaps(self, range: &PassedRange) -> bool {
+        let first = u32::from(range.address);
+        self.area == range.area
+            && u32::from(self.address) < first + range.count
+            && first < self.end()
+    }
+
+    fn is_in(self, range: &PassedRange) -> bool {
+        self.area == range.area
+            && range.address <= self.address
+            && self.end() <= u32::from(range.address) + range.count
+    }
+}
+
+/// What a request writes, and what it reads after that; `None` if it does not write items.
+fn touched(request: &Request<'_>) -> Option<(Items, Option<Items>)> {
+    let registers =
+        |address, count: u16| Items { area: Area::HoldingRegisters, address, count: count.into() };
+    let coils = |address, count: u16| Items { area: Area::Coils, address, count: count.into() };
+    Some(match *request {
+        Request::WriteSingleCoil { address, .. } => (coils(address, 1), None),
+        Request::WriteMultipleCoils { address, bits } => (coils(address, bits.quantity()), None),
+        Request::WriteSingleRegister { address, .. }
+        | Request::MaskWriteRegister { address, .. } => (registers(address, 1), None),
+        Request::WriteMultipleRegisters { address, registers: new } => {
+            (registers(address, new.quantity()), None)
+        }
+        Request::ReadWriteMultipleRegisters { read, write_address, registers: new } => {
+            let read = registers(read.address(), read.quantity());
+            (registers(write_address, new.quantity()), Some(read))
+        }
+        _ => return None,
+    })
+}
+
+impl Passage {
+    pub(super) fn new(
+        memory: Arc<Memory>,
+        ranges: Vec<PassedRange>,
+        orders: mpsc::UnboundedSender<Order>,
+    ) -> Passage {
+        Passage { memory, ranges, orders, waiting: Arc::default() }
+    }
+
+    /// Whether a request writes into one of the ranges.
+    pub(crate) fn takes(&self, pdu: &[u8]) -> bool {
+        let function = pdu.first().copied().and_then(Function::from_code);
+        function.is_some_and(Function::is_write)
+            && Request::parse(pdu).is_ok_and(|request| {
+                touched(&request).is_some_and(|(written, _)| {
+                    self.ranges.iter().any(|range| written.overlaps(range))
+                })
+            })
+    }
+
+    /// Sends such a request on its way. Returns the name of the device too.
+    ///
+    /// # Errors
+    /// The exception to refuse it with: the memory is sealed, the request touches more than one range,
+    /// too many wait, or the poller has stopped.
+    pub(crate) fn ask(&self, pdu: &[u8]) -> Result<(Arc<str>, Coming), ExceptionCode> {
+        let request = Request::parse(pdu)?;
+        let (written, read) = touched(&request).ok_or(ExceptionCode::IllegalFunction)?;
+        if self.memory.sealed() {
+            return Err(ExceptionCode::ServerDeviceBusy);
+        }
+        let is_whole = |range: &&PassedRange| {
+            written.is_in(range) && read.is_none_or(|read| read.is_in(range))
+        };
+        let range = self.ranges.iter().find(is_whole).ok_or(ExceptionCode::IllegalDataAddress)?;
+        let place = Place(Arc::clone(&self.waiting));
+        if self.waiting.fetch_add(1, Ordering::Relaxed) >= MAX_WAITING {
+            return Err(ExceptionCode::GatewayPathUnavailable);
+        }
+        let (reply, coming) = oneshot::channel();
+        let passed = PassedWrite {
+            memory: Arc::clone(&self.memory),
+            range: range.clone(),
+            request: translated(pdu, range, read.is_some())?,
+            pdu: pdu.to_vec(),
+            reply,
+            _place: place,
+        };
+        let sent = self.orders.send(Order::Pass(Box::new(passed)));
+        sent.or(Err(ExceptionCode::GatewayPathUnavailable))?;
+        Ok((Arc::clone(&range.device), coming))
+    }
+}
+
+/// The request with the addresses of the device.
+fn translated(
+    pdu: &[u8],
+    range: &PassedRange,
+    has_read: bool,
+) -> Result<EncodedRequest, ExceptionCode> {
+    let mut moved = pdu.to_vec();
+    // Function 23 has the address to read, the quantity to read, and the address to write.
+    for at in [Some(1), has_read.then_some(5)].into_iter().flatten() {
+        let Some(bytes) = moved.get_mut(at..).and_then(<[u8]>::first_chunk_mut::<2>) else {
+            return Err(ExceptionCode::IllegalDataValue);
+        };
+        let there = u16::from_be_bytes(*bytes) - range.address;
+        let here = range.device_address.checked_add(there);
+        *bytes = here.ok_or(ExceptionCode::IllegalDataAddress)?.to_be_bytes();
+    }
+    EncodedRequest::parse(&moved)
+}
+
+impl PassedWrite {
+    pub(super) fn device(&self) -> &str {
+        &self.range.device
+    }
+
+    /// Refuses it without a try.
+    pub(super) fn refuse(self, code: ExceptionCode) {
+        let pdu = self.exception(code);
+        // The client may have gone.
+        let _ = self.reply.send(pdu);
+    }
+
+    /// Carries it out. Returns what has changed in the device, if that is known.
+    pub(super) async fn carry_out(
+        self,
+        link: &Link,
+        unit_id: u8,
+        timeout: Duration,
+    ) -> Option<Change> {
+        if self.reply.is_closed() {
+            return None;
+        }
+        if link.retry_at().is_some() {
+            self.refuse(ExceptionCode::GatewayPathUnavailable);
+            return None;
+        }
+        let call = async |request: &EncodedRequest| {
+            link.call(unit_id, request, timeout, Priority::Urgent).await
+        };
+        let mask = match self.request.request() {
+            Some(Request::MaskWriteRegister { address, and_mask, or_mask }) => {
+                Some((address, and_mask, or_mask))
+            }
+            _ => None,
+        };
+        let read = |address| {
+            let range = Range::new(address, 1).expect("one register is a valid range");
+            EncodedRequest::new(&Request::ReadHoldingRegisters(range))
+        };
+        let mut value = None;
+        let answered = match mask {
+            Some((address, and_mask, or_mask)) if self.range.emulate => {
+                match call(&read(address)).await.map(|pdu| register(&pdu)) {
+                    Ok(Some(now)) => {
+                        let new = (now & and_mask) | (or_mask & !and_mask);
+                        value = Some(new);
+                        let write = Request::WriteSingleRegister { address, value: new };
+                        call(&EncodedRequest::new(&write)).await
+                    }
+                    Ok(None) => Err(Fault::Invalid),
+                    Err(fault) => Err(fault),
+                }
+            }
+            Some((address, ..)) => {
+                let answered = call(&self.request).await;
+                if answered.is_ok() {
+                    // The memory may not know what the device had before.
+                    value = call(&read(address)).await.ok().and_then(|pdu| register(&pdu));
+                }
+                answered
+            }
+            None => call(&self.request).await,
+        };
+        let pdu = match answered {
+            Ok(answer) => return self.confirm(&answer, value),
+            Err(Fault::Exception(code)) => vec![self.pdu[0] | 0x80, code],
+            Err(_) if link.retry_at().is_some() => {
+                self.exception(ExceptionCode::GatewayPathUnavailable)
+            }
+            Err(_) => self.exception(ExceptionCode::GatewayTargetFailedToRespond),
+        };
+        let _ = self.reply.send(pdu);
+        None
+    }
+
+    /// Takes what the device has confirmed into memory, then replies. `value` is what the device holds
+    /// after function 22.
+    fn confirm(self, answer: &[u8], value: Option<u16>) -> Option<Change> {
+        let change = self.change(value);
+        if let Some(change) = &change {
+            self.store(change);
+        }
+        let mut buffer = [0; pdu::MAX_LEN];
+        let reply = match Request::parse(&self.pdu) {
+            Ok(Request::ReadWriteMultipleRegisters { read, .. }) => {
+                if let Some(bytes) = answer.get(2..) {
+                    let (address, count) = (self.there(read.address()), read.quantity().into());
+                    let area = Area::HoldingRegisters;
+                    self.store(&Change { area, address, count, bytes: bytes.to_vec() });
+                }
+                answer
+            }
+            Ok(Request::WriteMultipleCoils { address, bits }) => {
+                let len = reply::write_multiple_coils(address, bits, &mut buffer);
+                &buffer[..len]
+            }
+            Ok(Request::WriteMultipleRegisters { address, registers }) => {
+                let len = reply::write_multiple_registers(address, registers, &mut buffer);
+                &buffer[..len]
+            }
+            // The reply repeats the request.
+            _ => &self.pdu,
+        };
+        let _ = self.reply.send(reply.to_vec());
+        change
+    }
+
+    /// What the device has taken over.
+    fn change(&self, value: Option<u16>) -> Option<Change> {
+        let request = self.request.request()?;
+        let (Items { area, address, count }, _) = touched(&request)?;
+        let bytes = match request {
+            Request::WriteSingleCoil { value, .. } => vec![u8::from(value)],
+            Request::WriteSingleRegister { value, .. } => value.to_be_bytes().to_vec(),
+            Request::WriteMultipleCoils { bits, .. } => bits.as_bytes().to_vec(),
+            Request::WriteMultipleRegisters { registers, .. } => registers.as_bytes().to_vec(),
+            Request::ReadWriteMultipleRegisters { registers, .. } => registers.as_bytes().to_vec(),
+            _ => value?.to_be_bytes().to_vec(),
+        };
+        Some(Change { area, address, count, bytes })
+    }
+
+    /// The address of the device that belongs to one of the memory.
+    fn there(&self, address: u16) -> u16 {
+        address - self.range.address + self.range.device_address
+    }
+
+    fn store(&self, change: &Change) {
+        let address = change.address - self.range.device_address + self.range.address;
+        let Change { area, count, ref bytes, .. } = *change;
+        let write = Write { area, address, count: count as usize, bytes };
+        let stored = self.memory.write(Access::Mirror, write);
+        debug_assert!(stored.is_ok(), "a mirrored range is inside its memory: {stored:?}");
+    }
+
+    fn exception(&self, code: ExceptionCode) -> Vec<u8> {
+        let mut buffer = [0; pdu::MAX_LEN];
+        let len = reply::exception(self.pdu[0], code, &mut buffer);
+        buffer[..len].to_vec()
+    }
+}
+
+/// The register in the reply to a read of one.
+fn register(pdu: &[u8]) -> Option<u16> {
+    pdu.get(2..)?.first_chunk::<2>().map(|bytes| u16::from_be_bytes(*bytes))
+}

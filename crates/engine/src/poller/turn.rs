@@ -1,0 +1,83 @@
+//! The turn of a device: it gets one request at a time, from polls and writes alike.
+
+use std::cell::{Cell, RefCell};
+
+use holdfast_memory::Area;
+use tokio::sync::{Mutex, MutexGuard};
+
+use super::passage::Change;
+
+#[derive(Default)]
+pub(super) struct Turn {
+    lock: Mutex<()>,
+    is_polling: Cell<bool>,
+    /// What was written to the device since its current poll began.
+    changes: RefCell<Vec<Change>>,
+}
+
+impl Turn {
+    /// Waits for the turn, which lasts as long as the result.
+    pub(super) async fn take(&self) -> MutexGuard<'_, ()> {
+        self.lock.lock().await
+    }
+
+    /// A poll begins or ends.
+    pub(super) fn polls(&self, is_polling: bool) {
+        self.is_polling.set(is_polling);
+        self.changes.borrow_mut().clear();
+    }
+
+    /// Keeps what was written for the reads of the current poll that began before.
+    pub(super) fn note(&self, change: Change) {
+        if self.is_polling.get() {
+            self.changes.borrow_mut().push(change);
+        }
+    }
+
+    /// Puts what was written during the poll into a read that took several requests: what it was written
+    /// over may have been read before.
+    pub(super) fn amend(&self, area: Area, address: u16, count: u32, bytes: &mut [u8]) {
+        let first = u32::from(address);
+        for change in self.changes.borrow().iter().filter(|change| change.area == area) {
+            let start = u32::from(change.address);
+            for item in start.max(first)..(start + change.count).min(first + count) {
+                let (from, to) = ((item - start) as usize, (item - first) as usize);
+                if area.is_bits() {
+                    let bit = change.bytes[from / 8] >> (from % 8) & 1;
+                    bytes[to / 8] = bytes[to / 8] & !(1 << (to % 8)) | bit << (to % 8);
+                } else {
+                    bytes[to * 2..to * 2 + 2]
+                        .copy_from_slice(&change.bytes[from * 2..from * 2 + 2]);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn change(area: Area, address: u16, count: u32, bytes: &[u8]) -> Change {
+        Change { area, address, count, bytes: bytes.to_vec() }
+    }
+
+    #[test]
+    fn what_was_written_during_a_poll_is_in_its_reads() {
+        let turn = Turn::default();
+        turn.note(change(Area::HoldingRegisters, 0, 1, &[9, 9]));
+        turn.polls(true);
+        turn.note(change(Area::HoldingRegisters, 9, 2, &[1, 2, 3, 4]));
+        turn.note(change(Area::Coils, 8, 3, &[0b101]));
+        let mut registers = [0; 6];
+        turn.amend(Area::HoldingRegisters, 10, 3, &mut registers);
+        assert_eq!(registers, [3, 4, 0, 0, 0, 0]);
+        let mut coils = [0b1111_1111, 0b1111];
+        turn.amend(Area::Coils, 1, 12, &mut coils);
+        assert_eq!(coils, [0b1111_1111, 0b1110]);
+        turn.polls(false);
+        let mut after = [0; 6];
+        turn.amend(Area::HoldingRegisters, 10, 3, &mut after);
+        assert_eq!(after, [0; 6]);
+    }
+}
