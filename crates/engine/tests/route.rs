@@ -1,0 +1,277 @@
+//! Many masters on one device, through a route. `HOLDFAST_TORTURE=1` asks a million times.
+
+use std::collections::VecDeque;
+use std::env;
+use std::io::{ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Barrier, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use holdfast_engine::client::Place;
+use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink};
+use holdfast_engine::poller::Poller;
+use holdfast_engine::server::event::Verbosity;
+use holdfast_engine::server::policy::{AccessMode, Elsewhere, Functions, Rule};
+use holdfast_engine::server::{
+    ConnectionLimits, Engine, ListenerKind, ListenerSettings, Settings, StreamFraming,
+    StreamSettings, WhenFull,
+};
+use holdfast_protocol::frame::{mbap, rtu};
+
+const MASTERS: usize = 50;
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Bits of a character on a serial line.
+const CHARACTER: u32 = 11;
+
+fn is_torture() -> bool {
+    env::var_os("HOLDFAST_TORTURE").is_some()
+}
+
+/// What a device has seen.
+#[derive(Default)]
+struct Seen {
+    requests: AtomicU64,
+    /// Bytes that arrived between a request and its reply.
+    overlapping: AtomicU64,
+}
+
+/// A device of RTU frames over TCP: registers hold their address and its complement. With a baud rate,
+/// request and reply take as long as on a line.
+fn device(baud: Option<u32>) -> (SocketAddr, Arc<Seen>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let (address, seen) = (listener.local_addr().unwrap(), Arc::<Seen>::default());
+    let shared = Arc::clone(&seen);
+    thread::spawn(move || {
+        for stream in listener.incoming() {
+            let shared = Arc::clone(&shared);
+            thread::spawn(move || answer(&mut stream.unwrap(), baud, &shared));
+        }
+    });
+    (address, seen)
+}
+
+fn answer(stream: &mut TcpStream, baud: Option<u32>, seen: &Seen) {
+    stream.set_nodelay(true).unwrap();
+    let mut request = [0; 8];
+    while stream.read_exact(&mut request).is_ok() {
+        let (unit_id, pdu) = rtu::decode(&request).expect("the link sends whole frames");
+        let address = u16::from_be_bytes([pdu[1], pdu[2]]);
+        let mut reply = vec![3, 4];
+        reply.extend(address.to_be_bytes());
+        reply.extend((!address).to_be_bytes());
+        let mut frame = [0; rtu::MAX_LEN];
+        let len = rtu::encode(unit_id, &reply, &mut frame).unwrap();
+        if let Some(baud) = baud {
+            thread::sleep(Duration::from_secs(1) * (request.len() + len) as u32 * CHARACTER / baud);
+        }
+        seen.requests.fetch_add(1, Ordering::Relaxed);
+        stream.set_nonblocking(true).unwrap();
+        match stream.peek(&mut [0]) {
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            Ok(0) => return,
+            _ => {
+                seen.overlapping.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        stream.set_nonblocking(false).unwrap();
+        stream.write_all(&frame[..len]).unwrap();
+    }
+}
+
+/// A listener whose unit 1 is the device.
+struct Front {
+    engine: Engine,
+    poller: Poller,
+    link: Arc<SharedLink>,
+}
+
+impl Front {
+    fn new(device: SocketAddr) -> Front {
+        let poller = Poller::start(Vec::new()).unwrap();
+        let place = Place::RtuOverTcp { host: "127.0.0.1".into(), port: device.port() };
+        let link = LinkSettings {
+            name: "device".into(),
+            endpoint: place.into(),
+            in_flight: InFlight::Fixed(1),
+            queue: 1000,
+            coalesce: false,
+            cache: Duration::ZERO,
+            preferred: Vec::new(),
+        };
+        let link = poller.link(link).unwrap();
+        let (name, timeout) = ("device".into(), PATIENCE);
+        let route = Route { name, link: Arc::clone(&link), unit_id: None, timeout };
+        let rule = Rule {
+            sources: vec!["127.0.0.1/32".parse().unwrap()],
+            roles: None,
+            units: Vec::new(),
+            elsewhere: vec![(1, Elsewhere::Device(route))],
+            access: AccessMode::ReadWrite,
+            functions: Functions::All,
+        };
+        let stream = StreamSettings {
+            bind: "127.0.0.1:0".parse().unwrap(),
+            framing: StreamFraming::Mbap,
+            rules: vec![rule],
+            limits: ConnectionLimits {
+                max_connections: 100,
+                max_connections_per_source: None,
+                when_full: WhenFull::Refuse,
+            },
+            idle_timeout: None,
+            request_timeout: PATIENCE,
+            frame_timeout: None,
+            tls: None,
+        };
+        let kind = ListenerKind::ModbusStream(stream);
+        let engine = Engine::start(Settings {
+            listeners: vec![ListenerSettings { name: "front".into(), kind }],
+            identity: vec![(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())],
+            unit_names: Vec::new(),
+            workers: 2,
+            events: Verbosity::Nothing,
+            audit: false,
+        });
+        Front { engine: engine.unwrap(), poller, link }
+    }
+
+    fn connect(&self) -> TcpStream {
+        let address = self.engine.addresses()[0].unwrap();
+        let stream = TcpStream::connect(address).unwrap();
+        stream.set_nodelay(true).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream
+    }
+
+    fn stop(self) {
+        self.engine.stop();
+        self.poller.stop();
+    }
+}
+
+/// A master that keeps `depth` requests in flight, and checks each reply.
+struct Master {
+    stream: TcpStream,
+    number: u16,
+    sent: u16,
+    /// Transaction ids and addresses of requests without a reply.
+    open: VecDeque<(u16, u16)>,
+}
+
+impl Master {
+    fn ask(&mut self) {
+        let (id, address) = (self.sent.wrapping_mul(7), self.number * 1000 + self.sent % 1000);
+        self.sent = self.sent.wrapping_add(1);
+        let mut frame = mbap::header(id, 1, 5).to_vec();
+        frame.push(3);
+        frame.extend(address.to_be_bytes());
+        frame.extend([0, 2]);
+        self.stream.write_all(&frame).unwrap();
+        self.open.push_back((id, address));
+    }
+
+    fn receive(&mut self) {
+        let mut reply = [0; 13];
+        self.stream.read_exact(&mut reply).unwrap();
+        let (id, address) = self.open.pop_front().unwrap();
+        let mut expected = mbap::header(id, 1, 6).to_vec();
+        expected.extend([3, 4]);
+        expected.extend(address.to_be_bytes());
+        expected.extend((!address).to_be_bytes());
+        assert_eq!(reply, expected[..], "master {}", self.number);
+    }
+}
+
+/// Asks until each master has asked `each` times, or until `enough`. Returns how often each was answered,
+/// and its longest wait.
+fn crowd(front: &Front, each: u64, enough: Option<u64>) -> Vec<(u64, Duration)> {
+    let (start, all) = (Arc::new(Barrier::new(MASTERS)), Arc::new(AtomicU64::new(0)));
+    let is_over = Arc::new(AtomicBool::new(false));
+    let masters: Vec<_> = (0..MASTERS)
+        .map(|number| {
+            let (start, all, is_over) =
+                (Arc::clone(&start), Arc::clone(&all), Arc::clone(&is_over));
+            let stream = front.connect();
+            thread::spawn(move || {
+                let mut master =
+                    Master { stream, number: number as u16, sent: 0, open: VecDeque::new() };
+                // Some masters ask for much more than their share.
+                let depth = if number % 10 == 0 { 16 } else { 1 };
+                let (mut answered, mut longest) = (0, Duration::ZERO);
+                start.wait();
+                (0..depth).for_each(|_| master.ask());
+                while !is_over.load(Ordering::Relaxed) && answered < each {
+                    let began = Instant::now();
+                    master.receive();
+                    longest = longest.max(began.elapsed());
+                    answered += 1;
+                    let total = all.fetch_add(1, Ordering::Relaxed) + 1;
+                    if enough.is_some_and(|enough| total >= enough) {
+                        is_over.store(true, Ordering::Relaxed);
+                    }
+                    master.ask();
+                }
+                (answered, longest)
+            })
+        })
+        .collect();
+    masters.into_iter().map(|master| master.join().unwrap()).collect()
+}
+
+#[test]
+fn no_master_gets_the_reply_of_another_and_the_device_gets_one_request_at_a_time() {
+    let each = if is_torture() { 20_000 } else { 400 };
+    let (address, seen) = device(None);
+    let front = Front::new(address);
+    let answered: u64 = crowd(&front, each, None).iter().map(|(answered, _)| answered).sum();
+    assert_eq!(answered, MASTERS as u64 * each);
+    assert_eq!(seen.overlapping.load(Ordering::Relaxed), 0);
+    assert_eq!(front.link.counters.timeouts.get() + front.link.counters.failures.get(), 0);
+    assert_eq!(front.link.counters.refused_full.get(), 0);
+    front.stop();
+}
+
+#[test]
+fn fifty_masters_on_a_slow_line_have_equal_shares() {
+    // 19,200 baud, or a line that is quicker so that the test ends soon.
+    let (baud, enough) = if is_torture() { (19_200, 5_000) } else { (192_000, 1_000) };
+    let (address, seen) = device(Some(baud));
+    let front = Front::new(address);
+    let shares = crowd(&front, u64::MAX, Some(enough));
+    let mean = shares.iter().map(|(answered, _)| answered).sum::<u64>() / MASTERS as u64;
+    for (number, (answered, longest)) in shares.iter().enumerate() {
+        assert!(2 * answered >= mean, "master {number}: {answered} of {mean}, waited {longest:?}");
+    }
+    assert_eq!(seen.overlapping.load(Ordering::Relaxed), 0);
+    front.stop();
+}
+
+#[test]
+fn a_master_that_has_gone_is_not_asked_for() {
+    let (address, seen) = device(Some(19_200));
+    let front = Front::new(address);
+    let waits: Mutex<Vec<Master>> = Mutex::default();
+    for number in 0..10 {
+        let stream = front.connect();
+        let mut master = Master { stream, number, sent: 0, open: VecDeque::new() };
+        (0..16).for_each(|_| master.ask());
+        waits.lock().unwrap().push(master);
+    }
+    let mut masters = waits.into_inner().unwrap();
+    let mut stays = masters.pop().unwrap();
+    while front.link.waiting() < 100 {
+        thread::yield_now();
+    }
+    drop(masters);
+    (0..16).for_each(|_| stays.receive());
+    while front.link.waiting() > 0 {
+        thread::yield_now();
+    }
+    let asked = seen.requests.load(Ordering::Relaxed);
+    assert_eq!(asked + front.link.counters.withdrawn.get(), 160);
+    assert!(asked < 120, "{asked} requests were sent");
+    front.stop();
+}
