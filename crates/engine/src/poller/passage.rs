@@ -14,7 +14,6 @@ use holdfast_protocol::pdu::{
 };
 use tokio::sync::{mpsc, oneshot};
 
-use super::thread::Order;
 use crate::link::{Coming, Fault, Link, Priority};
 
 /// The most writes into one memory that wait for devices.
@@ -39,7 +38,7 @@ pub struct PassedRange {
 pub struct Passage {
     pub memory: Arc<Memory>,
     ranges: Vec<PassedRange>,
-    orders: mpsc::UnboundedSender<Order>,
+    writes: mpsc::UnboundedSender<PassedWrite>,
     waiting: Arc<AtomicUsize>,
 }
 
@@ -125,9 +124,9 @@ impl Passage {
     pub(super) fn new(
         memory: Arc<Memory>,
         ranges: Vec<PassedRange>,
-        orders: mpsc::UnboundedSender<Order>,
+        writes: mpsc::UnboundedSender<PassedWrite>,
     ) -> Passage {
-        Passage { memory, ranges, orders, waiting: Arc::default() }
+        Passage { memory, ranges, writes, waiting: Arc::default() }
     }
 
     /// Whether a request writes into one of the ranges.
@@ -169,7 +168,7 @@ impl Passage {
             reply,
             _place: place,
         };
-        let sent = self.orders.send(Order::Pass(Box::new(passed)));
+        let sent = self.writes.send(passed);
         sent.or(Err(ExceptionCode::GatewayPathUnavailable))?;
         Ok((Arc::clone(&range.device), coming))
     }

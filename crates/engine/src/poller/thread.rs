@@ -75,13 +75,15 @@ pub struct Poller {
     orders: mpsc::UnboundedSender<Order>,
     results: Arc<Results>,
     tickets: AtomicU64,
+    /// Writes of Modbus clients into what is read from devices.
+    passed: mpsc::UnboundedSender<PassedWrite>,
     /// The links that listeners use.
     shared: Mutex<Vec<(Address, Weak<SharedLink>)>>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
 /// Orders to the thread of the poller. The thread ends when all senders are dropped.
-pub(super) enum Order {
+enum Order {
     Add(Box<Planned>, Polled),
     /// Replaces the device of that name.
     Replace {
@@ -98,8 +100,6 @@ pub(super) enum Order {
         ticket: u64,
         request: Box<EncodedRequest>,
     },
-    /// A write of a Modbus client into what is read from a device.
-    Pass(Box<PassedWrite>),
     Stop,
 }
 
@@ -111,6 +111,7 @@ impl Poller {
     pub fn start(devices: Vec<DeviceSettings>) -> Result<Poller, PollerError> {
         let devices = devices.into_iter().map(checked).collect::<Result<Vec<_>, _>>()?;
         let (orders, told) = mpsc::unbounded_channel();
+        let (passed, writes) = mpsc::unbounded_channel();
         let results = Arc::new(Results::default());
         let runtime = Builder::new_current_thread()
             .enable_io()
@@ -119,7 +120,7 @@ impl Poller {
             .map_err(PollerError::Thread)?;
         let to = Arc::clone(&results);
         let work = move || {
-            LocalSet::new().block_on(&runtime, obey(told, Arc::clone(&to)));
+            LocalSet::new().block_on(&runtime, obey(told, writes, Arc::clone(&to)));
             to.end();
             // Does not wait for name resolution in progress.
             runtime.shutdown_background();
@@ -133,6 +134,7 @@ impl Poller {
             orders,
             results,
             tickets: AtomicU64::default(),
+            passed,
             shared: Mutex::default(),
             thread: Mutex::new(Some(thread)),
         };
@@ -229,7 +231,7 @@ impl Poller {
                 return Err(PollerError::Beyond { device: range.device.to_string(), read });
             }
         }
-        Ok(Passage::new(memory, ranges, self.orders.clone()))
+        Ok(Passage::new(memory, ranges, self.passed.clone()))
     }
 
     /// Sends a write over the connection of a device. Returns a number; [`Poller::results`] reports
@@ -319,11 +321,27 @@ impl Drop for Running {
 const IN_ORDER: &str = "the running devices are those in the list";
 
 /// Starts and stops the tasks of devices, until `Order::Stop`.
-async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>) {
+async fn obey(
+    mut orders: mpsc::UnboundedReceiver<Order>,
+    mut passed: mpsc::UnboundedReceiver<PassedWrite>,
+    results: Arc<Results>,
+) {
     let mut links: HashMap<Address, rc::Weak<Link>> = HashMap::new();
     let mut running: HashMap<String, Running> = HashMap::new();
     let mut started = 0;
-    while let Some(order) = orders.recv().await {
+    loop {
+        let order = tokio::select! {
+            biased;
+            order = orders.recv() => order,
+            Some(write) = passed.recv() => {
+                match running.get(write.device()) {
+                    Some(device) => device.pass(write),
+                    None => write.refuse(ExceptionCode::GatewayPathUnavailable),
+                }
+                continue;
+            }
+        };
+        let Some(order) = order else { return };
         match order {
             Order::Stop => return,
             Order::Serve(settings, shared, calls) => {
@@ -366,10 +384,6 @@ async fn obey(mut orders: mpsc::UnboundedReceiver<Order>, results: Arc<Results>)
             Order::Write { device, ticket, request } => match running.get(&device) {
                 Some(device) => device.write(ticket, request, &results),
                 None => results.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
-            },
-            Order::Pass(write) => match running.get(write.device()) {
-                Some(device) => device.pass(*write),
-                None => write.refuse(ExceptionCode::GatewayPathUnavailable),
             },
         }
     }
