@@ -1,4 +1,4 @@
-"""Passes requests on to a device: URL, requests in flight, and whether equal reads go `together`."""
+"""Passes requests on to a device: URL, requests in flight, equal reads `together` or `apart`."""
 
 from __future__ import annotations
 

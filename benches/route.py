@@ -1,11 +1,12 @@
 """Compares a route to a device with the device itself, with modbus-proxy and with mbusd.
 
-The load has one core, devices and gateways share the other: a request crosses between cores as often
-on each way. All run all the time, but only one is under load at a time. Their order rotates, so that changes of the machine's speed affect all alike.
-Ratios compare results of the same round; figures are the medians of all rounds.
+The load has one core, devices and gateways share the other: a request crosses between cores as
+often on each way. All run all the time, but only one is under load at a time. Their order rotates,
+so that changes of the machine's speed affect all alike. Ratios compare results of the same round;
+figures are the medians of all rounds.
 
-All clients read the same registers, which is why coalescing is off unless named. modbus-proxy and mbusd
-are measured if their commands are found; mbusd pauses at least 1 ms between requests.
+All clients read the same registers, which is why coalescing is off unless named. modbus-proxy and
+mbusd are measured if their commands are found; mbusd pauses at least 1 ms between requests.
 """
 
 from __future__ import annotations
@@ -70,9 +71,7 @@ def main() -> None:
 def tcp(options: Any, stack: ExitStack) -> list[Any]:
     """A device on Modbus TCP."""
     start = common.started
-    device = stack.enter_context(
-        start("device", common.python("holdfast_server.py"), options.core)
-    )
+    device = stack.enter_context(start("device", common.python("holdfast_server.py"), options.core))
     servers: dict[str, Any] = {"direct": device}
     ways = {
         "holdfast": (1, "apart"),
@@ -90,29 +89,37 @@ def tcp(options: Any, stack: ExitStack) -> list[Any]:
 
 def serial(options: Any, stack: ExitStack) -> list[Any]:
     """An RTU device behind a pseudo-terminal, which answers at once."""
-    lines = common.Server(
-        "device",
-        common.python("rtu_device.py", "holdfast", "mbusd"),
-        options.core,
-        2,
-        stack.enter_context(tempfile.TemporaryFile("w+")),
-    )
-    stack.callback(lines.stop)
-    url = f"rtu://{lines.addresses['holdfast']}?baud={BAUD}&parity=none"
+    command = common.python("rtu_device.py", "holdfast", "mbusd")
+    lines = stack.enter_context(common.started("device", command, options.core, 2))
+    url = f"rtu://{lines.addresses['holdfast']}?baud={BAUD}&parity=none&silence=0.001"
     command = common.python("holdfast_route.py", url, 1, "apart")
     servers: dict[str, Any] = {
         "holdfast": stack.enter_context(common.started("holdfast", command, options.core))
     }
     if shutil.which("mbusd"):
         command = ["mbusd", "-d", "-L-", "-v0", "-p", lines.addresses["mbusd"], "-s", str(BAUD)]
-        command += ["-m", "8N1", "-A", "127.0.0.1", "-P", "{port}", "-R", "1", "-N", "0", "-C", "99"]
+        command += [
+            "-m",
+            "8N1",
+            "-A",
+            "127.0.0.1",
+            "-P",
+            "{port}",
+            "-R",
+            "1",
+            "-N",
+            "0",
+            "-C",
+            "99",
+        ]
         servers["mbusd"] = foreign(command, options, stack)
     return [measure("RTU device", servers, count, options) for count in CONNECTIONS]
 
 
 def foreign(command: list[str], options: Any, stack: ExitStack) -> Foreign:
     """Starts a gateway of others."""
-    gateway = Foreign(command, options.core, stack.enter_context(tempfile.TemporaryFile("w+")))
+    log: IO[str] = stack.enter_context(tempfile.TemporaryFile("w+"))  # noqa: SIM115
+    gateway = Foreign(command, options.core, log)
     stack.callback(gateway.stop)
     return gateway
 

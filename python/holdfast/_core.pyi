@@ -165,8 +165,8 @@ def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> i
 class Rule:
     """What the peers of some networks may do.
 
-    `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or addresses, IPv4 or IPv6;
-    an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
+    `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
+    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
     codes, or `deny`, the codes that are not allowed, but not both. `roles`, only with TLS, are the
     allowed roles of the peer's certificate: "" is a certificate without a role, `None` is any role.
 
@@ -259,10 +259,12 @@ class Listener:
         stop_bits: int,
         data_bits: int,
         silence: float | None = None,
+        rs485: Literal["rts", "rts-low"] | None = None,
     ) -> Listener:
         """A listener for a serial line; the sources of the rule are ignored.
 
-        `silence`, in seconds, ends an RTU frame; `None` is 3.5 characters.
+        `silence`, in seconds, ends an RTU frame; `None` is 3.5 characters. With `rs485`, the driver
+        switches the direction of the line by RTS, which is high or low while sending.
         """
 
     @staticmethod
@@ -420,8 +422,9 @@ class Endpoint:
         stop_bits: int,
         data_bits: int,
         silence: float | None = None,
+        rs485: Literal["rts", "rts-low"] | None = None,
     ) -> Endpoint:
-        """A serial line."""
+        """A serial line; `silence` and `rs485` are those of `Listener.serial`."""
 
     def tolerating(
         self,

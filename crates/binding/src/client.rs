@@ -8,7 +8,7 @@ use holdfast_engine::client::{
 };
 use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
-use holdfast_engine::{LineMode, LineParity, SerialLine};
+use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
 use holdfast_protocol::client::{AcceptUnit, Tolerance};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
@@ -226,7 +226,7 @@ impl Endpoint {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (device, *, mode, baud, parity, stop_bits, data_bits, silence=None))]
+    #[pyo3(signature = (device, *, mode, baud, parity, stop_bits, data_bits, silence=None, rs485=None))]
     fn serial(
         device: String,
         mode: &str,
@@ -235,8 +235,9 @@ impl Endpoint {
         stop_bits: i128,
         data_bits: i128,
         silence: Option<f64>,
+        rs485: Option<String>,
     ) -> PyResult<Endpoint> {
-        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence)?;
+        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence, rs485)?;
         Ok(Endpoint { core: Place::Serial(line).into() })
     }
 
@@ -329,6 +330,7 @@ fn told(error: &std::io::Error) -> String {
 }
 
 /// Checks the arguments of a serial line.
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 pub fn line(
     device: String,
     mode: &str,
@@ -337,11 +339,14 @@ pub fn line(
     stop_bits: i128,
     data_bits: i128,
     silence: Option<f64>,
+    rs485: Option<String>,
 ) -> PyResult<SerialLine> {
     let silence = silence.map(|silence| seconds("silence", silence)).transpose()?;
     let modes = [("rtu", LineMode::Rtu { silence }), ("ascii", LineMode::Ascii)];
     let parities =
         [("none", LineParity::None), ("even", LineParity::Even), ("odd", LineParity::Odd)];
+    let directions = [("rts", LineDirection::Rts), ("rts-low", LineDirection::RtsLow)];
+    let direction = rs485.map(|given| word("rs485", &given, &directions)).transpose()?;
     Ok(SerialLine {
         device,
         baud: within("baud", baud, 50..=4_000_000)? as u32,
@@ -349,6 +354,7 @@ pub fn line(
         stop_bits: within("stop_bits", stop_bits, 1..=2)? as u8,
         data_bits: within("data_bits", data_bits, 7..=8)? as u8,
         mode: word("mode", mode, &modes)?,
+        direction: direction.unwrap_or(LineDirection::Adapter),
     })
 }
 

@@ -182,7 +182,7 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, device, rule, *, mode, baud, parity, stop_bits, data_bits, silence=None))]
+    #[pyo3(signature = (name, device, rule, *, mode, baud, parity, stop_bits, data_bits, silence=None, rs485=None))]
     fn serial(
         name: String,
         device: String,
@@ -193,8 +193,9 @@ impl Listener {
         stop_bits: i128,
         data_bits: i128,
         silence: Option<f64>,
+        rs485: Option<String>,
     ) -> PyResult<Listener> {
-        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence)?;
+        let line = line(device, mode, baud, parity, stop_bits, data_bits, silence, rs485)?;
         let kind = ListenerKind::ModbusSerial(SerialSettings { line, rule: rule.core.clone() });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }

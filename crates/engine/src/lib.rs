@@ -24,4 +24,4 @@ mod serial_line;
 pub mod server;
 pub mod tls;
 
-pub use serial_line::{LineMode, LineParity, SerialLine};
+pub use serial_line::{LineDirection, LineMode, LineParity, SerialLine};

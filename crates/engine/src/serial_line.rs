@@ -3,6 +3,7 @@
 use std::io;
 use std::time::Duration;
 
+use serial2_tokio::rs4xx::Rs485Config;
 use serial2_tokio::{CharSize, FlowControl, Parity, SerialPort, Settings, StopBits};
 
 /// Above 19,200 baud, the silence between RTU frames is constant (Serial Line V1.02, 2.5.1.1).
@@ -24,6 +25,17 @@ pub enum LineMode {
     Ascii,
 }
 
+/// Who switches an RS-485 line between sending and receiving.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LineDirection {
+    /// The adapter, or the driver as it is set up.
+    Adapter,
+    /// The driver, by RTS: high while sending. Only on Linux.
+    Rts,
+    /// The driver, by RTS: low while sending. Only on Linux.
+    RtsLow,
+}
+
 /// Settings of a serial line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SerialLine {
@@ -33,17 +45,37 @@ pub struct SerialLine {
     pub stop_bits: u8,
     pub data_bits: u8,
     pub mode: LineMode,
+    pub direction: LineDirection,
 }
 
 impl SerialLine {
     /// Opens the device. Must be called in the context of a runtime.
     pub(crate) fn open(&self) -> io::Result<SerialPort> {
-        SerialPort::open(&self.device, |settings: Settings| self.set(settings))
+        let port = SerialPort::open(&self.device, |settings: Settings| self.set(settings))?;
+        self.set_direction(|mode| set_mode_of_tokio(&port, mode))?;
+        Ok(port)
     }
 
     /// Opens the device for blocking calls.
     pub(crate) fn open_blocking(&self) -> io::Result<serial2::SerialPort> {
-        serial2::SerialPort::open(&self.device, |settings: Settings| self.set(settings))
+        let set = |settings: Settings| self.set(settings);
+        let port = serial2::SerialPort::open(&self.device, set)?;
+        self.set_direction(|mode| set_mode(&port, mode))?;
+        Ok(port)
+    }
+
+    /// Lets the driver switch the direction of the line.
+    fn set_direction(&self, set: impl FnOnce(Rs485Config) -> io::Result<()>) -> io::Result<()> {
+        let mut mode = Rs485Config::new();
+        match self.direction {
+            LineDirection::Adapter => return Ok(()),
+            LineDirection::Rts => {}
+            LineDirection::RtsLow => mode.set_invert_rts(true),
+        }
+        set(mode).map_err(|error| {
+            let what = "the driver can't switch an RS-485 line by RTS";
+            io::Error::new(error.kind(), format!("{what}: {error}"))
+        })
     }
 
     fn set(&self, mut settings: Settings) -> io::Result<Settings> {
@@ -82,4 +114,24 @@ impl SerialLine {
             }
         }
     }
+}
+
+#[cfg(target_os = "linux")]
+fn set_mode(port: &serial2::SerialPort, mode: Rs485Config) -> io::Result<()> {
+    port.set_rs4xx_mode(mode)
+}
+
+#[cfg(target_os = "linux")]
+fn set_mode_of_tokio(port: &SerialPort, mode: Rs485Config) -> io::Result<()> {
+    port.set_rs4xx_mode(mode)
+}
+
+#[cfg(not(target_os = "linux"))]
+fn set_mode(_: &serial2::SerialPort, _: Rs485Config) -> io::Result<()> {
+    Err(io::ErrorKind::Unsupported.into())
+}
+
+#[cfg(not(target_os = "linux"))]
+fn set_mode_of_tokio(_: &SerialPort, _: Rs485Config) -> io::Result<()> {
+    Err(io::ErrorKind::Unsupported.into())
 }

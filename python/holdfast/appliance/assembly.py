@@ -139,6 +139,7 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
                 stop_bits=line.stop_bits,
                 data_bits=line.data_bits,
                 silence=settings.serial.silence if settings.type == "modbus-rtu" else None,
+                rs485=line.rs485,
             )
         case RawIngestListener():
             return _core.Listener.raw_ingest(

@@ -33,6 +33,7 @@ def _place(target: Target) -> Endpoint:
             stop_bits=target.stop_bits,
             data_bits=target.data_bits,
             silence=target.silence,
+            rs485=target.rs485,
         )
     if target.transport == "tls":
         of = target.tls

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Mode: TypeAlias = Literal["rtu", "ascii"]
 Parity: TypeAlias = Literal["none", "even", "odd"]
+Rs485: TypeAlias = Literal["rts", "rts-low"]
 
 SERIAL = ("rtu", "ascii")
 ALL = (*TRANSPORTS, *SERIAL)
@@ -76,6 +77,8 @@ class SerialTarget:
     silence: float | None = None
     """Seconds that end an RTU frame; `None` for 3.5 characters."""
     tolerance: Tolerance = STRICT
+    rs485: Rs485 | None = None
+    """How the driver switches the direction of an RS-485 line; `None` if the adapter does."""
 
     def __str__(self) -> str:
         return f"{self.mode}://{self.device}"
@@ -193,6 +196,7 @@ OPTIONS: Mapping[str, _Option] = {
     "stop_bits": _one_of("1", "2", read=int),
     "data_bits": _one_of("7", "8", read=int),
     "silence": _Option("seconds, up to 10", _seconds, ("rtu",)),
+    "rs485": _one_of("rts", "rts-low"),
     "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, ALL),
     "pad": _flag(ALL),
     "echo": _flag(tuple(each for each in ALL if each not in MBAP)),

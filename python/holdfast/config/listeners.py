@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, Strict
 
+from holdfast.client.target import Rs485
 from holdfast.config.base import Model
 from holdfast.config.scalars import (
     RAW_UNIT_KEYS,
@@ -201,6 +202,8 @@ class SerialConfig(Model):
     """Stop bits. Default: 1 with a parity bit, 2 without."""
     data_bits: DataBits = 8
     """Data bits per character."""
+    rs485: Annotated[Rs485 | None, NotNull()] = None
+    """The driver switches an RS-485 line by RTS, high or low while sending. Default: the adapter."""
 
 
 class RtuSerialConfig(SerialConfig):
