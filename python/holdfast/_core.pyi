@@ -23,13 +23,16 @@ __all__ = [
     "Connection",
     "Endpoint",
     "Engine",
+    "Link",
     "Listener",
     "Memory",
     "OutOfRange",
+    "Passage",
     "PolledDevice",
     "Poller",
     "RawRule",
     "Request",
+    "Route",
     "Rule",
     "ServerTls",
     "__version__",
@@ -166,9 +169,10 @@ class Rule:
     """What the peers of some networks may do.
 
     `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
-    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
-    codes, or `deny`, the codes that are not allowed, but not both. `roles`, only with TLS, are the
-    allowed roles of the peer's certificate: "" is a certificate without a role, `None` is any role.
+    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set
+    `functions`, the allowed function codes, or `deny`, the codes that are not allowed, but not
+    both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
+    certificate without a role, `None` is any role.
 
     Raises `ValueError` for an invalid source or access.
     """
@@ -630,7 +634,7 @@ class Poller:
         queue: int = 256,
         coalesce: bool = True,
         cache: float = 0.0,
-        preferred: Sequence[str] = (),
+        preferred: Sequence[str] | None = None,
     ) -> Link:
         """The connection or serial line to an address, for the requests of listeners.
 

@@ -127,7 +127,7 @@ impl Poller {
         self.core.write(name, Box::new(request.encoded.clone())).map_err(raised)
     }
 
-    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=Vec::new()))]
+    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=None))]
     #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
     fn link(
         &self,
@@ -137,8 +137,9 @@ impl Poller {
         queue: i128,
         coalesce: bool,
         cache: f64,
-        preferred: Vec<String>,
+        preferred: Option<Vec<String>>,
     ) -> PyResult<Link> {
+        let preferred = preferred.unwrap_or_default();
         let settings =
             link::settings(name, &endpoint, in_flight, queue, coalesce, cache, preferred)?;
         Ok(Link { core: self.core.link(settings).map_err(raised)? })

@@ -203,7 +203,7 @@ class SerialConfig(Model):
     data_bits: DataBits = 8
     """Data bits per character."""
     rs485: Annotated[Rs485 | None, NotNull()] = None
-    """The driver switches an RS-485 line by RTS, high or low while sending. Default: the adapter."""
+    """The driver switches an RS-485 line by RTS, high or low while sending."""
 
 
 class RtuSerialConfig(SerialConfig):
