@@ -165,10 +165,11 @@ def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> i
 class Rule:
     """What the peers of some networks may do.
 
-    `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or addresses, IPv4 or IPv6;
-    an IPv4-mapped IPv6 address counts as its IPv4 address. Set `functions`, the allowed function
-    codes, or `deny`, the codes that are not allowed, but not both. `roles`, only with TLS, are the
-    allowed roles of the peer's certificate: "" is a certificate without a role, `None` is any role.
+    `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
+    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set
+    `functions`, the allowed function codes, or `deny`, the codes that are not allowed, but not
+    both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
+    certificate without a role, `None` is any role.
 
     Raises `ValueError` for an invalid source or access.
     """
