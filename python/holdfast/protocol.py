@@ -54,6 +54,13 @@ MAX_PDU = _core.MAX_PDU
 FUNCTIONS = tuple(Function(*row) for row in _core.FUNCTIONS)
 OF_CODE = {each.code: each for each in FUNCTIONS}
 CODES = tuple(OF_CODE)
+MAX_CODE = 0x7F
+"""The largest function code; greater ones are exceptions (V1.1b3, 4.1)."""
+
+OTHER_READS = (7, 12, 20, 24)
+"""Functions that only devices have, and that change nothing."""
+
+WRITE_FILE_RECORD = 21
 WRITING_CODES = tuple(each.code for each in FUNCTIONS if each.writes)
 
 BROADCAST_CODES = tuple(each.code for each in FUNCTIONS if each.writes and not each.most_read)

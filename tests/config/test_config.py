@@ -516,6 +516,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "        units: {1: plant, 16: plant}\n"
         "        access: read-only\n"
         "devices: {}\n"
+        "links: {}\n"
         "adapters: {}\n"
         "log:\n"
         "  level: info\n"
@@ -611,11 +612,12 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "ClientTlsConfig": None,
         "CostConfig": ["per_request", "per_register"],
         "DestinationConfig": ["memory", "area", "address"],
-        "DeviceConfig": ["url", "unit", "interval", "reads"],
+        "DeviceConfig": ["url", "unit"],
         "ForwardConfig": ["url"],
         "GatewayConfig": ["bind", "sources", "allow", "access", "tokens"],
         "GatewayTokenConfig": ["name", "sha256"],
         "IdentityConfig": None,
+        "LinkConfig": ["url"],
         "LogConfig": None,
         "MemoryConfig": None,
         "MetricsConfig": ["bind"],
@@ -635,6 +637,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RawRuleConfig": ["sources", "areas"],
         "ReadConfig": ["area", "address", "count"],
         "RestConfig": ["bind", "sources", "tokens"],
+        "RouteConfig": ["route"],
         "RtuSerialConfig": ["device"],
         "RuleConfig": ["sources", "units", "access"],
         "Seal": ["area", "address"],

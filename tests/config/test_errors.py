@@ -50,14 +50,15 @@ SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
 CODES = "1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"
 TOP = (
-    "memories, identity, listeners, devices, rest, mqtt, nats, gateway, adapters, metrics, audit, "
-    "log, workers"
+    "memories, identity, listeners, devices, links, rest, mqtt, nats, gateway, adapters, metrics, "
+    "audit, log, workers"
 )
 TYPES = (
     "modbus-tcp, modbus-tls, modbus-rtu-over-tcp, modbus-ascii-over-tcp, raw-ingest, modbus-udp, "
     "modbus-rtu-over-udp, modbus-rtu or modbus-ascii"
 )
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
+UNIT = "a unit id from 0 to 255, or a range, as in 20-40"
 RULE = "listeners.scada.rules[0]"
 
 
@@ -237,8 +238,8 @@ def test_limits_and_times_are_checked(folder: Folder, setting: str, problem: str
          "8: sources[0]: found '::ffff:10.0.0.7', write its IPv4 form 10.0.0.7/32"),
         ("{1: plant}", "{}",
          "9: units: found an empty mapping, allowed: a mapping with at least one entry"),
-        ("{1: plant}", "{256: plant}", "9: units.256: found 256, allowed: a unit id from 0 to 255"),
-        ("{1: plant}", "{'1': plant}", "9: units.1: found '1', allowed: a unit id from 0 to 255"),
+        ("{1: plant}", "{256: plant}", f"9: units.256: found 256, allowed: {UNIT}"),
+        ("{1: plant}", "{'1': plant}", f"9: units.1: found '1', allowed: {UNIT}"),
         ("{1: plant}", "{1: plan}",
          "9: units.1: found 'plan', allowed: plant; did you mean 'plant'?"),
         ("{1: plant}", "{1: 5}",

@@ -58,7 +58,9 @@ TLS = """\
 """
 PEM = {"c_pem": "", "k_pem": "", "a_pem": ""}
 AREAS = "coils, discrete_inputs, holding_registers or input_registers"
-SERIAL_UNIT = "a unit id from 1 to 247; 0 is the broadcast, 248 to 255 are reserved"
+SERIAL_UNIT = (
+    "a unit id from 1 to 247, or a range, as in 20-40; 0 is the broadcast, 248 to 255 are reserved"
+)
 SOME = "a list with at least one entry"
 
 
@@ -107,7 +109,7 @@ def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) 
             "8: idle_timeout: unknown key, allowed: type, bind, rules",
         ),
         ("{1: plant}", "{256: plant}", "9: rules[0].units.256: found 256, allowed: a unit id from "
-         "0 to 255"),
+         "0 to 255, or a range, as in 20-40"),
         ("read-only", "rw", "9: rules[0].access: found 'rw', allowed: read-only or read-write"),
         ("read-only", "read-only, deny: [3, 3]", "9: rules[0].deny[1]: found 3 again, "
          "allowed: once"),

@@ -33,6 +33,17 @@ STATES = ("running", "failed", "stopped")
 HEALTH = ("unknown", "ok", "error", "stale", "disabled")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
 """The outcomes of requests to a device."""
+LINK_OUTCOMES = (
+    "replies",
+    "timeouts",
+    "failures",
+    "refused_full",
+    "refused_down",
+    "coalesced",
+    "cached",
+    "withdrawn",
+)
+"""The outcomes of requests of listeners to a link."""
 
 
 class Metrics:
@@ -122,6 +133,7 @@ class Figures(Collector):
             )
         yield from _of_listeners(stats["listeners"])
         yield from _of_devices(stats["devices"])
+        yield from _of_links(stats["links"])
         yield from _of_adapters(stats["adapters"])
         yield from _of_memories(self._diagnostics.memories())
 
@@ -198,6 +210,17 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             for outcome, count in packets.items():
                 forward.add_metric([name, str(number), outcome], count)
     yield from (health, requests, *counters.values(), *gauges.values(), forward)
+
+
+def _of_links(links: Mapping[str, Mapping[str, int]]) -> Iterator[Metric]:
+    requests = _counter("link_requests", "Requests of listeners, by outcome.", "link", "outcome")
+    exceptions = _counter("link_exceptions", "Replies that were exceptions.", "link")
+    waiting = _gauge("link_waiting", "Requests that wait for a reply.", "link")
+    for name, told in links.items():
+        _add(requests, name, {outcome: told[outcome] for outcome in LINK_OUTCOMES})
+        exceptions.add_metric([name], told["exceptions"])
+        waiting.add_metric([name], told["waiting"])
+    yield from (requests, exceptions, waiting)
 
 
 def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:

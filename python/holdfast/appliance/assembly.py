@@ -7,6 +7,7 @@ here. Gateway and scanner are imported only if they are configured.
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, assert_never
 
 from holdfast import _core
@@ -21,8 +22,11 @@ from holdfast.config import (
     ModbusTlsListener,
     ModbusUdpListener,
     RawIngestListener,
+    RouteConfig,
 )
 from holdfast.config.devices import STATUS_BLOCK
+from holdfast.config.listeners import unit_targets
+from holdfast.config.route_checks import routed
 from holdfast.net.tls import NO_FILES
 from holdfast.server import Identity
 from holdfast.tools import planning
@@ -31,6 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast._core import Memory
+    from holdfast.client.target import Target
     from holdfast.config import (
         Config,
         DestinationConfig,
@@ -95,7 +100,55 @@ def identity(settings: IdentityConfig) -> Identity:
     )
 
 
-def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.Listener:
+@dataclass(frozen=True)
+class Links:
+    """What listeners pass requests on to."""
+
+    links: dict[str, _core.Link] = field(default_factory=dict)
+    """By name; a link without a name of its own has that of the first device behind it."""
+    routes: dict[str, _core.Route] = field(default_factory=dict)
+    """By the name of the link or device."""
+
+
+def links(config: Config, poller: _core.Poller) -> Links:
+    """Creates all links, and the routes of listeners. Raises `OSError` for unusable files.
+
+    The first use of an address decides the settings of its connection, so links come first, and
+    polled devices later.
+    """
+    made = Links()
+    for name, settings in config.links.items():
+        link = poller.link(
+            name,
+            _endpoint(f"links.{name}.url", settings.target),
+            in_flight=None if settings.in_flight == "auto" else settings.in_flight,
+            queue=settings.queue,
+            coalesce=settings.coalesce,
+            cache=settings.cache,
+            preferred=list(settings.priority),
+        )
+        made.links[name] = link
+        made.routes[name] = link.route(name, timeout=settings.timeout)
+    for name in routed(config):
+        if name not in config.devices:
+            continue
+        device = config.devices[name]
+        link = poller.link(
+            name,
+            _endpoint(f"devices.{name}.url", device.target),
+            in_flight=None if device.in_flight == "auto" else device.in_flight,
+        )
+        made.links.setdefault(link.name, link)
+        made.routes[name] = link.route(name, unit=device.unit, timeout=device.timeout)
+    return made
+
+
+def listener(
+    name: str,
+    config: Config,
+    memories: Mapping[str, Memory],
+    routes: Mapping[str, _core.Route],
+) -> _core.Listener:
     """Creates the native listener of that name."""
     settings: Listener = config.listeners[name]
     match settings:
@@ -109,7 +162,7 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
             return _core.Listener(
                 name,
                 str(settings.bind),
-                [_rule(rule, memories) for rule in settings.rules],
+                [_rule(rule, memories, routes) for rule in settings.rules],
                 framing=_FRAMINGS[settings.type],
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
@@ -120,7 +173,7 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
             )
         case ModbusUdpListener() | ModbusRtuOverUdpListener():
-            rules = [_rule(rule, memories) for rule in settings.rules]
+            rules = [_rule(rule, memories, routes) for rule in settings.rules]
             return _core.Listener.udp(
                 name,
                 str(settings.bind),
@@ -132,7 +185,7 @@ def listener(name: str, config: Config, memories: Mapping[str, Memory]) -> _core
             return _core.Listener.serial(
                 name,
                 line.device,
-                _rule(settings.rules[0], memories),
+                _rule(settings.rules[0], memories, routes),
                 mode="rtu" if settings.type == "modbus-rtu" else "ascii",
                 baud=line.baud,
                 parity=line.parity,
@@ -170,13 +223,10 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
     """Creates the native poller's device of that name. Raises `OSError` for unusable files."""
     settings = config.devices[name]
     status = settings.status
-    try:
-        made = endpoint(settings.target)
-    except (OSError, ValueError) as error:
-        raise OSError(f"devices.{name}.url: {error}") from error
+    assert settings.interval is not None, "a device with reads has an interval"
     return _core.PolledDevice(
         name,
-        made,
+        _endpoint(f"devices.{name}.url", settings.target),
         unit=settings.unit,
         interval=settings.interval,
         timeout=settings.timeout,
@@ -254,15 +304,30 @@ def scanner(settings: NatsConfig) -> ScannerSettings:
     return Settings(servers, settings.prefix, settings.devices, limits, trust)
 
 
+def _endpoint(key: str, target: Target) -> _core.Endpoint:
+    """The native endpoint of the URL at this key. Raises `OSError` for unusable files."""
+    try:
+        return endpoint(target)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{key}: {error}") from error
+
+
 def _place(
     into: DestinationConfig | None, memories: Mapping[str, Memory]
 ) -> tuple[Memory, Area, int] | None:
     return None if into is None else (memories[into.memory], into.area, into.address)
 
 
-def _rule(rule: RuleConfig | SerialRuleConfig, memories: Mapping[str, Memory]) -> _core.Rule:
+def _rule(
+    rule: RuleConfig | SerialRuleConfig,
+    memories: Mapping[str, Memory],
+    routes: Mapping[str, _core.Route],
+) -> _core.Rule:
     return _core.Rule(
-        {unit: memories[name] for unit, name in rule.units.items()},
+        {
+            unit: routes[target.route] if isinstance(target, RouteConfig) else memories[target]
+            for unit, target in unit_targets(rule.units)
+        },
         sources=[str(source) for source in getattr(rule, "sources", ())],
         access=rule.access,
         functions=rule.functions,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from holdfast._core import Engine, Memory, Poller
+    from holdfast._core import Engine, Link, Memory, Poller
     from holdfast.appliance.supervision import Supervisor
     from holdfast.ingest import MemoryAccess
     from holdfast.ingest.audit import Audit
@@ -24,6 +24,8 @@ class Diagnostics:
         self.adapters: dict[str, tuple[Supervisor, MemoryAccess | None]] = {}
         self.audit: Audit | None = None
         self.poller: Poller | None = None
+        self.links: Mapping[str, Link] = {}
+        """What listeners pass requests on to."""
         self.disabled: Sequence[str] = ()
         """Devices that are not polled."""
 
@@ -43,11 +45,12 @@ class Diagnostics:
         }
 
     def stats(self) -> dict[str, Any]:
-        """Returns all counters of listeners, devices, adapters, log and audit log."""
+        """Returns all counters of listeners, devices, links, adapters, log and audit log."""
         return {
             "uptime": round(time.monotonic() - self._began, 3),
             "listeners": self._engine.counters(),
             "devices": self.devices(),
+            "links": {name: link.counters() for name, link in self.links.items()},
             "adapters": {name: self.adapter(name) for name in self.adapters},
             "events_lost": self._engine.lost_events,
             "audit": None if self.audit is None else self.audit.counts(),

@@ -19,6 +19,7 @@ from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
 from holdfast.config import ModbusAsciiListener, ModbusRtuListener
+from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.ingest.audit import Audit
@@ -151,21 +152,29 @@ class _Running:
         devices = [
             assembly.device(name, config, memories)
             for name, device in config.devices.items()
-            if device.enabled
+            if device.is_polled
         ]
         disabled = self._tell_disabled()
         with ExitStack() as undo:
             self._audit = self._opened_audit(undo)
             self._sockets = sockets = self._bound_sockets(undo)
-            self._engine = self._started_engine()
-            undo.callback(self._engine.stop)
-            self._poller = _core.Poller(devices) if devices else None
-            if self._poller is not None:
+            # The links of listeners come first: the first use of an address decides its settings.
+            self._poller = None
+            links = assembly.Links()
+            if devices or config.links or routed(config):
+                self._poller = _core.Poller([])
                 undo.callback(self._poller.stop)
+                links = assembly.links(config, self._poller)
+            self._engine = self._started_engine(links.routes)
+            undo.callback(self._engine.stop)
+            if self._poller is not None:
+                for device in devices:
+                    self._poller.add(device)
             self.endpoints = self._listed(sockets)
             self.diagnostics = Diagnostics(memories, self._engine)
             self.diagnostics.audit = self._audit
             self.diagnostics.poller = self._poller
+            self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
             self._add_adapters(sockets)
             undo.pop_all()
@@ -177,12 +186,15 @@ class _Running:
             supervisor.start()
 
     def stop(self) -> None:
-        """Requests the stop of all parts, then waits for each."""
-        if self._poller is not None:
-            self._poller.stop()
+        """Requests the stop of all parts, then waits for each.
+
+        Links stop after the listeners, which still answer the requests that they have passed on.
+        """
         for supervisor in self._supervisors:
             supervisor.stop()
         self._engine.stop()
+        if self._poller is not None:
+            self._poller.stop()
         self._stopped.set()
         for supervisor in self._supervisors:
             supervisor.join()
@@ -260,11 +272,11 @@ class _Running:
                 undo.callback(sockets[name].close)
         return sockets
 
-    def _started_engine(self) -> _core.Engine:
+    def _started_engine(self, routes: Mapping[str, _core.Route]) -> _core.Engine:
         config = self._config
         identity = assembly.identity(config.identity)
         return _core.Engine(
-            [assembly.listener(name, config, self._memories) for name in config.listeners],
+            [assembly.listener(name, config, self._memories, routes) for name in config.listeners],
             identity=identity.objects(),
             unit_names=identity.names(),
             workers=config.workers,

@@ -14,6 +14,7 @@ from holdfast.config import ConfigError, ModbusTlsListener, load, source
 from holdfast.config.report import Report
 
 if TYPE_CHECKING:
+    from holdfast.client.target import Target
     from holdfast.config import Config
     from holdfast.config.source import KeyPath
 
@@ -35,11 +36,15 @@ def load_whole(path: Path | str) -> Config:
                 assembly.server_tls(listener.tls)
             except ValueError as error:
                 problems["listeners", name, "tls"] = str(error)
-    for name, device in config.devices.items():
+    targets: list[tuple[KeyPath, Target]] = [
+        (("devices", name), device.target) for name, device in config.devices.items()
+    ]
+    targets += [(("links", name), link.target) for name, link in config.links.items()]
+    for place, target in targets:
         try:
-            endpoint(device.target)
+            endpoint(target)
         except (OSError, ValueError) as error:
-            problems["devices", name, "url"] = str(error)
+            problems[*place, "url"] = str(error)
     if config.nats is not None and config.nats.device_tls is not None:
         from holdfast.scanner import device_tls
 
@@ -54,8 +59,8 @@ def load_whole(path: Path | str) -> Config:
             problems["gateway", "tls"] = str(error)
     if problems:
         report = Report(source.parse(source.read_text(Path(path), file), file)[0])
-        for place, message in problems.items():
-            report.add(place, message)
+        for where, message in problems.items():
+            report.add(where, message)
         raise ConfigError(file, report.problems)
     return config
 

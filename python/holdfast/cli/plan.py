@@ -173,7 +173,8 @@ class _Shown:
     def title(self) -> str:
         if self.of is None:
             return self.url
-        how = f"every {self.of.interval:g} s" if self.of.enabled else "not polled"
+        interval = self.of.interval if self.of.enabled else None
+        how = "not polled" if interval is None else f"every {interval:g} s"
         return f"{self.name}: {self.url} unit {self.of.unit}, {how}"
 
 
@@ -194,9 +195,11 @@ def _of_file(
 ) -> Iterator[_Shown]:
     if reads:
         raise click.UsageError("--read requires URL: FILE has its own reads.")
-    devices = load_or_exit(file).devices
+    configured = load_or_exit(file).devices
+    devices = {name: device for name, device in configured.items() if device.reads}
     if not devices:
-        raise click.UsageError(f"{file} has no devices.")
+        what = "no devices with reads" if configured else "no devices"
+        raise click.UsageError(f"{file} has {what}.")
     for name in names or devices:
         if name not in devices:
             known = ", ".join(devices)

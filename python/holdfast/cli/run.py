@@ -20,13 +20,15 @@ from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
-from holdfast.config import GatewayConfig, ModbusTcpListener
+from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig
 from holdfast.config.scanning import written_pollable
+from holdfast.config.unit_keys import unit_ids
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import FrameType
 
     from holdfast.appliance.running import ListenAddress
@@ -63,6 +65,11 @@ def run(file: Path) -> None:
     by a signal, 1 can't bind a listener, 2 the configuration has errors.
     """
     config = load_or_exit(file)
+    serve(config, lambda appliance: _greeting(appliance, file), named=str(file))
+
+
+def serve(config: Config, greeting: Callable[[Appliance], str], *, named: str) -> None:
+    """Runs an appliance until a signal. Exits with 1 or 2 if it can't start."""
     logs.configure(config.log.level, config.log.format)
     give_way()
     allow_open_files(_connections(config))
@@ -74,10 +81,10 @@ def run(file: Path) -> None:
         click.echo(f"holdfast: {_explained(error)}", err=True)
         sys.exit(1)
     except UnknownAdapter as error:
-        click.echo(f"{file}: {error}", err=True)
+        click.echo(f"{named}: {error}", err=True)
         sys.exit(WRONG)
     try:
-        click.echo(_greeting(appliance, file))
+        click.echo(greeting(appliance))
         while not signals.received:
             appliance.log_events(timeout=JOIN_TIMEOUT)
     finally:
@@ -89,6 +96,7 @@ def _connections(config: Config) -> int:
     served = [*config.listeners.values(), config.rest]
     most = sum(getattr(each, "max_connections", 0) for each in served)
     most += sum(1 + len(device.forward) for device in config.devices.values())
+    most += len(config.links)
     if config.nats is not None:
         most += assembly.scanner(config.nats).limits.connections
     if config.gateway is not None:
@@ -117,11 +125,11 @@ def _explained(error: OSError) -> str:
 
 
 def _greeting(appliance: Appliance, file: Path) -> str:
-    endpoints = appliance.endpoints()
-    devices, nats = list(appliance.config.devices.items()), appliance.config.nats
+    endpoints, config = appliance.endpoints(), appliance.config
+    devices, nats = list(config.devices.items()), config.nats
     shown = devices[:MAX_DEVICES]
     names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
-    names += [] if nats is None else ["nats"]
+    names += [*config.links, *([] if nats is None else ["nats"])]
     width = max(map(len, names), default=0)
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
@@ -133,6 +141,7 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     if nats is not None:
         lines.append(f"  {'nats':{width}}  {', '.join(nats.servers)}")
         lines.append(f"  {'':{width}}    {_scanned(nats)}")
+    lines += [f"  {name:{width}}  {link.url}" for name, link in config.links.items()]
     lines += [f"  {name:{width}}  {_polled(device)}" for name, device in shown]
     if len(devices) > len(shown):
         lines.append(f"  and {len(devices) - len(shown)} more devices")
@@ -152,6 +161,8 @@ def _polled(device: DeviceConfig) -> str:
     """The polling of a device, in one line."""
     if not device.enabled:
         return f"{device.url} unit {device.unit}, not polled"
+    if device.interval is None or not device.reads:
+        return f"{device.url} unit {device.unit}, by routes only"
     return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
 
 
@@ -171,13 +182,17 @@ def _scanned(nats: NatsConfig) -> str:
 
 def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
     """The access that a rule gives, in one line."""
-    units = ", ".join(f"{unit} = {memory}" for unit, memory in rule.units.items())
+    units = ", ".join(f"{key} = {_behind(target)}" for key, target in rule.units.items())
     to = f"units {units}" if units else f"memories {', '.join(getattr(rule, 'memories', ()))}"
     rights = getattr(rule, "access", None) or f"writes {', '.join(getattr(rule, 'areas', ()))}"
     sources = ", ".join(str(source) for source in getattr(rule, "sources", ()))
     roles = getattr(rule, "roles", None)
     of = "" if roles is None else f" as {', '.join(role or 'no role' for role in roles)}"
     return f"{to}; {rights} for {sources or 'the line'}{of}"
+
+
+def _behind(target: str | RouteConfig) -> str:
+    return target.route if isinstance(target, RouteConfig) else target
 
 
 def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Path) -> list[str]:
@@ -187,18 +202,18 @@ def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Pat
         if not isinstance(endpoint.settings, ModbusTcpListener):
             continue
         for rule in endpoint.settings.rules:
-            unit, name = next(iter(rule.units.items()))
-            areas = appliance.memories[name].areas
+            key, target = next(iter(rule.units.items()))
+            place = f"mbpoll -m tcp -p {endpoint.port} -a {unit_ids(key)[0]} -0"
+            host = reachable(endpoint.host)
+            if isinstance(target, RouteConfig):
+                return [f"{place} -t 4 -r 0 -c 1 -1 {host}", check]
+            areas = appliance.memories[target].areas
             area, addresses = next(iter(areas.items()))
             for preferred in MBPOLL_TYPES:
                 if preferred in areas:
                     area, addresses = preferred, areas[preferred]
                     break
-            command = (
-                f"mbpoll -m tcp -p {endpoint.port} -a {unit} -0 -t {MBPOLL_TYPES[area]}"
-                f" -r {addresses.start}"
-            )
-            host = reachable(endpoint.host)
+            command = f"{place} -t {MBPOLL_TYPES[area]} -r {addresses.start}"
             read = f"{command} -c {min(len(addresses), 5)} -1 {host}"
             writable = rule.access == "read-write" and area in WRITE_LIMITS
             return [read, f"{command} {host} 1", check] if writable else [read, check]

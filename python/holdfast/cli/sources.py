@@ -11,6 +11,7 @@ from urllib.parse import urlencode
 
 from holdfast.cli.device import read_raw
 from holdfast.config import ModbusTcpListener
+from holdfast.config.listeners import unit_targets
 from holdfast.net.addresses import holds, joined, parse_address, reachable
 from holdfast.protocol import READ_FUNCTIONS
 from holdfast.types import AREAS
@@ -167,8 +168,8 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
     rule = rules[0]
     blocks: list[WatchedRange] = []
     seen: set[str] = set()
-    for unit, memory in rule.units.items():
-        if memory not in seen:
+    for unit, memory in unit_targets(rule.units):
+        if isinstance(memory, str) and memory not in seen:
             seen.add(memory)
             blocks += [
                 block

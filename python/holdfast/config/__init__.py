@@ -18,6 +18,7 @@ from holdfast.config.devices import (
     StatusConfig,
 )
 from holdfast.config.initial import InitialRun
+from holdfast.config.links import LinkConfig
 from holdfast.config.listeners import (
     AsciiSerialConfig,
     Listener,
@@ -31,6 +32,7 @@ from holdfast.config.listeners import (
     ModbusUdpListener,
     RawIngestListener,
     RawRuleConfig,
+    RouteConfig,
     RtuSerialConfig,
     RuleConfig,
     SerialConfig,
@@ -75,6 +77,7 @@ __all__ = [
     "GatewayTokenConfig",
     "IdentityConfig",
     "InitialRun",
+    "LinkConfig",
     "Listener",
     "LogConfig",
     "MemoryConfig",
@@ -97,6 +100,7 @@ __all__ = [
     "RawRuleConfig",
     "ReadConfig",
     "RestConfig",
+    "RouteConfig",
     "RtuSerialConfig",
     "RuleConfig",
     "Seal",

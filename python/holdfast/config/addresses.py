@@ -15,6 +15,7 @@ from holdfast.config.words import show
 from holdfast.net.addresses import LAST_PORT, Address, Network, joined, unmapped
 
 BIND_FORM = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
+PEER_FORM = "an IP address, as in 10.0.0.7 or fd00::7"
 SOURCE_FORM = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 
 _BIND = re.compile(r"(?:\[(?P<six>[^\]]*)\]|(?P<four>[^:\[\]]*)):(?P<port>[0-9]{1,5})", re.ASCII)
@@ -85,3 +86,17 @@ def parse_source(text: object) -> Network:
     if str(network.network_address) != str(ipaddress.ip_address(text.partition("/")[0])):
         raise ValueError(f"found {show(text)}, which has host bits set: the network is {network}")
     return network
+
+
+def parse_peer(text: object) -> str:
+    """Checks the address of one peer. Raises `ValueError` for anything else."""
+    if not isinstance(text, str) or not re.fullmatch(r"[0-9a-fA-F.:]+", text):
+        raise ValueError(f"found {show(text)}, allowed: {PEER_FORM}")
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        raise ValueError(f"found {show(text)}, allowed: {PEER_FORM}") from None
+    four = unmapped(address)
+    if four != address:
+        raise ValueError(f"found {show(text)}, write its IPv4 form {four}")
+    return str(address)

@@ -1,35 +1,20 @@
-"""Checks rules between keys of devices: destinations, ranges, forwards and serial lines.
-
-A serial line that is polled for NATS subscribers can't have another user.
-"""
+"""Checks rules between keys of devices: reads, destinations, ranges and forwards."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pydantic import TypeAdapter
-
-from holdfast.client.target import SerialTarget, parse
-from holdfast.client.tolerance import STRICT, Tolerance
-from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, ToleranceConfig
-from holdfast.config.files import check_readable
+from holdfast.config.allowed import allowed
+from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
 from holdfast.config.initial import extent
-from holdfast.config.lenient import entries, fitting, integer, mapping, parsed
-from holdfast.config.listeners import SERIAL_TYPES
+from holdfast.config.lenient import entries, integer, mapping
 from holdfast.config.memory_checks import addresses
-from holdfast.config.scalars import NOT_ON_A_LINE, parse_url
-from holdfast.config.scanning import parse_pollable
 from holdfast.config.words import choice, listing, show
-from holdfast.net.allow_list import AllowedDevice
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
-from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, SERIAL_FRAMES, Area
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
+from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, Area
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from holdfast.client.target import Target
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
@@ -39,6 +24,10 @@ MAX_OF_A_PACKET = MAX_WORD
 
 _NAMING = {"v1": "unit", "crc": "memory_id"}
 """The key for the target of a packet, by format."""
+
+
+_OF_POLLING = ("interval", "cost", "readable", "forbidden", "forward", "status")
+"""Keys that only concern polling, and that are not set by default."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +43,10 @@ class Claim:
         return f"{self.area} {extent(self.addresses)} of {self.memory}"
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """What devices of one address have in common."""
-
-    tolerance: Tolerance
-    in_flight: object
-
-
 @dataclass
 class DeviceChecks:
-    """Checks the devices of one file; files are relative to `folder`."""
+    """Checks the devices of one file."""
 
-    folder: Path
     report: Report
     grants: GrantChecks
     memories: dict[Any, Any]
@@ -74,29 +54,16 @@ class DeviceChecks:
 
     def __post_init__(self) -> None:
         self._claims: list[Claim] = []
-        self._lines: dict[str, tuple[KeyPath, SerialTarget]] = {}
-        self._addresses: dict[tuple[str, str, int], tuple[KeyPath, _Shared]] = {}
 
-    def check(self, data: dict[Any, Any]) -> None:
+    def check(self, devices: object) -> None:
         """Reports what is wrong."""
-        taken = _serial_listeners(data)
-        for name, device in mapping(data.get("devices")).items():
+        for name, device in mapping(devices).items():
             if isinstance(device, dict):
-                self._device(("devices", name), device, taken)
-        self._subscribed(entries(mapping(data.get("nats")).get("devices")), taken)
+                self._device(("devices", name), device)
         self._overlaps()
 
-    def _device(self, path: KeyPath, device: dict[Any, Any], taken: dict[str, KeyPath]) -> None:
-        target = parsed(_target, device.get("url"))
-        if target is not None:
-            target = self._tolerance(path, target, device)
-            self._shared(path, target, device)
-        if isinstance(target, SerialTarget):
-            self._line(path, target, device.get("unit"), taken)
-        elif target is not None:
-            for key, file in target.tls.files():
-                where, shown = (*path, "url"), f"{key}={show(file)}"
-                check_readable(where, file, self.folder, self.report, shown=shown)
+    def _device(self, path: KeyPath, device: dict[Any, Any]) -> None:
+        self._polling(path, device)
         if "max_gap" in device and "cost" in device:
             message = "found together with max_gap, allowed: only one of them"
             self.report.add((*path, "cost"), message, of_key=True)
@@ -114,66 +81,17 @@ class DeviceChecks:
         if isinstance(device.get("status"), dict):
             self._status((*path, "status"), device["status"])
 
-    def _tolerance(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> Target:
-        """The target with what its device needs tolerated."""
-        block = device.get("tolerance")
-        if block is None:
-            return target
-        where = (*path, "tolerance")
-        if target.tolerance != STRICT:
-            message = "found beside options of the URL, allowed: one of both"
-            self.report.add(where, message, of_key=True)
-        if mapping(block).get("echo") is True and not _has_echo(target):
-            message = "found true, allowed with RTU and ASCII frames only"
-            self.report.add((*where, "echo"), message)
-        found = fitting(TypeAdapter(ToleranceConfig), block)
-        tolerance = STRICT if found is None else Tolerance(**found.model_dump())
-        return replace(target, tolerance=tolerance)
-
-    def _shared(self, path: KeyPath, target: Target, device: dict[Any, Any]) -> None:
-        """What devices of one address share, which have one connection."""
-        if isinstance(target, SerialTarget):
+    def _polling(self, path: KeyPath, device: dict[Any, Any]) -> None:
+        """Reads need an interval; without reads, all settings of polling have no effect."""
+        if "reads" in device:
+            if "interval" not in device:
+                words = allowed((*path, "interval"), self.report.document.data)
+                message = f"missing, allowed: {words}"
+                self.report.add((*path, "interval"), message, of_key=True)
             return
-        settings = _Shared(target.tolerance, device.get("in_flight", 1))
-        key = (target.transport, target.host, target.port)
-        first, other = self._addresses.setdefault(key, (path, settings))
-        if settings != other:
-            differs = "in_flight" if settings.in_flight != other.in_flight else "tolerance"
-            where = (*path, differs if differs in device else "url")
-            message = f"found another {differs} than {self._named(first)} has at this address"
-            self.report.add(where, f"{message}, allowed: the same")
-
-    def _line(
-        self, path: KeyPath, target: SerialTarget, unit: object, taken: dict[str, KeyPath]
-    ) -> None:
-        """Devices share a serial line only with equal settings, and never with a listener."""
-        number = integer(unit, 0, MAX_UNIT)
-        if number is not None and not 1 <= number <= MAX_SERIAL_UNIT:
-            allowed = (
-                f"allowed on a serial line: a unit id from 1 to {MAX_SERIAL_UNIT}{NOT_ON_A_LINE}"
-            )
-            self.report.add((*path, "unit"), f"found {number}, {allowed}")
-        port = os.path.realpath(target.device)
-        if port in taken:
-            self._taken((*path, "url"), target.device, taken[port])
-        first, other = self._lines.setdefault(port, (path, target))
-        if replace(target, device=other.device) != other:
-            message = f"found line settings that differ from those of {self._named(first)}"
-            self.report.add((*path, "url"), f"{message}, allowed: the same settings")
-
-    def _subscribed(self, devices: list[Any], taken: dict[str, KeyPath]) -> None:
-        """Reports serial lines of the scanner that a device or a listener uses."""
-        lines = {port: path for port, (path, _) in self._lines.items()} | taken
-        for index, device in enumerate(devices):
-            entry = parsed(parse_pollable, device)
-            port = os.path.realpath(entry.path) if isinstance(entry, AllowedDevice) else None
-            if port in lines:
-                self._taken(("nats", "devices", index), str(entry), lines[port])
-
-    def _taken(self, path: KeyPath, device: str, owner: KeyPath) -> None:
-        of = self._named(owner)
-        message = f"found {show(device)}, which is the device of {of}, allowed: a different one"
-        self.report.add(path, message)
+        for key in _OF_POLLING:
+            if device.get(key):
+                self.report.doubt((*path, key), "has no effect: the device has no reads")
 
     def _ranges(self, path: KeyPath, ranges: object) -> list[tuple[KeyPath, object, range]]:
         """The valid ranges, each with its path and its area."""
@@ -330,28 +248,9 @@ class DeviceChecks:
         return f"{self.report.document.spell(path)} in line {self.report.line(path)}"
 
 
-def _target(url: object) -> Target:
-    return parse(parse_url(url))
-
-
-def _serial_listeners(data: dict[Any, Any]) -> dict[str, KeyPath]:
-    """The serial ports of listeners, each with the path of its listener."""
-    ports: dict[str, KeyPath] = {}
-    for name, listener in mapping(data.get("listeners")).items():
-        if mapping(listener).get("type") in SERIAL_TYPES:
-            device = mapping(mapping(listener).get("serial")).get("device")
-            if isinstance(device, str) and device and "\0" not in device:
-                ports.setdefault(os.path.realpath(device), ("listeners", name))
-    return ports
-
-
 def _meet(one: range, other: range) -> bool:
     return one.start < other.stop and other.start < one.stop
 
 
 def _last(path: KeyPath) -> str:
     return f"{path[-2]}[{path[-1]}]"
-
-
-def _has_echo(target: Target) -> bool:
-    return isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES

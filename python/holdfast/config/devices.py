@@ -1,11 +1,11 @@
-"""Models of polled devices: their reads, request limits and destinations."""
+"""Models of devices: their reads, request limits and destinations."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict
+from pydantic import ConfigDict, Field, Strict
 
 from holdfast.client.target import MAX_IN_FLIGHT, Target, parse
 from holdfast.client.tolerance import MAX_CLOSE_AFTER, MAX_PAUSE, MAX_RETRIES, Tolerance
@@ -134,6 +134,12 @@ class StatusConfig(Model):
         return range(self.slot * STATUS_BLOCK, (self.slot + 1) * STATUS_BLOCK)
 
 
+InFlight = Annotated[int, Field(ge=1, le=MAX_IN_FLIGHT)] | Literal["auto"]
+Interval = Annotated[
+    float,
+    Field(ge=MIN_INTERVAL, le=MAX_TIME, allow_inf_nan=False),
+    whole_number,
+]
 Pause = Annotated[float, Field(ge=0, le=MAX_PAUSE, allow_inf_nan=False), whole_number]
 AcceptUnit = Annotated[Annotated[int, Field(ge=0, le=MAX_UNIT)] | Literal["any"] | None, NotNull()]
 
@@ -161,12 +167,21 @@ class ToleranceConfig(Model):
     """Seconds between the end of a connection and the next attempt to connect."""
 
 
+def tolerating(target: Target, tolerance: ToleranceConfig | None) -> Target:
+    """The target, with a tolerance in place of its own if there is one."""
+    if tolerance is None:
+        return target
+    return replace(target, tolerance=Tolerance(**tolerance.model_dump()))
+
+
 def _max_gap(data: dict[str, Any]) -> int | None:
     return 0 if data["cost"] is None else None
 
 
 class DeviceConfig(Model):
-    """A device that is polled."""
+    """A device that is polled, or that routes pass requests on to."""
+
+    model_config = ConfigDict(json_schema_extra={"dependentRequired": {"reads": ["interval"]}})
 
     url: DeviceUrl
     """The URL of the device, or of the gateway in front of it."""
@@ -175,21 +190,19 @@ class DeviceConfig(Model):
     writes: Literal["refuse", "local"] = "refuse"
     """Writes into ranges that its reads go into: refused, or kept until the next poll."""
     enabled: bool = True
-    """Whether it is polled."""
-    interval: Annotated[
-        float,
-        Field(ge=MIN_INTERVAL, le=MAX_TIME, allow_inf_nan=False),
-        whole_number,
-    ]
-    """Seconds from the start of a poll to the start of the next."""
+    """Whether it is used."""
+    interval: Annotated[Interval | None, NotNull()] = None
+    """Seconds from the start of a poll to the start of the next; required with reads."""
     timeout: Duration = 1.0
     """Seconds for a request and its reply."""
-    in_flight: Annotated[int, Field(ge=1, le=MAX_IN_FLIGHT)] | Literal["auto"] = 1
+    in_flight: InFlight = 1
     """The most requests in flight at its address, over TCP; auto: more while replies stay fast."""
     tolerance: Annotated[ToleranceConfig | None, NotNull()] = None
     """How to treat it if it deviates from the standard; in place of these options of the URL."""
-    reads: Annotated[tuple[ReadConfig, ...], Strict(False), Field(min_length=1)]
-    """The ranges to read."""
+    reads: Annotated[tuple[ReadConfig, ...], Strict(False)] = Field(
+        default=(), min_length=1, exclude_if=lambda v: not v
+    )
+    """The ranges to read. Without it, the device is only reachable by routes."""
     cost: Annotated[CostConfig | None, NotNull()] = None
     """Reads gaps between reads if that is cheaper; instead of max_gap."""
     max_gap: Annotated[Annotated[int, Field(ge=0, le=LAST_ADDRESS)] | None, NotNull()] = Field(
@@ -212,7 +225,9 @@ class DeviceConfig(Model):
     @property
     def target(self) -> Target:
         """The parts of the URL."""
-        target = parse(self.url)
-        if self.tolerance is None:
-            return target
-        return replace(target, tolerance=Tolerance(**self.tolerance.model_dump()))
+        return tolerating(parse(self.url), self.tolerance)
+
+    @property
+    def is_polled(self) -> bool:
+        """Whether it is read at an interval."""
+        return self.enabled and bool(self.reads)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from holdfast.config.lenient import entries, mapping
+from holdfast.config.lenient import entries
 from holdfast.config.scalars import is_name
 from holdfast.config.unique import refuse_repeats
 from holdfast.config.words import guess, listing, show
@@ -32,11 +32,6 @@ class GrantChecks:
         """Checks the `memories` and `areas` of a grant."""
         self.memories((*path, "memories"), grant.get("memories"))
         self.areas((*path, "areas"), grant.get("areas"))
-
-    def units(self, path: KeyPath, units: object) -> None:
-        """Checks a mapping of unit ids to memories."""
-        for unit, name in mapping(units).items():
-            self.memory((*path, unit), name)
 
     def memories(self, path: KeyPath, names: object) -> None:
         """Checks a list of memories."""

@@ -9,18 +9,20 @@ from holdfast.config.addresses import parse_source
 from holdfast.config.allowed import allowed
 from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
+from holdfast.config.route_checks import has_route
 from holdfast.config.scalars import MAX_CONNECTIONS
 from holdfast.config.tls_checks import check_server_tls
 from holdfast.config.unique import refuse_repeats
-from holdfast.config.words import show
+from holdfast.config.words import choice, show
 from holdfast.net.addresses import Network, covers
-from holdfast.protocol import WRITING_CODES
+from holdfast.protocol import CODES, MAX_CODE, OTHER_READS, WRITING_CODES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.report import Report
+    from holdfast.config.route_checks import RouteChecks
     from holdfast.config.source import KeyPath
 
 _DEFAULT_CONNECTIONS = ModbusTcpListener.model_fields["max_connections"].default
@@ -53,6 +55,7 @@ class ListenerChecks:
     folder: Path
     report: Report
     grants: GrantChecks
+    routes: RouteChecks
     ids: dict[Any, Any]
     """The memories, as in the file and not validated, for their ids."""
 
@@ -73,7 +76,7 @@ class ListenerChecks:
                 if kind == "raw-ingest":
                     self._raw_rule(rule_path, rule, listener.get("format", "v1"))
                 else:
-                    RuleCheck(rule_path, rule, self.report, self.grants).check()
+                    RuleCheck(rule_path, rule, self.report, self.routes).check()
             if kind in SERIAL_TYPES:
                 self._line(path, listener)
             else:
@@ -136,7 +139,12 @@ class ListenerChecks:
             self.report.add((*path, "crc"), message, of_key=True)
 
     def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
-        self.grants.units((*path, "units"), rule.get("units"))
+        for unit, target in mapping(rule.get("units")).items():
+            if isinstance(target, dict):
+                message = "found a route, allowed: a memory; a route takes Modbus requests only"
+                self.report.settle((*path, "units", unit), message)
+            else:
+                self.grants.memory((*path, "units", unit), target)
         self.grants.grant(path, rule)
         if form not in ("v1", "crc"):
             return
@@ -166,11 +174,14 @@ class RuleCheck:
     path: KeyPath
     rule: dict[Any, Any]
     report: Report
-    grants: GrantChecks
+    routes: RouteChecks
 
     def check(self) -> None:
         """Reports what is wrong."""
-        self.grants.units((*self.path, "units"), self.rule.get("units"))
+        units = self.rule.get("units")
+        self.routes.units((*self.path, "units"), units)
+        for key in ("functions", "deny"):
+            self._codes((*self.path, key), entries(self.rule.get(key)), routed=has_route(units))
         for key in ("functions", "deny", "roles"):
             refuse_repeats((*self.path, key), entries(self.rule.get(key)), self.report)
         if "functions" in self.rule and "deny" in self.rule:
@@ -179,8 +190,19 @@ class RuleCheck:
         if self.rule.get("access") == "read-only":
             self._writes()
 
+    def _codes(self, path: KeyPath, codes: list[Any], *, routed: bool) -> None:
+        """Reports function codes that no unit of the rule can have."""
+        known = range(1, MAX_CODE + 1) if routed else CODES
+        words = f"a function code from 1 to {MAX_CODE}" if routed else choice(CODES)
+        for index, code in enumerate(codes):
+            if type(code) is not int or code not in known:
+                self.report.settle((*path, index), f"found {show(code)}, allowed: {words}")
+
     def _writes(self) -> None:
         for index, code in enumerate(entries(self.rule.get("functions"))):
             if integer(code, 0, 255) in WRITING_CODES:
                 message = f"function {code} has no effect: it writes, and access is read-only"
+                self.report.doubt((*self.path, "functions", index), message)
+            elif integer(code, 1, MAX_CODE) and code not in (*CODES, *OTHER_READS):
+                message = f"function {code} has no effect: it may write, and access is read-only"
                 self.report.doubt((*self.path, "functions", index), message)

@@ -5,16 +5,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import Field, Strict
+from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.client.target import Rs485
 from holdfast.config.base import Model
 from holdfast.config.scalars import (
     RAW_UNIT_KEYS,
-    SERIAL_UNIT_KEYS,
-    UNIT_KEYS,
+    SERIAL_UNITS_KEYS,
+    UNITS_KEYS,
     Areas,
     BindAddress,
     Codes,
@@ -30,15 +30,50 @@ from holdfast.config.scalars import (
     NotNull,
     RawUnitId,
     Role,
-    SerialUnitId,
+    SerialUnitIds,
     Sources,
     StopBits,
-    UnitId,
+    UnitIds,
 )
+from holdfast.config.unit_keys import unit_ids
 from holdfast.types import Access
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
 
 FunctionList: TypeAlias = Annotated[Annotated[Codes, Field(min_length=1)] | None, NotNull()]
 DenyList: TypeAlias = Annotated[Codes | None, NotNull()]
+
+
+class RouteConfig(Model):
+    """Passes the requests of a unit id on to a device."""
+
+    route: Name
+    """A device, or a link. A link keeps the unit id of the request."""
+
+
+UNIT_TAGS = ("memory", "route")
+
+
+def _tag_of(value: object) -> str:
+    memory, route = UNIT_TAGS
+    return route if isinstance(value, dict | RouteConfig) else memory
+
+
+Target: TypeAlias = Annotated[
+    Annotated[Name, Tag("memory")] | Annotated[RouteConfig, Tag("route")],
+    Discriminator(_tag_of),
+]
+"""What is behind a unit id: a memory, or a route."""
+
+
+def unit_targets(
+    units: Mapping[Any, str | RouteConfig],
+) -> Iterator[tuple[int, str | RouteConfig]]:
+    """The memory or route behind each unit id of a rule; ranges are taken apart."""
+    for key, target in units.items():
+        for unit in unit_ids(key):
+            yield unit, target
 
 
 class RuleConfig(Model):
@@ -46,12 +81,12 @@ class RuleConfig(Model):
 
     sources: Sources
     """Networks and addresses of the peers, IPv4 or IPv6."""
-    units: dict[UnitId, Name] = Field(min_length=1, json_schema_extra=UNIT_KEYS)
-    """The memory behind each unit id."""
+    units: dict[UnitIds, Target] = Field(min_length=1, json_schema_extra=UNITS_KEYS)
+    """What is behind each unit id, or range of unit ids: a memory, or a route to devices."""
     access: Access
     """Whether these peers may write."""
     functions: FunctionList = None
-    """The allowed function codes. Default: all."""
+    """The allowed function codes. Default: all; with a route, all standard ones."""
     deny: DenyList = None
     """Function codes that are not allowed; all others are."""
 
@@ -68,12 +103,12 @@ class TlsRuleConfig(RuleConfig):
 class SerialRuleConfig(Model):
     """What the client of a serial line may do."""
 
-    units: dict[SerialUnitId, Name] = Field(min_length=1, json_schema_extra=SERIAL_UNIT_KEYS)
-    """The memory behind each unit id, 1 to 247."""
+    units: dict[SerialUnitIds, Target] = Field(min_length=1, json_schema_extra=SERIAL_UNITS_KEYS)
+    """What is behind each unit id, or range of unit ids, 1 to 247: a memory, or a route."""
     access: Access
     """Whether the client may write."""
     functions: FunctionList = None
-    """The allowed function codes. Default: all."""
+    """The allowed function codes. Default: all; with a route, all standard ones."""
     deny: DenyList = None
     """Function codes that are not allowed; all others are."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.config import source
+from holdfast.config.address_checks import AddressChecks
 from holdfast.config.allowed import allowed
 from holdfast.config.device_checks import DeviceChecks
 from holdfast.config.grant_checks import GrantChecks, doubt_grants
@@ -19,6 +20,7 @@ from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.report import Report
+from holdfast.config.route_checks import RouteChecks, doubt_routes
 from holdfast.config.service_checks import ServiceChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
@@ -47,13 +49,17 @@ def load(path: Path | str) -> Config:
     if config is None or problems:
         raise ConfigError(file, problems)
     doubt_grants(config, report)
+    doubt_routes(config, report)
     return config.with_warnings(sorted(report.doubts, key=lambda doubt: doubt.line or 0))
 
 
 def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     memories = mapping(data.get("memories"))
     grants = GrantChecks(report, [str(name) for name in memories])
-    ListenerChecks(folder, report, grants, memories).check(data.get("listeners"))
+    routes = RouteChecks(report, grants, mapping(data.get("devices")), mapping(data.get("links")))
+    routes.check_names()
+    ListenerChecks(folder, report, grants, routes, memories).check(data.get("listeners"))
     ServiceChecks(folder, report, grants).check(data)
-    DeviceChecks(folder, report, grants, memories).check(data)
+    AddressChecks(folder, report).check(data)
+    DeviceChecks(report, grants, memories).check(data.get("devices"))
     check_sockets(data, report)

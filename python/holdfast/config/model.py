@@ -15,6 +15,7 @@ from pydantic import Field, PrivateAttr
 from holdfast.config import dump
 from holdfast.config.base import Model
 from holdfast.config.devices import DeviceConfig
+from holdfast.config.links import LinkConfig
 from holdfast.config.listeners import Listener
 from holdfast.config.memories import MemoryConfig
 from holdfast.config.scalars import (
@@ -89,7 +90,7 @@ class Config(Model):
     """The configuration of a Holdfast appliance."""
 
     memories: dict[Name, MemoryConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
-    """The memories, by name; optional when only nats and gateway are configured."""
+    """The memories, by name; optional when only nats, gateway and routes are configured."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
     """The identification of the appliance."""
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(
@@ -97,7 +98,9 @@ class Config(Model):
     )
     """The servers, by name; optional with rest, mqtt, nats, gateway or a device."""
     devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
-    """Devices to poll, by name."""
+    """Devices to poll, or to pass requests on to, by name."""
+    links: dict[Name, LinkConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
+    """Connections and serial lines to pass requests on to, by name."""
     rest: Annotated[RestConfig | None, NotNull()] = None
     """The REST interface."""
     mqtt: Annotated[MqttConfig | None, NotNull()] = None

@@ -29,7 +29,7 @@ from pydantic.json_schema import JsonSchemaValue, WithJsonSchema
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from holdfast.client.target import FORMS, in_folder, parse
-from holdfast.config.addresses import Bind, parse_bind, parse_source
+from holdfast.config.addresses import Bind, parse_bind, parse_peer, parse_source
 from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
 from holdfast.config.egress import parse_allowed
 from holdfast.config.receiver import parse_receiver
@@ -40,10 +40,11 @@ from holdfast.config.scanning import (
     parse_server,
     written_pollable,
 )
+from holdfast.config.unit_keys import EXAMPLE, UnitKey, parse_unit_key
 from holdfast.config.words import choice, shape, show
 from holdfast.net.addresses import Network
 from holdfast.net.allow_list import AllowedNetwork, AllowEntry
-from holdfast.protocol import CODES, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
+from holdfast.protocol import MAX_CODE, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
 from holdfast.types import Area
 
 MAX_BYTES = 244
@@ -163,10 +164,17 @@ def _in_folder(value: object, info: ValidationInfo) -> object:
     return _folder(info) / value
 
 
-def _function(value: object) -> int:
-    if type(value) is int and value in CODES:
-        return value
-    raise ValueError(f"found {show(value)}, allowed: {choice(CODES)}")
+def _key_of(least: int, most: int, note: str = "") -> Callable[[object], UnitKey]:
+    """A validator for keys that are a unit id or a range of unit ids."""
+    allowed = f"a unit id from {least} to {most}, or a range, as in {EXAMPLE}{note}"
+
+    def key(value: object) -> UnitKey:
+        parsed = parse_unit_key(value, least, most)
+        if parsed is None:
+            raise ValueError(f"found {show(value)}, allowed: {allowed}")
+        return parsed
+
+    return key
 
 
 def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
@@ -241,10 +249,15 @@ UnitId = Annotated[
     PlainValidator(_id_of("a unit id", 0, MAX_UNIT)),
     WithJsonSchema({"type": "integer", "minimum": 0, "maximum": MAX_UNIT}),
 ]
-SerialUnitId = Annotated[
-    int,
-    PlainValidator(_id_of("a unit id", 1, MAX_SERIAL_UNIT, NOT_ON_A_LINE)),
-    WithJsonSchema({"type": "integer"}),
+UnitIds = Annotated[
+    int | str,
+    PlainValidator(_key_of(0, MAX_UNIT)),
+    WithJsonSchema({"type": "string"}),
+]
+SerialUnitIds = Annotated[
+    int | str,
+    PlainValidator(_key_of(1, MAX_SERIAL_UNIT, NOT_ON_A_LINE)),
+    WithJsonSchema({"type": "string"}),
 ]
 RawUnitId = Annotated[
     int, PlainValidator(_id_of("a unit id", 0, MAX_WORD)), WithJsonSchema({"type": "integer"})
@@ -355,10 +368,11 @@ DurationOrZero = Annotated[
     AfterValidator(_no_instant),
     whole_number,
 ]
+PeerAddress = Annotated[str, PlainValidator(parse_peer), WithJsonSchema({"type": "string"})]
 FunctionCode = Annotated[
     int,
-    PlainValidator(_function),
-    WithJsonSchema({"type": "integer", "enum": list(CODES)}),
+    PlainValidator(_id_of("a function code", 1, MAX_CODE)),
+    WithJsonSchema({"type": "integer", "minimum": 1, "maximum": MAX_CODE}),
 ]
 Codes = Annotated[
     tuple[FunctionCode, ...], Strict(False), Field(json_schema_extra={"uniqueItems": True})
@@ -378,8 +392,10 @@ Areas = Annotated[
 
 NAME_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_NAME}$"}}
 UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_BYTE}$"}}
-SERIAL_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_SERIAL}$"}}
+UNITS_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_BYTE}(-{_BYTE})?$"}}
+SERIAL_UNITS_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_SERIAL}(-{_SERIAL})?$"}}
 RAW_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_WORD}$"}}
+PEER_KEYS: JsonDict = {"propertyNames": {"pattern": "^[0-9a-fA-F.:]+$"}}
 OBJECT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_HIGH_BYTE}$"}}
 ADAPTER_KEYS: JsonDict = {
     "propertyNames": {"pattern": f"^{_NAME}$", "not": {"enum": list(RESERVED)}}

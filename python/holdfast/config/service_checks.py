@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 
-_USERS_OF_MEMORIES = ("listeners", "devices", "rest", "mqtt", "adapters")
-_USERS_OF_NONE = {"nats", "gateway"}
+_USERS_OF_MEMORIES = ("rest", "mqtt", "adapters")
+_USERS_OF_NONE = {"nats", "gateway", "links", "devices"}
 _INSTEAD_OF_LISTENERS = ("rest", "mqtt", "nats", "gateway", "devices")
 _IDENTITIES = ("username", "token_file", "credentials_file")
 """Keys that authenticate the scanner at the NATS server; only one of them is allowed."""
@@ -49,9 +49,9 @@ class ServiceChecks:
 
     def _served(self, data: dict[Any, Any]) -> None:
         """Reports a missing server, and missing memories if a section uses them."""
-        used = any(data.get(key, {}) != {} for key in _USERS_OF_MEMORIES)
+        used = any(data.get(key, {}) != {} for key in _USERS_OF_MEMORIES) or _uses_memories(data)
         if data.get("memories", {}) == {} and (used or not data.keys() & _USERS_OF_NONE):
-            self._empty("memories", data, "when only nats and gateway are configured")
+            self._empty("memories", data, "when only nats, gateway and routes are configured")
         if data.get("listeners", {}) == {} and not data.keys() & {*_INSTEAD_OF_LISTENERS}:
             self._empty("listeners", data, f"with {choice(_INSTEAD_OF_LISTENERS)}")
 
@@ -144,3 +144,20 @@ class ServiceChecks:
         elif not path.parent.is_dir():
             message = f"found {show(file)}, allowed: a file in an existing folder"
             self.report.add(("audit", "file"), message)
+
+
+def _uses_memories(data: dict[Any, Any]) -> bool:
+    """Whether a listener or a device needs a memory: all do that are not only for routes."""
+    devices, listeners = data.get("devices", {}), data.get("listeners", {})
+    if devices != {} and not isinstance(devices, dict):
+        return True
+    if listeners != {} and not isinstance(listeners, dict):
+        return True
+    rules = [rule for each in listeners.values() for rule in entries(mapping(each).get("rules"))]
+    only_routes = all(
+        isinstance(target, dict)
+        for rule in rules
+        for target in mapping(mapping(rule).get("units")).values() or [None]
+    )
+    polled = any("reads" in device for device in devices.values() if isinstance(device, dict))
+    return (bool(listeners) and not (rules and only_routes)) or polled

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from holdfast.config.allowed import allowed, known_keys
-from holdfast.config.listeners import LISTENER_TYPES
+from holdfast.config.listeners import LISTENER_TYPES, UNIT_TAGS
 from holdfast.config.model import Config
 from holdfast.config.words import choice, guess, listing, shape, show
 
@@ -43,9 +43,12 @@ def build(data: object, context: Mapping[str, Any], report: Report) -> Config | 
 
 
 def _untagged(path: KeyPath) -> KeyPath:
-    """The path without the tag that pydantic inserts for a discriminated union."""
+    """The path without the tags that pydantic inserts for discriminated unions."""
     of_listener = path[:1] == ("listeners",) and path[2:] != (_KEY,)
-    return path[:2] + path[3:] if of_listener or path[:2] in _TOKENS else path
+    if of_listener or path[:2] in _TOKENS:
+        path = path[:2] + path[3:]
+    of_unit = of_listener and path[4:5] == ("units",) and path[6:7] and path[6] in UNIT_TAGS
+    return path[:6] + path[7:] if of_unit else path
 
 
 def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:

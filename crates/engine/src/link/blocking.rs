@@ -8,7 +8,8 @@ use holdfast_protocol::pdu::EncodedRequest;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 
-use super::{Answer, Fault, backoff};
+use super::backoff;
+use super::fault::{Answer, Fault};
 use crate::client::{BlockingClient, ClientError, Endpoint};
 
 pub(super) struct BlockingLink {

@@ -1,5 +1,7 @@
 //! Why a request to a device failed.
 
+use holdfast_protocol::client::Failure;
+
 /// Errors from this code on are not exceptions.
 const NO_EXCEPTION: u16 = 0x8000;
 
@@ -39,5 +41,18 @@ impl Fault {
             Fault::Unstored => NO_EXCEPTION + 6,
             Fault::Internal => NO_EXCEPTION + 7,
         }
+    }
+}
+
+/// The PDU of a reply, empty after a broadcast; or the fault.
+pub(crate) type Answer = Result<Vec<u8>, Fault>;
+
+/// The fault that a failed request counts as.
+pub(super) fn fault(failure: Failure) -> Fault {
+    match failure {
+        Failure::Exception(code) => Fault::Exception(code),
+        Failure::Timeout => Fault::Timeout,
+        Failure::Invalid(_) => Fault::Invalid,
+        _ => Fault::Reset,
     }
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use tokio::sync::{mpsc, oneshot};
 
-use super::InFlight;
+use super::pace::InFlight;
 use super::queue::Priority;
 use crate::client::Endpoint;
 use crate::counter::Counter;

@@ -13,9 +13,10 @@ use tokio::sync::mpsc;
 use tokio::task::spawn_local;
 use tokio::time::Instant;
 
+use super::access::Link;
 use super::backoff;
+use super::fault::{Answer, Fault};
 use super::route::{Call, LinkSettings, Reply, SharedLink};
-use super::{Answer, Fault, Link};
 
 /// Timeouts in a row after which requests to a unit are refused for a while.
 const SILENT_AFTER: u32 = 3;

@@ -16,9 +16,10 @@ use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
+use super::backoff;
+use super::fault::{Answer, Fault, fault};
 use super::handshake;
 use super::pace::Pace;
-use super::{Answer, Fault, backoff, fault};
 use crate::tls::Channel;
 use crate::tls::client::ClientTls;
 
@@ -367,8 +368,8 @@ mod tests {
     use tokio::task::{LocalSet, spawn_local};
 
     use super::*;
-    use crate::client::Place;
-    use crate::link::{Endpoint, InFlight, Link, Priority};
+    use crate::client::{Endpoint, Place};
+    use crate::link::{InFlight, Link, Priority};
 
     const TIMEOUT: Duration = Duration::from_secs(60);
 

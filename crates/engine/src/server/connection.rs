@@ -147,6 +147,8 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     /// Serves until the connection ends. The end is counted before the peer can see it.
     pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
         let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer);
+        // The engine waits until all receivers are dropped.
+        let _running = stop.clone();
         match self.serve(stop).await {
             Some(end) => {
                 context.ended(end, peer);
@@ -157,7 +159,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
                 }
             }
             None => {
-                self.finish();
+                self.finish().await;
                 context.ended(Kind::Closed, peer);
             }
         }
@@ -314,13 +316,22 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
-    /// Answers what the system has already received, then ends.
-    fn finish(mut self) {
+    /// Answers what the system has already received, then ends. The engine drops connections whose
+    /// devices take too long.
+    async fn finish(&mut self) {
         // A peer that does not read loses these replies.
-        if self.answering.drain(&mut self.stream, &mut self.unsent).is_ok() {
-            self.stream.end(&mut self.unsent);
-            let _ = stream::write(self.stream.socket(), &mut self.unsent);
+        if self.answering.drain(&mut self.stream, &mut self.unsent).is_err() {
+            return;
         }
+        while self.answering.is_waiting() {
+            let step = poll_fn(|context| self.poll_deferred(context)).await;
+            let sent = stream::write(self.stream.socket(), &mut self.unsent);
+            if step.is_err() || sent.is_err() {
+                return;
+            }
+        }
+        self.stream.end(&mut self.unsent);
+        let _ = stream::write(self.stream.socket(), &mut self.unsent);
     }
 }
 
@@ -470,7 +481,7 @@ impl<F: Framing> Answering<F> {
         stream::write(stream.socket(), unsent)?;
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             for _ in 0..LAST_READS {
-                // Who waits for a device is not answered any more.
+                // The replies of devices come first.
                 if self.is_waiting() {
                     break;
                 }

@@ -114,6 +114,10 @@ impl ModbusUdp {
                 Err(_) => {}
             }
         }
+        // The engine drops listeners whose devices take too long.
+        while let Some(Ok(completed)) = later.replies.join_next().await {
+            self.complete::<D>(context, &socket, completed);
+        }
     }
 
     /// Answers all datagrams of one read. All have the same length, except the last.
@@ -213,6 +217,10 @@ impl ModbusUdp {
                 Err(code) => {
                     let function_code = request.first().copied().unwrap_or_default();
                     let len = reply::exception(function_code, code, buffer);
+                    if let Some(auditor) = &context.auditor {
+                        let refused = (None, request, &buffer[..len]);
+                        auditor.note_forwarded(&context.name, Some(peer), unit_id, refused);
+                    }
                     D::complete(output, tag, unit_id, len)
                 }
             };

@@ -96,6 +96,26 @@ DIAGNOSTICS: dict[str, Schema] = {
                     },
                 },
             },
+            "links": {
+                "type": "object",
+                "description": "By name of the link, or of the first device behind it: requests of "
+                "listeners by outcome, and how many wait for a reply",
+                "additionalProperties": object_of(
+                    {
+                        "requests": COUNTER,
+                        "replies": COUNTER | {"description": "With the exceptions of devices"},
+                        "exceptions": COUNTER,
+                        "timeouts": COUNTER,
+                        "failures": COUNTER | {"description": "Invalid replies, lost connections"},
+                        "refused_full": COUNTER,
+                        "refused_down": COUNTER,
+                        "coalesced": COUNTER | {"description": "Answered by an equal read"},
+                        "cached": COUNTER | {"description": "Answered by an earlier reply"},
+                        "withdrawn": COUNTER | {"description": "Not sent: the client had gone"},
+                        "waiting": COUNTER,
+                    }
+                ),
+            },
             "adapters": {
                 "type": "object",
                 "description": "By name of the adapter: messages accepted, values written, "

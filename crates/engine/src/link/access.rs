@@ -1,0 +1,107 @@
+//! Access to a link, in turns.
+
+use std::cell::Cell;
+use std::rc::Rc;
+use std::time::Duration;
+
+use holdfast_protocol::pdu::EncodedRequest;
+use tokio::time::Instant;
+
+use super::blocking::BlockingLink;
+use super::fault::Answer;
+use super::pace::{InFlight, Pace, Place as Turn};
+use super::queue::Priority;
+use super::tcp::TcpLink;
+use crate::client::{Endpoint, Place};
+
+/// Requests of the poller, as one source beside the clients of listeners.
+const POLLER: u64 = 0;
+
+pub(crate) struct Link {
+    pub(super) pace: Pace,
+    pub(super) wire: Wire,
+    /// Grows whenever a device may have changed by a request.
+    pub(super) changes: Cell<u64>,
+}
+
+pub(super) enum Wire {
+    Tcp(Box<TcpLink>),
+    Blocking(BlockingLink),
+}
+
+impl Link {
+    /// Must be called in the context of a `LocalSet`.
+    pub(crate) fn new(endpoint: Endpoint, in_flight: InFlight) -> Rc<Link> {
+        let one = InFlight::Fixed(1);
+        let (wire, in_flight) = match endpoint.place {
+            Place::Tcp { host, port, tls } => {
+                let is_one = endpoint.tolerance.is_one_at_a_time();
+                let link = TcpLink::new((host, port), tls, endpoint.tolerance);
+                (Wire::Tcp(Box::new(link)), if is_one { one } else { in_flight })
+            }
+            _ => (Wire::Blocking(BlockingLink::new(endpoint)), one),
+        };
+        Rc::new(Link { pace: Pace::new(in_flight), wire, changes: Cell::default() })
+    }
+
+    /// Sends a request of the poller when it is its turn, and waits for the answer. `timeout` does not
+    /// include the wait for the turn.
+    pub(crate) async fn call(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        priority: Priority,
+    ) -> Answer {
+        let _turn = self.turn(POLLER, priority).await;
+        let eager = priority == Priority::Urgent;
+        self.exchange(unit_id, request, timeout, eager).await
+    }
+
+    /// Waits for a turn, which lasts as long as the result.
+    pub(super) async fn turn(&self, source: u64, priority: Priority) -> Turn<'_> {
+        self.pace.place(source, priority).await
+    }
+
+    /// Sends a request and waits for the answer. With `eager`, an unreachable address is tried even
+    /// before its pause is over.
+    pub(super) async fn exchange(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        eager: bool,
+    ) -> Answer {
+        self.note_change(request);
+        let answer = match &self.wire {
+            Wire::Tcp(link) => link.exchange(&self.pace, unit_id, request, timeout, eager).await,
+            Wire::Blocking(link) => link.exchange(unit_id, request, timeout, eager).await,
+        };
+        self.note_change(request);
+        answer
+    }
+
+    /// Counts a request that may change a device, before it is sent and after it was answered.
+    fn note_change(&self, request: &EncodedRequest) {
+        if !request.is_read() {
+            self.changes.set(self.changes.get() + 1);
+        }
+    }
+
+    /// When an unreachable address is tried again. Until then polls fail immediately.
+    pub(crate) fn retry_at(&self) -> Option<Instant> {
+        let failed = match &self.wire {
+            Wire::Tcp(link) => link.retry_at(),
+            Wire::Blocking(link) => link.retry_at(),
+        };
+        failed.filter(|until| Instant::now() < *until)
+    }
+
+    /// Closes the connection if no request is in flight. The next request opens a new one.
+    pub(crate) fn release(&self) {
+        match &self.wire {
+            Wire::Tcp(link) => link.release(),
+            Wire::Blocking(link) => link.release(),
+        }
+    }
+}

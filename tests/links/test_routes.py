@@ -1,0 +1,636 @@
+"""Requests that listeners pass on: what the device receives, and what the client gets."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from support import routed, wire
+from support.fake_device import FakeDevice, Serial, Stream, Udp, exception, good, silent
+from support.lines import ASCII, RTU, Line, Mode
+from support.routed import Held, await_count, configuration, counters
+from support.running import endpoint
+from support.transports import Datagrams, FramedConnection, client
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from holdfast.appliance import Appliance
+    from support.fake_device import Asked
+    from support.running import Connect, Run
+
+READ = bytes.fromhex("0300050001")
+FIVE = bytes.fromhex("03020005")
+WRITE = bytes.fromhex("0600051234")
+VENDOR = bytes.fromhex("4101020304")
+
+EXCHANGES = {
+    "1": ("0100000009", "0102ff01"),
+    "2": ("0200000008", "020155"),
+    "3": ("0300010002", "030400070008"),
+    "4": ("0400010001", "04020009"),
+    "5": ("050001ff00", "050001ff00"),
+    "6": ("0600011234", "0600011234"),
+    "7": ("07", "076d"),
+    "8": ("08000000aa", "08000000aa"),
+    "12": ("0c", "0c080000010801212000"),
+    "15": ("0f000000080155", "0f00000008"),
+    "16": ("1000010001020007", "1000010001"),
+    "20": ("140706000400010002", "140605060dfe0020"),
+    "21": ("15090600040007000106af", "15090600040007000106af"),
+    "22": ("16000400f20025", "16000400f20025"),
+    "23": ("170003000100010001020007", "17020009"),
+    "24": ("1804de", "180006000201020304"),
+    "43": ("2b0e0100", "2b0e01010000010003616263"),
+    "65, listed": ("4101020304", "41ffee"),
+}
+"""Requests and replies by function code. Replies that differ from what memories would answer."""
+
+
+@pytest.fixture
+def unmodelled() -> Iterator[FakeDevice]:
+    """A device that answers what its test sets."""
+    with FakeDevice(lambda pdu: pdu) as device:
+        yield device
+
+
+@pytest.fixture
+def device() -> Iterator[Stream]:
+    """A device over TCP: unit 1 whose holding register N holds N."""
+    with Stream("tcp") as made:
+        yield made
+
+
+@pytest.fixture
+def meter(device: Stream, run: Run) -> Appliance:
+    """All unit ids lead to `device`."""
+    return run(configuration(device.url))
+
+
+def scada(appliance: Appliance) -> tuple[str, int]:
+    return endpoint(appliance, "scada")
+
+
+def lines_of(file: Path, count: int) -> list[dict[str, Any]]:
+    """Returns the lines of an audit log, when there are so many."""
+    wire.until(lambda: file.read_text().count("\n") >= count, f"{count} lines")
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+# What passes
+
+
+@pytest.mark.parametrize(("request_", "reply"), EXCHANGES.values(), ids=EXCHANGES)
+def test_request_and_reply_pass_unchanged(
+    unmodelled: FakeDevice, run: Run, connect: Connect, request_: str, reply: str
+) -> None:
+    unmodelled.answer = lambda _: bytes.fromhex(reply)
+    functions = {"functions": [int(request_[:2], 16)]}
+    front = connect(scada(run(configuration(unmodelled.url, rule=functions))))
+
+    assert front.ask(bytes.fromhex(request_), unit=9).hex() == reply
+    assert [(asked.unit, asked.pdu.hex()) for asked in unmodelled.requests] == [(9, request_)]
+
+
+@pytest.mark.parametrize("code", [name for name in EXCHANGES if "," not in name])
+def test_functions_of_the_standard_need_no_list(
+    unmodelled: FakeDevice, run: Run, connect: Connect, code: str
+) -> None:
+    request, reply = (bytes.fromhex(text) for text in EXCHANGES[code])
+    unmodelled.answer = lambda _: reply
+
+    assert connect(scada(run(configuration(unmodelled.url)))).ask(request) == reply
+
+
+def test_a_function_of_a_vendor_that_is_not_listed_is_refused(
+    device: Stream, meter: Appliance, connect: Connect
+) -> None:
+    front = connect(scada(meter))
+
+    assert front.ask(VENDOR) == exception(VENDOR, 1)
+    assert front.ask(READ) == FIVE
+    assert [asked.pdu for asked in device.requests] == [READ]
+
+
+@pytest.mark.parametrize("code", [1, 2, 4, 6, 10, 11, 0x63, 0xFF])
+def test_the_exceptions_of_the_device_come_through(
+    unmodelled: FakeDevice, run: Run, connect: Connect, code: int
+) -> None:
+    unmodelled.answer = lambda pdu: exception(pdu, code)
+    appliance = run(configuration(unmodelled.url))
+
+    assert connect(scada(appliance)).ask(WRITE) == exception(WRITE, code)
+    assert counters(appliance)["exceptions"] == 1
+
+
+def test_a_request_that_a_memory_would_refuse_is_for_the_device_to_judge(
+    unmodelled: FakeDevice, run: Run, connect: Connect
+) -> None:
+    beyond = bytes.fromhex("0300000fff")
+    unmodelled.answer = lambda pdu: exception(pdu, 3)
+
+    assert connect(scada(run(configuration(unmodelled.url)))).ask(beyond) == exception(beyond, 3)
+    assert unmodelled.asked == [beyond]
+
+
+def test_a_read_only_rule_passes_on_no_write(device: Stream, run: Run, connect: Connect) -> None:
+    front = connect(scada(run(configuration(device.url, rule={"access": "read-only"}))))
+
+    for text in ["0500010000", "0600011234", "15090600040007000106af", "4101020304"]:
+        write = bytes.fromhex(text)
+        assert front.ask(write) == exception(write, 1)
+    assert front.ask(READ) == FIVE
+    assert [asked.pdu for asked in device.requests] == [READ]
+
+
+def test_a_route_to_a_device_sends_its_unit_id_and_a_link_keeps_that_of_the_request(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    units: dict[int | str, Any] = {5: {"route": "drive"}, "6-9": {"route": "bus"}}
+    devices = {"drive": {"url": device.url, "unit": 1}}
+    front = connect(scada(run(configuration(device.url, units=units, devices=devices))))
+
+    for unit in (5, 6, 9):
+        front.ask(READ, unit)
+    assert [asked.unit for asked in device.requests] == [1, 6, 9]
+    assert device.connections == 1
+
+
+def test_a_unit_id_without_a_route_is_answered_as_before(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    front = connect(scada(run(configuration(device.url, units={5: {"route": "bus"}}))))
+
+    assert front.ask(READ, unit=6) == exception(READ, 0x0B)
+    assert device.requests == []
+
+
+def test_a_device_that_is_polled_has_routes_over_the_same_connection(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    polled = {
+        "url": device.url,
+        "unit": 1,
+        "interval": 0.05,
+        "reads": [{"area": "coils", "address": 0, "count": 8}],
+        "forward": [{"url": "raw://127.0.0.1:1", "unit": 1}],
+    }
+    appliance = run(
+        configuration(
+            device.url,
+            units={5: {"route": "meter"}, 6: "plant"},
+            devices={"meter": polled},
+            memories={"plant": {"coils": 8}},
+        )
+    )
+
+    assert connect(scada(appliance)).ask(READ, unit=5) == FIVE
+    polls = len(device.requests) + 2
+    wire.until(lambda: len(device.requests) >= polls, "the device is polled")
+    assert device.connections == 1
+
+
+# Order
+
+
+def test_replies_have_the_order_of_their_requests(device: Stream, run: Run) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(
+        configuration(
+            device.url,
+            units={1: {"route": "bus"}, 2: "plant"},
+            memories={"plant": {"holding_registers": 9}},
+        )
+    )
+    units = [1, 2, 1, 1, 2, 2, 1]
+    requests = b"".join(wire.frame(READ, unit, number) for number, unit in enumerate(units))
+    with wire.Connection(scada(appliance)) as front:
+        front.send(requests)
+        wire.until(lambda: device.requests, "the first request is passed on")
+        held.release()
+        replies = front.receive_many(len(units))
+
+    zero = bytes.fromhex("03020000")
+    assert [(reply.transaction, reply.unit, reply.pdu) for reply in replies] == [
+        (number, unit, FIVE if unit == 1 else zero) for number, unit in enumerate(units)
+    ]
+
+
+def test_a_request_to_memory_waits_for_the_write_before_it(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(
+        configuration(
+            device.url,
+            units={1: {"route": "bus"}, 2: "plant"},
+            memories={"plant": {"holding_registers": 9}},
+        )
+    )
+    connect(scada(appliance)).send(wire.frame(WRITE, 1) + wire.frame(WRITE, 2))
+    device.await_requests(1)
+    assert appliance.memories["plant"].read("holding_registers", 5, 1) == [0]
+    held.release()
+    wire.until(
+        lambda: appliance.memories["plant"].read("holding_registers", 5, 1) == [0x1234], "written"
+    )
+
+
+@pytest.mark.parametrize("in_flight", [1, 8])
+def test_many_clients_never_get_the_reply_of_another(
+    device: Stream, run: Run, in_flight: int
+) -> None:
+    appliance = run(configuration(device.url, link={"in_flight": in_flight}))
+
+    def ask(number: int) -> bool:
+        with wire.Connection(scada(appliance)) as front:
+            for turn in range(100):
+                address = 100 * number + turn % 100
+                reply = front.ask(b"\x03" + address.to_bytes(2) + b"\0\1")
+                if reply != b"\x03\x02" + address.to_bytes(2):
+                    return False
+        return True
+
+    with ThreadPoolExecutor(8) as threads:
+        assert all(threads.map(ask, range(8)))
+    assert counters(appliance)["replies"] == len(device.requests)
+
+
+# Transports
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp", "rtu", "rtu-udp", "ascii"])
+def test_every_listener_passes_requests_on(device: Stream, run: Run, kind: str) -> None:
+    appliance = run(configuration(device.url, kind=kind))
+    missing = bytes.fromhex("03ffff0001")
+    with client(kind, scada(appliance)) as front:
+        assert isinstance(front, wire.Connection | Datagrams | FramedConnection)
+        assert front.ask(READ) == FIVE
+        assert front.ask(WRITE) == WRITE
+        assert front.ask(READ) == bytes.fromhex("03021234")
+        assert front.ask(missing) == exception(missing, 2)
+    assert [asked.pdu for asked in device.requests] == [READ, WRITE, READ, missing]
+
+
+@pytest.mark.parametrize("mode", [RTU, ASCII], ids=lambda mode: mode.name)
+def test_a_serial_listener_passes_requests_on(
+    device: Stream, run: Run, tmp_path: Path, mode: Mode
+) -> None:
+    with Line(tmp_path / "line", mode) as line:
+        run(routed.serial_configuration(device.url, mode.listener, line.device))
+        assert line.ask(READ, unit=1) == FIVE
+        assert line.ask(WRITE, unit=1) == WRITE
+    assert [asked.pdu for asked in device.requests] == [READ, WRITE]
+
+
+@pytest.mark.parametrize("kind", ["udp", "rtu+tcp", "ascii+tcp", "rtu+udp"])
+def test_every_network_transport_leads_to_devices(run: Run, connect: Connect, kind: str) -> None:
+    device = Udp(kind=kind) if "udp" in kind else Stream(kind)
+    with device:
+        front = connect(scada(run(configuration(device.url))))
+        assert front.ask(READ) == FIVE
+        assert front.ask(WRITE) == WRITE
+        assert front.ask(READ) == bytes.fromhex("03021234")
+
+
+class OnLine:
+    """An appliance whose link is a serial line, and the device on it."""
+
+    def __init__(self, device: Serial, appliance: Appliance) -> None:
+        self.device = device
+        self.appliance = appliance
+
+
+@pytest.fixture(params=[RTU, ASCII], ids=lambda mode: mode.name)
+def on_line(request: pytest.FixtureRequest, tmp_path: Path, run: Run) -> Iterator[OnLine]:
+    device = Serial(request.param, tmp_path / "device")
+    with device:
+        rule = {"functions": [3, 6, 8, 16, 43, 65]}
+        yield OnLine(device, run(configuration(device.url, rule=rule)))
+
+
+def test_a_serial_line_leads_to_devices(on_line: OnLine, connect: Connect) -> None:
+    front = connect(scada(on_line.appliance))
+    many = bytes.fromhex("100001000204 0007 0008")
+
+    assert front.ask(READ) == FIVE
+    assert front.ask(WRITE) == WRITE
+    assert front.ask(many) == many[:5]
+    assert front.ask(bytes.fromhex("0300010002")) == bytes.fromhex("030400070008")
+    missing = bytes.fromhex("03ffff0001")
+    assert front.ask(missing) == exception(missing, 2)
+
+
+def test_a_function_of_a_vendor_passes_over_a_serial_line(
+    on_line: OnLine, connect: Connect
+) -> None:
+    on_line.device.is_modelled = False
+    on_line.device.then = lambda asked: asked.answer(b"\x41\xff\xee")
+
+    assert connect(scada(on_line.appliance)).ask(VENDOR) == b"\x41\xff\xee"
+    assert on_line.device.requests[0].pdu == VENDOR
+
+
+def test_a_broadcast_on_a_serial_line_has_no_reply(on_line: OnLine, connect: Connect) -> None:
+    on_line.device.script = [silent]
+    front = connect(scada(on_line.appliance))
+
+    front.send(wire.frame(WRITE, unit=0, transaction=1) + wire.frame(READ, 1, 2))
+
+    assert front.receive() == wire.Frame(2, 1, FIVE)
+    assert [(asked.unit, asked.pdu) for asked in on_line.device.requests] == [
+        (0, WRITE),
+        (1, READ),
+    ]
+
+
+def test_clients_of_a_serial_line_never_overlap(on_line: OnLine) -> None:
+    def ask(number: int) -> bool:
+        with wire.Connection(scada(on_line.appliance)) as front:
+            for address in range(number, 1000, 50):
+                expected = b"\x03\x02" + address.to_bytes(2)
+                if front.ask(b"\x03" + address.to_bytes(2) + b"\0\1") != expected:
+                    return False
+        return True
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(ask, range(4)))
+
+
+# Failures
+
+
+def closed_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port: int = listener.getsockname()[1]
+    return port
+
+
+def test_a_device_that_can_t_be_reached_is_exception_0a(run: Run, connect: Connect) -> None:
+    appliance = run(configuration(f"tcp://127.0.0.1:{closed_port()}"))
+    front = connect(scada(appliance))
+
+    assert front.ask(READ) == exception(READ, 0x0A)
+    assert front.ask(WRITE) == exception(WRITE, 0x0A)
+
+
+def test_a_device_that_is_back_is_asked_again(run: Run, connect: Connect) -> None:
+    with Stream("tcp", port=closed_port()) as device:
+        device.stop()
+        front = connect(scada(run(configuration(device.url))))
+        assert front.ask(READ) == exception(READ, 0x0A)
+        device.start()
+        wire.until(lambda: front.ask(READ) == FIVE, "the device is asked again")
+
+
+def test_a_silent_unit_is_exception_0b_and_the_others_are_served(
+    run: Run, connect: Connect
+) -> None:
+    def only_one(asked: Asked) -> None:
+        if asked.unit == 1:
+            good(asked)
+
+    with Stream("tcp", then=only_one) as device:
+        appliance = run(configuration(device.url, link={"timeout": 0.2}))
+        with wire.Connection(scada(appliance)) as other:
+            front = connect(scada(appliance))
+            for _ in range(4):
+                assert front.ask(READ, unit=2) == exception(READ, 0x0B)
+                assert other.ask(READ, unit=1) == FIVE
+        assert counters(appliance)["timeouts"] + counters(appliance)["refused_down"] == 4
+        assert counters(appliance)["replies"] == 4
+
+
+def test_a_late_reply_is_not_the_answer_to_the_next_request(run: Run, connect: Connect) -> None:
+    def late(asked: Asked) -> None:
+        """Answers when the next request is there, before the reply to that one."""
+        waiting.append(asked.frame())
+
+    def next_one(asked: Asked) -> None:
+        asked.send(*waiting, asked.frame())
+
+    waiting: list[bytes] = []
+    with Stream("tcp", late, next_one) as device:
+        front = connect(scada(run(configuration(device.url, link={"timeout": 0.2}))))
+        assert front.ask(READ) == exception(READ, 0x0B)
+        six = bytes.fromhex("0300060001")
+        assert front.ask(six) == bytes.fromhex("03020006")
+
+
+def test_a_full_queue_is_exception_06(device: Stream, run: Run, connect: Connect) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, link={"queue": 1}))
+    first, second = connect(scada(appliance)), connect(scada(appliance))
+    first.send(wire.frame(READ))
+    device.await_requests(1)
+
+    assert second.ask(WRITE) == exception(WRITE, 6)
+    held.release()
+    assert first.receive().pdu == FIVE
+    assert counters(appliance)["refused_full"] == 1
+    assert [asked.pdu for asked in device.requests] == [READ]
+
+
+def test_the_write_of_a_client_that_has_gone_is_not_sent(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url))
+    first, gone = connect(scada(appliance)), connect(scada(appliance))
+    first.send(wire.frame(READ))
+    device.await_requests(1)
+    gone.send(wire.frame(WRITE))
+    await_count(appliance, "waiting", 2)
+    gone.reset()
+    wire.until(
+        lambda: appliance.diagnostics.stats()["listeners"]["scada"]["connections"]["open"] == 1,
+        "the client has gone",
+    )
+    held.release()
+
+    assert first.receive().pdu == FIVE
+    await_count(appliance, "withdrawn", 1)
+    assert [asked.pdu for asked in device.requests] == [READ]
+
+
+# Sharing
+
+
+@pytest.mark.parametrize(("coalesce", "requests"), [(True, 2), (False, 3)])
+def test_equal_reads_that_wait_are_answered_together(
+    device: Stream, run: Run, connect: Connect, coalesce: bool, requests: int
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, link={"coalesce": coalesce}))
+    first, one, other = (connect(scada(appliance)) for _ in range(3))
+    first.send(wire.frame(bytes.fromhex("0300060001")))
+    device.await_requests(1)
+    one.send(wire.frame(READ, transaction=1))
+    await_count(appliance, "waiting", 2)
+    other.send(wire.frame(READ, transaction=2))
+    # A read that joins another one has joined when it is counted.
+    await_count(appliance, "coalesced" if coalesce else "waiting", 1 if coalesce else 3)
+    held.release()
+
+    assert [one.receive(), other.receive()] == [wire.Frame(1, 1, FIVE), wire.Frame(2, 1, FIVE)]
+    device.await_requests(requests)
+
+
+def test_a_reply_answers_equal_reads_as_long_as_it_is_kept(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    appliance = run(configuration(device.url, link={"cache": 3600}))
+    front, other = connect(scada(appliance)), connect(scada(appliance))
+
+    assert [front.ask(READ), other.ask(READ), front.ask(READ)] == [FIVE] * 3
+    assert len(device.requests) == 1
+    assert front.ask(WRITE) == WRITE
+    assert other.ask(READ) == bytes.fromhex("03021234")
+    assert [asked.pdu for asked in device.requests] == [READ, WRITE, READ]
+    assert counters(appliance)["cached"] == 2
+
+
+def test_without_a_cache_every_read_reaches_the_device(
+    device: Stream, meter: Appliance, connect: Connect
+) -> None:
+    front = connect(scada(meter))
+
+    assert [front.ask(READ) for _ in range(3)] == [FIVE] * 3
+    device.await_requests(3)
+
+
+def test_reads_of_preferred_clients_and_writes_go_first(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, link={"priority": {"127.0.0.2": "high"}}))
+    to = scada(appliance)
+    first, usual, writer = connect(to), connect(to), connect(to)
+    preferred = connect(to, source="127.0.0.2")
+    first.send(wire.frame(READ))
+    device.await_requests(1)
+    seven, eight = bytes.fromhex("0300070001"), bytes.fromhex("0300080001")
+    for number, (front, pdu) in enumerate([(usual, seven), (preferred, eight), (writer, WRITE)]):
+        front.send(wire.frame(pdu))
+        await_count(appliance, "waiting", number + 2)
+    held.release()
+
+    assert usual.receive().pdu == bytes.fromhex("03020007")
+    assert [asked.pdu for asked in device.requests] == [READ, WRITE, eight, seven]
+
+
+# Audit
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp"])
+def test_what_is_passed_on_is_in_the_audit_log(
+    device: Stream, run: Run, tmp_path: Path, kind: str
+) -> None:
+    device.is_modelled = False
+    device.then = lambda asked: asked.answer(
+        exception(asked.pdu, 0x63) if asked.pdu[:1] == b"\x10" else asked.pdu
+    )
+    many = bytes.fromhex("100005000102 0001")
+    appliance = run(
+        configuration(
+            device.url,
+            kind=kind,
+            units={5: {"route": "bus"}},
+            rule={"functions": [3, 6, 16, 65]},
+            audit={"file": "audit.log"},
+        )
+    )
+    with client(kind, scada(appliance)) as front:
+        for pdu in (WRITE, many, VENDOR, READ, bytes.fromhex("0500050000")):
+            front.ask(pdu, 5)
+
+    found = [
+        {key: value for key, value in line.items() if key not in ("time", "peer", "listener")}
+        for line in lines_of(tmp_path / "audit.log", 4)
+    ]
+    register = {"area": "holding_registers", "address": 5}
+    assert found[0] == {
+        "unit": 5, "route": "bus", "function": 6, **register, "values": [0x1234],
+        "outcome": "done",
+    }  # fmt: skip
+    assert found[1] == {
+        "unit": 5, "route": "bus", "function": 16, **register, "values": [1],
+        "outcome": found[1]["outcome"],
+    }  # fmt: skip
+    assert found[1]["outcome"] != "done"
+    assert found[2] == {
+        "unit": 5, "route": "bus", "function": 65, "pdu": "4101020304", "outcome": "done",
+    }  # fmt: skip
+    assert found[3]["function"] == 5
+    assert found[3]["outcome"] == "illegal_function"
+    assert "route" not in found[3]
+    assert len(found) == 4
+
+
+# The end
+
+
+def is_listening(to: tuple[str, int]) -> bool:
+    try:
+        socket.create_connection(to, timeout=wire.DEADLINE).close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+def test_a_request_under_way_is_answered_before_the_end(
+    device: Stream, run: Run, connect: Connect, tmp_path: Path
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, audit={"file": "audit.log"}))
+    to = scada(appliance)
+    front = connect(to)
+    front.send(wire.frame(WRITE))
+    device.await_requests(1)
+    stopping = threading.Thread(target=appliance.stop)
+    stopping.start()
+    wire.until(lambda: not is_listening(to), "the listener is closed")
+    held.release()
+    stopping.join()
+
+    assert front.receive().pdu == WRITE
+    assert front.rest() == b""
+    assert [line["outcome"] for line in lines_of(tmp_path / "audit.log", 1)] == ["done"]
+
+
+def test_the_end_does_not_wait_for_a_silent_device(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    device.then = silent
+    appliance = run(configuration(device.url, link={"timeout": 3600}))
+    front = connect(scada(appliance))
+    front.send(wire.frame(READ))
+    device.await_requests(1)
+    appliance.stop()
+
+    assert front.rest() == b""
+
+
+def test_nothing_is_left_running_if_a_listener_can_t_start(device: Stream, run: Run) -> None:
+    before = {thread.name for thread in threading.enumerate()}
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        bind = f'"bind": "127.0.0.1:{taken.getsockname()[1]}"'
+        text = configuration(device.url).replace('"bind": "127.0.0.1:0"', bind)
+        assert bind in text
+        with pytest.raises(OSError, match="listener scada"):
+            run(text)
+    assert {thread.name for thread in threading.enumerate()} == before
+    assert device.connections == 0
