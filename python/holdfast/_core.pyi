@@ -150,6 +150,7 @@ class BatchRefused(ValueError):
         "gate_bit",
         "wrong_length",
         "not_registers",
+        "mirrored",
     ]
     """`invalid_type`: a value of another type, or with `index` `None`, values that are not a
     sequence of integers. `invalid_value`: an integer out of range."""
@@ -590,6 +591,17 @@ class Link:
 @final
 class Passage:
     """A memory, some of whose ranges are written through to devices."""
+
+    def device_of(self, area: Area, address: int, count: int) -> str | None:
+        """The device that takes a write of this range, `None` if it is not within one range."""
+
+    def write(self, area: Area, address: int, values: list[int]) -> int:
+        """Writes to the device, and to the memory when the device has confirmed it.
+
+        Blocks until the device has answered, or did not in time. Returns 0, or the exception code:
+        of the device, 10 if it can't be reached, 11 if it does not answer. Raises `ValueError` for
+        more values than a request can have.
+        """
 
 @final
 class Route:

@@ -7,6 +7,8 @@ from typing import Literal, TypeAlias, TypedDict, get_args
 Access: TypeAlias = Literal["read-only", "read-write"]
 Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
 AREAS: tuple[Area, ...] = get_args(Area)
+WRITABLE_AREAS: tuple[Area, ...] = ("coils", "holding_registers")
+"""The areas that Modbus clients can write."""
 BitArea: TypeAlias = Literal["coils", "discrete_inputs"]
 RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
 BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)

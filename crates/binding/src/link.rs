@@ -5,6 +5,8 @@ use std::sync::Arc;
 
 use holdfast_engine::link::{InFlight, LinkSettings, Route as CoreRoute, SharedLink};
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
+use holdfast_memory::Area;
+use holdfast_protocol::pdu::{Bits, Registers, Request as CoreRequest, limit, pack_bits};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -103,6 +105,48 @@ type Passed = (String, u16, u32, String, u16, bool);
 #[pyclass(frozen, module = "holdfast")]
 pub struct Passage {
     pub(crate) core: Arc<CorePassage>,
+}
+
+#[pymethods]
+impl Passage {
+    fn device_of(&self, area: &str, address: u16, count: u32) -> PyResult<Option<&str>> {
+        Ok(self.core.device_of(named(area)?, address, count))
+    }
+
+    /// Returns the code of the exception, 0 if the device has confirmed the write.
+    fn write(&self, py: Python<'_>, area: &str, address: u16, values: Vec<u16>) -> PyResult<u8> {
+        let most = usize::from(if named(area)?.is_bits() {
+            limit::WRITE_BITS
+        } else {
+            limit::WRITE_REGISTERS
+        });
+        within("number of values", values.len() as i128, 1..=most)?;
+        let written = match named(area)? {
+            Area::Coils => {
+                let items: Vec<bool> = values.iter().map(|value| *value != 0).collect();
+                let mut packed = vec![0; items.len().div_ceil(8)];
+                pack_bits(&items, &mut packed);
+                let quantity = values.len() as u16;
+                let bits = Bits::new(quantity, &packed).expect("there are as many bits");
+                let request = match items[..] {
+                    [value] => CoreRequest::WriteSingleCoil { address, value },
+                    _ => CoreRequest::WriteMultipleCoils { address, bits },
+                };
+                py.detach(|| self.core.write(&request))
+            }
+            Area::HoldingRegisters => {
+                let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_be_bytes()).collect();
+                let registers = Registers::new(&bytes).expect("there are 1 to 123 registers");
+                let request = match values[..] {
+                    [value] => CoreRequest::WriteSingleRegister { address, value },
+                    _ => CoreRequest::WriteMultipleRegisters { address, registers },
+                };
+                py.detach(|| self.core.write(&request))
+            }
+            _ => return Err(PyValueError::new_err(format!("devices have no writable {area}"))),
+        };
+        Ok(written.err().unwrap_or(0))
+    }
 }
 
 /// The ranges of a memory whose writes go to devices.

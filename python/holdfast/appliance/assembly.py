@@ -108,10 +108,12 @@ class Links:
     """By name; a link without a name of its own has that of the first device behind it."""
     routes: dict[str, _core.Route] = field(default_factory=dict)
     """By the name of the link or device."""
+    passages: dict[str, _core.Passage] = field(default_factory=dict)
+    """By the name of the memory."""
 
 
-def links(config: Config, poller: _core.Poller) -> Links:
-    """Creates all links, and the routes of listeners. Raises `OSError` for unusable files.
+def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) -> Links:
+    """Creates all links, routes and passages. Raises `OSError` for unusable files.
 
     The first use of an address decides the settings of its connection, so links come first, and
     polled devices later.
@@ -140,6 +142,13 @@ def links(config: Config, poller: _core.Poller) -> Links:
         )
         made.links.setdefault(link.name, link)
         made.routes[name] = link.route(name, unit=device.unit, timeout=device.timeout)
+    passed: dict[str, list[tuple[Area, int, int, str, int, bool]]] = {}
+    for name, device in config.devices.items():
+        for read, into in device.passed:
+            ranges = passed.setdefault(into.memory, [])
+            ranges.append((into.area, into.address, read.count, name, read.address, device.emulate))
+    for name, ranges in passed.items():
+        made.passages[name] = poller.passage(memories[name], ranges)
     return made
 
 
@@ -147,7 +156,7 @@ def listener(
     name: str,
     config: Config,
     memories: Mapping[str, Memory],
-    routes: Mapping[str, _core.Route],
+    links: Links,
 ) -> _core.Listener:
     """Creates the native listener of that name."""
     settings: Listener = config.listeners[name]
@@ -162,7 +171,7 @@ def listener(
             return _core.Listener(
                 name,
                 str(settings.bind),
-                [_rule(rule, memories, routes) for rule in settings.rules],
+                [_rule(rule, memories, links) for rule in settings.rules],
                 framing=_FRAMINGS[settings.type],
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
@@ -173,7 +182,7 @@ def listener(
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
             )
         case ModbusUdpListener() | ModbusRtuOverUdpListener():
-            rules = [_rule(rule, memories, routes) for rule in settings.rules]
+            rules = [_rule(rule, memories, links) for rule in settings.rules]
             return _core.Listener.udp(
                 name,
                 str(settings.bind),
@@ -185,7 +194,7 @@ def listener(
             return _core.Listener.serial(
                 name,
                 line.device,
-                _rule(settings.rules[0], memories, routes),
+                _rule(settings.rules[0], memories, links),
                 mode="rtu" if settings.type == "modbus-rtu" else "ascii",
                 baud=line.baud,
                 parity=line.parity,
@@ -319,13 +328,13 @@ def _place(
 
 
 def _rule(
-    rule: RuleConfig | SerialRuleConfig,
-    memories: Mapping[str, Memory],
-    routes: Mapping[str, _core.Route],
+    rule: RuleConfig | SerialRuleConfig, memories: Mapping[str, Memory], links: Links
 ) -> _core.Rule:
     return _core.Rule(
         {
-            unit: routes[target.route] if isinstance(target, RouteConfig) else memories[target]
+            unit: links.routes[target.route]
+            if isinstance(target, RouteConfig)
+            else links.passages.get(target, memories[target])
             for unit, target in unit_targets(rule.units)
         },
         sources=[str(source) for source in getattr(rule, "sources", ())],

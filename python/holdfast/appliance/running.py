@@ -164,8 +164,9 @@ class _Running:
             if devices or config.links or routed(config):
                 self._poller = _core.Poller([])
                 undo.callback(self._poller.stop)
-                links = assembly.links(config, self._poller)
-            self._engine = self._started_engine(links.routes)
+                links = assembly.links(config, memories, self._poller)
+            self._engine = self._started_engine(links)
+            self._passages = links.passages
             undo.callback(self._engine.stop)
             if self._poller is not None:
                 for device in devices:
@@ -272,11 +273,11 @@ class _Running:
                 undo.callback(sockets[name].close)
         return sockets
 
-    def _started_engine(self, routes: Mapping[str, _core.Route]) -> _core.Engine:
+    def _started_engine(self, links: assembly.Links) -> _core.Engine:
         config = self._config
         identity = assembly.identity(config.identity)
         return _core.Engine(
-            [assembly.listener(name, config, self._memories, routes) for name in config.listeners],
+            [assembly.listener(name, config, self._memories, links) for name in config.listeners],
             identity=identity.objects(),
             unit_names=identity.names(),
             workers=config.workers,
@@ -345,7 +346,7 @@ class _Running:
             self._add(name, own_door, foreign.factory(name, settings, own_door))
 
     def _memory_access(self, name: str) -> MemoryAccess:
-        return MemoryAccess(name, self._memories, self._audit)
+        return MemoryAccess(name, self._memories, self._audit, self._passages)
 
     def _add(
         self,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.allowed import allowed
-from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK
+from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, takes_writes
 from holdfast.config.initial import extent
 from holdfast.config.lenient import entries, integer, mapping
 from holdfast.config.memory_checks import addresses
@@ -64,6 +64,7 @@ class DeviceChecks:
 
     def _device(self, path: KeyPath, device: dict[Any, Any]) -> None:
         self._polling(path, device)
+        self._passing(path, device)
         if "max_gap" in device and "cost" in device:
             message = "found together with max_gap, allowed: only one of them"
             self.report.add((*path, "cost"), message, of_key=True)
@@ -92,6 +93,18 @@ class DeviceChecks:
         for key in _OF_POLLING:
             if device.get(key):
                 self.report.doubt((*path, key), "has no effect: the device has no reads")
+
+    def _passing(self, path: KeyPath, device: dict[Any, Any]) -> None:
+        """Warns about writes that can't be passed on to the device."""
+        passes = device.get("writes") == "pass"
+        if device.get("emulate") is True and not passes:
+            self.report.doubt((*path, "emulate"), "has no effect without writes: pass")
+        reads = [mapping(read) for read in entries(device.get("reads"))]
+        if passes and not any(
+            takes_writes(read.get("area"), mapping(read.get("into")).get("area")) for read in reads
+        ):
+            message = "pass has no effect: no coils are read into coils, and no holding registers"
+            self.report.doubt((*path, "writes"), f"{message} into holding registers")
 
     def _ranges(self, path: KeyPath, ranges: object) -> list[tuple[KeyPath, object, range]]:
         """The valid ranges, each with its path and its area."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, Strict
 
@@ -24,7 +24,10 @@ from holdfast.config.scalars import (
     whole_number,
 )
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
-from holdfast.types import Area, RegisterArea
+from holdfast.types import WRITABLE_AREAS, Area, RegisterArea
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 MIN_INTERVAL = 0.01
 STATUS_BLOCK = 30
@@ -174,6 +177,11 @@ def tolerating(target: Target, tolerance: ToleranceConfig | None) -> Target:
     return replace(target, tolerance=Tolerance(**tolerance.model_dump()))
 
 
+def takes_writes(area: object, into: object) -> bool:
+    """Whether Modbus clients can write what is read from one area into the other."""
+    return area == into and area in WRITABLE_AREAS
+
+
 def _max_gap(data: dict[str, Any]) -> int | None:
     return 0 if data["cost"] is None else None
 
@@ -187,8 +195,10 @@ class DeviceConfig(Model):
     """The URL of the device, or of the gateway in front of it."""
     unit: UnitId
     """The unit id, 0 to 255; on a serial line 1 to 247."""
-    writes: Literal["refuse", "local"] = "refuse"
-    """Writes into ranges that its reads go into: refused, or kept until the next poll."""
+    writes: Literal["refuse", "pass", "local"] = "refuse"
+    """Writes into what it is read into: refused, sent to it, or kept until the next poll."""
+    emulate: bool = False
+    """With writes: pass, whether function 22 is sent as a read and function 6."""
     enabled: bool = True
     """Whether it is used."""
     interval: Annotated[Interval | None, NotNull()] = None
@@ -226,6 +236,14 @@ class DeviceConfig(Model):
     def target(self) -> Target:
         """The parts of the URL."""
         return tolerating(parse(self.url), self.tolerance)
+
+    @property
+    def passed(self) -> Iterator[tuple[ReadConfig, DestinationConfig]]:
+        """The reads whose destination takes writes for the device."""
+        if self.enabled and self.writes == "pass":
+            for read in self.reads:
+                if read.into is not None and takes_writes(read.area, read.into.area):
+                    yield read, read.into
 
     @property
     def is_polled(self) -> bool:

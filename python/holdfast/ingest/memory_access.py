@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast import _core, logs
+from holdfast.protocol import EXCEPTIONS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from holdfast._core import Memory
+    from holdfast._core import Memory, Passage
     from holdfast.ingest.audit import Audit
 
 MAX_SHOWN = 40
@@ -103,13 +104,24 @@ class MemoryAccess:
     """Reads and writes memories for one adapter. Thread-safe."""
 
     def __init__(
-        self, name: str, memories: Mapping[str, Memory], audit: Audit | None = None
+        self,
+        name: str,
+        memories: Mapping[str, Memory],
+        audit: Audit | None = None,
+        passages: Mapping[str, Passage] | None = None,
     ) -> None:
+        """`passages`: the memories whose ranges are written through to devices."""
         self.name = name
         self.memories = memories
         self._audit = audit
+        self._passages = passages or {}
         self._counts = Counts()
         self._lock = threading.Lock()
+
+    @property
+    def may_wait(self) -> bool:
+        """Whether a write can take as long as a device needs to answer."""
+        return bool(self._passages)
 
     def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
         """Carries out JSON: one command, or an array of commands. Raises `Refused`."""
@@ -195,7 +207,10 @@ class MemoryAccess:
             )
         except _core.BatchRefused as refused:
             command = batch[refused.command]
-            raise self._refused(command, refused, None if single else refused.command) from None
+            device = self._device(command) if single and refused.reason == "mirrored" else None
+            if device is None:
+                raise self._refused(command, refused, None if single else refused.command) from None
+            values = self._pass(command, device)
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
@@ -213,6 +228,27 @@ class MemoryAccess:
                     outcome="done",
                 )
         return Written(len(batch), values, batch[0]["memory"] if single else None)
+
+    def _device(self, command: Mapping[str, Any]) -> str | None:
+        """The device that takes a write, if its range is written through to one."""
+        passage = self._passages.get(command["memory"])
+        count = len(_values(command))
+        return passage and passage.device_of(command["area"], command["address"], count)
+
+    def _pass(self, command: Mapping[str, Any], device: str) -> int:
+        """Writes to a device. Returns the number of values. Raises `Refused`."""
+        memory, area, address = command["memory"], command["area"], command["address"]
+        where = _where(None, memory, area, address)
+        values = [int(value) for value in _values(command)]
+        try:
+            code = self._passages[memory].write(area, address, values)
+        except ValueError as error:
+            raise Refused("out_of_range", f"{error}, in one write to {device}", **where) from None
+        if code == 0:
+            return len(values)
+        name = EXCEPTIONS.get(code, "unknown")
+        detail = f"{device} did not take the write: exception {code:02X} ({name})"
+        raise Refused("device_refused", detail, **where)
 
     def _checked(self, command: object, grant: Grant, index: int | None) -> Write:
         """Checks a command, except its range and its values, which native code checks."""

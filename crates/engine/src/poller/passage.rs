@@ -140,17 +140,43 @@ impl Passage {
             })
     }
 
-    /// Sends such a request on its way. Returns the name of the device too.
+    /// Sends such a request of a client on its way. Returns the name of the device too.
     ///
     /// # Errors
     /// The exception to refuse it with: the memory is sealed, the request touches more than one range,
     /// too many wait, or the poller has stopped.
     pub(crate) fn ask(&self, pdu: &[u8]) -> Result<(Arc<str>, Coming), ExceptionCode> {
-        let request = Request::parse(pdu)?;
-        let (written, read) = touched(&request).ok_or(ExceptionCode::IllegalFunction)?;
+        Request::parse(pdu)?;
         if self.memory.sealed() {
             return Err(ExceptionCode::ServerDeviceBusy);
         }
+        self.pass(pdu)
+    }
+
+    /// The device that a range of the memory is read from, if one write can change it.
+    pub fn device_of(&self, area: Area, address: u16, count: u32) -> Option<&str> {
+        let items = Items { area, address, count };
+        let range = self.ranges.iter().find(|range| items.is_in(range));
+        range.map(|range| &*range.device)
+    }
+
+    /// Sends a write that is not of a Modbus client, and waits for the answer of the device.
+    ///
+    /// # Errors
+    /// The code of the exception: of the device, or as for clients.
+    pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
+        let encoded = EncodedRequest::new(request);
+        let (_, coming) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
+        match coming.blocking_recv().as_deref() {
+            Ok([function, code]) if function & 0x80 != 0 => Err(*code),
+            Ok(_) => Ok(()),
+            Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),
+        }
+    }
+
+    fn pass(&self, pdu: &[u8]) -> Result<(Arc<str>, Coming), ExceptionCode> {
+        let request = Request::parse(pdu)?;
+        let (written, read) = touched(&request).ok_or(ExceptionCode::IllegalFunction)?;
         let is_whole = |range: &&PassedRange| {
             written.is_in(range) && read.is_none_or(|read| read.is_in(range))
         };

@@ -5,6 +5,8 @@ The memory access checks everything about memories. A request that is refused he
 
 from __future__ import annotations
 
+import asyncio
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qsl
 
@@ -138,9 +140,9 @@ class App:
         grant = self._authorize(request)
         request.check_json()
         body = await request.body(self._max_body)
-        return JSON, msgspec.json.encode(
-            self._memory_access.ingest(body, grant, request.peer).answer()
-        )
+        ingest = partial(self._memory_access.ingest, body, grant, request.peer)
+        written = await asyncio.to_thread(ingest) if self._memory_access.may_wait else ingest()
+        return JSON, msgspec.json.encode(written.answer())
 
     def _read(self, request: Request) -> Answer:
         grant = self._authorize(request)

@@ -54,6 +54,12 @@ REFUSALS = Refusals(
         "the body has more than 8388608 bytes",
     ),
     Refusal(
+        502,
+        ("device_refused",),
+        "The range is written through to a device, which refused the write or did not answer",
+        "drive_7 did not take the write: exception 02 (Illegal Data Address)",
+    ),
+    Refusal(
         415,
         ("not_json",),
         "The body is not `application/json`, or is compressed",
@@ -67,4 +73,4 @@ QUERY = ("malformed",)
 MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 """Refusals of a range by the memory access."""
 
-VALUES = ("invalid_value", "mirrored")
+VALUES = ("invalid_value", "mirrored", "device_refused")

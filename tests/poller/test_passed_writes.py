@@ -1,0 +1,262 @@
+"""Writes into ranges that mirror a device, passed on to the device (`writes: pass`)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from support import web, wire
+from support.fake_device import Asked, Stream, exception, good
+from support.polled import configuration, counters, device, read, until_polled
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from holdfast.appliance import Appliance
+    from support.fake_device import Behaviour
+    from support.running import Run
+
+SOURCES = ["127.0.0.1"]
+RULE = {"sources": SOURCES, "units": {1: "mirror"}, "access": "read-write"}
+MORE: dict[str, Any] = {
+    "listeners": {
+        "scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": [RULE]},
+        "datagrams": {"type": "modbus-udp", "bind": "127.0.0.1:0", "rules": [RULE]},
+    },
+    "rest": {"bind": "127.0.0.1:0", "sources": SOURCES, "tokens": "none"},
+}
+READS = [
+    read("holding_registers", 500, 3, ("holding_registers", 10)),
+    read("holding_registers", 600, 2, ("holding_registers", 13)),
+    read("coils", 0, 8, ("coils", 100)),
+    read("input_registers", 0, 2, ("holding_registers", 40)),
+]
+"""The device's registers 500 to 502 and 600 to 601 are 10 to 14 of the mirror, its coils 0 to 7 are
+100 to 107, and its input registers 0 and 1 are holding registers 40 and 41."""
+
+RARELY: dict[str, Any] = {"interval": 3600, "writes": "pass"}
+
+
+def plc(then: Behaviour = good) -> Stream:
+    return Stream("tcp", then=then)
+
+
+def started(run: Run, source: Stream, **settings: Any) -> Appliance:
+    meter = device(source.url, *READS, **{**RARELY, **settings})
+    appliance = run(configuration({"meter": meter}, **MORE))
+    until_read(appliance)
+    return appliance
+
+
+def until_read(appliance: Appliance) -> None:
+    """Waits until the mirror has all that is read at the start."""
+    wire.until(lambda: counters(appliance, "meter")["reads"] >= len(READS), "all is read")
+
+
+def client(appliance: Appliance, listener: str = "scada") -> holdfast.SyncClient:
+    host, port = endpoint(appliance, listener)
+    scheme = "udp" if listener == "datagrams" else "tcp"
+    return holdfast.SyncClient(f"{scheme}://{host}:{port}", timeout=wire.DEADLINE)
+
+
+@contextlib.contextmanager
+def refused_with(code: int) -> Iterator[None]:
+    with pytest.raises(holdfast.ModbusException) as raised:
+        yield
+    assert raised.value.code == code
+
+
+def requests_of(source: Stream) -> list[bytes]:
+    return [asked.pdu for asked in source.requests]
+
+
+def writes_of(source: Stream) -> list[bytes]:
+    return [pdu for pdu in requests_of(source) if pdu[0] > 4]
+
+
+WRITES: dict[str, tuple[Callable[[holdfast.SyncClient], object], bytes, list[int]]] = {
+    "function 6": (lambda plc: plc.write_register(11, 7), b"\x06\x01\xf5\x00\x07", [500, 7, 502]),
+    "function 16": (
+        lambda plc: plc.write_registers(10, [1, 2]),
+        b"\x10\x01\xf4\x00\x02\x04\x00\x01\x00\x02",
+        [1, 2, 502],
+    ),
+    "function 22": (
+        lambda plc: plc.mask_write(12, and_mask=0xFF00, or_mask=0x0011),
+        b"\x16\x01\xf6\xff\x00\x00\x11",
+        [500, 501, 0x0111],
+    ),
+    "function 23": (
+        lambda plc: plc.read_write(10, 3, 11, [9]),
+        b"\x17\x01\xf4\x00\x03\x01\xf5\x00\x01\x02\x00\x09",
+        [500, 9, 502],
+    ),
+}
+
+
+@pytest.mark.parametrize("listener", ["scada", "datagrams"])
+@pytest.mark.parametrize("name", WRITES)
+def test_a_write_reaches_the_device_and_then_memory(name: str, listener: str, run: Run) -> None:
+    write, sent, after = WRITES[name]
+    with plc() as source:
+        appliance = started(run, source)
+        with client(appliance, listener) as scada:
+            result = write(scada)
+            assert scada.read_holding_registers(10, 3) == after
+        assert writes_of(source) == [sent]
+        assert result in (None, after)
+
+
+def test_coils_reach_the_device_and_then_memory(run: Run) -> None:
+    with plc() as source:
+        appliance = started(run, source)
+        with client(appliance) as scada:
+            scada.write_coil(103, True)
+            scada.write_coils(105, [True, True])
+            assert scada.read_coils(100, 8) == [0, 0, 0, 1, 0, 1, 1, 0]
+        assert writes_of(source) == [b"\x05\x00\x03\xff\x00", b"\x0f\x00\x05\x00\x02\x01\x03"]
+
+
+def test_function_22_can_be_a_read_and_a_write(run: Run) -> None:
+    with plc() as source:
+        appliance = started(run, source, emulate=True)
+        asked = len(source.requests)
+        with client(appliance) as scada:
+            scada.mask_write(12, and_mask=0xFF00, or_mask=0x0011)
+            assert scada.read_holding_registers(12, 1) == [0x0111]
+        assert requests_of(source)[asked:] == [b"\x03\x01\xf6\x00\x01", b"\x06\x01\xf6\x01\x11"]
+
+
+def test_what_is_read_from_input_registers_is_never_written(run: Run) -> None:
+    with plc() as source:
+        appliance = started(run, source)
+        with client(appliance) as scada, refused_with(2):
+            scada.write_register(40, 1)
+        assert writes_of(source) == []
+
+
+MIXED: dict[str, Callable[[holdfast.SyncClient], object]] = {
+    "two ranges": lambda plc: plc.write_registers(12, [1, 1]),
+    "a range and what is before it": lambda plc: plc.write_registers(9, [1, 1]),
+    "all": lambda plc: plc.write_registers(0, [1] * 50),
+    "a write in a range, a read beyond it": lambda plc: plc.read_write(9, 2, 10, [1]),
+}
+
+
+@pytest.mark.parametrize("write", MIXED.values(), ids=MIXED)
+def test_a_write_of_more_than_one_range_is_refused(
+    write: Callable[[holdfast.SyncClient], object], run: Run
+) -> None:
+    with plc() as source:
+        appliance = started(run, source)
+        with client(appliance) as scada:
+            with refused_with(2):
+                write(scada)
+            assert scada.read_holding_registers(9, 6) == [0, 500, 501, 502, 600, 601]
+        assert writes_of(source) == []
+
+
+def refuse_writes(asked: Asked) -> None:
+    asked.answer(exception(asked.pdu, 4) if asked.pdu[0] > 4 else None)
+
+
+def ignore_writes(asked: Asked) -> None:
+    if asked.pdu[0] <= 4:
+        asked.answer()
+
+
+def test_the_client_gets_the_exception_of_the_device(run: Run) -> None:
+    with plc(refuse_writes) as source:
+        appliance = started(run, source)
+        with client(appliance) as scada:
+            with refused_with(4):
+                scada.write_register(11, 7)
+            assert scada.read_holding_registers(11, 1) == [501]
+
+
+def test_a_device_that_does_not_answer_is_exception_11(run: Run) -> None:
+    with plc(ignore_writes) as source:
+        appliance = started(run, source, timeout=0.2)
+        with client(appliance) as scada:
+            with refused_with(11):
+                scada.write_register(11, 7)
+            assert scada.read_holding_registers(11, 1) == [501]
+
+
+def test_a_device_that_has_gone_is_exception_10(run: Run) -> None:
+    with plc() as source:
+        appliance = started(run, source)
+    with client(appliance) as scada:
+        for _ in range(3):
+            with pytest.raises(holdfast.ModbusException) as raised:
+                scada.write_register(11, 7)
+        assert raised.value.code == 10
+        assert scada.read_holding_registers(11, 1) == [501]
+
+
+def test_a_sealed_memory_passes_nothing_on(run: Run) -> None:
+    with plc() as source:
+        meter = device(source.url, *READS, **RARELY)
+        text = configuration({"meter": meter}, **MORE)
+        sealed = text.replace('"coils":', '"seal": {"area": "coils", "address": 0}, "coils":', 1)
+        assert sealed != text
+        appliance = run(sealed)
+        until_read(appliance)
+        with client(appliance) as scada, refused_with(6):
+            scada.write_register(11, 7)
+        assert writes_of(source) == []
+
+
+def test_a_read_that_takes_several_requests_keeps_what_was_written_meanwhile(run: Run) -> None:
+    with plc() as source:
+        wide = read("holding_registers", 0, 400, ("holding_registers", 0))
+        meter = device(source.url, wide, interval=0.01, writes="pass")
+        appliance = run(configuration({"meter": meter}, **MORE))
+        until_polled(appliance, "meter")
+        mirror = appliance.memories["mirror"]
+        with client(appliance) as scada:
+            for value in range(300):
+                scada.write_register(5, value)
+                for _ in range(5):
+                    assert mirror.read("holding_registers", 5, 1) == [value]
+                    assert scada.read_holding_registers(5, 1) == [value]
+
+
+def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
+    with plc() as source:
+        appliance = started(run, source)
+        rest = web.Client(endpoint(appliance, "rest"))
+        with contextlib.closing(rest):
+            done = rest.ingest(web.command("holding_registers", 10, [3, 4], "mirror"))
+            both = rest.ingest(web.command("holding_registers", 12, [3, 4], "mirror"))
+        assert (done.status, done.json["written"]) == (200, 2)
+        assert writes_of(source) == [b"\x10\x01\xf4\x00\x02\x04\x00\x03\x00\x04"]
+        assert appliance.memories["mirror"].read("holding_registers", 10, 3) == [3, 4, 502]
+        assert (both.status, both.json["reason"]) == (409, "mirrored")
+    with plc(refuse_writes) as source:
+        appliance = started(run, source)
+        rest = web.Client(endpoint(appliance, "rest"))
+        with contextlib.closing(rest):
+            refused = rest.ingest(web.command("holding_registers", 10, [3], "mirror"))
+        assert (refused.status, refused.json["reason"]) == (502, "device_refused")
+        assert "meter did not take the write: exception 04" in refused.json["detail"]
+
+
+def test_the_audit_log_names_the_device(run: Run, tmp_path: Path) -> None:
+    log = tmp_path / "audit.jsonl"
+    with plc() as source:
+        meter = device(source.url, *READS, **RARELY)
+        appliance = run(configuration({"meter": meter}, **MORE, audit={"file": str(log)}))
+        until_read(appliance)
+        with client(appliance) as scada:
+            scada.write_register(11, 7)
+        appliance.stop()
+    (line,) = [json.loads(line) for line in log.read_text().splitlines()]
+    told = [line[key] for key in ("route", "unit", "address", "outcome")]
+    assert told == ["meter", 1, 11, "done"]
