@@ -8,6 +8,7 @@ CRATES := --workspace --exclude holdfast-binding
 PROTOCOL := -p holdfast-protocol
 NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
+PEERS := tests/peers/drivers
 
 .PHONY: run test lint no-std format bench docs lock clean
 .DELETE_ON_ERROR:
@@ -68,6 +69,8 @@ lock: .venv/dev.stamp
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	cargo update
 	cargo update --manifest-path $(NO_STD)
+	cd $(PEERS)/node && npm install --package-lock-only --ignore-scripts
+	cd $(PEERS)/go && go mod tidy
 
 clean:
 	rm -rf .venv target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

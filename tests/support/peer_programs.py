@@ -1,0 +1,155 @@
+"""The drivers of peers: how each is built, and how it is run as a client or a server.
+
+A driver is a program in `tests/peers/drivers` with two forms:
+
+    DRIVER client URL UNIT    executes operations: JSON lines on standard input, a result for each
+    DRIVER server URL         prints its port (0 on a serial line), and serves until it is killed
+
+What a driver needs is downloaded once, by the package manager of its language, with the versions
+and check sums of a lock file. It is kept in `.cache/peers`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from support.machine import missing, tool
+from support.paths import ROOT, TESTS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+DRIVERS = TESTS / "peers" / "drivers"
+CACHE = ROOT / ".cache" / "peers"
+
+TIMEOUT = 60.0
+"""Seconds that a driver has for all its operations."""
+BUILD_TIMEOUT = 600.0
+
+
+@dataclass(frozen=True)
+class Driver:
+    """The command that runs a driver, with its working directory and further environment."""
+
+    command: tuple[str, ...]
+    folder: Path = TESTS
+    environment: dict[str, str] = field(default_factory=dict)
+
+    def results(
+        self, url: str, unit: int, operations: Sequence[dict[str, Any]]
+    ) -> list[dict[str, Any]]:
+        """Runs the driver as a client, and returns the result of each operation."""
+        ran = subprocess.run(
+            [*self.command, "client", url, str(unit)],
+            cwd=self.folder,
+            env=os.environ | self.environment,
+            input="".join(f"{json.dumps(operation)}\n" for operation in operations),
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT,
+            check=False,
+        )
+        assert ran.returncode == 0, f"{ran.stdout}{ran.stderr}"
+        return [json.loads(line) for line in ran.stdout.splitlines()]
+
+    @contextlib.contextmanager
+    def serving(self, url: str) -> Iterator[int]:
+        """Runs the driver as a server, and returns its port."""
+        with subprocess.Popen(
+            [*self.command, "server", url],
+            cwd=self.folder,
+            env=os.environ | self.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as process:
+            try:
+                assert process.stdout is not None
+                line = process.stdout.readline()
+                assert line.strip().isdigit(), f"the server printed {line!r} in place of its port"
+                yield int(line)
+            finally:
+                process.kill()
+
+
+def python(name: str) -> Driver:
+    """A driver in Python. Its packages are those of `requirements/dev.lock`."""
+    return Driver((sys.executable, "-m", f"peers.drivers.{name}"))
+
+
+def node(name: str) -> Driver:
+    """A driver for Node.js, with the packages of `package-lock.json`."""
+    return Driver(
+        (tool("node"), str(DRIVERS / "node" / f"{name}.cjs")),
+        environment={"NODE_PATH": str(node_modules())},
+    )
+
+
+@functools.cache
+def node_modules() -> Path:
+    npm = tool("npm")
+    files = [DRIVERS / "node" / "package.json", DRIVERS / "node" / "package-lock.json"]
+
+    def install(folder: Path) -> None:
+        for file in files:
+            shutil.copy(file, folder)
+        # Scripts would compile serial ports, which are there as compiled files.
+        built([npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"], folder)
+
+    return made("node", files, install) / "node_modules"
+
+
+@functools.cache
+def go() -> Driver:
+    """The driver in Go, with the modules of `go.sum`."""
+    compiler = tool("go")
+    source = DRIVERS / "go"
+
+    def install(folder: Path) -> None:
+        options = {"GOTOOLCHAIN": "local", "GOFLAGS": "-mod=readonly"}
+        built([compiler, "build", "-o", str(folder / "driver"), "."], source, options)
+
+    return Driver((str(made("go", sorted(source.iterdir()), install) / "driver"),))
+
+
+def made(name: str, sources: Sequence[Path], install: Callable[[Path], None]) -> Path:
+    """Returns the folder made from these files. It is made once, and is complete or absent."""
+    digest = hashlib.sha256()
+    for source in sources:
+        digest.update(f"{source.name}\0".encode() + source.read_bytes())
+    folder = CACHE / f"{name}-{digest.hexdigest()[:16]}"
+    if not folder.exists():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=CACHE, prefix=f"{name}-") as building:
+            whole = Path(building) / "whole"
+            whole.mkdir()
+            install(whole)
+            with contextlib.suppress(FileExistsError):
+                whole.rename(folder)
+    return folder
+
+
+def built(command: Sequence[str], folder: Path, environment: dict[str, str] | None = None) -> None:
+    """Runs a package manager or compiler. Without its packages, tests are skipped."""
+    ran = subprocess.run(
+        command,
+        cwd=folder,
+        env=os.environ | (environment or {}),
+        capture_output=True,
+        text=True,
+        timeout=BUILD_TIMEOUT,
+        check=False,
+    )
+    if ran.returncode != 0:
+        missing(f"what `{' '.join(command)}` makes: {ran.stdout[-2000:]}{ran.stderr[-2000:]}")
