@@ -40,6 +40,16 @@ def go_versions() -> dict[str, str]:
     return dict(re.findall(r"github\.com/(\S+) v(\S+)", text))
 
 
+def java_versions() -> dict[str, str]:
+    """The versions of the direct dependencies."""
+    found = re.findall(
+        r"<groupId>(\S+)</groupId>\s*<artifactId>(\S+)</artifactId>\s*<version>(\S+)</version>",
+        (DRIVERS / "java" / "pom.xml").read_text(),
+    )
+    versions = {artifact: version for _, artifact, version in found}
+    return versions | {"digitalpetri/modbus": versions["modbus-tcp"]}
+
+
 @pytest.mark.parametrize(
     ("peer", "locked"),
     [
@@ -48,6 +58,8 @@ def go_versions() -> dict[str, str]:
         ("MinimalModbus", python_versions),
         ("jsmodbus", node_versions),
         ("modbus-serial", node_versions),
+        ("j2mod", java_versions),
+        ("digitalpetri/modbus", java_versions),
         ("simonvetter/modbus", go_versions),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

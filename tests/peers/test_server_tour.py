@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from support.peer_programs import Driver
+    from support.pymodbus_server import PastEnd
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class Server:
     schemes: tuple[str, ...]
     lacks: Mapping[int, int | None] = field(default_factory=dict)
     """Functions that it lacks: the exception code of its reply, or nothing if it does not reply."""
-    checks: bool = True
-    """Whether it answers exception 02 where an area ends; else it returns fewer values."""
+    past_end: PastEnd = "exception"
+    """What it answers where an area ends."""
     max_written: Mapping[str, int] = field(default_factory=dict)
     """How many registers it accepts in a write, if fewer than 123, by transport."""
     identity: bool = True
@@ -47,11 +48,24 @@ SERVERS = {
         lambda: programs.node("jsmodbus"),
         ("tcp", "rtu"),
         {22: None, 23: None},
-        checks=False,
+        past_end="fewer values",
         max_written={"rtu": 120},
         identity=False,
     ),
     "modbus-serial": Server(lambda: programs.node("modbus-serial"), ("tcp", "rtu"), {22: 1, 23: 1}),
+    "j2mod": Server(
+        lambda: programs.java("J2mod"),
+        ("tcp", "udp", "rtu+tcp"),
+        max_written={"udp": 121},
+        identity=False,
+    ),
+    "digitalpetri/modbus": Server(
+        lambda: programs.java("DigitalPetri"),
+        ("tcp", "rtu+tcp"),
+        past_end="all addresses",
+        max_written={"rtu+tcp": 63},
+        identity=False,
+    ),
     "simonvetter/modbus": Server(programs.go, ("tcp",), {22: 1, 23: 1}, identity=False),
 }
 PAIRS = [(name, scheme) for name, server in SERVERS.items() for scheme in server.schemes]
@@ -83,7 +97,7 @@ def test_a_server_is_asked_everything(running: tuple[Server, str], dial: Dial) -
     client = dial(url)
 
     most = server.max_written.get(url.split(":")[0], 123)
-    tour(client, server.lacks, checks=server.checks, max_written=most)
+    tour(client, server.lacks, past_end=server.past_end, max_written=most)
 
     if server.identity:
         who = client.identify()

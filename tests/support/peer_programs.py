@@ -37,6 +37,8 @@ TIMEOUT = 60.0
 """Seconds that a driver has for all its operations."""
 BUILD_TIMEOUT = 600.0
 
+COPY_JARS = "org.apache.maven.plugins:maven-dependency-plugin:3.6.1:copy-dependencies"
+
 
 @dataclass(frozen=True)
 class Driver:
@@ -121,6 +123,32 @@ def go() -> Driver:
         built([compiler, "build", "-o", str(folder / "driver"), "."], source, options)
 
     return Driver((str(made("go", sorted(source.iterdir()), install) / "driver"),))
+
+
+def java(name: str) -> Driver:
+    """A driver in Java, with the packages of `pom.xml`."""
+    classes = java_classes()
+    path = os.pathsep.join([str(classes), str(classes / "jars" / "*")])
+    # A driver runs for a second: compiling it to fast code takes longer than it saves.
+    return Driver((tool("java"), "-XX:TieredStopAtLevel=1", "-Xshare:auto", "-cp", path, name))
+
+
+@functools.cache
+def java_classes() -> Path:
+    """The compiled drivers, with `jars` as a folder beside them."""
+    maven, compiler = tool("mvn"), tool("javac")
+    source = DRIVERS / "java"
+
+    def install(folder: Path) -> None:
+        jars = folder / "jars"
+        built([maven, "-q", "-B", COPY_JARS, f"-DoutputDirectory={jars}"], source)
+        found = {jar.name: hashlib.sha256(jar.read_bytes()).hexdigest() for jar in jars.iterdir()}
+        lines = (source / "jars.sha256").read_text().splitlines()
+        assert found == {name: digest for digest, name in map(str.split, lines)}
+        files = map(str, sorted(source.glob("*.java")))
+        built([compiler, "-nowarn", "-d", str(folder), "-cp", f"{jars}/*", *files], source)
+
+    return made("java", sorted(source.iterdir()), install)
 
 
 def made(name: str, sources: Sequence[Path], install: Callable[[Path], None]) -> Path:

@@ -203,15 +203,19 @@ TOUR = [*READS, *WRITES, *MORE, *EXCEPTIONS]
 
 READ_ONLY = [
     Step("read", reading(INPUT, 5, 2), Values([5, 6])),
-    Step("write coil", writing(COIL, 0, 1), Refusal(1)),
-    Step("write register", writing(REGISTER, 0, 1), Refusal(1)),
-    Step("write coils", writing(ALL_COILS, 0, [1, 1]), Refusal(1)),
-    Step("write registers", writing(REGISTERS, 0, [1, 2]), Refusal(1)),
-    Step("mask write", mask(0, 0, 0), Refusal(1)),
-    Step("read and write", both(0, 1, 0, [1]), Refusal(1)),
+    Step("refused write coil", writing(COIL, 0, 1), Refusal(1)),
+    Step("refused write register", writing(REGISTER, 0, 1), Refusal(1)),
+    Step("refused write coils", writing(ALL_COILS, 0, [1, 1]), Refusal(1)),
+    Step("refused write registers", writing(REGISTERS, 0, [1, 2]), Refusal(1)),
+    Step("refused mask write", mask(0, 0, 0), Refusal(1)),
+    Step("refused read and write", both(0, 1, 0, [1]), Refusal(1)),
     Step("read again", reading(HOLDING, 0, 2), Values([0, 0])),
 ]
 """What a client gets from a listener with read-only access."""
+
+
+ELSEWHERE = [Step("a unit that is not there", reading(HOLDING, 0, 1), Refusal(11))]
+"""What a client gets for a unit id that is not mapped."""
 
 
 def filled(memory: holdfast.Memory) -> None:
@@ -222,13 +226,19 @@ def filled(memory: holdfast.Memory) -> None:
 
 def written(calls: Collection[str], differences: Mapping[str, Outcome]) -> dict[Area, list[int]]:
     """What the coils and holding registers hold after the tour of a client."""
+
+    def done(name: str) -> bool:
+        return not isinstance(differences.get(name), Refusal)
+
     coils, registers = [0] * 65536, [0] * 65536
     coils[65535] = 1
-    coils[3:14] = BITS
-    coils[100:2068] = third(0, 1968)
+    if done("write 11 coils"):
+        coils[3:14] = BITS
+    if done("write 1968 coils"):
+        coils[100:2068] = third(0, 1968)
     registers[0], registers[65535] = 4711, 65535
     registers[10:17] = WORDS
-    if not isinstance(differences.get("write 123 registers"), Refusal):
+    if done("write 123 registers"):
         registers[65400:65523] = range(1000, 1123)
     registers[200] = 0x12
     if MASK in calls:

@@ -6,7 +6,7 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from pymodbus import FramerType
@@ -23,6 +23,8 @@ Identity: Any = ModbusDeviceIdentification
 
 LONG = {"ModelName": "m" * 200, "UserApplicationName": "u" * 200}
 """Two objects that do not fit into one reply."""
+
+PastEnd = Literal["exception", "fewer values", "all addresses"]
 
 FRAMERS = {
     "tcp": FramerType.SOCKET,
@@ -93,14 +95,14 @@ def tour(
     client: Face,
     lacks: Mapping[int, int | None] = MappingProxyType({}),
     *,
-    checks: bool = True,
+    past_end: PastEnd = "exception",
     max_written: int = 123,
 ) -> None:
     """Calls every function that reads or writes, and provokes an exception.
 
     `lacks` has functions that the server lacks, with the exception code of its reply, or nothing if
-    it does not reply. `checks` says whether the server answers exception 02 after its last address:
-    if not, its reply has fewer values. It accepts up to `max_written` registers in a request.
+    it does not reply. `past_end` says what it answers past its last address: exception 02, fewer
+    values, or it has all addresses. It accepts up to `max_written` registers in a request.
     """
     assert client.read_input_registers(5, 125) == list(range(5, 130))
     assert client.read_input_registers(0, 1000) == list(range(1000))
@@ -138,10 +140,10 @@ def tour(
         client.write("holding_registers", 12, True, "bit:9")
         assert client.read_holding_registers(12, 1) == [1 << 9]
 
-    if checks:
+    if past_end == "exception":
         _refused(2, lambda: client.read_holding_registers(1000, 1))
         _refused(2, lambda: client.write_registers(999, [1, 2]))
-    else:
+    elif past_end == "fewer values":
         with pytest.raises(holdfast.InvalidResponse, match="does not match the request"):
             client.read_holding_registers(1000, 1)
 
