@@ -24,6 +24,7 @@ test: .venv/core.stamp .venv/dev.stamp
 lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
 	cargo fmt --check --manifest-path $(NO_STD)
+	cargo fmt --check --manifest-path $(PEERS)/rust/Cargo.toml
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
@@ -48,6 +49,7 @@ no-std:
 format: .venv/dev.stamp
 	cargo fmt
 	cargo fmt --manifest-path $(NO_STD)
+	cargo fmt --manifest-path $(PEERS)/rust/Cargo.toml
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
@@ -69,6 +71,7 @@ lock: .venv/dev.stamp
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	cargo update
 	cargo update --manifest-path $(NO_STD)
+	cargo update --manifest-path $(PEERS)/rust/Cargo.toml
 	cd $(PEERS)/node && npm install --package-lock-only --ignore-scripts
 	cd $(PEERS)/go && go mod tidy
 

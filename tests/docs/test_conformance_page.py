@@ -40,6 +40,11 @@ def go_versions() -> dict[str, str]:
     return dict(re.findall(r"github\.com/(\S+) v(\S+)", text))
 
 
+def rust_versions() -> dict[str, str]:
+    lock = (DRIVERS / "rust" / "Cargo.lock").read_text()
+    return dict(re.findall(r'name = "(\S+)"\nversion = "(\S+)"', lock))
+
+
 def java_versions() -> dict[str, str]:
     """The versions of the direct dependencies."""
     found = re.findall(
@@ -60,6 +65,7 @@ def java_versions() -> dict[str, str]:
         ("modbus-serial", node_versions),
         ("j2mod", java_versions),
         ("digitalpetri/modbus", java_versions),
+        ("tokio-modbus", rust_versions),
         ("simonvetter/modbus", go_versions),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from support.peer_tour import Outcome
 
 
+# The first test of a peer may have to download and compile its driver.
+pytestmark = pytest.mark.timeout(900)
+
+
 @dataclass(frozen=True)
 class Client:
     """A client of others."""
@@ -119,6 +123,13 @@ CLIENTS = {
         lambda: programs.java("DigitalPetri"),
         dict.fromkeys(["tcp", "rtu+tcp"], tour.BASIC | {tour.MASK, tour.BOTH}),
         differences_on={"rtu+tcp": NO_EXCEPTIONS},
+    ),
+    "tokio-modbus": Client(
+        programs.rust,
+        dict.fromkeys(
+            ["tcp", "rtu+tcp"],
+            tour.BASIC | {tour.MASK, tour.BOTH, tour.IDENTIFY},
+        ),
     ),
     "simonvetter/modbus": Client(
         programs.go,

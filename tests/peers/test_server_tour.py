@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from support.pymodbus_server import PastEnd
 
 
+# The first test of a peer may have to download and compile its driver.
+pytestmark = pytest.mark.timeout(900)
+
+
 @dataclass(frozen=True)
 class Server:
     """A server of others."""
@@ -66,6 +70,7 @@ SERVERS = {
         max_written={"rtu+tcp": 63},
         identity=False,
     ),
+    "tokio-modbus": Server(programs.rust, ("tcp", "rtu+tcp"), identity=False),
     "simonvetter/modbus": Server(programs.go, ("tcp",), {22: 1, 23: 1}, identity=False),
 }
 PAIRS = [(name, scheme) for name, server in SERVERS.items() for scheme in server.schemes]

@@ -125,6 +125,22 @@ def go() -> Driver:
     return Driver((str(made("go", sorted(source.iterdir()), install) / "driver"),))
 
 
+@functools.cache
+def rust() -> Driver:
+    """The driver in Rust, with the crates of `Cargo.lock`."""
+    cargo = tool("cargo")
+    source = DRIVERS / "rust"
+    files = [source / "Cargo.toml", source / "Cargo.lock", source / "src" / "main.rs"]
+
+    def install(folder: Path) -> None:
+        target = CACHE / "rust-target"
+        options = {"CARGO_TARGET_DIR": str(target)}
+        built([cargo, "build", "--locked", "--quiet"], source, options)
+        shutil.copy(target / "debug" / "driver", folder)
+
+    return Driver((str(made("rust", files, install) / "driver"),))
+
+
 def java(name: str) -> Driver:
     """A driver in Java, with the packages of `pom.xml`."""
     classes = java_classes()
