@@ -61,6 +61,7 @@ def java_versions() -> dict[str, str]:
         ("pymodbus", python_versions),
         ("pyModbusTCP", python_versions),
         ("MinimalModbus", python_versions),
+        ("tModbus", python_versions),
         ("jsmodbus", node_versions),
         ("modbus-serial", node_versions),
         ("j2mod", java_versions),

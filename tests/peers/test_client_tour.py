@@ -83,6 +83,19 @@ CLIENTS = {
             "write 1969 coils": Error("number of coils out of range"),
         },
     ),
+    "tModbus": Client(
+        lambda: programs.python("tmodbus_client", requires=(3, 12)),
+        dict.fromkeys(["tcp", "udp", "rtu+tcp"], tour.EVERY),
+        {
+            "coils past 65535": Error("must not exceed 65536"),
+            "write coils past 65535": Error("must not exceed 65536"),
+            "write registers past 65535": Error("must not exceed 65536"),
+            "0 holding registers": Error("must be between 1 and 125"),
+            "126 holding registers": Error("must be between 1 and 125"),
+            "2001 coils": Error("must be between 1 and 2000"),
+            "write 1969 coils": Error("must be between 1 and 1968"),
+        },
+    ),
     "MinimalModbus": Client(
         lambda: programs.python("minimalmodbus_line"),
         dict.fromkeys(["rtu", "ascii"], tour.BASIC),

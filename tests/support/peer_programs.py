@@ -24,6 +24,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from support.machine import missing, tool
 from support.paths import ROOT, TESTS
 
@@ -85,8 +87,10 @@ class Driver:
                 process.kill()
 
 
-def python(name: str) -> Driver:
+def python(name: str, requires: tuple[int, int] = (3, 11)) -> Driver:
     """A driver in Python. Its packages are those of `requirements/dev.lock`."""
+    if sys.version_info < requires:
+        pytest.skip(f"{name} requires Python {'.'.join(map(str, requires))}")
     return Driver((sys.executable, "-m", f"peers.drivers.{name}"))
 
 
