@@ -76,7 +76,7 @@ lock: .venv/dev.stamp
 	cd $(PEERS)/go && go mod tidy
 
 clean:
-	rm -rf .venv target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .cache target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	rm -f python/holdfast/_core.*.so
 
 .venv/run.stamp: requirements/run.lock

@@ -151,10 +151,16 @@ CLIENTS = {
         dict.fromkeys([*CHECKS_RANGES, *BEYOND_LIMITS], Error("^unexpected parameters$")),
     ),
 }
-PAIRS = [(name, scheme) for name, client in CLIENTS.items() for scheme in client.calls]
+RUNS = [
+    (name, scheme, way)
+    for way, made in WAYS.items()
+    for name, client in CLIENTS.items()
+    for scheme in client.calls
+    if scheme in made.schemes
+]
 ROUTED = [
-    (name, scheme)
-    for name, scheme in PAIRS
+    (name, scheme, way)
+    for name, scheme, way in RUNS
     if scheme not in LINES
     and tour.steps_of(tour.ELSEWHERE, tour.EVERY, CLIENTS[name].differs(scheme))
 ]
@@ -162,26 +168,26 @@ ROUTED = [
 
 
 class Open(Protocol):
-    """Opens the target of a scheme, with some access."""
+    """Opens a target: the way to a memory, the scheme of the URL, and the access."""
 
-    def __call__(self, scheme: str, access: str = "read-write") -> Target: ...
+    def __call__(self, way: str, scheme: str, access: str = "read-write") -> Target: ...
 
 
-@pytest.fixture(params=WAYS)
-def target(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Open]:
+@pytest.fixture
+def target(tmp_path: Path) -> Iterator[Open]:
     with ExitStack() as stack:
 
-        def opened(scheme: str, access: str = "read-write") -> Target:
-            return stack.enter_context(WAYS[request.param](scheme, tmp_path, access))
+        def opened(way: str, scheme: str, access: str = "read-write") -> Target:
+            return stack.enter_context(WAYS[way].open(scheme, tmp_path, access))
 
         yield opened
 
 
-@pytest.mark.parametrize(("name", "scheme"), PAIRS, ids=map("-".join, PAIRS))
-def test_a_client_calls_every_function(name: str, scheme: str, target: Open) -> None:
+@pytest.mark.parametrize(("name", "scheme", "way"), RUNS, ids=map("-".join, RUNS))
+def test_a_client_calls_every_function(name: str, scheme: str, way: str, target: Open) -> None:
     client = CLIENTS[name]
     driver = client.driver()
-    to = target(scheme)
+    to = target(way, scheme)
     steps = tour.steps_of(tour.TOUR, client.calls[scheme], client.differs(scheme))
 
     results = driver.results(to.url, to.unit, [step.operation for step in steps])
@@ -191,13 +197,13 @@ def test_a_client_calls_every_function(name: str, scheme: str, target: Open) -> 
         assert to.memory.read(area, 0, 65536) == expected
 
 
-@pytest.mark.parametrize(("name", "scheme"), PAIRS, ids=map("-".join, PAIRS))
+@pytest.mark.parametrize(("name", "scheme", "way"), RUNS, ids=map("-".join, RUNS))
 def test_a_client_is_refused_writes_where_it_may_only_read(
-    name: str, scheme: str, target: Open
+    name: str, scheme: str, way: str, target: Open
 ) -> None:
     client = CLIENTS[name]
     driver = client.driver()
-    to = target(scheme, access="read-only")
+    to = target(way, scheme, access="read-only")
     steps = tour.steps_of(tour.READ_ONLY, client.calls[scheme], client.differs(scheme))
 
     results = driver.results(to.url, to.unit, [step.operation for step in steps])
@@ -205,10 +211,12 @@ def test_a_client_is_refused_writes_where_it_may_only_read(
     assert tour.judged(steps, results, client.differs(scheme)) == {}
 
 
-@pytest.mark.parametrize(("name", "scheme"), ROUTED, ids=map("-".join, ROUTED))
-def test_a_client_is_told_that_a_unit_is_not_there(name: str, scheme: str, target: Open) -> None:
+@pytest.mark.parametrize(("name", "scheme", "way"), ROUTED, ids=map("-".join, ROUTED))
+def test_a_client_is_told_that_a_unit_is_not_there(
+    name: str, scheme: str, way: str, target: Open
+) -> None:
     driver = CLIENTS[name].driver()
-    to = target(scheme)
+    to = target(way, scheme)
 
     results = driver.results(to.url, to.unit + 1, [step.operation for step in tour.ELSEWHERE])
 

@@ -1,6 +1,7 @@
 """What the tour of peers is addressed to: today a listener itself.
 
-`WAYS` is the one place where another way to the same memory is added.
+`WAYS` is the one place where another way to the same memory is added, for some or all schemes of
+URLs.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from support.lines import Cable
 from support.running import endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
     from contextlib import AbstractContextManager
     from pathlib import Path
     from typing import Any
@@ -44,12 +45,21 @@ class Target:
     unit: int = peer_tour.UNIT
 
 
-class Way(Protocol):
+class Opening(Protocol):
     """Opens a way to a memory that the tour has filled, for one scheme of URLs."""
 
     def __call__(
         self, scheme: str, folder: Path, access: str
     ) -> AbstractContextManager[Target]: ...
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to a memory."""
+
+    open: Opening
+    schemes: Collection[str]
+    """The schemes that clients can use."""
 
 
 @contextlib.contextmanager
@@ -87,4 +97,4 @@ def listening(scheme: str, cable: Cable | None, access: str) -> str:
     )
 
 
-WAYS: dict[str, Way] = {"direct": direct}
+WAYS: dict[str, Way] = {"direct": Way(direct, LISTENERS)}
