@@ -62,6 +62,7 @@ def java_versions() -> dict[str, str]:
         ("pyModbusTCP", python_versions),
         ("MinimalModbus", python_versions),
         ("tModbus", python_versions),
+        ("uModbus", python_versions),
         ("jsmodbus", node_versions),
         ("modbus-serial", node_versions),
         ("j2mod", java_versions),

@@ -96,6 +96,9 @@ CLIENTS = {
             "write 1969 coils": Error("must be between 1 and 1968"),
         },
     ),
+    "uModbus": Client(
+        lambda: programs.python("umodbus_tcp"), dict.fromkeys(["tcp", "rtu"], tour.BASIC)
+    ),
     "MinimalModbus": Client(
         lambda: programs.python("minimalmodbus_line"),
         dict.fromkeys(["rtu", "ascii"], tour.BASIC),

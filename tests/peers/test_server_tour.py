@@ -47,6 +47,9 @@ class Server:
 
 SERVERS = {
     "pyModbusTCP": Server(lambda: programs.python("pymodbus_tcp"), ("tcp",), {22: 1}),
+    "uModbus": Server(
+        lambda: programs.python("umodbus_tcp"), ("tcp",), {22: 1, 23: 1}, identity=False
+    ),
     # After a function that it lacks, it answers no further request of the connection.
     "jsmodbus": Server(
         lambda: programs.node("jsmodbus"),
