@@ -42,6 +42,14 @@ BUILD_TIMEOUT = 600.0
 COPY_JARS = "org.apache.maven.plugins:maven-dependency-plugin:3.6.1:copy-dependencies"
 
 
+FAILURES: dict[str, str] = {}
+"""The drivers that could not be made in this run, and why."""
+
+
+class BuildFailed(Exception):
+    """A package manager or compiler failed."""
+
+
 @dataclass(frozen=True)
 class Driver:
     """The command that runs a driver, with its working directory and further environment."""
@@ -111,7 +119,9 @@ def node_modules() -> Path:
         for file in files:
             shutil.copy(file, folder)
         # Scripts would compile serial ports, which are there as compiled files.
-        built([npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"], folder)
+        built(
+            [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"], folder
+        )
 
     return made("node", files, install) / "node_modules"
 
@@ -173,6 +183,9 @@ def java_classes() -> Path:
 
 def made(name: str, sources: Sequence[Path], install: Callable[[Path], None]) -> Path:
     """Returns the folder made from these files. It is made once, and is complete or absent."""
+    if name in FAILURES:
+        # Without the network, each attempt takes long.
+        missing(FAILURES[name])
     digest = hashlib.sha256()
     for source in sources:
         digest.update(f"{source.name}\0".encode() + source.read_bytes())
@@ -182,14 +195,18 @@ def made(name: str, sources: Sequence[Path], install: Callable[[Path], None]) ->
         with tempfile.TemporaryDirectory(dir=CACHE, prefix=f"{name}-") as building:
             whole = Path(building) / "whole"
             whole.mkdir()
-            install(whole)
+            try:
+                install(whole)
+            except BuildFailed as failure:
+                FAILURES[name] = str(failure)
+                missing(FAILURES[name])
             with contextlib.suppress(FileExistsError):
                 whole.rename(folder)
     return folder
 
 
 def built(command: Sequence[str], folder: Path, environment: dict[str, str] | None = None) -> None:
-    """Runs a package manager or compiler. Without its packages, tests are skipped."""
+    """Runs a package manager or compiler."""
     ran = subprocess.run(
         command,
         cwd=folder,
@@ -200,4 +217,5 @@ def built(command: Sequence[str], folder: Path, environment: dict[str, str] | No
         check=False,
     )
     if ran.returncode != 0:
-        missing(f"what `{' '.join(command)}` makes: {ran.stdout[-2000:]}{ran.stderr[-2000:]}")
+        output = ran.stdout[-2000:] + ran.stderr[-2000:]
+        raise BuildFailed(f"what `{' '.join(command)}` makes: {output}")
