@@ -8,6 +8,7 @@ CRATES := --workspace --exclude holdfast-binding
 PROTOCOL := -p holdfast-protocol
 NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
+PEERS := tests/peers/drivers
 
 .PHONY: run test lint no-std format bench docs lock clean
 .DELETE_ON_ERROR:
@@ -23,6 +24,7 @@ test: .venv/core.stamp .venv/dev.stamp
 lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo fmt --check
 	cargo fmt --check --manifest-path $(NO_STD)
+	cargo fmt --check --manifest-path $(PEERS)/rust/Cargo.toml
 	cargo clippy --locked --quiet --workspace --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
@@ -47,6 +49,7 @@ no-std:
 format: .venv/dev.stamp
 	cargo fmt
 	cargo fmt --manifest-path $(NO_STD)
+	cargo fmt --manifest-path $(PEERS)/rust/Cargo.toml
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
@@ -68,9 +71,12 @@ lock: .venv/dev.stamp
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	cargo update
 	cargo update --manifest-path $(NO_STD)
+	cargo update --manifest-path $(PEERS)/rust/Cargo.toml
+	cd $(PEERS)/node && npm install --package-lock-only --ignore-scripts
+	cd $(PEERS)/go && go mod tidy
 
 clean:
-	rm -rf .venv target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .cache target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	rm -f python/holdfast/_core.*.so
 
 .venv/run.stamp: requirements/run.lock

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Awaitable
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Literal
 
 import pytest
 from pymodbus import FramerType
@@ -22,6 +23,8 @@ Identity: Any = ModbusDeviceIdentification
 
 LONG = {"ModelName": "m" * 200, "UserApplicationName": "u" * 200}
 """Two objects that do not fit into one reply."""
+
+PastEnd = Literal["exception", "fewer values", "all addresses"]
 
 FRAMERS = {
     "tcp": FramerType.SOCKET,
@@ -88,8 +91,19 @@ def unit_1() -> SimDevice:
     )
 
 
-def tour(client: Face) -> None:
-    """Calls every function that reads or writes, and provokes an exception."""
+def tour(
+    client: Face,
+    lacks: Mapping[int, int | None] = MappingProxyType({}),
+    *,
+    past_end: PastEnd = "exception",
+    max_written: int = 123,
+) -> None:
+    """Calls every function that reads or writes, and provokes an exception.
+
+    `lacks` has functions that the server lacks, with the exception code of its reply, or nothing if
+    it does not reply. `past_end` says what it answers past its last address: exception 02, fewer
+    values, or it has all addresses. It accepts up to `max_written` registers in a request.
+    """
     assert client.read_input_registers(5, 125) == list(range(5, 130))
     assert client.read_input_registers(0, 1000) == list(range(1000))
     assert client.read_discrete_inputs(3, 4) == [True, False, False, True]
@@ -104,22 +118,41 @@ def tour(client: Face) -> None:
     client.write_register(3, 4711)
     client.write_registers(0, [1, 2, 3])
     assert client.read_holding_registers(0, 5) == [1, 2, 3, 4711, 0]
-    client.mask_write(0, and_mask=0xF2, or_mask=0x25)
-    assert client.read_holding_registers(0, 1) == [(1 & 0xF2) | (0x25 & ~0xF2)]
-    assert client.read_write(0, 4, 1, [70, 80]) == [5, 70, 80, 4711]
-    client.write_registers(100, range(300), split=True)
+    if 22 not in lacks:
+        client.mask_write(0, and_mask=0xF2, or_mask=0x25)
+        assert client.read_holding_registers(0, 1) == [(1 & 0xF2) | (0x25 & ~0xF2)]
+    elif lacks[22] is not None:
+        _refused(lacks[22], lambda: client.mask_write(0, and_mask=0xF2, or_mask=0x25))
+    if 23 not in lacks:
+        before = client.read_holding_registers(0, 1)
+        assert client.read_write(0, 4, 1, [70, 80]) == [*before, 70, 80, 4711]
+    elif lacks[23] is not None:
+        _refused(lacks[23], lambda: client.read_write(0, 4, 1, [70, 80]))
+    if max_written == 123:
+        client.write_registers(100, range(300), split=True)
+    else:
+        for at in range(0, 300, max_written):
+            client.write_registers(100 + at, range(at, min(at + max_written, 300)))
     assert client.read_holding_registers(100, 300) == list(range(300))
     client.write("holding_registers", 10, -21.5, "float32", "CDAB")
     assert client.read("holding_registers", 10, "float32", "CDAB") == -21.5
-    client.write("holding_registers", 12, True, "bit:9")
-    assert client.read_holding_registers(12, 1) == [1 << 9]
+    if 22 not in lacks:
+        client.write("holding_registers", 12, True, "bit:9")
+        assert client.read_holding_registers(12, 1) == [1 << 9]
 
+    if past_end == "exception":
+        _refused(2, lambda: client.read_holding_registers(1000, 1))
+        _refused(2, lambda: client.write_registers(999, [1, 2]))
+    elif past_end == "fewer values":
+        with pytest.raises(holdfast.InvalidResponse, match="does not match the request"):
+            client.read_holding_registers(1000, 1)
+
+
+def _refused(code: int, call: Callable[[], object]) -> None:
     with pytest.raises(holdfast.ModbusException) as caught:
-        client.read_holding_registers(1000, 1)
-    assert (caught.value.code, caught.value.name) == (2, "Illegal Data Address")
-    with pytest.raises(holdfast.ModbusException) as caught:
-        client.write_registers(999, [1, 2])
-    assert caught.value.code == 2
+        call()
+    names = {1: "Illegal Function", 2: "Illegal Data Address"}
+    assert (caught.value.code, caught.value.name) == (code, names[code])
 
 
 # pymodbus

@@ -1,0 +1,87 @@
+"""The page on conformance has the peers of the tests, in the versions that are locked."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from support.paths import DOCS, ROOT, TESTS
+
+DRIVERS = TESTS / "peers" / "drivers"
+PAGE = (DOCS / "conformance.md").read_text()
+
+
+def rows(heading: str) -> dict[str, list[str]]:
+    """The table of a section, by its first column."""
+    section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("| ")][2:]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {first: rest for first, *rest in cells}
+
+
+def python_versions() -> dict[str, str]:
+    lock = (ROOT / "requirements" / "dev.lock").read_text()
+    return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", lock, re.MULTILINE))
+
+
+def node_versions() -> dict[str, str]:
+    lock = json.loads((DRIVERS / "node" / "package-lock.json").read_text())
+    return {
+        path.removeprefix("node_modules/"): package["version"]
+        for path, package in lock["packages"].items()
+        if path
+    }
+
+
+def go_versions() -> dict[str, str]:
+    text = (DRIVERS / "go" / "go.mod").read_text()
+    return dict(re.findall(r"github\.com/(\S+) v(\S+)", text))
+
+
+def rust_versions() -> dict[str, str]:
+    lock = (DRIVERS / "rust" / "Cargo.lock").read_text()
+    return dict(re.findall(r'name = "(\S+)"\nversion = "(\S+)"', lock))
+
+
+def java_versions() -> dict[str, str]:
+    """The versions of the direct dependencies."""
+    found = re.findall(
+        r"<groupId>(\S+)</groupId>\s*<artifactId>(\S+)</artifactId>\s*<version>(\S+)</version>",
+        (DRIVERS / "java" / "pom.xml").read_text(),
+    )
+    versions = {artifact: version for _, artifact, version in found}
+    return versions | {"digitalpetri/modbus": versions["modbus-tcp"]}
+
+
+@pytest.mark.parametrize(
+    ("peer", "locked"),
+    [
+        ("pymodbus", python_versions),
+        ("pyModbusTCP", python_versions),
+        ("MinimalModbus", python_versions),
+        ("tModbus", python_versions),
+        ("uModbus", python_versions),
+        ("jsmodbus", node_versions),
+        ("modbus-serial", node_versions),
+        ("j2mod", java_versions),
+        ("digitalpetri/modbus", java_versions),
+        ("tokio-modbus", rust_versions),
+        ("simonvetter/modbus", go_versions),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_page_has_the_locked_version(peer: str, locked: object) -> None:
+    assert callable(locked)
+    versions = locked()
+    assert rows("Peers")[peer][1] == versions.get(peer, versions.get(peer.lower()))
+
+
+@pytest.mark.parametrize(
+    "file", ["node/package-lock.json", "node/.npmrc", "go/go.sum", "go/go.mod"]
+)
+def test_lock_files_name_no_registry(file: str) -> None:
+    text = (DRIVERS / file).read_text()
+    assert '"resolved"' not in text
+    assert "registry." not in text
