@@ -1,4 +1,4 @@
-"""What the tour of peers is addressed to: today a listener itself.
+"""What the tour of peers is addressed to: a listener itself, or a route to an RTU device.
 
 `WAYS` is the one place where another way to the same memory is added, for some or all schemes of
 URLs.
@@ -79,6 +79,36 @@ def direct(scheme: str, folder: Path, access: str) -> Iterator[Target]:
             yield Target(f"{scheme}://{host}:{port}", memory)
 
 
+@contextlib.contextmanager
+def routed(scheme: str, folder: Path, access: str) -> Iterator[Target]:
+    """A listener of the scheme's type whose unit is an RTU device on a serial line."""
+    with Cable(folder) as cable:
+        rule = {"sources": ["127.0.0.1"], "access": access}
+        route = {"units": {peer_tour.UNIT: {"route": "line"}}}
+        listener = {"type": LISTENERS[scheme], "bind": "127.0.0.1:0", "rules": [rule | route]}
+        line = {"device": str(cable.devices[0]), "parity": "none"}
+        served = {"units": {peer_tour.UNIT: "plant"}, "access": "read-write"}
+        file = folder / "appliance.yaml"
+        file.write_text(
+            written(
+                {
+                    "memories": {"plant": peer_tour.SIZES},
+                    "identity": peer_tour.IDENTITY,
+                    "links": {"line": {"url": f"rtu://{cable.devices[1]}?parity=none"}},
+                    "listeners": {
+                        "scada": listener,
+                        "device": {"type": "modbus-rtu", "serial": line, "rules": [served]},
+                    },
+                }
+            )
+        )
+        with Appliance(load(file)) as appliance:
+            memory = appliance.memories["plant"]
+            peer_tour.filled(memory)
+            host, port = endpoint(appliance, "scada")
+            yield Target(f"{scheme}://{host}:{port}", memory)
+
+
 def listening(scheme: str, cable: Cable | None, access: str) -> str:
     """Builds the configuration of an appliance with one listener, `scada`."""
     rule: dict[str, Any] = {"units": {peer_tour.UNIT: "plant"}, "access": access}
@@ -97,4 +127,4 @@ def listening(scheme: str, cable: Cable | None, access: str) -> str:
     )
 
 
-WAYS: dict[str, Way] = {"direct": Way(direct, LISTENERS)}
+WAYS: dict[str, Way] = {"direct": Way(direct, LISTENERS), "route": Way(routed, ("tcp", "rtu+tcp"))}
