@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.scanner.messages import Publish
+    from holdfast.config.scanning import Publish
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)

@@ -337,7 +337,7 @@ def test_what_is_browsed_tells_all_of_a_device(caller: Caller, server: holdfast.
         "state": "online",
         "failures": 0,
         "scanRate": 50,
-        "timeout": 1000,
+        "timeout": 3000,
         "release": False,
         "missed": found["missed"],
         "tagCount": 1,

@@ -10,8 +10,9 @@ with NATS, `polling` and `commands` with devices. `registry` holds the subscript
 
 from __future__ import annotations
 
-from holdfast.scanner.broker import Servers
+from holdfast.scanner.broker import Ping, Servers
 from holdfast.scanner.limits import ScannerLimits
+from holdfast.scanner.rules import Defaults
 from holdfast.scanner.service import Scanner, Settings
 
-__all__ = ["Scanner", "ScannerLimits", "Servers", "Settings"]
+__all__ = ["Defaults", "Ping", "Scanner", "ScannerLimits", "Servers", "Settings"]

@@ -194,7 +194,7 @@ class _Report:
                 datatype=tag.asked_type,
                 byte_order=tag.order,
                 encoding=tag.encoding,
-                writable=any(wanted.writable for wanted in said),
+                writable=self._device.unwritable(tag) is None,
                 description=next((each.description for each in said if each.description), None),
                 error=errors.get(tag.id),
             )

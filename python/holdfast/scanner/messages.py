@@ -1,8 +1,8 @@
 """The messages of the service: requests, answers and published messages.
 
-Requests are checked strictly: an unknown key, a wrong type or a value out of range refuses the
-whole request. `null` for an optional value is the same as omitting it. Checks that need the state
-of the scanner are in other modules.
+`decode` checks requests strictly: an unknown key, a wrong type or a value out of range refuses the
+whole request. `null` for an optional value is the same as omitting it. `adjusting` accepts more.
+Checks that need the state of the scanner are in other modules.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import msgspec
 from msgspec import Meta
 
+from holdfast.config.scanning import Publish
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
 from holdfast.types import TRANSPORTS, Area, Transport
 
 FunctionCode = Literal["coil", "discrete", "holding", "input"]
-Publish = Literal["scan", "change"]
 State = Literal["connecting", "online", "offline"]
 DataType = Literal["number", "boolean", "string", "array"]
 
@@ -60,6 +60,7 @@ class TagRequest(_Request):
     encoding: Annotated[str, Meta(max_length=64)] | None = None
     """The encoding of `string:N`. Default: ASCII."""
     writable: bool | None = None
+    """Default: writable, in areas that can be written."""
     description: str | None = None
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
     """Values that mean "not available"; they are published as `null`."""
@@ -95,11 +96,11 @@ class SubscribeRequest(_Request):
     unit_id: Annotated[int, Meta(ge=0, le=MAX_UNIT)] | None = None
     """Default: 1."""
     byte_order: str | None = None
-    """Default: `ABCD`."""
+    """Default: `ABCD`. `big` is `ABCD`, `little` is `DCBA`."""
     scan_rate: int | None = None
     """The scan interval in milliseconds. Default: 1000."""
     timeout: int | None = None
-    """The timeout of a Modbus request in milliseconds. Default: 1000."""
+    """The timeout of a Modbus request in milliseconds. Default: 3000."""
     publish: Publish | None = None
     """Default: `scan`."""
     deadband: Annotated[float, Meta(ge=0)] | None = None
@@ -287,27 +288,40 @@ Asked = TypeVar("Asked", bound=_Request)
 
 def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
     """Parses a request of at most `most` bytes. Raises `Refused`."""
-    if len(data) > most:
-        raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
+    check_size(data, most)
     try:
         try:
             return msgspec.json.decode(data, type=kind)
         except msgspec.ValidationError as error:
             if "got `float`" not in str(error):
                 raise
-            return msgspec.convert(_with_integers(msgspec.json.decode(data)), type=kind)
+            return msgspec.convert(with_integers(msgspec.json.decode(data)), type=kind)
     except msgspec.ValidationError as error:
         raise Refused(_explained(str(error))) from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused(f"not JSON: {error}") from None
 
 
-def _with_integers(value: Any) -> Any:
+def check_size(data: bytes, most: int) -> None:
+    """Raises `Refused` for a request of more than `most` bytes."""
+    if len(data) > most:
+        raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
+
+
+def converted(value: object, kind: type[Asked]) -> Asked:
+    """Converts parsed JSON to a request. Raises `Refused`."""
+    try:
+        return msgspec.convert(value, type=kind)
+    except msgspec.ValidationError as error:
+        raise Refused(_explained(str(error))) from None
+
+
+def with_integers(value: Any) -> Any:
     """Converts whole floats to integers. JavaScript callers do not distinguish them."""
     if type(value) is dict:
-        return {key: _with_integers(item) for key, item in value.items()}
+        return {key: with_integers(item) for key, item in value.items()}
     if type(value) is list:
-        return [_with_integers(item) for item in value]
+        return [with_integers(item) for item in value]
     if type(value) is float and value.is_integer() and abs(value) < EXACT:
         return int(value)
     return value

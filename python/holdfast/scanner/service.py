@@ -17,7 +17,8 @@ from weakref import WeakValueDictionary
 from holdfast import logs
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner import commands, device_tls, wire
-from holdfast.scanner.broker import Broker, Servers
+from holdfast.scanner.adjusting import Adjustments, adjusted
+from holdfast.scanner.broker import Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.groups import grouped
@@ -36,7 +37,8 @@ from holdfast.scanner.messages import (
 from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.polling import Polling
 from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.registry import Registry, check_address, understood
+from holdfast.scanner.registry import Registry, understood
+from holdfast.scanner.rules import Defaults, Rules
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -44,7 +46,9 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint
     from holdfast.client.target import Target
+    from holdfast.config.scanning import Writes
     from holdfast.net.allow_list import AllowEntry
+    from holdfast.scanner.adjusting import Asked
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.registry import Subscription
@@ -57,6 +61,9 @@ LARGE = 16 * 1024
 
 SOON = 1000
 """Scan interval in milliseconds up to which a new subscriber waits for the next regular scan."""
+
+MAX_ADJUSTED = 10_000
+"""Limit of remembered subscribers whose requests were adjusted."""
 
 ENDING = 2.0
 """Timeout in seconds of each step of a stop."""
@@ -74,6 +81,18 @@ class Settings:
     limits: ScannerLimits = field(default_factory=ScannerLimits)
     device_tls: Tls = NO_FILES
     """The TLS files for connections to devices."""
+    defaults: Defaults = field(default_factory=Defaults)
+    """What subscribe requests leave out."""
+    writes: Writes = "tags"
+    """Which tags callers may write."""
+    strict: bool = False
+    """Whether requests are refused that would otherwise be adjusted."""
+    ping: Ping = field(default_factory=Ping)
+    """How a NATS server that does not answer is detected."""
+    publish_logs: bool = True
+    """Whether the log is also published."""
+    keep_subscriptions: bool = True
+    """Whether subscriptions and states are kept in JetStream."""
 
 
 class Scanner:
@@ -87,11 +106,14 @@ class Scanner:
         self._one_by_one = asyncio.Lock()
         """Held while a request is parsed and checked."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._registry = Registry(settings.limits)
+        self._rules = Rules(settings.limits, settings.defaults, settings.strict)
+        self._registry = Registry(settings.limits, settings.writes)
+        self._adjusted: set[tuple[str, str]] = set()
+        """The subscribers, and the kinds of adjustments, that are already logged."""
         self._publishers: dict[str, Publisher] = {}
         self._heart = Heart(settings.prefix)
         self.outbox = Outbox()
-        self._broker = Broker(settings.servers, self._handlers(), self._connected)
+        self._broker = Broker(settings.servers, self._handlers(), self._connected, settings.ping)
         self._due = asyncio.Event()
         """Set when the next heartbeat is due immediately."""
 
@@ -187,21 +209,13 @@ class Scanner:
         task.add_done_callback(self._tasks.discard)
 
     async def _subscribe(self, message: Msg) -> Answer:
-        limits = self._settings.limits
         async with self._in_order(message):
-            asked = understood(decode(message.data, SubscribeRequest, limits.request), limits)
+            changes = Adjustments()
+            request = self._decoded(message.data, SubscribeRequest, changes)
+            asked = understood(request, self._rules, changes)
         async with self._turn(asked.device):
-            address, endpoint = await self._place(asked)
-            known = self._registry.devices.get(asked.device)
-            is_extended = known is not None and known.is_extended_by(asked.subscriber, asked.tags)
-            device, changed = self._registry.subscribe(asked, address)
-            if device is not None and asked.subscriber in device.subscribers:
-                device.endpoint = endpoint
-                self._begin_publishing(device, asked)
-                if not is_extended:
-                    self._publish_state(device)
-                if changed or (asked.tags and device.rate > SOON):
-                    self._polling.renew(device)
+            await self._add(asked)
+        self._log_adjustments(asked.subscriber, asked.device, changes)
         logs.write(
             logging.INFO,
             "subscribed",
@@ -210,7 +224,41 @@ class Scanner:
             tags=len(asked.tags),
             scan_rate=asked.rate,
         )
-        return Answer(success=True, count=len(asked.tags))
+        return Answer(success=True, count=len(request.tags))
+
+    async def _add(self, asked: Subscription) -> None:
+        """Adds a subscription, and polls and publishes accordingly. Raises `Refused`."""
+        address, endpoint = await self._place(asked)
+        known = self._registry.devices.get(asked.device)
+        is_extended = known is not None and known.is_extended_by(asked.subscriber, asked.tags)
+        change = self._registry.subscribe(asked, address)
+        device = change.device
+        if device is None or asked.subscriber not in device.subscribers:
+            return
+        if change.former is not None:
+            self._drop(change.former)
+        device.endpoint = endpoint
+        self._begin_publishing(device, asked)
+        if change.former is not None or not is_extended:
+            self._publish_state(device)
+        if change.polling or change.former or (asked.tags and device.rate > SOON):
+            self._polling.renew(device)
+
+    def _decoded(self, data: bytes, kind: type[Asked], changes: Adjustments) -> Asked:
+        most = self._settings.limits.request
+        if self._settings.strict:
+            return decode(data, kind, most)
+        return adjusted(data, kind, most, changes)
+
+    def _log_adjustments(self, subscriber: str, device: str, changes: Adjustments) -> None:
+        """Logs what was changed in a request: once for each subscriber and kind."""
+        for kind, what in changes:
+            if (subscriber, kind) in self._adjusted:
+                continue
+            if len(self._adjusted) >= MAX_ADJUSTED:
+                self._adjusted.clear()
+            self._adjusted.add((subscriber, kind))
+            logs.write(logging.WARNING, kind, subscriber=subscriber, device=device, found=what)
 
     def _begin_publishing(self, device: ScannedDevice, asked: Subscription) -> None:
         publisher = self._publishers.get(device.id)
@@ -221,16 +269,16 @@ class Scanner:
 
     async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
         """Returns the address of a device: the known one, or the result of a lookup."""
-        device = self._registry.devices.get(asked.device)
+        device = self._registry.known(asked)
         if device is None:
             address = await self._allowed.address(asked.source.target)
             return address, device_tls.endpoint_of(address, self._settings.device_tls)
-        check_address(device, asked)
         return device.address, device.endpoint
 
     async def _unsubscribe(self, message: Msg) -> Answer:
         async with self._in_order(message):
-            request = decode(message.data, UnsubscribeRequest, self._settings.limits.request)
+            changes = Adjustments()
+            request = self._decoded(message.data, UnsubscribeRequest, changes)
         async with self._turn(request.device_id):
             device, changed = self._registry.unsubscribe(request)
             if device is not None:
@@ -240,6 +288,7 @@ class Scanner:
                         self._polling.renew(device, at_once=False)
                 elif changed:
                     self._drop(device)
+        self._log_adjustments(request.subscriber_id, request.device_id, changes)
         logs.write(
             logging.INFO,
             "unsubscribed",
@@ -318,6 +367,11 @@ class Scanner:
         id = device.id
         messages = self._publishers[id].messages(due, blocks)
         self.outbox.put([((id, tag), text) for tag, text in messages])
+        if len(device.subjects) > 1:
+            one, other = (f"{self._settings.prefix}.data.{name}" for name in device.subjects)
+            self.outbox.put(
+                [((id, tag, other), wire.readdressed(text, one, other)) for tag, text in messages]
+            )
 
     async def _look_up(self, device: ScannedDevice) -> None:
         """Looks up the name of a device that does not respond; its address may have changed."""
@@ -352,8 +406,9 @@ class Scanner:
             error=health.error,
             timestamp=int(time.time() * 1000),
         )
-        subject = f"{self._settings.prefix}.status.{device.id}"
-        self.outbox.put([((device.id,), wire.message(subject, status))])
+        for name in device.subjects:
+            subject = f"{self._settings.prefix}.status.{name}"
+            self.outbox.put([((device.id, subject), wire.message(subject, status))])
 
     async def _beat(self) -> None:
         while True:
