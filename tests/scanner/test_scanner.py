@@ -434,7 +434,7 @@ def test_who_leaves_a_slow_device_causes_no_scan(
         assert caller.request("modbus.subscribe", request)["success"]
         while data.next()["variableId"] != id:
             pass
-    assert replaced == [True]
+    wire.until(lambda: replaced == [True], "it is polled for both")
     assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
     wire.until(lambda: len(replaced) == 2, "it is polled for what is left")
     assert replaced == [True, False]

@@ -184,9 +184,7 @@ class _Report:
             if fault:
                 inside = self._places.inside(area, address, count)
                 errors |= dict.fromkeys((tag.id for tag in inside), fault_text(fault))
-        subscribers = self._device.subscribers.values()
         for tag in tags:
-            said = [each.tags[tag.id] for each in subscribers if tag.id in each.tags]
             yield TagReport(
                 id=tag.id,
                 address=tag.address,
@@ -195,7 +193,7 @@ class _Report:
                 byte_order=tag.order,
                 encoding=tag.encoding,
                 writable=self._device.unwritable(tag) is None,
-                description=next((each.description for each in said if each.description), None),
+                description=self._device.description(tag.id),
                 error=errors.get(tag.id),
             )
 

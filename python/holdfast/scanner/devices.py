@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from holdfast._core import plan_blocks
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.latest import LatestBlocks
 from holdfast.scanner.subjects import second_id, subject_id
 from holdfast.scanner.tags import AREA_OF_CODE, Tag
 
@@ -38,6 +39,8 @@ class Plan:
     readable: tuple[tuple[Area, int, int], ...] = ()
     """Area, start and end of ranges; the end is exclusive."""
     forbidden: tuple[tuple[Area, int, int], ...] = ()
+    request: PlanRequest | None = field(default=None, compare=False)
+    """What this plan was made from."""
 
     @staticmethod
     def of(request: PlanRequest | None) -> Plan:
@@ -50,6 +53,7 @@ class Plan:
             request.max_bits or READ_BITS,
             tuple(_ranges("plan.readable", request.readable or ())),
             tuple(_ranges("plan.forbidden", request.forbidden or ())),
+            request,
         )
 
     def blocks(self, tags: Sequence[Tag]) -> list[tuple[Area, int, int, list[int], int]]:
@@ -102,6 +106,8 @@ class Source:
     """Milliseconds."""
     release: bool
     plan: Plan
+    url: str | None = field(default=None, compare=False)
+    """The URL in the request, if it has one."""
 
 
 @dataclass
@@ -147,6 +153,9 @@ class ScannedDevice:
         self.tags: dict[str, Tag] = {}
         """The tags of all subscribers, by id."""
         self.health = health
+        self.latest = LatestBlocks()
+        self.status = b""
+        """The last published state, as JSON."""
         self.polled_as = ""
         """The device's name in the poller. Each change gives it a new one."""
         self._writes = writes
@@ -170,6 +179,11 @@ class ScannedDevice:
     def is_extended_by(self, subscriber: str, ids: Collection[str]) -> bool:
         """Returns whether a known subscriber requests only tags that are new."""
         return subscriber in self.subscribers and self.tags.keys().isdisjoint(ids)
+
+    def description(self, id: str) -> str | None:
+        """Returns the description of a tag, of the first subscriber that has one."""
+        wanted = (each.tags[id] for each in self.subscribers.values() if id in each.tags)
+        return next((each.description for each in wanted if each.description), None)
 
     def users(self, id: str) -> list[str]:
         """Returns the ids of the subscribers of a tag."""

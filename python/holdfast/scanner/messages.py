@@ -20,6 +20,7 @@ from holdfast.types import TRANSPORTS, Area, Transport
 
 FunctionCode = Literal["coil", "discrete", "holding", "input"]
 State = Literal["connecting", "online", "offline"]
+Quality = Literal["good", "bad", "uncertain"]
 DataType = Literal["number", "boolean", "string", "array"]
 
 Id = Annotated[str, Meta(min_length=1, max_length=256)]
@@ -129,6 +130,14 @@ class BrowseRequest(_Request):
     """The number of tags of `deviceId` to skip."""
 
 
+class VariablesRequest(_Request):
+    """Requests the latest values. An empty message requests those of all devices."""
+
+    device_id: str | None = None
+    offset: Annotated[int, Meta(ge=0)] | None = None
+    """The number of tags to skip."""
+
+
 class Answer(_Message, omit_defaults=True):
     """The answer to a request."""
 
@@ -168,7 +177,55 @@ class Heartbeat(_Message):
     module_id: str
     last_seen: int
     started_at: int
-    metadata: dict[str, str]
+    metadata: HeartbeatMetadata
+
+
+class HeartbeatMetadata(_Message):
+    """What a heartbeat tells about the service."""
+
+    device_count: int
+    tag_count: int
+    """Tags of all devices."""
+    version: str
+    """The version of Holdfast."""
+
+
+class LogEntry(_Message):
+    """A line of the log."""
+
+    timestamp: int
+    """In milliseconds since 1970."""
+    level: str
+    """`debug`, `info`, `warn` or `error`."""
+    message: str
+    """The event and its fields."""
+    service_type: str
+    module_id: str
+    logger: str
+
+
+class Announcement(_Message):
+    """Announces a scanner to other scanners on the same subjects; a part of a heartbeat."""
+
+    started_at: int
+    """In milliseconds since 1970."""
+
+
+class Variable(_Message, omit_defaults=True):
+    """The latest value of a tag. The answer to `variables` is an array of these."""
+
+    module_id: str
+    device_id: str
+    variable_id: str
+    value: bool | int | float | str | list[Any] | None
+    """The latest value that was read, also while the device is offline."""
+    datatype: DataType
+    quality: Quality
+    """`good`: of the last scan; `bad`: older, or not decodable; `uncertain`: not read yet."""
+    origin: str
+    last_updated: int | None = None
+    """Time of the device's response, in milliseconds since 1970."""
+    description: str | None = None
 
 
 class BlockReport(_Message, omit_defaults=True):
@@ -254,7 +311,14 @@ class DeviceReport(_Message, omit_defaults=True):
     last_error_at: int | None = None
 
 
-class ServiceReport(_Message):
+class OtherScanner(_Message):
+    """Another scanner on the same subjects."""
+
+    started_at: int
+    """In milliseconds since 1970."""
+
+
+class ServiceReport(_Message, omit_defaults=True):
     """The counts of messages since the start."""
 
     started_at: int
@@ -266,6 +330,8 @@ class ServiceReport(_Message):
     """Messages lost because too many waited for NATS."""
     lost_scans: int
     """Scans lost because this process did not keep up."""
+    other_scanners: list[OtherScanner] | None = None
+    """Other scanners on the same subjects; each of them handles every request, too."""
 
 
 class BrowseAnswer(_Message, omit_defaults=True):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.scanner.decoding import Undecoded, decoder
+from holdfast.scanner.decoding import Undecoded, clean, decoder
 from holdfast.scanner.groups import Group
 from holdfast.scanner.subjects import subject_id
 from holdfast.scanner.tags import Places
@@ -144,7 +144,7 @@ class Publisher:
         """Returns the messages of the tags of one group in one block."""
         values = part.decoder(data)
         if part.special:
-            values = [_clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
+            values = [clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
         if part.plain:
             texts = _encode(values)[1:-1].split(b",")
         else:
@@ -295,17 +295,6 @@ def _template(prefix: str, device: str, subject: str, tag: Tag) -> tuple[bytes, 
     text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
     head_line = b"PUB %b %%d\r\n" % subject.encode()
     return head_line + text + b"\r\n", len(before) + len(after) + 1
-
-
-def _clean(value: Any, tag: Tag) -> Any:
-    """Returns the value; `None` for NaN and for markers of the tag."""
-    if type(value) is list:
-        return [_clean(item, tag) for item in value]
-    if type(value) is float and value != value:
-        return None
-    if tag.null and type(value) is not Undecoded and value in tag.null:
-        return None
-    return value
 
 
 def _differs(value: Any, last: Any, deadband: float) -> bool:

@@ -90,6 +90,7 @@ def understood(
         ),
         bool(request.release),
         Plan.of(request.plan),
+        request.url,
     )
     target = source.target
     if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
