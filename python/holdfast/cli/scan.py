@@ -366,7 +366,8 @@ def _greeting(settings: Settings) -> str:
     lines = [
         f"Scanning for subscribers at {', '.join(_without_secrets(settings.servers))}.",
         "",
-        f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse",
+        f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse, "
+        f"{prefix}.variables",
         f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",
         f"  published  {prefix}.data.DEVICE, {prefix}.status.DEVICE",
         f"  devices    {_places(settings.allow)}",

@@ -122,8 +122,9 @@ class Keeper:
                 await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT), bucket)
             except Exception as error:  # Keeping is optional, no error may stop the scanner.
                 bucket = None
-                self._failures += 1
-                self._tell(False, reason_of(error))
+                if self._client is client:  # Else the connection has ended, and not JetStream.
+                    self._failures += 1
+                    self._tell(False, reason_of(error))
             else:
                 self._failures = 0
                 self._tell(True, "")
@@ -203,8 +204,9 @@ class Keeper:
         self._waiting.clear()
 
     async def stop(self) -> None:
-        """Removes the states of devices, which nobody updates any more."""
-        client = self._client
+        """Removes the states of devices, which nobody updates any more; then writes nothing more."""
+        client, self._client = self._client, None
+        self._news.set()
         if client is not None and self._works:
             jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
             await jetstream.purge_stream(STREAM, subject=f"{PRE}{self._prefix}.status.*")
