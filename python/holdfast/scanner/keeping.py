@@ -204,7 +204,7 @@ class Keeper:
         self._waiting.clear()
 
     async def stop(self) -> None:
-        """Removes the states of devices, which nobody updates any more; then writes nothing more."""
+        """Removes the states of devices, which nobody updates any more. Then writes nothing."""
         client, self._client = self._client, None
         self._news.set()
         if client is not None and self._works:
