@@ -48,7 +48,8 @@ def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]
 def device(caller: Caller, id: str) -> Any:
     """What browsing tells of a device, apart from what moves by itself."""
     [found] = caller.request("modbus.browse", {"deviceId": id})["devices"]
-    moving = ("scans", "missed", "roundTrip", "lastAnswer", "state", "stateSince", "blocks")
+    moving = {"scans", "missed", "roundTrip", "lastAnswer", "state", "stateSince", "blocks"}
+    moving |= {"failures", "error", "lastError", "lastErrorAt"}
     return {key: value for key, value in found.items() if key not in moving}
 
 

@@ -152,6 +152,7 @@ class Caller:
     async def _listening(self, subject: str, inbox: Inbox) -> None:
         await self.client.subscribe(subject, cb=inbox.put)
         await self.client.flush()
+        await self.client.flush()  # The ping of the first one may overtake the subscription.
 
     def kept(self, bucket: str) -> dict[str, Any]:
         """Returns the JSON values of a key-value bucket; nothing if there is no bucket."""

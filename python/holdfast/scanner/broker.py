@@ -191,6 +191,9 @@ class Broker:
         try:
             for subject, handler in self._handlers.items():
                 await client.subscribe(subject, cb=handler)
+            # nats-py may send the ping of a flush before what is still in its buffer. At the end of
+            # the first flush, the buffer is sent; the second one waits until the server has it.
+            await client.flush()
             await client.flush()
             self._subscribed = True
         except (Error, OSError) as error:
