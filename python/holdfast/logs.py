@@ -50,10 +50,7 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, without a line end."""
-        fields = "".join(f" {key}={_quoted(value)}" for key, value in _fields(record).items())
-        return (
-            f"{timestamp(record.created)} {record.levelname.lower()} {record.getMessage()}{fields}"
-        )
+        return f"{timestamp(record.created)} {record.levelname.lower()} {message(record)}"
 
 
 class JsonFormatter(logging.Formatter):
@@ -67,6 +64,12 @@ class JsonFormatter(logging.Formatter):
             "event": record.getMessage(),
         }
         return json.dumps(head | _fields(record), default=str)
+
+
+def message(record: logging.LogRecord) -> str:
+    """Returns the event of a record with its fields, as text."""
+    fields = "".join(f" {key}={_quoted(value)}" for key, value in _fields(record).items())
+    return f"{record.getMessage()}{fields}"
 
 
 def _fields(record: logging.LogRecord) -> dict[str, object]:

@@ -107,6 +107,55 @@ def _ended(process: subprocess.Popen[str], caller: Caller) -> bool:
     return process.poll() is not None
 
 
+def test_options_say_what_requests_leave_out_and_what_is_written(
+    start: Start, nats: NatsServer, caller: Caller, server: holdfast.Server
+) -> None:
+    logs = caller.listen("service.logs.>")
+    options = "--timeout 700 --publish change --deadband 0.5 --scan-rate 200 --writes none --strict"
+    more = "--ping-interval 0.5 --ping-outstanding 4 --no-publish-logs --no-keep-subscriptions"
+    process = start("--nats", nats.url, *options.split(), *more.split())
+    connected(process)
+    wire.until(lambda: _answers(caller), "it answers")
+    request = subscription(server, tag("a", 0, writable=True))
+    del request["scanRate"]
+    assert (
+        "unknown field `more`"
+        in caller.request("modbus.subscribe", {**request, "more": 1})["error"]
+    )
+    assert caller.request("modbus.subscribe", request)["success"]
+    [found] = caller.request("modbus.browse", {"deviceId": "plc1"})["devices"]
+    assert (found["timeout"], found["scanRate"]) == (700, 200)
+    [subscriber] = found["subscribers"]
+    assert (subscriber["publish"], subscriber["deadband"]) == ("change", 0.5)
+    refused = caller.request("modbus.command.a", "1")
+    assert "this scanner writes nothing (nats.writes is none)" in refused["error"]
+    assert caller.kept("holdfast_scanner") == {}
+    assert logs.take() == []
+
+
+def _answers(caller: Caller) -> bool:
+    try:
+        return bool(caller.request("modbus.browse", b"")["success"])
+    except NoRespondersError:
+        return False
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ("--deadband 1", "--deadband requires --publish change."),
+        ("--timeout 9", "9 is not in the range 10<=x<=30000"),
+        ("--scan-rate 49", "49 is not in the range 50<=x<=86400000"),
+        ("--publish always", "'always' is not one of 'scan', 'change'"),
+        ("--writes all", "'all' is not one of 'tags', 'explicit', 'none'"),
+        ("--ping-interval 0", "0.0 is not in the range 0.1<=x<=3600.0"),
+        ("--ping-outstanding 0", "0 is not in the range 1<=x<=100"),
+    ],
+)
+def test_wrong_options_are_told(options: str, error: str) -> None:
+    assert error in usage_error("scan", *options.split())
+
+
 def test_secrets_are_used_and_not_shown(
     start: Start, tmp_path: Path, server: holdfast.Server
 ) -> None:

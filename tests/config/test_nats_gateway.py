@@ -10,7 +10,7 @@ from holdfast.appliance import assembly
 from holdfast.client.target import Tls
 from holdfast.config.scanning import written_pollable
 from holdfast.gateway import GatewayLimits
-from holdfast.scanner import ScannerLimits, Servers
+from holdfast.scanner import Defaults, Ping, ScannerLimits, Servers
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
@@ -92,6 +92,9 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
         "  tls: {ca_file: p.yaml, cert_file: p.yaml, key_file: p.yaml}\n"
         "  device_tls: {ca_file: ca.pem, cert_file: p.yaml, key_file: secret}\n"
         "  prefix: plant.modbus-1\n  limits: {devices: 7, tags: 8}\n"
+        "  defaults: {timeout: 500, publish: change, deadband: 0.5, scan_rate: 100}\n"
+        "  writes: explicit\n  strict: true\n  ping: {interval: 0.5, outstanding: 7}\n"
+        "  publish_logs: false\n  keep_subscriptions: false\n"
     )
     nats = nats_of(folder, text)
     settings = assembly.scanner(nats)
@@ -105,6 +108,10 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
     written = [written_pollable(entry) for entry in settings.allow]
     assert written == ["10.0.0.7/32", "fd00::/8", "/dev/ttyUSB0", "COM3"]
     assert settings.prefix == "plant.modbus-1"
+    assert settings.defaults == Defaults(500, "change", 0.5, 100)
+    assert (settings.writes, settings.strict) == ("explicit", True)
+    assert settings.ping == Ping(0.5, 7)
+    assert (settings.publish_logs, settings.keep_subscriptions) == (False, False)
     assert settings.limits == ScannerLimits(devices=7, tags=8)
     assert settings.device_tls == Tls(str(tmp_path / "ca.pem"), str(file), str(tmp_path / "secret"))
     assert "s3cret" not in repr(nats) + repr(settings)
@@ -123,6 +130,10 @@ def test_the_scanner_has_the_documented_defaults(folder: Folder) -> None:
     assert (nats.username, nats.tls) == (None, None)
     assert assembly.scanner(nats).limits == ScannerLimits()
     assert assembly.scanner(nats).device_tls == Tls()
+    assert assembly.scanner(nats).defaults == Defaults(3000, "scan", 0.0, 1000)
+    assert assembly.scanner(nats).ping == Ping()
+    assert (nats.writes, nats.strict) == ("tags", False)
+    assert (nats.publish_logs, nats.keep_subscriptions) == (True, True)
 
 
 def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) -> None:
@@ -151,6 +162,12 @@ def test_the_effective_configuration_shows_every_default(folder: Folder) -> None
         "  servers: [tls://nats.example]\n"
         "  devices: [10.0.0.0/8]\n"
         "  prefix: modbus\n"
+        "  defaults: {timeout: 3000, publish: scan, deadband: 0, scan_rate: 1000}\n"
+        "  writes: tags\n"
+        "  strict: false\n"
+        "  ping: {interval: 1, outstanding: 3}\n"
+        "  publish_logs: true\n"
+        "  keep_subscriptions: true\n"
         "  limits: {devices: 5000, tags: 500000}\n"
         "gateway:\n"
         "  bind: 127.0.0.1:8090\n"
@@ -257,7 +274,21 @@ def test_everything_else_needs_memories(
          "3: limits.tag: unknown key, allowed: devices, tags; did you mean 'tags'?"),
         ("  devices", "  embedded: true\n  devices", "3: embedded: unknown key, allowed: servers, "
          "devices, username, password_file, token_file, credentials_file, tls, device_tls, prefix, "
-         "limits"),
+         "defaults, writes, strict, ping, publish_logs, keep_subscriptions, limits"),
+        ("  devices", "  defaults: {timeout: 3}\n  devices",
+         "3: defaults.timeout: found 3, allowed: an integer from 10 to 30000"),
+        ("  devices", "  defaults: {scan_rate: 49}\n  devices",
+         "3: defaults.scan_rate: found 49, allowed: an integer from 50 to 86400000"),
+        ("  devices", "  defaults: {publish: always}\n  devices",
+         "3: defaults.publish: found 'always', allowed: scan or change"),
+        ("  devices", "  defaults: {deadband: 1}\n  devices",
+         "3: defaults.deadband: found without publish: change, allowed: only with it"),
+        ("  devices", "  writes: all\n  devices",
+         "3: writes: found 'all', allowed: tags, explicit or none"),
+        ("  devices", "  ping: {interval: 0}\n  devices",
+         "3: ping.interval: found 0, allowed: a number from 0.1 to 3600.0"),
+        ("  devices", "  ping: {outstanding: 0}\n  devices",
+         "3: ping.outstanding: found 0, allowed: an integer from 1 to 100"),
     ],
 )  # fmt: skip
 def test_nats_is_checked(folder: Folder, old: str, new: str, problem: str) -> None:

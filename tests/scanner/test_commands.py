@@ -146,17 +146,22 @@ def test_a_value_that_the_type_can_not_hold_is_refused(
 def test_what_is_not_writable_is_not_written(
     caller: Caller, server: holdfast.Server, memory: holdfast.Memory
 ) -> None:
-    request = subscription(server, tag("a", 0), tag("b", 1, writable=False))
-    caller.request("modbus.subscribe", request)
-    for name in ("a", "b"):
+    tags = [tag("a", 0, writable=False), tag("b", 1, functionCode="input")]
+    caller.request("modbus.subscribe", subscription(server, *tags))
+    reasons = {"a": 'hmi set "writable": false', "b": "functionCode input is not writable"}
+    for name, reason in reasons.items():
         answer = caller.request(f"modbus.command.{name}", "1")
-        assert answer["error"] == f"tag {name!r} of plc1 is not writable"
+        assert answer["error"] == f"tag {name!r} of plc1 is not writable: {reason}"
     unknown = caller.request("modbus.command.c", "1")
     assert unknown["error"] == "no tag 'c'"
     long = caller.request("modbus.command.a", "1" * 101)
     assert long["error"] == "the value has 101 bytes, allowed are 100"
     assert caller.request("modbus.command.a", b"\xff")["error"] == "the value is not UTF-8 text"
 
+    # A subscriber that leaves it out does not change it, one that declares it writable does.
+    reader = subscription(server, tag("a", 0), subscriberId="reader")
+    assert caller.request("modbus.subscribe", reader)["success"]
+    assert not caller.request("modbus.command.a", "4")["success"]
     writer = subscription(server, tag("a", 0, writable=True), subscriberId="operator")
     assert caller.request("modbus.subscribe", writer)["success"]
     assert caller.request("modbus.command.a", "5")["success"]
@@ -188,7 +193,7 @@ def test_a_message_that_is_refused_is_logged(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-    caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0, writable=False)))
     caller.publish("modbus.command.a", "7")
 
     def logged() -> bool:

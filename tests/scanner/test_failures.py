@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+import holdfast
 from holdfast import logs
 from holdfast.scanner import devices
 from support import wire
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    import holdfast
     from support.nats_bus import Run
     from support.running import Process, Serve
 
@@ -372,7 +372,8 @@ def test_the_heartbeat_is_in_its_bucket_and_gone_after_the_end(
     wire.until(beats, "there is a heartbeat")
     found = own_caller.do(entry())
     assert found.pop("startedAt") <= found.pop("lastSeen") <= time.time() * 1000
-    assert found == {"serviceType": "modbus", "moduleId": "modbus", "metadata": {}}
+    metadata = {"deviceCount": 0, "tagCount": 0, "version": holdfast.__version__}
+    assert found == {"serviceType": "modbus", "moduleId": "modbus", "metadata": metadata}
     scanner.stop()
     assert own_caller.do(entry()) == "KeyNotFoundError"
 
@@ -393,6 +394,8 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
         [told] = [each for each in caplog.records if each.getMessage() == "no_heartbeat"]
         reason = "JetStream is not enabled on the server or for this account"
         assert told.__dict__["fields"]["reason"] == reason
+        [told] = [each for each in caplog.records if "_not_kept" in each.getMessage()]
+        assert told.__dict__["fields"] == {"bucket": "holdfast_scanner", "reason": reason}
         scanner.stop()
     finally:
         bare.kill()

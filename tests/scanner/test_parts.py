@@ -18,7 +18,7 @@ from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wa
 from holdfast.scanner.groups import Group, grouped
 from holdfast.scanner.health import Health
 from holdfast.scanner.heartbeat import Heart
-from holdfast.scanner.messages import BrowseRequest, ServiceReport
+from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
 from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.publishing import Publisher
 from holdfast.scanner.tags import Places, Tag
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.scanner.messages import Publish
+    from holdfast.config.scanning import Publish
     from holdfast.types import PolledBlock
 
 TARGET = NetworkTarget("tcp", "127.0.0.1", 502)
@@ -513,7 +513,8 @@ def test_a_heartbeat_that_fails_after_the_stop_is_not_logged(
 
     async def beaten(*, stopped: bool) -> list[str]:
         caplog.clear()
-        heart, server = Heart("plant"), Jetstream()
+        heart = Heart("plant", lambda: HeartbeatMetadata(0, 0, "1"), lambda _: None)
+        server = Jetstream()
         client = cast("Client", server)
         beating = asyncio.create_task(heart.beat(client))
         await server.asked.wait()

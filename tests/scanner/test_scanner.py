@@ -337,7 +337,7 @@ def test_what_is_browsed_tells_all_of_a_device(caller: Caller, server: holdfast.
         "state": "online",
         "failures": 0,
         "scanRate": 50,
-        "timeout": 1000,
+        "timeout": 3000,
         "release": False,
         "missed": found["missed"],
         "tagCount": 1,
@@ -434,7 +434,7 @@ def test_who_leaves_a_slow_device_causes_no_scan(
         assert caller.request("modbus.subscribe", request)["success"]
         while data.next()["variableId"] != id:
             pass
-    assert replaced == [True]
+    wire.until(lambda: replaced == [True], "it is polled for both")
     assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
     wire.until(lambda: len(replaced) == 2, "it is polled for what is left")
     assert replaced == [True, False]

@@ -350,16 +350,19 @@ def test_a_refused_publish_is_told_and_the_rest_works(
     assert scanner.serves
 
 
+REQUESTS = ("subscribe", "unsubscribe", "browse", "variables", "shutdown", "scanner")
 RIGHTS = {
-    "sub": {
-        "allow": [
-            *(f"modbus.{name}" for name in ("subscribe", "unsubscribe", "browse", "shutdown")),
-            "modbus.command.>",
-            "_INBOX.>",
-        ]
-    },
+    "sub": {"allow": [*(f"modbus.{name}" for name in REQUESTS), "modbus.command.>", "_INBOX.>"]},
     "pub": {
-        "allow": ["modbus.data.>", "modbus.status.>", "$JS.API.>", "$KV.service_heartbeats.modbus"]
+        "allow": [
+            "modbus.data.>",
+            "modbus.status.>",
+            "modbus.scanner",
+            "service.logs.modbus.modbus",
+            "$JS.API.>",
+            "$KV.service_heartbeats.modbus",
+            "$KV.holdfast_scanner.modbus.>",
+        ]
     },
     "resp": {"max": 1, "ttl": 60 * 10**9},
 }
@@ -389,6 +392,8 @@ def test_the_rights_of_the_documentation_are_enough(
         assert caller.request("modbus.command.a", "7")["success"]
         data.until(lambda message: message["value"] == 7, "the new value comes")
         status.next()
+        wire.until(lambda: reasons(caplog, "subscriptions_kept"), "subscriptions are kept")
+        assert len(caller.kept("holdfast_scanner")) == 2
     scanner.stop()
     assert reasons(caplog, "nats_error") == []
 

@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import pytest
 from nats.aio.client import Client
+from nats.js.errors import NotFoundError
 
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import Scanner, Servers, Settings
+from holdfast.scanner.keeping import BUCKET
 from support import wire
 from support.brokers import NatsServer
 
@@ -150,6 +152,29 @@ class Caller:
     async def _listening(self, subject: str, inbox: Inbox) -> None:
         await self.client.subscribe(subject, cb=inbox.put)
         await self.client.flush()
+        await self.client.flush()  # The ping of the first one may overtake the subscription.
+
+    def kept(self, bucket: str) -> dict[str, Any]:
+        """Returns the JSON values of a key-value bucket; nothing if there is no bucket."""
+        return self._loop.do(self._kept(bucket))
+
+    async def _kept(self, bucket: str) -> dict[str, Any]:
+        before = f"$KV.{bucket}."
+        try:
+            found = await self.client.jetstream().key_value(bucket)
+            info = await self.client.jetstream().stream_info(f"KV_{bucket}", subjects_filter=">")
+        except NotFoundError:
+            return {}
+        entries: dict[str, Any] = {}
+        for key in (subject.removeprefix(before) for subject in info.state.subjects or {}):
+            with contextlib.suppress(NotFoundError):  # It is deleted.
+                entries[key] = json.loads((await found.get(key)).value or b"")
+        return entries
+
+    def forget(self, bucket: str) -> None:
+        """Deletes a key-value bucket, if there is one."""
+        with contextlib.suppress(NotFoundError):
+            self._loop.do(self.client.jetstream().delete_key_value(bucket))
 
     def do(self, work: Coroutine[Any, Any, Result]) -> Result:
         """Runs a coroutine in the client's loop and returns its result."""
@@ -214,11 +239,21 @@ class Run(Protocol):
 
 
 @pytest.fixture(scope="session")
-def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
-    """A server that all tests share, if they do not disturb it."""
+def shared_nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
     server = NatsServer(tmp_path_factory.mktemp("nats"))
     yield server
     server.kill()
+
+
+@pytest.fixture
+def nats(shared_nats: NatsServer) -> Iterator[NatsServer]:
+    """A server that all tests share, if they do not disturb it.
+
+    What a scanner keeps there is removed at the end of each test.
+    """
+    yield shared_nats
+    with Caller(shared_nats.url) as caller:
+        caller.forget(BUCKET)
 
 
 @pytest.fixture

@@ -298,7 +298,7 @@ def gateway_tls(settings: GatewayConfig) -> Tls:
 
 def scanner(settings: NatsConfig) -> ScannerSettings:
     """Returns the settings of the scanner."""
-    from holdfast.scanner import ScannerLimits, Servers, Settings
+    from holdfast.scanner import Defaults, Ping, ScannerLimits, Servers, Settings
 
     servers = Servers(
         settings.servers,
@@ -310,7 +310,20 @@ def scanner(settings: NatsConfig) -> ScannerSettings:
     )
     limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
     trust = NO_FILES if settings.device_tls is None else settings.device_tls.files
-    return Settings(servers, settings.prefix, settings.devices, limits, trust)
+    given = settings.defaults
+    return Settings(
+        servers,
+        settings.prefix,
+        settings.devices,
+        limits,
+        trust,
+        defaults=Defaults(given.timeout, given.publish, given.deadband, given.scan_rate),
+        writes=settings.writes,
+        strict=settings.strict,
+        ping=Ping(settings.ping.interval, settings.ping.outstanding),
+        publish_logs=settings.publish_logs,
+        keep_subscriptions=settings.keep_subscriptions,
+    )
 
 
 def _endpoint(key: str, target: Target) -> _core.Endpoint:

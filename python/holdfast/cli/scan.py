@@ -10,7 +10,7 @@ import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 from urllib.parse import urlsplit
 
 import click
@@ -19,15 +19,29 @@ from holdfast import logs
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.config.scanning import (
+    MAX_DEADBAND,
+    MAX_PING_INTERVAL,
+    MAX_PINGS,
+    MAX_SCAN_RATE,
+    MAX_TIMEOUT,
+    MIN_PING_INTERVAL,
+    MIN_SCAN_RATE,
+    MIN_TIMEOUT,
+    PING_INTERVAL,
+    PINGS_OUTSTANDING,
     PREFIX,
+    SCAN_RATE,
     SERVER_PORT,
+    TIMEOUT,
+    Publish,
+    Writes,
     parse_pollable,
     parse_prefix,
     parse_server,
     written_pollable,
 )
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.scanner import Scanner, ScannerLimits, Servers, Settings, device_tls
+from holdfast.scanner import Defaults, Ping, Scanner, ScannerLimits, Servers, Settings, device_tls
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
@@ -113,6 +127,77 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     metavar="SUBJECT",
     help="First part of all subjects.",
 )
+@click.option(
+    "--writes",
+    type=click.Choice(get_args(Writes)),
+    default="tags",
+    show_default=True,
+    help="Tags that may be written: all not declared read-only, those declared writable, or none.",
+)
+@click.option(
+    "--timeout",
+    type=click.IntRange(MIN_TIMEOUT, MAX_TIMEOUT),
+    default=TIMEOUT,
+    show_default=True,
+    metavar="MS",
+    help="Default timeout of a Modbus request.",
+)
+@click.option(
+    "--publish",
+    type=click.Choice(get_args(Publish)),
+    default="scan",
+    show_default=True,
+    help="Default for subscriptions: publish every value, or changes.",
+)
+@click.option(
+    "--deadband",
+    type=click.FloatRange(0, MAX_DEADBAND),
+    default=0.0,
+    show_default=True,
+    metavar="NUMBER",
+    help="Default for subscriptions: minimum change of a number, with --publish change.",
+)
+@click.option(
+    "--scan-rate",
+    type=click.IntRange(MIN_SCAN_RATE, MAX_SCAN_RATE),
+    default=SCAN_RATE,
+    show_default=True,
+    metavar="MS",
+    help="Default scan interval.",
+)
+@click.option(
+    "--strict",
+    is_flag=True,
+    help="Refuse requests with unknown keys or inexact values, instead of adjusting them.",
+)
+@click.option(
+    "--ping-interval",
+    type=click.FloatRange(MIN_PING_INTERVAL, MAX_PING_INTERVAL),
+    default=PING_INTERVAL,
+    show_default=True,
+    metavar="SECONDS",
+    help="Interval of pings to the NATS server.",
+)
+@click.option(
+    "--ping-outstanding",
+    type=click.IntRange(1, MAX_PINGS),
+    default=PINGS_OUTSTANDING,
+    show_default=True,
+    metavar="N",
+    help="Pings without an answer before a reconnect.",
+)
+@click.option(
+    "--publish-logs/--no-publish-logs",
+    default=True,
+    show_default=True,
+    help="Publish the log on service.logs.modbus.PREFIX.",
+)
+@click.option(
+    "--keep-subscriptions/--no-keep-subscriptions",
+    default=True,
+    show_default=True,
+    help="Keep subscriptions in JetStream, and restore them after a restart.",
+)
 @click.option("--user", metavar="NAME", help="User name for the NATS server.")
 @click.option("--password-file", type=FILE, metavar="FILE", help="File with the user's password.")
 @click.option(
@@ -164,6 +249,8 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
     trust = _tls("device", options)
     allow = _allowed(options["allow"])
+    if options["deadband"] and options["publish"] != "change":
+        raise click.UsageError("--deadband requires --publish change.")
     if store is not None and not embedded:
         raise click.UsageError("--store requires --embedded.")
     logs.configure(options["log_level"], options["log_format"])
@@ -176,12 +263,36 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
             if embedded:
                 server = stack.enter_context(Embedded(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
-            settings = Settings(servers, options["prefix"], allow, limits, trust)
+            settings = _settings(options, servers, allow, limits, trust)
             click.echo(_greeting(settings))
             asyncio.run(_serve(settings, check))
         except (EmbeddedFailed, OSError) as error:
             click.echo(f"holdfast: {error}", err=True)
             sys.exit(FAILED)
+
+
+def _settings(
+    options: dict[str, Any],
+    servers: Servers,
+    allow: tuple[AllowEntry, ...],
+    limits: ScannerLimits,
+    trust: Tls,
+) -> Settings:
+    return Settings(
+        servers,
+        options["prefix"],
+        allow,
+        limits,
+        trust,
+        defaults=Defaults(
+            options["timeout"], options["publish"], options["deadband"], options["scan_rate"]
+        ),
+        writes=options["writes"],
+        strict=options["strict"],
+        ping=Ping(options["ping_interval"], options["ping_outstanding"]),
+        publish_logs=options["publish_logs"],
+        keep_subscriptions=options["keep_subscriptions"],
+    )
 
 
 def _allowed(entries: tuple[str, ...]) -> tuple[AllowEntry, ...]:
@@ -255,7 +366,8 @@ def _greeting(settings: Settings) -> str:
     lines = [
         f"Scanning for subscribers at {', '.join(_without_secrets(settings.servers))}.",
         "",
-        f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse",
+        f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse, "
+        f"{prefix}.variables",
         f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",
         f"  published  {prefix}.data.DEVICE, {prefix}.status.DEVICE",
         f"  devices    {_places(settings.allow)}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from ipaddress import IPv4Network, IPv6Network
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from holdfast.config.addresses import SOURCE_FORM, parse_source
 from holdfast.config.remote import parse_remote
@@ -24,6 +24,25 @@ POLLABLE_FORM = f"{SOURCE_FORM}, or a serial device, as in /dev/ttyUSB0 or COM3"
 MAX_DEVICES = 5000
 MAX_TAGS = 500_000
 """Default limits of the scanner; `MAX_TAGS` counts the tags of all devices."""
+
+Publish = Literal["scan", "change"]
+Writes = Literal["tags", "explicit", "none"]
+"""Tags that may be written: all not declared read-only, those declared writable, or none."""
+
+SCAN_RATE = 1000
+TIMEOUT = 3000
+"""Defaults of subscribe requests in milliseconds."""
+
+MIN_SCAN_RATE, MAX_SCAN_RATE = 50, 86_400_000
+MIN_TIMEOUT, MAX_TIMEOUT = 10, 30_000
+"""Limits of subscribe requests in milliseconds."""
+MAX_DEADBAND = 1e300
+
+PING_INTERVAL = 1.0
+PINGS_OUTSTANDING = 3
+"""A server that does not answer is found after 4 s."""
+MIN_PING_INTERVAL, MAX_PING_INTERVAL = 0.1, 3600.0
+MAX_PINGS = 100
 
 _PORTS = {"nats": SERVER_PORT, "tls": SERVER_PORT}
 _PREFIX = re.compile(r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})*", re.ASCII)

@@ -121,6 +121,10 @@ class ServiceChecks:
             self.report.add(("nats", "tls"), message, of_key=True)
         self._tls(("nats", "tls"), nats.get("tls"))
         self._tls(("nats", "device_tls"), nats.get("device_tls"))
+        defaults = mapping(nats.get("defaults"))
+        if defaults.get("deadband") and defaults.get("publish") != "change":
+            message = "found without publish: change, allowed: only with it"
+            self.report.add(("nats", "defaults", "deadband"), message, of_key=True)
 
     def _password(self, section: str, settings: dict[Any, Any]) -> None:
         if "password_file" in settings and "username" not in settings:

@@ -29,8 +29,27 @@ from holdfast.config.scalars import (
     Sources,
     SubjectPrefix,
     TopicFilter,
+    whole_number,
 )
-from holdfast.config.scanning import MAX_DEVICES, MAX_TAGS, PREFIX
+from holdfast.config.scanning import (
+    MAX_DEADBAND,
+    MAX_DEVICES,
+    MAX_PING_INTERVAL,
+    MAX_PINGS,
+    MAX_SCAN_RATE,
+    MAX_TAGS,
+    MAX_TIMEOUT,
+    MIN_PING_INTERVAL,
+    MIN_SCAN_RATE,
+    MIN_TIMEOUT,
+    PING_INTERVAL,
+    PINGS_OUTSTANDING,
+    PREFIX,
+    SCAN_RATE,
+    TIMEOUT,
+    Publish,
+    Writes,
+)
 from holdfast.net.addresses import LOOPBACK
 from holdfast.net.tls import Tls
 from holdfast.types import Access
@@ -164,6 +183,30 @@ class NatsLimitsConfig(Model):
     """Maximum number of tags of all devices."""
 
 
+class NatsDefaultsConfig(Model):
+    """The values for keys that a subscribe request leaves out."""
+
+    timeout: Annotated[int, Field(ge=MIN_TIMEOUT, le=MAX_TIMEOUT)] = TIMEOUT
+    """Milliseconds for a Modbus request and its reply."""
+    publish: Publish = "scan"
+    """Whether every value is published, or only changes."""
+    deadband: Annotated[float, Field(ge=0, le=MAX_DEADBAND), whole_number] = 0.0
+    """With publish: change, the change of a number must be greater than this."""
+    scan_rate: Annotated[int, Field(ge=MIN_SCAN_RATE, le=MAX_SCAN_RATE)] = SCAN_RATE
+    """The scan interval in milliseconds."""
+
+
+class NatsPingConfig(Model):
+    """How a NATS server that does not answer is detected."""
+
+    interval: Annotated[float, Field(ge=MIN_PING_INTERVAL, le=MAX_PING_INTERVAL), whole_number] = (
+        PING_INTERVAL
+    )
+    """Seconds between pings to the server."""
+    outstanding: Annotated[int, Field(ge=1, le=MAX_PINGS)] = PINGS_OUTSTANDING
+    """Pings without an answer after which the scanner reconnects."""
+
+
 class NatsConfig(Model):
     """The scanner: polls devices for NATS subscribers."""
 
@@ -185,6 +228,18 @@ class NatsConfig(Model):
     """Certificates for TLS connections to devices."""
     prefix: SubjectPrefix = PREFIX
     """The first part of all subjects."""
+    defaults: NatsDefaultsConfig = Field(default_factory=NatsDefaultsConfig)
+    """What subscribe requests leave out."""
+    writes: Writes = "tags"
+    """Tags that may be written: all not declared read-only, those declared writable, or none."""
+    strict: bool = False
+    """Whether requests with unknown keys or inexact values are refused, instead of adjusted."""
+    ping: NatsPingConfig = Field(default_factory=NatsPingConfig)
+    """Pings that detect a NATS server that does not answer."""
+    publish_logs: bool = True
+    """Whether the scanner's log is also published on service.logs.modbus.PREFIX."""
+    keep_subscriptions: bool = True
+    """Whether subscriptions are kept in JetStream, and restored after a restart."""
     limits: NatsLimitsConfig = Field(default_factory=NatsLimitsConfig)
     """Limits on what subscribers can request."""
 

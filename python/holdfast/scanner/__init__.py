@@ -1,17 +1,19 @@
 """The scanner: polls Modbus devices for subscribers on NATS, and publishes the values.
 
 It has no configuration of devices. It connects to a device at the first subscription to its tags,
-and disconnects after the last one ends. It keeps no state over a restart.
+and disconnects after the last one ends. It keeps subscriptions over a restart in JetStream only.
 
 The modules: `service` connects the parts. `broker`, `receiving`, `outbox` and `wire` communicate
 with NATS, `polling` and `commands` with devices. `registry` holds the subscriptions. `groups`,
 `decoding` and `publishing` convert values to messages. `registry` and these three do no I/O.
+`adjusting` reads inexact requests. `keeping` and `kept` store subscriptions, and restore them.
 """
 
 from __future__ import annotations
 
-from holdfast.scanner.broker import Servers
+from holdfast.scanner.broker import Ping, Servers
 from holdfast.scanner.limits import ScannerLimits
+from holdfast.scanner.rules import Defaults
 from holdfast.scanner.service import Scanner, Settings
 
-__all__ = ["Scanner", "ScannerLimits", "Servers", "Settings"]
+__all__ = ["Defaults", "Ping", "Scanner", "ScannerLimits", "Servers", "Settings"]

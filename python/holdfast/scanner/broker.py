@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from nats.errors import Error
 
 from holdfast import logs
+from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
 from holdfast.net.tls import NO_FILES, Tls, broker_context
 from holdfast.scanner.credentials import Credentials
 from holdfast.scanner.receiving import SafeClient, TlsClient
@@ -34,9 +35,6 @@ MAX_PAUSE = 2.0
 
 SILENCE = 600.0
 """Seconds before a failure to connect with the same reason is logged again."""
-
-PING = 10
-"""Seconds between pings to the server. nats-py reconnects when two have no answer."""
 
 PENDING = 64 * 1024 * 1024
 """The limit of nats-py's send buffer in bytes. The outbox always stays below it."""
@@ -83,6 +81,16 @@ class Servers:
         return options
 
 
+@dataclass(frozen=True)
+class Ping:
+    """How a server that does not answer is detected."""
+
+    interval: float = PING_INTERVAL
+    """Seconds between pings."""
+    outstanding: int = PINGS_OUTSTANDING
+    """Pings without an answer. When the next one is due, the client reconnects."""
+
+
 def _secret(file: Path) -> str:
     try:
         return file.read_text().removesuffix("\n").removesuffix("\r")
@@ -98,7 +106,9 @@ class Broker:
         servers: Servers,
         handlers: Mapping[str, Handler],
         connected: Callable[[Client | None], None],
+        ping: Ping,
     ) -> None:
+        self._ping = ping
         self._servers = servers
         self._handlers = handlers
         self._connected = connected
@@ -161,7 +171,8 @@ class Broker:
                 closed_cb=closed,
                 max_reconnect_attempts=-1,
                 reconnect_time_wait=FIRST_PAUSE,  # type: ignore[arg-type]
-                ping_interval=PING,
+                ping_interval=self._ping.interval,  # type: ignore[arg-type]
+                max_outstanding_pings=self._ping.outstanding,
                 pending_size=PENDING,
             )
         except Error as error:
@@ -180,6 +191,9 @@ class Broker:
         try:
             for subject, handler in self._handlers.items():
                 await client.subscribe(subject, cb=handler)
+            # nats-py may send the ping of a flush before what is still in its buffer. At the end of
+            # the first flush, the buffer is sent; the second one waits until the server has it.
+            await client.flush()
             await client.flush()
             self._subscribed = True
         except (Error, OSError) as error:

@@ -184,9 +184,7 @@ class _Report:
             if fault:
                 inside = self._places.inside(area, address, count)
                 errors |= dict.fromkeys((tag.id for tag in inside), fault_text(fault))
-        subscribers = self._device.subscribers.values()
         for tag in tags:
-            said = [each.tags[tag.id] for each in subscribers if tag.id in each.tags]
             yield TagReport(
                 id=tag.id,
                 address=tag.address,
@@ -194,8 +192,8 @@ class _Report:
                 datatype=tag.asked_type,
                 byte_order=tag.order,
                 encoding=tag.encoding,
-                writable=any(wanted.writable for wanted in said),
-                description=next((each.description for each in said if each.description), None),
+                writable=self._device.unwritable(tag) is None,
+                description=self._device.description(tag.id),
                 error=errors.get(tag.id),
             )
 

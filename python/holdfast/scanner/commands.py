@@ -15,7 +15,6 @@ import msgspec
 from holdfast import logs
 from holdfast.client.requests import write_typed
 from holdfast.faults import fault_text
-from holdfast.protocol import WRITE_LIMITS
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import is_unwritten
 from holdfast.scanner.tags import FLOATS
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
-_NUMBER = re.compile(r"-?[0-9]{1,400}(\.[0-9]{1,400})?([eE][+-]?[0-9]{1,3})?")
+_NUMBER = re.compile(r"[+-]?([0-9]{1,400}(\.[0-9]{0,400})?|\.[0-9]{1,400})([eE][+-]?[0-9]{1,3})?")
 
 
 def value(text: str, tag: Tag) -> Any:
@@ -112,8 +111,8 @@ async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) ->
 
     Raises `Refused`.
     """
-    if not device.writable(tag.id) or tag.area not in WRITE_LIMITS:
-        raise Refused(f"tag {tag.id!r} of {device.id} is not writable")
+    if (flaw := device.unwritable(tag)) is not None:
+        raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
     made = value(text, tag)
     try:
         [request] = write_typed(

@@ -52,6 +52,24 @@ def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
     return Layout(named, size=count)
 
 
+def value_of(tag: Tag, data: bytes, address: int) -> Any:
+    """Decodes one tag of a block that begins at `address`."""
+    if not tag.of_bits:
+        return _alone(tag, data, address)
+    return _bits([tag], address)(data)[0]
+
+
+def clean(value: Any, tag: Tag) -> Any:
+    """Returns the value; `None` for NaN and for markers of the tag."""
+    if type(value) is list:
+        return [clean(item, tag) for item in value]
+    if type(value) is float and value != value:
+        return None
+    if tag.null and type(value) is not Undecoded and value in tag.null:
+        return None
+    return value
+
+
 def _alone(tag: Tag, data: bytes, address: int) -> Any:
     """Decodes one tag, independently of the others."""
     start = 2 * (tag.address - address)

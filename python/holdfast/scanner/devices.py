@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from holdfast._core import plan_blocks
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.latest import LatestBlocks
+from holdfast.scanner.subjects import second_id, subject_id
 from holdfast.scanner.tags import AREA_OF_CODE, Tag
 
 if TYPE_CHECKING:
@@ -16,8 +18,9 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint
     from holdfast.client.target import Target
+    from holdfast.config.scanning import Publish, Writes
     from holdfast.scanner.health import Health
-    from holdfast.scanner.messages import PlanRequest, Publish, Range
+    from holdfast.scanner.messages import PlanRequest, Range
     from holdfast.types import Area
 
 MAX_GAP = 10
@@ -36,6 +39,8 @@ class Plan:
     readable: tuple[tuple[Area, int, int], ...] = ()
     """Area, start and end of ranges; the end is exclusive."""
     forbidden: tuple[tuple[Area, int, int], ...] = ()
+    request: PlanRequest | None = field(default=None, compare=False)
+    """What this plan was made from."""
 
     @staticmethod
     def of(request: PlanRequest | None) -> Plan:
@@ -48,6 +53,7 @@ class Plan:
             request.max_bits or READ_BITS,
             tuple(_ranges("plan.readable", request.readable or ())),
             tuple(_ranges("plan.forbidden", request.forbidden or ())),
+            request,
         )
 
     def blocks(self, tags: Sequence[Tag]) -> list[tuple[Area, int, int, list[int], int]]:
@@ -100,6 +106,8 @@ class Source:
     """Milliseconds."""
     release: bool
     plan: Plan
+    url: str | None = field(default=None, compare=False)
+    """The URL in the request, if it has one."""
 
 
 @dataclass
@@ -117,15 +125,25 @@ class Subscriber:
 class Wanted:
     """The properties of a tag that each subscriber sets for itself."""
 
-    writable: bool
+    writable: bool | None
+    """`None` if the request leaves it out."""
     description: str | None
 
 
 class ScannedDevice:
     """A device with at least one subscriber."""
 
-    def __init__(self, id: str, source: Source, address: Target, health: Health) -> None:
+    def __init__(
+        self,
+        id: str,
+        source: Source,
+        address: Target,
+        health: Health,
+        writes: Writes = "tags",
+    ) -> None:
         self.id = id
+        self.subjects = tuple(filter(None, (subject_id(id), second_id(id))))
+        """The names of the device in subjects; nearly always one."""
         self.source = source
         self.address = address
         """The target with the resolved address."""
@@ -135,8 +153,12 @@ class ScannedDevice:
         self.tags: dict[str, Tag] = {}
         """The tags of all subscribers, by id."""
         self.health = health
+        self.latest = LatestBlocks()
+        self.status = b""
+        """The last published state, as JSON."""
         self.polled_as = ""
         """The device's name in the poller. Each change gives it a new one."""
+        self._writes = writes
         self._looked_up = time.monotonic()
 
     @property
@@ -158,11 +180,31 @@ class ScannedDevice:
         """Returns whether a known subscriber requests only tags that are new."""
         return subscriber in self.subscribers and self.tags.keys().isdisjoint(ids)
 
-    def writable(self, id: str) -> bool:
-        """Returns whether one of the tag's subscribers declared it writable."""
-        return any(
-            id in subscriber.tags and subscriber.tags[id].writable
-            for subscriber in self.subscribers.values()
+    def description(self, id: str) -> str | None:
+        """Returns the description of a tag, of the first subscriber that has one."""
+        wanted = (each.tags[id] for each in self.subscribers.values() if id in each.tags)
+        return next((each.description for each in wanted if each.description), None)
+
+    def users(self, id: str) -> list[str]:
+        """Returns the ids of the subscribers of a tag."""
+        return [name for name, each in self.subscribers.items() if id in each.tags]
+
+    def unwritable(self, tag: Tag) -> str | None:
+        """Returns why a tag can't be written; `None` if it can.
+
+        A subscriber that declares it writable decides, then one that declares it read-only.
+        """
+        if (flaw := tag.unwritable) is not None:
+            return flaw
+        if self._writes == "none":
+            return "this scanner writes nothing (nats.writes is none)"
+        said = {user: self.subscribers[user].tags[tag.id].writable for user in self.users(tag.id)}
+        if True in said.values():
+            return None
+        if self._writes == "explicit":
+            return 'no subscriber set "writable": true, which nats.writes: explicit requires'
+        return next(
+            (f'{user} set "writable": false' for user, each in said.items() if each is False), None
         )
 
     def forget(self, ids: Collection[str]) -> list[str]:

@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING
 
 import msgspec
 from nats.errors import NoRespondersError, TimeoutError
-from nats.js.errors import APIError, NotFoundError, ServiceUnavailableError
+from nats.js.errors import APIError, KeyNotFoundError, NotFoundError, ServiceUnavailableError
 
 from holdfast import logs
-from holdfast.scanner.messages import Heartbeat
+from holdfast.scanner.messages import Announcement, Heartbeat
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from nats.aio.client import Client
     from nats.js.kv import KeyValue
+
+    from holdfast.scanner.messages import HeartbeatMetadata
 
 BUCKET = "service_heartbeats"
 EVERY = 10.0
@@ -33,10 +37,17 @@ JETSTREAM_TIMEOUT = 2.0
 class Heart:
     """Writes heartbeats to one key of the bucket."""
 
-    def __init__(self, key: str) -> None:
+    def __init__(
+        self, key: str, metadata: Callable[[], HeartbeatMetadata], rival: Callable[[int], object]
+    ) -> None:
+        """`rival` is called with the start time of another service that writes the same key."""
         self._key = key
+        self._metadata = metadata
+        self._rival = rival
         self.started = _now()
         """Milliseconds since 1970."""
+        self._revision: int | None = None
+        """The revision of the own last heartbeat."""
         self._works: bool | None = None
         self._checked = False
         self._stopped = False
@@ -50,17 +61,32 @@ class Heart:
             module_id=self._key,
             last_seen=_now(),
             started_at=self.started,
-            metadata={},
+            metadata=self._metadata(),
         )
         try:
             bucket = await _bucket(client)
             if not self._works:
                 await self._check(bucket)
-            await bucket.put(self._key, msgspec.json.encode(sign))
+            await self._look(bucket)
+            self._revision = await bucket.put(self._key, msgspec.json.encode(sign))
         except Exception as error:  # Heartbeats are optional, so no error may stop the scanner.
-            self._told(False, _reason(error))
+            self._told(False, reason_of(error))
         else:
             self._told(True, "")
+
+    async def _look(self, bucket: KeyValue) -> None:
+        """Reports another service that has written the key since the own last heartbeat."""
+        if self._revision is None:
+            return
+        try:
+            found = await bucket.get(self._key)
+            if found.revision == self._revision:
+                return
+            other = msgspec.json.decode(found.value or b"", type=Announcement)
+        except (KeyNotFoundError, msgspec.DecodeError):
+            return
+        if other.started_at != self.started:
+            self._rival(other.started_at)
 
     async def _check(self, bucket: KeyValue) -> None:
         """Logs once if heartbeats in the bucket never expire."""
@@ -89,7 +115,8 @@ class Heart:
         self._works = works
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
+    """Returns why JetStream failed."""
     if isinstance(error, APIError) and error.description:
         return error.description
     if isinstance(error, ServiceUnavailableError | NoRespondersError):

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from holdfast.config.scanning import MAX_DEVICES, MAX_TAGS
+from holdfast.config.scanning import (
+    MAX_DEVICES,
+    MAX_SCAN_RATE,
+    MAX_TAGS,
+    MAX_TIMEOUT,
+    MIN_SCAN_RATE,
+    MIN_TIMEOUT,
+)
 
 
 @dataclass(frozen=True)
@@ -18,10 +25,10 @@ class ScannerLimits:
     """Tags of one device."""
     subscribers: int = 100
     """Subscribers of one device."""
-    shortest_scan: int = 50
-    longest_scan: int = 86_400_000
-    shortest_timeout: int = 10
-    longest_timeout: int = 30_000
+    shortest_scan: int = MIN_SCAN_RATE
+    longest_scan: int = MAX_SCAN_RATE
+    shortest_timeout: int = MIN_TIMEOUT
+    longest_timeout: int = MAX_TIMEOUT
     request: int = 4 * 1024 * 1024
     """Size of a request in bytes."""
     command: int = 4096

@@ -1,8 +1,8 @@
 """The messages of the service: requests, answers and published messages.
 
-Requests are checked strictly: an unknown key, a wrong type or a value out of range refuses the
-whole request. `null` for an optional value is the same as omitting it. Checks that need the state
-of the scanner are in other modules.
+`decode` checks requests strictly: an unknown key, a wrong type or a value out of range refuses the
+whole request. `null` for an optional value is the same as omitting it. `adjusting` accepts more.
+Checks that need the state of the scanner are in other modules.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import msgspec
 from msgspec import Meta
 
+from holdfast.config.scanning import Publish
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
 from holdfast.types import TRANSPORTS, Area, Transport
 
 FunctionCode = Literal["coil", "discrete", "holding", "input"]
-Publish = Literal["scan", "change"]
 State = Literal["connecting", "online", "offline"]
+Quality = Literal["good", "bad", "uncertain"]
 DataType = Literal["number", "boolean", "string", "array"]
 
 Id = Annotated[str, Meta(min_length=1, max_length=256)]
@@ -60,6 +61,7 @@ class TagRequest(_Request):
     encoding: Annotated[str, Meta(max_length=64)] | None = None
     """The encoding of `string:N`. Default: ASCII."""
     writable: bool | None = None
+    """Default: writable, in areas that can be written."""
     description: str | None = None
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
     """Values that mean "not available"; they are published as `null`."""
@@ -95,11 +97,11 @@ class SubscribeRequest(_Request):
     unit_id: Annotated[int, Meta(ge=0, le=MAX_UNIT)] | None = None
     """Default: 1."""
     byte_order: str | None = None
-    """Default: `ABCD`."""
+    """Default: `ABCD`. `big` is `ABCD`, `little` is `DCBA`."""
     scan_rate: int | None = None
     """The scan interval in milliseconds. Default: 1000."""
     timeout: int | None = None
-    """The timeout of a Modbus request in milliseconds. Default: 1000."""
+    """The timeout of a Modbus request in milliseconds. Default: 3000."""
     publish: Publish | None = None
     """Default: `scan`."""
     deadband: Annotated[float, Meta(ge=0)] | None = None
@@ -126,6 +128,14 @@ class BrowseRequest(_Request):
     """The number of devices to skip."""
     tag_offset: Annotated[int, Meta(ge=0)] | None = None
     """The number of tags of `deviceId` to skip."""
+
+
+class VariablesRequest(_Request):
+    """Requests the latest values. An empty message requests those of all devices."""
+
+    device_id: str | None = None
+    offset: Annotated[int, Meta(ge=0)] | None = None
+    """The number of tags to skip."""
 
 
 class Answer(_Message, omit_defaults=True):
@@ -167,7 +177,55 @@ class Heartbeat(_Message):
     module_id: str
     last_seen: int
     started_at: int
-    metadata: dict[str, str]
+    metadata: HeartbeatMetadata
+
+
+class HeartbeatMetadata(_Message):
+    """What a heartbeat tells about the service."""
+
+    device_count: int
+    tag_count: int
+    """Tags of all devices."""
+    version: str
+    """The version of Holdfast."""
+
+
+class LogEntry(_Message):
+    """A line of the log."""
+
+    timestamp: int
+    """In milliseconds since 1970."""
+    level: str
+    """`debug`, `info`, `warn` or `error`."""
+    message: str
+    """The event and its fields."""
+    service_type: str
+    module_id: str
+    logger: str
+
+
+class Announcement(_Message):
+    """Announces a scanner to other scanners on the same subjects; a part of a heartbeat."""
+
+    started_at: int
+    """In milliseconds since 1970."""
+
+
+class Variable(_Message, omit_defaults=True):
+    """The latest value of a tag. The answer to `variables` is an array of these."""
+
+    module_id: str
+    device_id: str
+    variable_id: str
+    value: bool | int | float | str | list[Any] | None
+    """The latest value that was read, also while the device is offline."""
+    datatype: DataType
+    quality: Quality
+    """`good`: of the last scan; `bad`: older, or not decodable; `uncertain`: not read yet."""
+    origin: str
+    last_updated: int | None = None
+    """Time of the device's response, in milliseconds since 1970."""
+    description: str | None = None
 
 
 class BlockReport(_Message, omit_defaults=True):
@@ -253,7 +311,14 @@ class DeviceReport(_Message, omit_defaults=True):
     last_error_at: int | None = None
 
 
-class ServiceReport(_Message):
+class OtherScanner(_Message):
+    """Another scanner on the same subjects."""
+
+    started_at: int
+    """In milliseconds since 1970."""
+
+
+class ServiceReport(_Message, omit_defaults=True):
     """The counts of messages since the start."""
 
     started_at: int
@@ -265,6 +330,8 @@ class ServiceReport(_Message):
     """Messages lost because too many waited for NATS."""
     lost_scans: int
     """Scans lost because this process did not keep up."""
+    other_scanners: list[OtherScanner] | None = None
+    """Other scanners on the same subjects; each of them handles every request, too."""
 
 
 class BrowseAnswer(_Message, omit_defaults=True):
@@ -287,27 +354,40 @@ Asked = TypeVar("Asked", bound=_Request)
 
 def decode(data: bytes, kind: type[Asked], most: int) -> Asked:
     """Parses a request of at most `most` bytes. Raises `Refused`."""
-    if len(data) > most:
-        raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
+    check_size(data, most)
     try:
         try:
             return msgspec.json.decode(data, type=kind)
         except msgspec.ValidationError as error:
             if "got `float`" not in str(error):
                 raise
-            return msgspec.convert(_with_integers(msgspec.json.decode(data)), type=kind)
+            return msgspec.convert(with_integers(msgspec.json.decode(data)), type=kind)
     except msgspec.ValidationError as error:
         raise Refused(_explained(str(error))) from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused(f"not JSON: {error}") from None
 
 
-def _with_integers(value: Any) -> Any:
+def check_size(data: bytes, most: int) -> None:
+    """Raises `Refused` for a request of more than `most` bytes."""
+    if len(data) > most:
+        raise Refused(f"the request has {len(data)} bytes, allowed are {most}")
+
+
+def converted(value: object, kind: type[Asked]) -> Asked:
+    """Converts parsed JSON to a request. Raises `Refused`."""
+    try:
+        return msgspec.convert(value, type=kind)
+    except msgspec.ValidationError as error:
+        raise Refused(_explained(str(error))) from None
+
+
+def with_integers(value: Any) -> Any:
     """Converts whole floats to integers. JavaScript callers do not distinguish them."""
     if type(value) is dict:
-        return {key: _with_integers(item) for key, item in value.items()}
+        return {key: with_integers(item) for key, item in value.items()}
     if type(value) is list:
-        return [_with_integers(item) for item in value]
+        return [with_integers(item) for item in value]
     if type(value) is float and value.is_integer() and abs(value) < EXACT:
         return int(value)
     return value

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.scanner.decoding import Undecoded, decoder
+from holdfast.scanner.decoding import Undecoded, clean, decoder
 from holdfast.scanner.groups import Group
+from holdfast.scanner.subjects import subject_id
 from holdfast.scanner.tags import Places
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class Publisher:
     def __init__(self, prefix: str, device: str) -> None:
         self._prefix = prefix
         self._device = device
+        self._subject = f"{prefix}.data.{subject_id(device)}"
         self._wanted: Callable[[], Sequence[Group]] | None = None
         """Returns the groups from the next poll on; `None` if they have not changed."""
         self._newcomers: set[str] = set()
@@ -142,7 +144,7 @@ class Publisher:
         """Returns the messages of the tags of one group in one block."""
         values = part.decoder(data)
         if part.special:
-            values = [_clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
+            values = [clean(value, tag) for value, tag in zip(values, part.tags, strict=True)]
         if part.plain:
             texts = _encode(values)[1:-1].split(b",")
         else:
@@ -201,7 +203,7 @@ class Publisher:
     def _part(self, due: _Due, tags: list[Tag], block: Place) -> _Part:
         _, address, count = block
         group = due.group
-        texts = [_template(self._prefix, self._device, tag) for tag in tags]
+        texts = [_template(self._prefix, self._device, self._subject, tag) for tag in tags]
         infallible = all(tag.type in _INFALLIBLE for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
         return _Part(
@@ -285,25 +287,14 @@ class _Due:
         return True
 
 
-def _template(prefix: str, device: str, tag: Tag) -> tuple[bytes, int]:
+def _template(prefix: str, device: str, subject: str, tag: Tag) -> tuple[bytes, int]:
     """Returns the text of a message, with placeholders, and the fixed part of its length."""
     head = {"moduleId": prefix, "deviceId": device, "variableId": tag.id}
     before = _encode(head)[:-1] + b',"value":'
     after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
     text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
-    subject = f"{prefix}.data.{device}".replace("%", "%%").encode()
-    return b"PUB %b %%d\r\n%b\r\n" % (subject, text), len(before) + len(after) + 1
-
-
-def _clean(value: Any, tag: Tag) -> Any:
-    """Returns the value; `None` for NaN and for markers of the tag."""
-    if type(value) is list:
-        return [_clean(item, tag) for item in value]
-    if type(value) is float and value != value:
-        return None
-    if tag.null and type(value) is not Undecoded and value in tag.null:
-        return None
-    return value
+    head_line = b"PUB %b %%d\r\n" % subject.encode()
+    return head_line + text + b"\r\n", len(before) + len(after) + 1
 
 
 def _differs(value: Any, last: Any, deadband: float) -> bool:

@@ -6,7 +6,7 @@ by itself. The registry checks it against the existing subscriptions.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlsplit
 
@@ -15,22 +15,26 @@ from holdfast.client.target import NetworkTarget, SerialTarget
 from holdfast.client.tolerance import STRICT
 from holdfast.net.addresses import address_in, unbracketed
 from holdfast.protocol import usual_port
+from holdfast.scanner.adjusting import Adjustments
 from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
-from holdfast.scanner.tags import tag
+from holdfast.scanner.subjects import subject_id
+from holdfast.scanner.tags import ORDERS, tag
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.client.target import Target
+    from holdfast.config.scanning import Publish, Writes
     from holdfast.scanner.limits import ScannerLimits
     from holdfast.scanner.messages import SubscribeRequest, UnsubscribeRequest
+    from holdfast.scanner.rules import Rules
     from holdfast.scanner.tags import Tag
 
-SCAN_RATE = 1000
-TIMEOUT = 1000
+SETTINGS = ("timeout", "release", "plan")
+"""The settings of a device that a request may leave out, once another has set them."""
 
 LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
 """What all devices on one serial line have alike."""
@@ -48,59 +52,89 @@ class Subscription:
     tags: Mapping[str, Tag]
     wanted: Mapping[str, Wanted]
     rate: int
-    publish: str
+    publish: Publish
     deadband: float
 
 
-def understood(request: SubscribeRequest, limits: ScannerLimits) -> Subscription:
-    """Checks a request by itself. Raises `Refused`."""
+@dataclass(frozen=True)
+class Change:
+    """What a request has changed."""
+
+    device: ScannedDevice | None
+    """The device of the request, if it is known."""
+    polling: bool = False
+    """Whether its polling must change."""
+    former: ScannedDevice | None = None
+    """The device that `device` replaces, because its address or a setting is another."""
+
+
+def understood(
+    request: SubscribeRequest, rules: Rules, changes: Adjustments | None = None
+) -> Subscription:
+    """Checks a request by itself. Adds to `changes` what is adjusted. Raises `Refused`."""
+    changes = Adjustments() if changes is None else changes
+    limits, defaults = rules.limits, rules.defaults
     _check_id(request.device_id)
-    if request.deadband and request.publish != "change":
+    publish = request.publish or defaults.publish
+    if request.deadband and publish != "change":
         raise Refused('deadband requires "publish": "change"')
+    deadband = defaults.deadband if request.deadband is None else request.deadband
     source = Source(
         _target(request),
         1 if request.unit_id is None else request.unit_id,
         _within(
-            "timeout", request.timeout, TIMEOUT, limits.shortest_timeout, limits.longest_timeout
+            "timeout",
+            defaults.timeout if request.timeout is None else request.timeout,
+            limits.shortest_timeout,
+            limits.longest_timeout,
         ),
         bool(request.release),
         Plan.of(request.plan),
+        request.url,
     )
     target = source.target
     if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
         raise Refused("unitId is 0, which is the broadcast of a serial line")
+    order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
     tags: dict[str, Tag] = {}
     for index, entry in enumerate(request.tags):
         where = f"tags[{index}]"
-        made = tag(entry, request.byte_order or "ABCD", where)
+        made = tag(entry, order, where, changes, rules)
         if made.id in tags:
-            raise Refused(f"{where}: duplicate id {made.id!r}")
+            if rules.strict:
+                raise Refused(f"{where}: duplicate id {made.id!r}")
+            changes.add("tag_repeated", made.id)
         tags[made.id] = made
     source.plan.check(list(tags.values()))
-    said = {key for key in ("timeout", "release", "plan") if getattr(request, key) is not None}
+    said = {key for key in SETTINGS if getattr(request, key) is not None}
     return Subscription(
         request.device_id,
         request.subscriber_id,
         source,
         frozenset(said),
         tags,
-        {entry.id: Wanted(bool(entry.writable), entry.description) for entry in request.tags},
-        _within(
-            "scanRate", request.scan_rate, SCAN_RATE, limits.shortest_scan, limits.longest_scan
-        ),
-        request.publish or "scan",
-        request.deadband or 0.0,
+        {entry.id: Wanted(entry.writable, entry.description) for entry in request.tags},
+        _rate(request, rules, changes),
+        publish,
+        deadband if publish == "change" else 0.0,
     )
 
 
 def _check_id(id: str) -> None:
     """Checks a device id, which becomes a part of subjects. Raises `Refused`."""
-    flaw = not id.isprintable() or " " in id or "*" in id or ">" in id
-    if flaw or "" in id.split("."):
-        raise Refused(
-            f"deviceId is {id!r}, which can't be a part of a subject: it must have no spaces, * or "
-            ">, and no dots at its ends or beside each other"
-        )
+    if not id.isprintable():
+        raise Refused(f"deviceId is {id!r}, allowed are printable characters and blanks")
+
+
+def _rate(request: SubscribeRequest, rules: Rules, changes: Adjustments) -> int:
+    """Returns the scan rate; one that is too short is raised. Raises `Refused`."""
+    limits, rate = rules.limits, request.scan_rate
+    if rate is None:
+        return rules.defaults.scan_rate
+    if rate < limits.shortest_scan and not rules.strict:
+        changes.add("scan_rate_raised", f"{rate} to {limits.shortest_scan} ms")
+        return limits.shortest_scan
+    return _within("scanRate", rate, limits.shortest_scan, limits.longest_scan)
 
 
 def _target(request: SubscribeRequest) -> Target:
@@ -126,9 +160,7 @@ def _target(request: SubscribeRequest) -> Target:
     return NetworkTarget(transport, host, port)
 
 
-def _within(key: str, value: int | None, default: int, least: int, most: int) -> int:
-    if value is None:
-        return default
+def _within(key: str, value: int, least: int, most: int) -> int:
     if not least <= value <= most:
         raise Refused(f"{key} is {value}, allowed are {least} to {most} ms")
     return value
@@ -137,44 +169,80 @@ def _within(key: str, value: int | None, default: int, least: int, most: int) ->
 class Registry:
     """The devices by id, with their subscribers."""
 
-    def __init__(self, limits: ScannerLimits) -> None:
+    def __init__(self, limits: ScannerLimits, writes: Writes = "tags") -> None:
         self.devices: dict[str, ScannedDevice] = {}
         self._limits = limits
+        self._writes = writes
         self._tags = 0
         self._holders: dict[str, set[str]] = {}
         """The ids of the devices that have a tag id."""
+        self._subjects: dict[str, str] = {}
+        """The ids of the devices, by their names in subjects."""
 
-    def subscribe(self, asked: Subscription, address: Target) -> tuple[ScannedDevice | None, bool]:
-        """Adds a subscription. Returns the device, and whether its polling must change.
+    @property
+    def tags(self) -> int:
+        """The number of tags of all devices."""
+        return self._tags
+
+    def known(self, asked: Subscription) -> ScannedDevice | None:
+        """Returns the device of a request, if the request does not replace it.
+
+        Raises `Refused` if it would replace a device that others use.
+        """
+        device = self.devices.get(asked.device)
+        if device is None or not _replaces(device, asked):
+            return device
+        return None
+
+    def subscribe(self, asked: Subscription, address: Target) -> Change:
+        """Adds a subscription. Returns what has changed.
 
         A request without tags adds no subscriber, and no device. Raises `Refused`.
         """
         device = self.devices.get(asked.device)
         new = [id for id in asked.tags if device is None or id not in device.tags]
         self._check_limits(device, asked, len(new))
+        former = None
+        source = asked.source
         if device is None:
+            self._check_subject(asked.device)
             self._check_shared(asked)
         else:
-            _check_known(device, asked)
-            device.source.plan.check([asked.tags[id] for id in new])
+            source = _merged(device.source, asked)
+            if _replaces(device, asked):
+                former = device
+                self._check_shared(asked)
+            _check_tags(device, asked)
+            source.plan.check(list((device.tags | dict(asked.tags)).values()))
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
-            return device, False
-        if device is None:
-            device = ScannedDevice(asked.device, asked.source, address, Health())
-            self.devices[device.id] = device
-        before = device.rate if device.subscribers else None
+            return Change(device)
+        before = device.rate if device is not None and device.subscribers else None
+        if device is None or former is not None:
+            device = self._made(asked, source, address, former)
         subscriber = device.subscribers.setdefault(
             asked.subscriber, Subscriber(asked.rate, "scan", 0.0)
         )
         subscriber.rate = asked.rate
-        subscriber.publish = "change" if asked.publish == "change" else "scan"
+        subscriber.publish = asked.publish
         subscriber.deadband = asked.deadband
         subscriber.tags |= asked.wanted
-        device.tags |= {id: asked.tags[id] for id in new}
+        redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
+        device.tags |= asked.tags
         for id in new:
             self._holders.setdefault(id, set()).add(device.id)
         self._tags += len(new)
-        return device, bool(new) or device.rate != before
+        return Change(device, bool(new) or redefined or device.rate != before, former)
+
+    def _made(
+        self, asked: Subscription, source: Source, address: Target, former: ScannedDevice | None
+    ) -> ScannedDevice:
+        """Adds a device; with the subscribers and the tags of the one that it replaces, if any."""
+        device = ScannedDevice(asked.device, source, address, Health(), self._writes)
+        if former is not None:
+            device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
+        self.devices[device.id] = device
+        self._subjects |= dict.fromkeys(device.subjects, device.id)
+        return device
 
     def unsubscribe(self, request: UnsubscribeRequest) -> tuple[ScannedDevice | None, bool]:
         """Removes tags of a subscriber. Returns the device, and whether its polling must change.
@@ -199,6 +267,8 @@ class Registry:
         self._tags -= len(unwanted)
         if not device.subscribers:
             del self.devices[device.id]
+            for name in device.subjects:
+                del self._subjects[name]
             return device, True
         return device, bool(unwanted) or device.rate != before
 
@@ -208,8 +278,9 @@ class Registry:
         parts = name.split(".")
         for at in range(1, len(parts)):
             device, id = ".".join(parts[:at]), ".".join(parts[at:])
-            if device in self._holders.get(id, ()):
-                found.add((device, id))
+            for named in {device, self._subjects.get(device, device)}:
+                if named in self._holders.get(id, ()):
+                    found.add((named, id))
         if not found:
             raise Refused(f"no tag {name!r}")
         if len(found) > 1:
@@ -218,12 +289,22 @@ class Registry:
         [(of, id)] = found
         return self.devices[of], self.devices[of].tags[id]
 
+    def _check_subject(self, id: str) -> None:
+        """Checks that no other device has the same name in subjects. Raises `Refused`."""
+        name = subject_id(id)
+        other = self._subjects.get(name)
+        if other is not None:
+            raise Refused(
+                f"deviceId {id!r} has the same name in subjects as {other!r}, which is known: "
+                f"{name}; give one of them another id"
+            )
+
     def _check_shared(self, asked: Subscription) -> None:
         """Checks that a new device has the settings of the devices that share its connection."""
         target = asked.source.target
         place, settings = _place(target), _settings(target)
         for device in self.devices.values():
-            if _place(device.source.target) != place:
+            if device.id == asked.device or _place(device.source.target) != place:
                 continue
             for key, known in _settings(device.source.target).items():
                 if known != settings[key]:
@@ -255,30 +336,51 @@ class Registry:
             raise Refused(f"there would be {self._tags + new} tags, allowed are {limits.tags}")
 
 
-def _check_known(device: ScannedDevice, asked: Subscription) -> None:
-    """Checks that a request agrees with earlier requests for the device. Raises `Refused`."""
-    check_address(device, asked)
-    for key in ("timeout", "release", "plan"):
-        known, said = getattr(device.source, key), getattr(asked.source, key)
-        if key in asked.said and said != known:
-            raise Refused(
-                f"{key} of {device.id} is already different; end all of its subscriptions first"
-            )
-    for id, wanted in asked.tags.items():
-        if id in device.tags and device.tags[id] != wanted:
-            raise Refused(
-                f"tag {id!r} of {device.id} already has another definition; unsubscribe it first"
-            )
+def _replaces(device: ScannedDevice, asked: Subscription) -> bool:
+    """Returns whether a request changes the address or a setting of a device.
 
-
-def check_address(device: ScannedDevice, asked: Subscription) -> None:
-    """Checks that a request names the known address of a device. Raises `Refused`."""
+    Raises `Refused` if other subscribers use the device.
+    """
     known, said = device.source, asked.source
+    found = ""
     if (known.target, known.unit) != (said.target, said.unit):
-        raise Refused(
-            f"{device.id} is known as {_told(known)}, not as {_told(said)}; end all of its "
-            "subscriptions first"
-        )
+        found = f"{device.id} is known as {_told(known)}, not as {_told(said)}"
+    else:
+        for key in SETTINGS:
+            one, other = getattr(known, key), getattr(said, key)
+            if key in asked.said and one != other:
+                found = f"{key} of {device.id} is already different: {one}, not {other}"
+                break
+    if not found:
+        return False
+    _check_unused(found, [name for name in device.subscribers if name != asked.subscriber])
+    return True
+
+
+def _merged(known: Source, asked: Subscription) -> Source:
+    """Returns the source of a request, with the known settings in place of those left out."""
+    kept = {key: getattr(known, key) for key in SETTINGS if key not in asked.said}
+    return replace(asked.source, **kept)
+
+
+def _check_tags(device: ScannedDevice, asked: Subscription) -> None:
+    """Checks that no other subscriber uses another definition of a tag. Raises `Refused`."""
+    for id, wanted in asked.tags.items():
+        known = device.tags.get(id)
+        if known is not None and known != wanted:
+            difference = f"{known}, not {wanted}"
+            if str(known) == str(wanted):
+                difference = "another encoding or other null values"
+            found = f"tag {id!r} of {device.id} already has another definition: {difference}"
+            users = [name for name in device.users(id) if name != asked.subscriber]
+            _check_unused(found, users)
+
+
+def _check_unused(found: str, users: list[str]) -> None:
+    """Raises `Refused` if there are other users of something that a request would replace."""
+    if users:
+        more = f" and {len(users) - 1} more" if len(users) > 1 else ""
+        raise Refused(f"{found}; {users[0]}{more} must unsubscribe first")
 
 
 def _place(target: Target) -> str:

@@ -7,14 +7,18 @@ from typing import Any
 import msgspec
 
 from holdfast.scanner.messages import (
+    Announcement,
     Answer,
     BrowseAnswer,
     BrowseRequest,
     Data,
     Heartbeat,
+    LogEntry,
     Status,
     SubscribeRequest,
     UnsubscribeRequest,
+    Variable,
+    VariablesRequest,
 )
 
 MESSAGES = (
@@ -26,6 +30,10 @@ MESSAGES = (
     Data,
     Status,
     Heartbeat,
+    VariablesRequest,
+    Variable,
+    LogEntry,
+    Announcement,
 )
 
 

@@ -9,34 +9,45 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import WeakValueDictionary
 
-from holdfast import logs
+import msgspec
+
+from holdfast import _core, logs
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.scanner import commands, device_tls, wire
-from holdfast.scanner.broker import Broker, Servers
+from holdfast.scanner.adjusting import Adjustments, adjusted
+from holdfast.scanner.broker import Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
 from holdfast.scanner.hosts import Allowed
+from holdfast.scanner.kept import Kept
 from holdfast.scanner.limits import ScannerLimits
 from holdfast.scanner.messages import (
+    Announcement,
     Answer,
     BrowseRequest,
+    HeartbeatMetadata,
     ServiceReport,
     Status,
     SubscribeRequest,
     UnsubscribeRequest,
+    VariablesRequest,
     decode,
 )
 from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.polling import Polling
+from holdfast.scanner.published_log import PublishedLog
 from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.registry import Registry, check_address, understood
+from holdfast.scanner.registry import Registry, understood
+from holdfast.scanner.rivals import Rivals
+from holdfast.scanner.rules import Defaults, Rules
+from holdfast.scanner.variables import variables
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -44,19 +55,28 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint
     from holdfast.client.target import Target
+    from holdfast.config.scanning import Writes
     from holdfast.net.allow_list import AllowEntry
+    from holdfast.scanner.adjusting import Asked
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.registry import Subscription
     from holdfast.types import PolledBlock
 
-Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer]]"
+Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer | bytes]]"
+"""Carries out a message. Returns the answer, or its JSON."""
 
 LARGE = 16 * 1024
 """Size in bytes of a request that takes milliseconds to parse."""
 
 SOON = 1000
 """Scan interval in milliseconds up to which a new subscriber waits for the next regular scan."""
+
+MAX_PAYLOAD = 2**20
+"""The size limit of messages in bytes, before a NATS server tells its own."""
+
+MAX_ADJUSTED = 10_000
+"""Limit of remembered subscribers whose requests were adjusted."""
 
 ENDING = 2.0
 """Timeout in seconds of each step of a stop."""
@@ -74,6 +94,18 @@ class Settings:
     limits: ScannerLimits = field(default_factory=ScannerLimits)
     device_tls: Tls = NO_FILES
     """The TLS files for connections to devices."""
+    defaults: Defaults = field(default_factory=Defaults)
+    """What subscribe requests leave out."""
+    writes: Writes = "tags"
+    """Which tags callers may write."""
+    strict: bool = False
+    """Whether requests are refused that would otherwise be adjusted."""
+    ping: Ping = field(default_factory=Ping)
+    """How a NATS server that does not answer is detected."""
+    publish_logs: bool = True
+    """Whether the log is also published."""
+    keep_subscriptions: bool = True
+    """Whether subscriptions and states are kept in JetStream."""
 
 
 class Scanner:
@@ -87,11 +119,18 @@ class Scanner:
         self._one_by_one = asyncio.Lock()
         """Held while a request is parsed and checked."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._registry = Registry(settings.limits)
+        self._rules = Rules(settings.limits, settings.defaults, settings.strict)
+        self._registry = Registry(settings.limits, settings.writes)
+        self._adjusted: set[tuple[str, str]] = set()
+        """The subscribers, and the kinds of adjustments, that are already logged."""
         self._publishers: dict[str, Publisher] = {}
-        self._heart = Heart(settings.prefix)
+        self._heart = Heart(settings.prefix, self._metadata, self._rival)
+        self._rivals = Rivals(self._heart.started)
         self.outbox = Outbox()
-        self._broker = Broker(settings.servers, self._handlers(), self._connected)
+        self._kept = Kept(settings.prefix, self._registry, self._restore_request)
+        self._ready = asyncio.Event()
+        """Set when the kept subscriptions are restored, or can't be."""
+        self._broker = Broker(settings.servers, self._handlers(), self._connected, settings.ping)
         self._due = asyncio.Event()
         """Set when the next heartbeat is due immediately."""
 
@@ -102,16 +141,22 @@ class Scanner:
         """
         device_tls.check(self._settings.device_tls)
         self._polling = Polling(self._take)
-        running: list[asyncio.Task[object]] = [
-            asyncio.create_task(work)
-            for work in (self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait())
-        ]
+        works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
+        if self._settings.keep_subscriptions:
+            works += [self._kept.keeper.run(), self._kept.restore(self._ready)]
+        else:
+            self._ready.set()
+        running: list[asyncio.Task[object]] = [asyncio.create_task(work) for work in works]
+        published_log = PublishedLog(self._settings.prefix, self._publish_log)
+        if self._settings.publish_logs:
+            logs.LOGGER.addHandler(published_log)
         try:
             done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         finally:
             await self._stop(running)
+            logs.LOGGER.removeHandler(published_log)
 
     @property
     def serves(self) -> bool:
@@ -134,6 +179,7 @@ class Scanner:
         values and states again.
         """
         self.outbox.connected(client)
+        self._kept.keeper.connected(client)
         self._due.set()
         if client is not None:
             for device in self._registry.devices.values():
@@ -152,18 +198,47 @@ class Scanner:
             f"{prefix}.unsubscribe": self._answering("unsubscribe", self._unsubscribe),
             f"{prefix}.command.>": self._answering("command", self._command),
             f"{prefix}.browse": self._answering("browse", self._browse),
+            f"{prefix}.variables": self._answering("variables", self._variables),
+            f"{prefix}.scanner": self._announced,
             f"{prefix}.shutdown": shutdown,
         }
+
+    async def _announced(self, message: Msg) -> None:
+        """Handles the announcement of another scanner, or of this one."""
+        with contextlib.suppress(msgspec.DecodeError):
+            self._rival(msgspec.json.decode(message.data, type=Announcement).started_at)
+
+    def _rival(self, started: int) -> None:
+        if self._rivals.seen(started):
+            self._announce()
+
+    def _announce(self) -> None:
+        subject = f"{self._settings.prefix}.scanner"
+        text = wire.message(subject, Announcement(started_at=self._heart.started))
+        if self._broker.client is not None:
+            self.outbox.put([((subject,), text)])
+
+    def _publish_log(self, key: object, text: bytes) -> None:
+        if self._broker.client is not None:
+            self.outbox.put([(key, text)])
+
+    def _metadata(self) -> HeartbeatMetadata:
+        return HeartbeatMetadata(
+            device_count=len(self._registry.devices),
+            tag_count=self._registry.tags,
+            version=_core.__version__,
+        )
 
     def _answering(self, kind: str, handle: Handle) -> Callable[[Msg], Awaitable[None]]:
         """Returns a handler that carries out messages concurrently and answers them."""
 
         async def carry_out(message: Msg) -> None:
-            answer: Answer | BrowseAnswer
+            answer: Answer | BrowseAnswer | bytes
             most = self._settings.limits.pending
             try:
                 if len(self._tasks) > most:
                     raise Refused(f"too many requests: {most} are pending, which is the limit")
+                await self._ready.wait()
                 answer = await handle(message)
             except Refused as refused:
                 logs.refused(
@@ -174,7 +249,9 @@ class Scanner:
                 logs.problem("request_failed", subject=message.subject)
                 answer = Answer(success=False, error=f"internal error: {type(error).__name__}")
             if message.reply:
-                await self.outbox.answer(message.reply, wire.message(message.reply, answer))
+                subject = message.reply
+                payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
+                await self.outbox.answer(subject, wire.text(subject, payload))
 
         async def begin(message: Msg) -> None:
             self._begin(carry_out(message))
@@ -187,21 +264,14 @@ class Scanner:
         task.add_done_callback(self._tasks.discard)
 
     async def _subscribe(self, message: Msg) -> Answer:
-        limits = self._settings.limits
         async with self._in_order(message):
-            asked = understood(decode(message.data, SubscribeRequest, limits.request), limits)
+            changes = Adjustments()
+            request = self._decoded(message.data, SubscribeRequest, changes)
+            asked = understood(request, self._rules, changes)
         async with self._turn(asked.device):
-            address, endpoint = await self._place(asked)
-            known = self._registry.devices.get(asked.device)
-            is_extended = known is not None and known.is_extended_by(asked.subscriber, asked.tags)
-            device, changed = self._registry.subscribe(asked, address)
-            if device is not None and asked.subscriber in device.subscribers:
-                device.endpoint = endpoint
-                self._begin_publishing(device, asked)
-                if not is_extended:
-                    self._publish_state(device)
-                if changed or (asked.tags and device.rate > SOON):
-                    self._polling.renew(device)
+            await self._add(asked)
+        await self._kept.settled(asked.device, asked.subscriber)
+        self._log_adjustments(asked.subscriber, asked.device, changes)
         logs.write(
             logging.INFO,
             "subscribed",
@@ -210,7 +280,52 @@ class Scanner:
             tags=len(asked.tags),
             scan_rate=asked.rate,
         )
-        return Answer(success=True, count=len(asked.tags))
+        return Answer(success=True, count=len(request.tags))
+
+    async def _restore_request(self, request: SubscribeRequest) -> None:
+        """Carries out a kept request. Raises `Refused`."""
+        asked = understood(request, self._rules)
+        async with self._turn(asked.device):
+            await self._add(asked, kept=True)
+
+    async def _add(self, asked: Subscription, *, kept: bool = False) -> None:
+        """Adds a subscription, and polls and publishes accordingly. Raises `Refused`.
+
+        A subscription that is already `kept` is not stored again.
+        """
+        address, endpoint = await self._place(asked)
+        known = self._registry.devices.get(asked.device)
+        is_extended = known is not None and known.is_extended_by(asked.subscriber, asked.tags)
+        change = self._registry.subscribe(asked, address)
+        device = change.device
+        if device is None or asked.subscriber not in device.subscribers:
+            return
+        if change.former is not None:
+            self._drop(change.former)
+        device.endpoint = endpoint
+        self._begin_publishing(device, asked)
+        if not kept:
+            self._kept.changed(device.id, asked.subscriber)
+        if change.former is not None or not is_extended:
+            self._publish_state(device)
+        if change.polling or change.former or (asked.tags and device.rate > SOON):
+            self._polling.renew(device)
+
+    def _decoded(self, data: bytes, kind: type[Asked], changes: Adjustments) -> Asked:
+        most = self._settings.limits.request
+        if self._settings.strict:
+            return decode(data, kind, most)
+        return adjusted(data, kind, most, changes)
+
+    def _log_adjustments(self, subscriber: str, device: str, changes: Adjustments) -> None:
+        """Logs what was changed in a request: once for each subscriber and kind."""
+        for kind, what in changes:
+            if (subscriber, kind) in self._adjusted:
+                continue
+            if len(self._adjusted) >= MAX_ADJUSTED:
+                self._adjusted.clear()
+            self._adjusted.add((subscriber, kind))
+            logs.write(logging.WARNING, kind, subscriber=subscriber, device=device, found=what)
 
     def _begin_publishing(self, device: ScannedDevice, asked: Subscription) -> None:
         publisher = self._publishers.get(device.id)
@@ -221,17 +336,18 @@ class Scanner:
 
     async def _place(self, asked: Subscription) -> tuple[Target, Endpoint | None]:
         """Returns the address of a device: the known one, or the result of a lookup."""
-        device = self._registry.devices.get(asked.device)
+        device = self._registry.known(asked)
         if device is None:
             address = await self._allowed.address(asked.source.target)
             return address, device_tls.endpoint_of(address, self._settings.device_tls)
-        check_address(device, asked)
         return device.address, device.endpoint
 
     async def _unsubscribe(self, message: Msg) -> Answer:
         async with self._in_order(message):
-            request = decode(message.data, UnsubscribeRequest, self._settings.limits.request)
+            changes = Adjustments()
+            request = self._decoded(message.data, UnsubscribeRequest, changes)
         async with self._turn(request.device_id):
+            self._kept.unsubscribed(request)
             device, changed = self._registry.unsubscribe(request)
             if device is not None:
                 if device.subscribers:
@@ -240,6 +356,9 @@ class Scanner:
                         self._polling.renew(device, at_once=False)
                 elif changed:
                     self._drop(device)
+                    self._kept.state_changed(device.id)
+        await self._kept.settled(request.device_id, request.subscriber_id)
+        self._log_adjustments(request.subscriber_id, request.device_id, changes)
         logs.write(
             logging.INFO,
             "unsubscribed",
@@ -287,21 +406,37 @@ class Scanner:
         async with self._in_order(message, is_large=True):
             return self._browsed(request)
 
-    def _browsed(self, request: BrowseRequest) -> BrowseAnswer:
-        devices = {
+    async def _variables(self, message: Msg) -> bytes:
+        request = VariablesRequest()
+        if message.data:
+            request = decode(message.data, VariablesRequest, self._settings.limits.request)
+        async with self._in_order(message, is_large=True):
+            prefix = self._settings.prefix
+            return variables(request, self._shown_devices(), prefix, self._most())
+
+    def _shown_devices(self) -> dict[str, tuple[ScannedDevice, Mapping[str, str]]]:
+        """Returns each device with the errors of its tags that could not be decoded."""
+        return {
             id: (device, self._publishers[id].undecoded)
             for id, device in self._registry.devices.items()
         }
+
+    def _most(self) -> int:
+        """Returns the size limit of an answer."""
         client = self._broker.client
-        most = 2**20 if client is None else client.max_payload
+        return MAX_PAYLOAD if client is None else client.max_payload
+
+    def _browsed(self, request: BrowseRequest) -> BrowseAnswer:
         service = ServiceReport(
             started_at=self._heart.started,
             published=self.outbox.sent,
             replaced=self.outbox.replaced,
             dropped=self.outbox.dropped,
             lost_scans=self._polling.dropped,
+            other_scanners=self._rivals.current() or None,
         )
-        return browsed(request, devices, self._polling.counters(), service, most)
+        counters = self._polling.counters()
+        return browsed(request, self._shown_devices(), counters, service, self._most())
 
     def _take(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         """Publishes the results of a poll."""
@@ -315,9 +450,15 @@ class Scanner:
             self._tell(device)
         if device.may_have_moved():
             self._begin(self._look_up(device))
+        device.latest.take(blocks)
         id = device.id
         messages = self._publishers[id].messages(due, blocks)
         self.outbox.put([((id, tag), text) for tag, text in messages])
+        if len(device.subjects) > 1:
+            one, other = (f"{self._settings.prefix}.data.{name}" for name in device.subjects)
+            self.outbox.put(
+                [((id, tag, other), wire.readdressed(text, one, other)) for tag, text in messages]
+            )
 
     async def _look_up(self, device: ScannedDevice) -> None:
         """Looks up the name of a device that does not respond; its address may have changed."""
@@ -352,12 +493,16 @@ class Scanner:
             error=health.error,
             timestamp=int(time.time() * 1000),
         )
-        subject = f"{self._settings.prefix}.status.{device.id}"
-        self.outbox.put([((device.id,), wire.message(subject, status))])
+        device.status = msgspec.json.encode(status)
+        self._kept.state_changed(device.id)
+        for name in device.subjects:
+            subject = f"{self._settings.prefix}.status.{name}"
+            self.outbox.put([((device.id, subject), wire.text(subject, device.status))])
 
     async def _beat(self) -> None:
         while True:
             self._due.clear()
+            self._announce()
             await self._heart.beat(self._broker.client)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(EVERY):
@@ -374,7 +519,10 @@ class Scanner:
         await _within(asyncio.wait(running))
 
     async def _farewell(self) -> None:
-        """Deletes the heartbeat, and waits until all messages are sent."""
+        """Deletes heartbeat and states, and waits until all messages are sent."""
+        if self._settings.keep_subscriptions:
+            with contextlib.suppress(Exception):
+                await self._kept.keeper.stop()
         await self._heart.stop(self._broker.client)
         await self.outbox.flush()
 

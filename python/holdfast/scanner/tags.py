@@ -17,7 +17,9 @@ from holdfast.values.types import parsed
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from holdfast.scanner.adjusting import Adjustments
     from holdfast.scanner.messages import DataType, Marker, TagRequest
+    from holdfast.scanner.rules import Rules
     from holdfast.types import Area
     from holdfast.values.types import Type
 
@@ -26,6 +28,12 @@ CODE_OF_AREA = {area: code for code, area in AREA_OF_CODE.items()}
 """The names of the areas in messages."""
 
 FLOATS = ("float16", "float32", "float64")
+ORDERS = {"big": "ABCD", "little": "DCBA"}
+"""Other names of byte orders, as callers of tentacle-modbus use them."""
+
+NUMERIC = ("bcd", "float", "int", "uint")
+"""What the names of numeric types begin with."""
+
 KINDS: dict[str, DataType] = {
     "bool": "boolean",
     "bit": "boolean",
@@ -71,6 +79,25 @@ class Tag:
         return "array" if type.count is not None else KINDS.get(type.base, "number")
 
     @property
+    def unwritable(self) -> str | None:
+        """Returns why no Modbus request can write the tag; `None` if one can."""
+        type = parsed(self.type)
+        if self.area not in WRITE_LIMITS:
+            return f"functionCode {CODE_OF_AREA[self.area]} is not writable"
+        if type.base == "bit" and type.count is not None:
+            return f"{self.type} can't be written, only one bit can"
+        most = WRITE_LIMITS[self.area]
+        if type.registers > most:
+            kind = "coils" if self.of_bits else "registers"
+            has = f"{self.asked_type} has {type.registers} {kind}"
+            return f"{has}, one request writes at most {most}"
+        return None
+
+    def __str__(self) -> str:
+        kind = "" if self.of_bits else f" {self.order}"
+        return f"{self.asked_type}{kind} at {CODE_OF_AREA[self.area]} {self.address}"
+
+    @property
     def of_bits(self) -> bool:
         """Whether the tag is in an area of bits."""
         return self.area in BIT_AREAS
@@ -92,15 +119,23 @@ class Places:
         return [tag for tag in self._tags.get(area, [])[first:last] if tag.end <= end]
 
 
-def tag(request: TagRequest, order: str, where: str) -> Tag:
-    """Creates the tag of a request; `order` is the default byte order. Raises `Refused`."""
+def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules: Rules) -> Tag:
+    """Creates the tag of a request; `order` is the default byte order. Raises `Refused`.
+
+    Unless the rules are strict, a number in an area of bits becomes a boolean, and `writable` is
+    ignored in an area that can't be written. Adds this to `changes`.
+    """
     area = AREA_OF_CODE[request.function_code]
-    asked = name = request.datatype
+    name = request.datatype
     if name == "boolean" or name.startswith("boolean["):
         name = "bool" + name.removeprefix("boolean")
     order = request.byte_order or order
+    order = ORDERS.get(order, order)
     try:
         type = parsed(name)
+        if _is_number(type) and area in BIT_AREAS and not rules.strict:
+            changes.add("datatype_ignored", f"{request.id} ({name} in {area})")
+            name, type = "bool", parsed("bool")
         if type.base == "bool":
             order = "ABCD"
         codec_for(area, name, order, request.encoding)
@@ -110,10 +145,6 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
         ) from None
     except ConversionError as error:
         raise Refused(f"{where}: {error}") from None
-    if request.writable and area not in WRITE_LIMITS:
-        raise Refused(f"{where}: functionCode {request.function_code} is not writable")
-    if request.writable:
-        _check_writable(asked, type, area, where)
     if request.address + type.registers > ADDRESSES:
         raise Refused(
             f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
@@ -121,19 +152,16 @@ def tag(request: TagRequest, order: str, where: str) -> Tag:
     null = frozenset(
         _marker(marker, type, request.encoding, where) for marker in request.null or ()
     )
-    return Tag(request.id, area, request.address, name, order, null, request.encoding)
+    made = Tag(request.id, area, request.address, name, order, null, request.encoding)
+    if request.writable and (flaw := made.unwritable) is not None:
+        if area in WRITE_LIMITS or rules.strict:
+            raise Refused(f"{where}: {flaw}")
+        changes.add("writable_ignored", f"{request.id} ({area})")
+    return made
 
 
-def _check_writable(name: str, type: Type, area: Area, where: str) -> None:
-    """Checks that one Modbus request can write a tag. Raises `Refused`."""
-    if type.base == "bit" and type.count is not None:
-        raise Refused(f"{where}: {name} can't be written, only one bit can")
-    most = WRITE_LIMITS[area]
-    if type.registers > most:
-        kind = "coils" if area in BIT_AREAS else "registers"
-        raise Refused(
-            f"{where}: {name} has {type.registers} {kind}, one request writes at most {most}"
-        )
+def _is_number(type: Type) -> bool:
+    return type.count is None and type.base.startswith(NUMERIC)
 
 
 def _marker(marker: Marker, type: Type, encoding: str | None, where: str) -> Marker:

@@ -37,6 +37,11 @@ def message(subject: str, content: msgspec.Struct) -> bytes:
     return text(subject, _encode(content))
 
 
+def readdressed(text: bytes, subject: str, other: str) -> bytes:
+    """Returns the text of a message to `subject` with another subject."""
+    return b"PUB %b" % other.encode() + text.removeprefix(b"PUB %b" % subject.encode())
+
+
 async def send(client: Client, texts: bytes, count: int) -> None:
     """Sends the texts of `count` messages.
 

@@ -1,0 +1,90 @@
+"""The answer to `variables`: the latest value of every tag, for callers that come late."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from holdfast.scanner.messages import Variable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from holdfast.scanner.devices import ScannedDevice
+    from holdfast.scanner.messages import Quality, VariablesRequest
+    from holdfast.scanner.tags import Tag
+
+_encode = msgspec.json.Encoder().encode
+
+ENVELOPE = 2
+"""Bytes of an answer without variables."""
+
+
+def variables(
+    request: VariablesRequest,
+    devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
+    module: str,
+    most: int,
+) -> bytes:
+    """Returns the answer as JSON, with as many tags as fit into `most` bytes.
+
+    `devices` holds each device with the errors of tags that could not be decoded. The tags are
+    sorted by device; `offset` of the request skips the first ones.
+    """
+    texts: list[bytes] = []
+    room = most - ENVELOPE
+    for device, undecoded, tag in _requested(request, devices):
+        text = _encode(_variable(device, undecoded, tag, module))
+        room -= len(text) + 1
+        if room < 0:
+            break
+        texts.append(text)
+    return b"[" + b",".join(texts) + b"]"
+
+
+def _requested(
+    request: VariablesRequest, devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]]
+) -> Iterator[tuple[ScannedDevice, Mapping[str, str], Tag]]:
+    ids: Iterable[str] = sorted(devices)
+    if request.device_id is not None:
+        ids = [request.device_id] if request.device_id in devices else []
+    left = request.offset or 0
+    for id in ids:
+        device, undecoded = devices[id]
+        if left >= len(device.tags):
+            left -= len(device.tags)
+            continue
+        for tag in list(device.tags.values())[left:]:
+            yield device, undecoded, tag
+        left = 0
+
+
+def _variable(
+    device: ScannedDevice, undecoded: Mapping[str, str], tag: Tag, module: str
+) -> Variable:
+    latest = device.latest.value(tag)
+    quality: Quality = "good"
+    if latest is None:
+        quality = "uncertain"
+    elif device.health.state != "online" or tag.id in undecoded or _failed(device, tag):
+        quality = "bad"
+    return Variable(
+        module_id=module,
+        device_id=device.id,
+        variable_id=tag.id,
+        value=None if latest is None else latest.value,
+        datatype=tag.datatype,
+        quality=quality,
+        origin="modbus",
+        last_updated=None if latest is None else int(latest.time * 1000),
+        description=device.description(tag.id),
+    )
+
+
+def _failed(device: ScannedDevice, tag: Tag) -> bool:
+    """Returns whether the last scan that read a tag failed."""
+    return any(
+        fault and area == tag.area and address <= tag.address and tag.end <= address + count
+        for area, address, count, _, fault, _ in device.health.blocks
+    )

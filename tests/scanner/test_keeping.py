@@ -1,0 +1,331 @@
+"""What the scanner keeps in JetStream, and what a restarted scanner makes of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast import logs
+from holdfast.scanner import keeping, kept_entries
+from holdfast.scanner.keeping import BUCKET
+from support import wire
+from support.brokers import NatsServer
+from support.nats_bus import Caller, leaving, subscription, tag
+from support.tentacle import plc_subscribe, plc_tag, plc_unsubscribe
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    import holdfast
+    from support.nats_bus import Run
+
+
+@pytest.fixture(autouse=True)
+def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
+@pytest.fixture
+def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
+    with Caller(own_nats.url) as caller:
+        yield caller
+
+
+def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
+    return [
+        record.fields  # type: ignore[attr-defined]
+        for record in caplog.records
+        if record.getMessage() == event
+    ]
+
+
+def device(caller: Caller, id: str) -> Any:
+    """What browsing tells of a device, apart from what moves by itself."""
+    [found] = caller.request("modbus.browse", {"deviceId": id})["devices"]
+    moving = {"scans", "missed", "roundTrip", "lastAnswer", "state", "stateSince", "blocks"}
+    moving |= {"failures", "error", "lastError", "lastErrorAt"}
+    return {key: value for key, value in found.items() if key not in moving}
+
+
+def subscriptions(caller: Caller) -> dict[str, Any]:
+    return {key: each for key, each in caller.kept(BUCKET).items() if "subscription" in key}
+
+
+def put(caller: Caller, key: str, value: bytes) -> None:
+    async def put_it() -> None:
+        bucket = await caller.client.jetstream().key_value(BUCKET)
+        await bucket.put(key, value)
+
+    caller.do(put_it())
+
+
+def test_a_restarted_scanner_goes_on_for_callers_that_never_repeat(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    first = run_scanner()
+    data = caller.listen("modbus.data.Pump_1")
+    request = plc_subscribe(server, plc_tag("a", 0), plc_tag("b", 1), device="Pump 1", rate=100)
+    assert caller.request("modbus.subscribe", request)["success"]
+    data.next()
+    first.stop()
+    data.take()
+
+    second = run_scanner()
+    assert {data.next()["variableId"] for _ in range(4)} == {"a", "b"}
+    assert caller.request("modbus.command.a", "7") == {"success": True}
+    assert logged(caplog, "restored") == [
+        {"device": "Pump 1", "subscriber": "my-project", "tags": 2}
+    ]
+    left = plc_unsubscribe("a", "b", device="Pump 1")
+    assert caller.request("modbus.unsubscribe", left)["success"]
+    second.stop()
+    run_scanner()
+    assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+def test_everything_of_a_subscription_is_restored(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    first = run_scanner()
+    host, port = server.address
+    url = f"tcp://{host}:{port}?retries=1"
+    tags = [
+        tag("f", 0, "float32", byteOrder="CDAB", null=["nan", -1], writable=False),
+        tag("s", 10, "string:4", encoding="latin-1", description="näme"),
+        tag("c", 3, "boolean", functionCode="coil", writable=True),
+        tag("w", 20, "uint16[124]"),
+        tag("l", 300, "uint32"),
+    ]
+    more: dict[str, Any] = {
+        "host": None,
+        "port": None,
+        "url": url,
+        "timeout": 700,
+        "byteOrder": "little",
+        "publish": "change",
+        "deadband": 0.5,
+        "scanRate": 60_000,
+        "release": True,
+        "plan": {"max_gap": 3, "readable": [[0, 900]] * 20, "forbidden": [["coil", 9, 9]]},
+    }
+    ids = {"deviceId": "a b/ü", "subscriberId": "who ever.*"}
+    assert caller.request("modbus.subscribe", subscription(server, *tags) | more | ids)["success"]
+    plain = subscription(server, tag("x", 5), timeout=900, deviceId="udp", transport="udp")
+    assert caller.request("modbus.subscribe", plain)["success"]
+    before = [device(caller, "a b/ü"), device(caller, "udp")]
+    stored = caller.kept(BUCKET)
+    assert set(stored) == {
+        "modbus.subscription.=d2hvIGV2ZXIuKg.a_b__.0",
+        "modbus.status.a_b__",
+        "modbus.subscription.hmi.udp.0",
+        "modbus.status.udp",
+    }
+    assert stored["modbus.status.udp"]["deviceId"] == "udp"
+    first.stop()
+    # The states are gone with the scanner, the subscriptions are not.
+    assert set(caller.kept(BUCKET)) == {key for key in stored if "subscription" in key}
+    run_scanner()
+    assert [device(caller, "a b/ü"), device(caller, "udp")] == before
+
+
+def test_a_large_subscription_is_kept_in_parts(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kept_entries, "MAX_PART", 300)
+    first = run_scanner()
+    for start in range(0, 20, 5):
+        tags = [tag(f"t{number}", number) for number in range(start, start + 5)]
+        request = subscription(server, *tags, scanRate=60_000)
+        assert caller.request("modbus.subscribe", request)["success"]
+    found = subscriptions(caller)
+    assert len(found) > 5
+    assert {each["id"] for part in found.values() for each in part["tags"]} == {
+        f"t{number}" for number in range(20)
+    }
+    first.stop()
+    second = run_scanner()
+    assert device(caller, "plc1")["tagCount"] == 20
+    assert caller.request("modbus.unsubscribe", leaving("t0", "t1", "t2"))["success"]
+    assert len(subscriptions(caller)) < len(found)
+    assert caller.request("modbus.unsubscribe", {"deviceId": "plc1", "subscriberId": "hmi"})
+    assert caller.kept(BUCKET) == {}
+    second.stop()
+
+
+def test_the_state_of_a_device_is_there_for_those_who_come_late(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner()
+    caller.request("modbus.subscribe", subscription(server, tag("a", 0)))
+
+    def state() -> Any:
+        return caller.kept(BUCKET).get("modbus.status.plc1", {}).get("state")
+
+    wire.until(lambda: state() == "online", "the state is kept")
+    caller.request("modbus.unsubscribe", leaving("a"))
+    wire.until(lambda: state() is None, "it is gone with the device")
+
+
+def test_nothing_is_kept_if_that_is_switched_off(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    first = run_scanner(keep_subscriptions=False)
+    request = subscription(server, tag("a", 0))
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert caller.kept(BUCKET) == {}
+    first.stop()
+    run_scanner()
+    assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+def test_prefixes_are_kept_apart(run_scanner: Run, caller: Caller, server: holdfast.Server) -> None:
+    first = run_scanner(prefix="plant.one")
+    request = subscription(server, tag("a", 0))
+    assert caller.request("plant.one.subscribe", request)["success"]
+    first.stop()
+    run_scanner()
+    assert caller.request("modbus.browse", b"")["count"] == 0
+    run_scanner(prefix="plant.one")
+    assert caller.request("plant.one.browse", b"")["count"] == 1
+
+
+def test_what_is_not_a_subscription_or_no_longer_allowed_is_logged_and_left_alone(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = run_scanner()
+    assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    first.stop()
+    other = subscription(server, tag("a", 0), deviceId="gone", host="8.8.8.8")
+    put(caller, "modbus.subscription.hmi.gone.0", json.dumps(other).encode())
+    put(caller, "modbus.subscription.hmi.bad.0", b'"nonsense"')
+    put(caller, "modbus.subscription.hmi.worse.x", b"\xff{")
+    put(caller, "modbus.status.bad", b"7")
+    second = run_scanner()
+    assert caller.request("modbus.browse", b"")["count"] == 1
+    [refused] = logged(caplog, "not_restored")
+    assert (refused["device"], refused["subscriber"]) == ("gone", "hmi")
+    assert refused["reason"].startswith("8.8.8.8 is not allowed")
+    assert {each["key"] for each in logged(caplog, "kept_entry_malformed")} == {
+        "modbus.subscription.hmi.bad.0",
+        "modbus.subscription.hmi.worse.x",
+        "modbus.status.bad",
+    }
+    second.stop()
+    # With the device allowed, its subscription is there again; callers can also end it.
+    third = run_scanner(allow=("127.0.0.0/8", "8.8.8.8/32"))
+    wire.until(lambda: caller.request("modbus.browse", b"")["count"] == 2, "it is restored")
+    third.stop()
+    run_scanner()
+    ended = caller.request("modbus.unsubscribe", leaving("a", deviceId="gone"))
+    assert ended == {"success": True}
+    assert "modbus.subscription.hmi.gone.0" not in _keys(caller)
+
+
+def _keys(caller: Caller) -> set[str]:
+    async def keys() -> set[str]:
+        bucket = await caller.client.jetstream().key_value(BUCKET)
+        return set(await bucket.keys())
+
+    return caller.do(keys())
+
+
+def test_a_tag_of_a_pending_subscription_can_be_left(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    first = run_scanner()
+    request = subscription(server, tag("a", 0), tag("b", 1))
+    assert caller.request("modbus.subscribe", request)["success"]
+    first.stop()
+    second = run_scanner(allow=("192.0.2.0/24",))
+    assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
+    second.stop()
+    run_scanner()
+    assert [each["id"] for each in device(caller, "plc1")["tags"]] == ["b"]
+
+
+def test_a_bucket_that_is_lost_is_written_again(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    tmp_path: Path,
+) -> None:
+    scanner = run_scanner(own_nats)
+    assert own_caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    assert len(subscriptions(own_caller)) == 1
+    own_nats.kill()
+    shutil.rmtree(tmp_path / "store")
+    own_nats.start()
+    wire.until(lambda: scanner.serves, "it is connected again")
+    wire.until(lambda: len(own_caller.kept(BUCKET)) == 2, "both entries are there again")
+
+
+def test_jetstream_that_fails_holds_no_request_up_and_gets_everything_later(
+    run_scanner: Run,
+    tmp_path: Path,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(keeping, "RETRIED", 0.1)
+    bare = NatsServer(tmp_path, jetstream=False)
+    try:
+        scanner = run_scanner(bare)
+        with Caller(bare.url) as caller:
+            for name in ("hmi", "historian"):
+                request = subscription(server, tag("a", 0), subscriberId=name)
+                assert caller.request("modbus.subscribe", request)["success"]
+            gone = leaving("a", subscriberId="historian")
+            assert caller.request("modbus.unsubscribe", gone)["success"]
+            assert len(logged(caplog, "subscriptions_not_kept")) == 1
+            bare.kill()
+            bare._options = ("-js", "-sd", str(tmp_path / "store"))
+            bare.start()
+            wire.until(lambda: len(caller.kept(BUCKET)) == 2, "it is kept")
+            assert set(caller.kept(BUCKET)) == {
+                "modbus.subscription.hmi.plc1.0",
+                "modbus.status.plc1",
+            }
+        scanner.stop()
+    finally:
+        bare.kill()
+
+
+def test_a_request_is_answered_when_it_is_kept(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner()
+    for number in range(20):
+        tags = [tag("a", 0), tag("b", number)]
+        request = subscription(server, *tags, deviceId=f"d{number}", scanRate=60_000)
+        assert caller.request("modbus.subscribe", request)["success"]
+        assert f"modbus.subscription.hmi.d{number}.0" in _keys(caller)
+
+
+def test_many_requests_at_once_are_all_kept(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner()
+
+    async def ask(number: int) -> bytes:
+        request = subscription(
+            server, tag("a", 0), deviceId=f"d{number % 7}", subscriberId=f"s{number}"
+        )
+        data = json.dumps(request | {"scanRate": 60_000}).encode()
+        return (await caller.client.request("modbus.subscribe", data, timeout=10)).data
+
+    async def ask_all() -> list[bytes]:
+        return await asyncio.gather(*map(ask, range(100)))
+
+    assert set(caller.do(ask_all())) == {b'{"success":true,"count":1}'}
+    assert len(subscriptions(caller)) == 100

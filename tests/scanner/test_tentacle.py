@@ -1,0 +1,465 @@
+"""The messages of tentacle-plc and tentacle-gateway, played against the scanner."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast import logs
+from holdfast.scanner import Defaults
+from support import wire
+from support.nats_bus import leaving, subscription, tag
+from support.tentacle import (
+    gateway_tag,
+    plc_subscribe,
+    plc_tag,
+    plc_unsubscribe,
+    scanner_tag,
+    subject_part,
+    text,
+)
+
+if TYPE_CHECKING:
+    from support.nats_bus import Caller, Inbox, Run
+    from support.running import Serve
+
+
+@pytest.fixture(autouse=True)
+def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
+def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
+    """The fields of an event, for each time it was logged."""
+    return [
+        record.fields  # type: ignore[attr-defined]
+        for record in caplog.records
+        if record.getMessage() == event
+    ]
+
+
+def device(caller: Caller, id: str) -> Any:
+    [found] = caller.request("modbus.browse", {"deviceId": id})["devices"]
+    return found
+
+
+def connections(server: holdfast.Server) -> int:
+    """How many are open."""
+    counters = server.counters()
+    assert "connections" in counters
+    return counters["connections"]["open"]
+
+
+def values(data: Inbox, *ids: str) -> dict[str, Any]:
+    """The next values of these tags."""
+    found: dict[str, Any] = {}
+    while not found.keys() >= set(ids):
+        message = data.next()
+        found[message["variableId"]] = message["value"]
+    return {id: found[id] for id in ids}
+
+
+# tentacle-plc and tentacle-gateway.
+
+
+@pytest.mark.usefixtures("scanner")
+def test_tentacle_plc_reads_and_writes_unchanged(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [7, 0x42F6, 0xE979])
+    data = caller.listen(f"modbus.data.{subject_part('pump-skid')}")
+    tags = [
+        plc_tag("pump_speed", 0),
+        plc_tag("pressure", 1, "float32"),
+        plc_tag("pump_running", 0, "boolean", function="coil"),
+    ]
+    request = plc_subscribe(server, *tags)
+    assert caller.request("modbus.subscribe", request) == {"success": True, "count": 3}
+    assert values(data, "pump_speed", "pressure", "pump_running") == {
+        "pump_speed": 7,
+        "pressure": 123.45600128173828,
+        "pump_running": False,
+    }
+
+    # String(newValue), without a reply subject.
+    caller.publish("modbus.command.pump_running", "true")
+    caller.publish("modbus.command.pump_speed", "1450")
+    caller.publish("modbus.command.pressure", "21.5")
+    wire.until(lambda: memory.read("coils", 0, 1) == [1], "the coil is on")
+    wire.until(lambda: memory.read("holding_registers", 0, 3) == [1450, 0x41AC, 0], "written")
+
+    left = plc_unsubscribe("pump_speed", "pressure", "pump_running")
+    assert caller.request("modbus.unsubscribe", left) == {"success": True}
+    assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+@pytest.mark.usefixtures("scanner")
+def test_tentacle_gateway_sends_big_and_uint16_for_everything(
+    caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    memory.write("holding_registers", 3, [0x0102])
+    memory.write("coils", 4, [1])
+    memory.write("discrete_inputs", 5, [1])
+    data = caller.listen("modbus.data.plc_1")
+    tags = [
+        gateway_tag("word", 3),
+        gateway_tag("coil", 4, function=1),
+        gateway_tag("contact", 5, function=2),
+    ]
+    request = plc_subscribe(server, *tags, device="plc 1", project="gateway", order="big")
+    for _ in range(2):
+        assert caller.request("modbus.subscribe", request) == {"success": True, "count": 3}
+    found = {message["variableId"]: message for message in (data.next() for _ in range(3))}
+    assert {id: (each["value"], each["datatype"]) for id, each in found.items()} == {
+        "word": (0x0102, "number"),
+        "coil": (True, "boolean"),
+        "contact": (True, "boolean"),
+    }
+    assert {each["deviceId"] for each in found.values()} == {"plc 1"}
+    assert logged(caplog, "datatype_ignored") == [
+        {
+            "subscriber": "gateway",
+            "device": "plc 1",
+            "found": "coil (uint16 in coils), contact (uint16 in discrete_inputs)",
+        }
+    ]
+
+
+@pytest.mark.usefixtures("scanner")
+def test_little_is_the_order_dcba(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [0x0403, 0x0201])
+    data = caller.listen("modbus.data.pump-skid")
+    little = plc_tag("a", 0, "uint32", order="little")
+    left_out = {**plc_tag("b", 0, "uint32"), "byteOrder": None}
+    caller.request("modbus.subscribe", plc_subscribe(server, little, left_out, order="little"))
+    assert values(data, "a", "b") == {"a": 0x01020304, "b": 0x01020304}
+
+
+# What requests leave out.
+
+
+@pytest.mark.usefixtures("scanner")
+def test_a_request_is_timed_out_after_3_s_unless_it_says_otherwise(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0)))
+    assert device(caller, "pump-skid")["timeout"] == 3000
+
+
+def test_the_settings_say_what_a_request_leaves_out(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner(defaults=Defaults(timeout=700, publish="change", deadband=2.5, scan_rate=100))
+    host, port = server.address
+    bare = {"deviceId": "a", "host": host, "port": port, "tags": [tag("x", 0)]}
+    assert caller.request("modbus.subscribe", {**bare, "subscriberId": "s"})["success"]
+    said = {"timeout": 900, "publish": "scan", "scanRate": 200}
+    assert caller.request(
+        "modbus.subscribe", {**bare, **said, "deviceId": "b", "subscriberId": "s"}
+    )
+    found = device(caller, "a")
+    assert (found["timeout"], found["scanRate"]) == (700, 100)
+    assert found["subscribers"][0]["publish"] == "change"
+    assert found["subscribers"][0]["deadband"] == 2.5
+    found = device(caller, "b")
+    assert (found["timeout"], found["scanRate"]) == (900, 200)
+    assert found["subscribers"][0]["publish"] == "scan"
+    assert "deadband" not in found["subscribers"][0]
+
+
+# What may be written.
+
+
+@pytest.mark.parametrize(
+    ("writes", "expected"),
+    [
+        ("tags", {"left_out": True, "yes": True, "no": False}),
+        ("explicit", {"left_out": False, "yes": True, "no": False}),
+        ("none", {"left_out": False, "yes": False, "no": False}),
+    ],
+)
+def test_the_settings_say_which_tags_are_written(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    memory: holdfast.Memory,
+    writes: str,
+    expected: dict[str, bool],
+) -> None:
+    run_scanner(writes=writes)
+    tags = [tag("left_out", 0), tag("yes", 1, writable=True), tag("no", 2, writable=False)]
+    caller.request("modbus.subscribe", subscription(server, *tags))
+    shown = {each["id"]: each["writable"] for each in device(caller, "plc1")["tags"]}
+    assert shown == expected
+    for id, allowed in expected.items():
+        answer = caller.request(f"modbus.command.{id}", "9")
+        assert answer["success"] is allowed
+        assert allowed or f"tag '{id}' of plc1 is not writable: " in answer["error"]
+    assert memory.read("holding_registers", 0, 3) == [9 * each for each in expected.values()]
+
+
+def test_a_write_outside_the_allow_list_is_impossible(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    run_scanner(allow=("192.0.2.0/24",))
+    answer = caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0)))
+    assert answer["error"] == "127.0.0.1 is not allowed, allowed are 192.0.2.0/24"
+    assert caller.request("modbus.command.a", "1") == {"success": False, "error": "no tag 'a'"}
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize("value", ["+5", "5.", "5", "5.0", " 5 ", "0.5e1"])
+def test_a_number_is_written_in_every_exact_notation(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory, value: str
+) -> None:
+    caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0)))
+    assert caller.request("modbus.command.a", value) == {"success": True}
+    assert memory.read("holding_registers", 0, 1) == [5]
+
+
+@pytest.mark.usefixtures("scanner")
+def test_a_fraction_may_begin_with_the_point(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0, "float32")))
+    assert caller.request("modbus.command.a", ".5") == {"success": True}
+    assert memory.read("holding_registers", 0, 2) == [0x3F00, 0]
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize(
+    "value", ["12.7", "65536", "-1", "1e30", "NaN", "Infinity", "0x10", "", ".", "+", "1,5", "5 6"]
+)
+def test_a_value_that_does_not_fit_is_refused_with_a_reply(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory, value: str
+) -> None:
+    caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0)))
+    answer = caller.request("modbus.command.a", value)
+    assert answer["success"] is False
+    assert "uint16" in answer["error"]
+    assert memory.read("holding_registers", 0, 1) == [0]
+
+
+# Requests that are not exact.
+
+
+@pytest.mark.usefixtures("scanner")
+def test_unknown_keys_are_ignored_and_logged_once_for_each_subscriber(
+    caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    more = {"protocol": "modbus", "units": 1}
+    for name in ("hmi", "hmi", "historian"):
+        request = subscription(server, tag("a", 0, units="bar"), subscriberId=name, **more)
+        assert caller.request("modbus.subscribe", request) == {"success": True, "count": 1}
+    assert caller.request("modbus.unsubscribe", leaving("a", all=True)) == {"success": True}
+    found = logged(caplog, "keys_ignored")
+    assert [(each["subscriber"], each["found"]) for each in found] == [
+        ("hmi", "protocol, units"),
+        ("historian", "protocol, units"),
+    ]
+
+
+@pytest.mark.usefixtures("scanner")
+def test_a_key_of_the_plan_is_never_ignored(caller: Caller, server: holdfast.Server) -> None:
+    request = subscription(server, tag("a", 0), plan={"maxGap": 1})
+    answer = caller.request("modbus.subscribe", request)
+    assert answer["error"] == "Object contains unknown field `maxGap` - at `$.plan`"
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize("rate", [0, -5, 1, 49, "0", 49.0])
+def test_a_scan_rate_that_is_too_short_is_raised(
+    caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture, rate: object
+) -> None:
+    request = subscription(server, tag("a", 0), scanRate=rate)
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert device(caller, "plc1")["scanRate"] == 50
+    [found] = logged(caplog, "scan_rate_raised")
+    assert found["found"] == f"{int(float(str(rate)))} to 50 ms"
+
+
+@pytest.mark.usefixtures("scanner")
+def test_numbers_as_text_are_taken_where_they_are_exact(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    sent: dict[str, Any] = {
+        "port": str(server.address[1]),
+        "unitId": "1",
+        "scanRate": " 1e3 ",
+        "timeout": "1500.0",
+        "publish": "change",
+        "deadband": "0.25",
+        "tags": [tag("a", 0) | {"address": "3"}],
+    }
+    assert caller.request("modbus.subscribe", subscription(server) | sent)["success"]
+    found = device(caller, "plc1")
+    assert (found["unitId"], found["scanRate"], found["timeout"]) == (1, 1000, 1500)
+    assert found["tags"][0]["address"] == 3
+    assert found["subscribers"][0]["deadband"] == 0.25
+
+
+@pytest.mark.usefixtures("scanner")
+def test_of_a_repeated_tag_id_the_last_one_holds(
+    caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    request = subscription(server, tag("a", 0), tag("b", 1), tag("a", 2, "int16"))
+    assert caller.request("modbus.subscribe", request) == {"success": True, "count": 3}
+    shown = {each["id"]: each for each in device(caller, "plc1")["tags"]}
+    assert (shown["a"]["address"], shown["a"]["datatype"]) == (2, "int16")
+    assert [each["found"] for each in logged(caplog, "tag_repeated")] == ["a"]
+
+
+@pytest.mark.usefixtures("scanner")
+def test_writable_is_ignored_where_nothing_can_be_written(
+    caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    tags = [
+        scanner_tag("a", 0, functionCode="input"),
+        scanner_tag("b", 0, functionCode="discrete", datatype="boolean"),
+        scanner_tag("c", 0),
+    ]
+    assert caller.request("modbus.subscribe", subscription(server, *tags))["success"]
+    shown = {each["id"]: each["writable"] for each in device(caller, "plc1")["tags"]}
+    assert shown == {"a": False, "b": False, "c": True}
+    [found] = logged(caplog, "writable_ignored")
+    assert found["found"] == "a (input_registers), b (discrete_inputs)"
+    assert "not writable" in caller.request("modbus.command.a", "1")["error"]
+
+
+# What a subscriber replaces.
+
+
+@pytest.mark.usefixtures("scanner")
+def test_a_subscriber_comes_back_with_another_definition_of_its_tag(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [65535, 7])
+    data = caller.listen("modbus.data.pump-skid")
+    for made, value in (
+        (plc_tag("a", 0), 65535),
+        (plc_tag("a", 0, "int16"), -1),
+        (plc_tag("a", 1), 7),
+        (plc_tag("a", 0, "boolean", function="coil"), False),
+    ):
+        answer = caller.request("modbus.subscribe", plc_subscribe(server, made, rate=100))
+        assert answer == {"success": True, "count": 1}
+
+        def is_new(message: Any, value: object = value) -> bool:
+            return message["value"] == value and type(message["value"]) is type(value)
+
+        data.until(is_new, f"the value {value}")
+    data.take()
+    assert {data.next()["value"] for _ in range(5)} == {False}
+
+
+@pytest.mark.usefixtures("scanner")
+def test_a_subscriber_comes_back_with_another_address_of_its_device(
+    caller: Caller, serve: Serve, memory: holdfast.Memory
+) -> None:
+    other = holdfast.Memory(holding_registers=10)
+    memory.write("holding_registers", 0, [1, 10])
+    other.write("holding_registers", 0, [2, 20])
+    old, new = serve({1: memory}), serve({1: other})
+    data = caller.listen("modbus.data.pump-skid")
+    caller.request("modbus.subscribe", plc_subscribe(old, plc_tag("a", 0), plc_tag("b", 1)))
+    assert values(data, "a", "b") == {"a": 1, "b": 10}
+    assert caller.request("modbus.subscribe", plc_subscribe(new, plc_tag("a", 0)))["success"]
+    # From then on, nothing of the old device is published, and the other tag is the new one's too.
+    data.take()
+    assert values(data, "a", "b") == {"a": 2, "b": 20}
+    wire.until(lambda: connections(old) == 0, "the old one is closed")
+    assert caller.request("modbus.command.a", "5") == {"success": True}
+    assert memory.read("holding_registers", 0, 1) == [1]
+    assert other.read("holding_registers", 0, 1) == [5]
+    caller.request("modbus.unsubscribe", plc_unsubscribe("a", "b"))
+    wire.until(lambda: connections(new) == 0, "the new one is closed")
+    assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize(
+    ("change", "key", "value"),
+    [
+        ({"timeout": 500}, "timeout", 500),
+        ({"release": True}, "release", True),
+        ({"plan": {"max_gap": 0}}, "plan", {"max_gap": 0, "max_registers": 125, "max_bits": 2000}),
+    ],
+)
+def test_a_subscriber_comes_back_with_another_setting_of_its_device(
+    caller: Caller, server: holdfast.Server, change: dict[str, Any], key: str, value: object
+) -> None:
+    first = subscription(server, tag("a", 0), timeout=900)
+    caller.request("modbus.subscribe", first)
+    again = subscription(server, tag("a", 0)) | change
+    assert caller.request("modbus.subscribe", again)["success"]
+    found = device(caller, "plc1")
+    assert found[key] == value
+    assert found["timeout"] == (500 if key == "timeout" else 900)
+
+
+# Device ids.
+
+
+@pytest.mark.usefixtures("scanner")
+@pytest.mark.parametrize(
+    ("id", "part"),
+    [
+        ("Pump 1", "Pump_1"),
+        ("line.1", "line_1"),
+        ("a*>b", "a__b"),
+        ("10.0.0.5:502", "10_0_0_5_502"),
+        ("Kühler/1", "K_hler_1"),
+        ("a%b", "a_b"),
+    ],
+)
+def test_a_device_id_may_have_any_printable_characters(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory, id: str, part: str
+) -> None:
+    data = caller.listen(f"modbus.data.{part}")
+    plc = caller.listen(f"modbus.data.{subject_part(id)}")
+    status = caller.listen(f"modbus.status.{part}")
+    request = plc_subscribe(server, plc_tag("a", 0), device=id)
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert data.next()["deviceId"] == id
+    assert plc.next()["deviceId"] == id
+    assert status.next()["deviceId"] == id
+    assert caller.request(f"modbus.command.{part}.a", "3") == {"success": True}
+    assert memory.read("holding_registers", 0, 1) == [3]
+    assert caller.request("modbus.unsubscribe", plc_unsubscribe("a", device=id))["success"]
+    assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+@pytest.mark.usefixtures("scanner")
+def test_two_device_ids_with_one_name_in_subjects_are_refused(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    def ask(id: str) -> Any:
+        return caller.request("modbus.subscribe", plc_subscribe(server, plc_tag("a", 0), device=id))
+
+    assert ask("Pump 1")["success"]
+    assert ask("Pump.1")["error"] == (
+        "deviceId 'Pump.1' has the same name in subjects as 'Pump 1', which is known: Pump_1; "
+        "give one of them another id"
+    )
+    assert ask("Pump 1")["success"]
+    caller.request("modbus.unsubscribe", plc_unsubscribe("a", device="Pump 1"))
+    assert ask("Pump.1")["success"]
+
+
+def test_the_fixtures_are_as_javascript_writes_them(server: holdfast.Server) -> None:
+    assert text({"a": "ü", "b": [1, None]}) == '{"a":"ü","b":[1,null]}'
+    assert plc_unsubscribe("a") == (
+        '{"deviceId":"pump-skid","tagIds":["a"],"subscriberId":"my-project"}'
+    )
+    assert plc_subscribe(server, plc_tag("a", 0)).endswith(
+        '"unitId":1,"byteOrder":"ABCD","scanRate":1000,"tags":[{"id":"a","address":0,'
+        '"functionCode":"holding","datatype":"uint16","byteOrder":"ABCD"}],'
+        '"subscriberId":"my-project"}'
+    )
