@@ -39,6 +39,20 @@ RAW: dict[str, Any] = {
     "name": "not a number",
 }
 
+LINK: dict[str, int] = {
+    "requests": 47,
+    "replies": 21,
+    "exceptions": 2,
+    "timeouts": 3,
+    "failures": 4,
+    "refused_full": 5,
+    "refused_down": 6,
+    "coalesced": 1,
+    "cached": 7,
+    "withdrawn": 0,
+    "waiting": 8,
+}
+
 METER: dict[str, Any] = {
     "health": "error",
     "last_error": 0x8001,
@@ -98,6 +112,8 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
     )
     made.poller = polled
     made.disabled = ["spare"]
+    bus: Any = SimpleNamespace(counters=lambda: LINK)
+    made.links = {"bus": bus}
     return made
 
 
@@ -177,6 +193,16 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_device_requests_per_poll", "meter"), 2),
         (("holdfast_device_forward_total", "meter", "sent", "0"), 20),
         (("holdfast_device_forward_total", "meter", "replaced", "0"), 4),
+        (("holdfast_link_requests_total", "bus", "replies"), 21),
+        (("holdfast_link_requests_total", "bus", "timeouts"), 3),
+        (("holdfast_link_requests_total", "bus", "failures"), 4),
+        (("holdfast_link_requests_total", "bus", "refused_full"), 5),
+        (("holdfast_link_requests_total", "bus", "refused_down"), 6),
+        (("holdfast_link_requests_total", "bus", "coalesced"), 1),
+        (("holdfast_link_requests_total", "bus", "cached"), 7),
+        (("holdfast_link_requests_total", "bus", "withdrawn"), 0),
+        (("holdfast_link_exceptions_total", "bus"), 2),
+        (("holdfast_link_waiting", "bus"), 8),
         (("holdfast_adapter_state", "rest", "running"), 1),
         (("holdfast_adapter_state", "rest", "failed"), 0),
         (("holdfast_adapter_state", "mqtt", "failed"), 1),

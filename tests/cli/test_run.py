@@ -92,6 +92,30 @@ def test_it_says_what_is_polled(
     assert "meter10" not in running.greeting
 
 
+def test_it_says_what_routes_lead_to(tmp_path: Path, run: Callable[[Path], RunCommand]) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text("""
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules:
+      - sources: [127.0.0.0/8]
+        units: {"20-40": {route: bus_1}, 7: {route: drive}}
+        access: read-write
+devices:
+  drive: {url: "tcp://127.0.0.1:1", unit: 3}
+links:
+  bus_1: {url: "rtu:///dev/none?baud=9600"}
+""")
+    running = run(file)
+    _, port = running.wait_until_it_serves()
+    assert "    units 20-40 = bus_1, 7 = drive; read-write for 127.0.0.0/8\n" in running.greeting
+    assert "  bus_1  rtu:///dev/none?baud=9600\n" in running.greeting
+    assert "  drive  tcp://127.0.0.1:1 unit 3, by routes only\n" in running.greeting
+    assert f"  mbpoll -m tcp -p {port} -a 20 -0 -t 4 -r 0 -c 1 -1 127.0.0.1\n" in running.greeting
+
+
 def test_it_serves_the_initial_values(
     configure: Callable[..., Path], run: Callable[[Path], RunCommand]
 ) -> None:

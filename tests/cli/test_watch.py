@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
-from holdfast.cli.sources import WatchedRange, cut, within
+from holdfast.cli.sources import WatchedRange, by_modbus, cut, within
 from holdfast.cli.watching import WINDOW, Tracker
+from holdfast.config import load
 from support import cli, wire
 from support.cli import answer, failure, invoke, usage_error
 from support.fake_device import FakeDevice, exception, registers
@@ -265,6 +266,15 @@ def test_an_appliance_that_can_not_be_watched_is_told(
     result = invoke("watch", str(file), *arguments)
     assert (result.exit_code, result.stdout) == (2, "")
     assert told in result.stderr
+
+
+def test_units_that_are_devices_are_not_watched(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    listener = LISTENER.replace("{3: boiler, 4: boiler, 5: pumps}", "{1-2: {route: d}, 3-5: pumps}")
+    devices = "links: {d: {url: 'tcp://10.0.0.9'}}\n"
+    file.write_text(MEMORIES + listener.replace("SCADA", "5020") + devices)
+    _, _, blocks = by_modbus(load(file))
+    assert [(block.memory, block.unit) for block in blocks] == [("pumps", 3)]
 
 
 def test_the_first_reading_must_succeed(server: holdfast.Server, tmp_path: Path) -> None:

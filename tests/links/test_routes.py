@@ -77,6 +77,14 @@ def scada(appliance: Appliance) -> tuple[str, int]:
     return endpoint(appliance, "scada")
 
 
+def await_nobody(appliance: Appliance, others: int = 0) -> None:
+    """Waits until no more than so many clients are connected."""
+    stats = appliance.diagnostics.stats
+    wire.until(
+        lambda: stats()["listeners"]["scada"]["connections"]["open"] == others, "the client is gone"
+    )
+
+
 def lines_of(file: Path, count: int) -> list[dict[str, Any]]:
     """Returns the lines of an audit log, when there are so many."""
     wire.until(lambda: file.read_text().count("\n") >= count, f"{count} lines")
@@ -365,6 +373,24 @@ def test_clients_of_a_serial_line_never_overlap(on_line: OnLine) -> None:
         assert all(threads.map(ask, range(4)))
 
 
+def test_a_line_that_vanishes_is_opened_again(tmp_path: Path, run: Run, connect: Connect) -> None:
+    path = tmp_path / "line"
+    with Serial(RTU, path) as device:
+        appliance = run(configuration(device.url))
+        front = connect(scada(appliance))
+        assert front.ask(READ) == FIVE
+    assert front.ask(READ) in (exception(READ, 0x0A), exception(READ, 0x0B))
+    with Serial(RTU, path):
+        wire.until(lambda: front.ask(READ) == FIVE, "the line is opened again")
+
+
+def test_the_reply_of_another_unit_is_no_answer(tmp_path: Path, run: Run, connect: Connect) -> None:
+    with Serial(RTU, tmp_path / "line", lambda asked: asked.answer(unit=9)) as device:
+        front = connect(scada(run(configuration(device.url, link={"timeout": 0.2}))))
+        assert front.ask(READ) == exception(READ, 0x0B)
+        assert front.ask(READ) == FIVE
+
+
 # Failures
 
 
@@ -452,10 +478,7 @@ def test_the_write_of_a_client_that_has_gone_is_not_sent(
     gone.send(wire.frame(WRITE))
     await_count(appliance, "waiting", 2)
     gone.reset()
-    wire.until(
-        lambda: appliance.diagnostics.stats()["listeners"]["scada"]["connections"]["open"] == 1,
-        "the client has gone",
-    )
+    await_nobody(appliance, others=1)
     held.release()
 
     assert first.receive().pdu == FIVE
@@ -579,6 +602,26 @@ def test_what_is_passed_on_is_in_the_audit_log(
     assert len(found) == 4
 
 
+def test_a_write_under_way_is_recorded_although_its_client_has_gone(
+    device: Stream, run: Run, connect: Connect, tmp_path: Path
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, audit={"file": "audit.log"}))
+    gone = connect(scada(appliance))
+    gone.send(wire.frame(WRITE, 1, 1) + wire.frame(WRITE, 2, 2))
+    device.await_requests(1)
+    await_count(appliance, "waiting", 2)
+    gone.reset()
+    await_nobody(appliance)
+    held.release()
+
+    await_count(appliance, "withdrawn", 1)
+    [line] = lines_of(tmp_path / "audit.log", 1)
+    assert (line["unit"], line["function"], line["outcome"]) == (1, 6, "done")
+    device.await_requests(1)
+
+
 # The end
 
 
@@ -587,6 +630,9 @@ def is_listening(to: tuple[str, int]) -> bool:
         socket.create_connection(to, timeout=wire.DEADLINE).close()
     except ConnectionRefusedError:
         return False
+    except ConnectionResetError:
+        # It was closed meanwhile.
+        return True
     return True
 
 

@@ -63,12 +63,12 @@ def usage_error(*arguments: str) -> str:
     return result.stderr.splitlines()[-1]
 
 
-class RunCommand:
-    """A running `holdfast run`, and the address of its first listener."""
+class ServingCommand:
+    """A running command that serves until a signal."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, *arguments: str) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "holdfast", "run", str(file)],
+            [sys.executable, "-m", "holdfast", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -83,14 +83,34 @@ class RunCommand:
             self.greeting += line
         return self.greeting
 
+    def end(self, number: signal.Signals) -> tuple[int, str]:
+        """Sends a signal. Returns the exit code and the log."""
+        self.process.send_signal(number)
+        _, log = self.process.communicate(timeout=wire.DEADLINE)
+        return self.process.returncode, log
+
+
+class RunCommand(ServingCommand):
+    """A running `holdfast run`, and the address of its listener `scada`."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__("run", str(file))
+
     def wait_until_it_serves(self) -> tuple[str, int]:
         self.wait_for_greeting()
         match = re.search(r"scada +modbus-tcp +([0-9.]+):([0-9]+)", self.greeting)
         assert match, self.greeting
         return match[1], int(match[2])
 
-    def end(self, number: signal.Signals) -> tuple[int, str]:
-        """Sends a signal. Returns the exit code and the log."""
-        self.process.send_signal(number)
-        _, log = self.process.communicate(timeout=wire.DEADLINE)
-        return self.process.returncode, log
+
+class ProxyCommand(ServingCommand):
+    """A running `holdfast proxy` on a port that the system picks."""
+
+    def __init__(self, *arguments: str) -> None:
+        super().__init__("proxy", *arguments, "--listen", "127.0.0.1:0")
+
+    def wait_until_it_serves(self) -> tuple[str, int]:
+        self.wait_for_greeting()
+        match = re.search(r"is served at tcp://([0-9.]+):([0-9]+):", self.greeting)
+        assert match, self.greeting
+        return match[1], int(match[2])

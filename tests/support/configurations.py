@@ -55,11 +55,16 @@ URLS = st.builds(
 )
 
 
+LINK = "the.link"
+
+
 @st.composite
 def modbus_rules(draw: st.DrawFn, memories: list[str], units: range = range(256)) -> dict[str, Any]:
-    ids = st.sampled_from(units)
+    ids = st.sampled_from([unit for unit in units if not 100 <= unit <= 120])
+    target: st.SearchStrategy[Any] = st.sampled_from(memories) | st.just({"route": LINK})
+    of_range = st.dictionaries(st.sampled_from(["100-120", "105-110"]), target, max_size=1)
     rule: dict[str, Any] = {
-        "units": draw(st.dictionaries(ids, st.sampled_from(memories), min_size=1, max_size=4)),
+        "units": draw(st.dictionaries(ids, target, min_size=1, max_size=4)) | draw(of_range),
         "access": draw(ACCESS),
     }
     limit = draw(st.sampled_from([None, "functions", "deny"]))
@@ -311,6 +316,22 @@ AUDITS = st.fixed_dictionaries(
 )
 
 
+LINKS = st.fixed_dictionaries(
+    {"url": st.just("tcp://192.168.0.1")},
+    optional={
+        "timeout": SECONDS,
+        "in_flight": st.integers(1, 1024) | st.just("auto"),
+        "tolerance": st.fixed_dictionaries({"retries": st.integers(0, 10)}),
+        "queue": st.integers(1, 65535),
+        "priority": st.dictionaries(
+            st.sampled_from(["10.0.0.5", "fd00::5"]), st.just("high"), max_size=2
+        ),
+        "coalesce": st.booleans(),
+        "cache": st.just(0) | SECONDS,
+    },
+)
+
+
 @st.composite
 def configurations(draw: st.DrawFn) -> dict[str, Any]:
     """Configurations that need no other files."""
@@ -341,6 +362,7 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
                 "identity": IDENTITIES,
                 "adapters": adapters(names),
                 "devices": devices(memories),
+                "links": st.builds(lambda link: {LINK: link}, LINKS),
                 "workers": st.integers(1, 64),
             },
             optional=optional,

@@ -22,6 +22,7 @@ COMMANDS = {
     "import": "holdfast.cli.import_:import_",
     "map": "holdfast.cli.map_:map_",
     "plan": "holdfast.cli.plan:plan",
+    "proxy": "holdfast.cli.proxy:proxy",
     "raw-send": "holdfast.cli.raw_send:raw_send",
     "read": "holdfast.cli.read:read",
     "run": "holdfast.cli.run:run",

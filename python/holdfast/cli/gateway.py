@@ -8,11 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
 from holdfast import logs
+from holdfast.cli.parsing import by
 from holdfast.cli.run import JOIN_TIMEOUT, Signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.client.endpoint import check_files
@@ -27,7 +28,6 @@ from holdfast.web.host import listen
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable
     from concurrent.futures import Future
 
     from holdfast.config.addresses import Bind
@@ -37,25 +37,11 @@ if TYPE_CHECKING:
 
 FAILED = 1
 
-Parsed = TypeVar("Parsed")
-
-
-def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
-    """The type of an option, from a function that parses its text."""
-
-    def parsed(text: str) -> Parsed:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise click.BadParameter(f"{error}.") from error
-
-    return parsed
-
 
 @click.command(epilog="Example: holdfast gateway --allow 10.0.0.0/8 --allow 10.0.0.5:5020")
 @click.option(
     "--bind",
-    type=_by(parse_bind),
+    type=by(parse_bind),
     default="127.0.0.1:8090",
     show_default=True,
     metavar="ADDRESS:PORT",
@@ -63,7 +49,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
 )
 @click.option(
     "--allow",
-    type=_by(parse_allowed),
+    type=by(parse_allowed),
     multiple=True,
     required=True,
     metavar="NETWORK[:PORTS]",
@@ -79,7 +65,7 @@ def _by(parse: Callable[[str], Parsed]) -> Callable[[str], Parsed]:
 )
 @click.option(
     "--sources",
-    type=_by(parse_source),
+    type=by(parse_source),
     multiple=True,
     default=[str(each) for each in LOOPBACK],
     show_default="this machine",

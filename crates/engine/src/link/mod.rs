@@ -10,6 +10,7 @@
 mod access;
 pub(crate) mod backoff;
 mod blocking;
+mod coming;
 mod fault;
 mod handshake;
 mod pace;
@@ -19,9 +20,10 @@ mod routing;
 mod tcp;
 
 pub(crate) use access::Link;
+pub(crate) use coming::{Coming, ReplyTo, coming};
 pub use fault::Fault;
 pub use pace::InFlight;
 pub(crate) use queue::Priority;
-pub(crate) use route::{Asker, Call, Coming};
+pub(crate) use route::{Asker, Call};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
 pub(crate) use routing::serve;

@@ -6,8 +6,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::mpsc;
 
+use super::coming::{Coming, ReplyTo, coming};
 use super::pace::InFlight;
 use super::queue::Priority;
 use crate::client::Endpoint;
@@ -78,15 +79,12 @@ pub(crate) struct Call {
 /// Where the reply to a request goes: a PDU, empty after a broadcast. The request has left the queue
 /// when this is dropped.
 pub(super) struct Reply {
-    to: oneshot::Sender<Vec<u8>>,
+    to: ReplyTo,
     _place: Place,
 }
 
 /// A place in the queue of a link.
 struct Place(Arc<SharedLink>);
-
-/// A reply that comes later. An error means that the link has ended.
-pub(crate) type Coming = oneshot::Receiver<Vec<u8>>;
 
 /// Who asks.
 #[derive(Debug, Clone, Copy)]
@@ -159,7 +157,7 @@ impl Route {
             return Err(ExceptionCode::ServerDeviceBusy);
         }
         let priority = link.priority(&request, asker.peer);
-        let (to, coming) = oneshot::channel();
+        let (to, coming) = coming();
         let call = Call {
             unit_id: self.unit_id.unwrap_or(unit_id),
             request,
@@ -177,13 +175,12 @@ impl Route {
 
 impl Reply {
     pub(super) fn send(self, pdu: Vec<u8>) {
-        // The client may have gone.
-        let _ = self.to.send(pdu);
+        self.to.send(pdu);
     }
 
     /// Whether nobody waits for the reply any more.
     pub(super) fn is_unwanted(&self) -> bool {
-        self.to.is_closed()
+        self.to.is_unwanted()
     }
 }
 

@@ -12,9 +12,9 @@ use holdfast_memory::{Access, Area, Memory, Write};
 use holdfast_protocol::pdu::{
     self, EncodedRequest, ExceptionCode, Function, Range, Request, reply,
 };
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::mpsc;
 
-use crate::link::{Coming, Fault, Link, Priority};
+use crate::link::{Coming, Fault, Link, Priority, ReplyTo, coming};
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;
@@ -58,7 +58,7 @@ pub(super) struct PassedWrite {
     pdu: Vec<u8>,
     /// As the device gets it.
     request: EncodedRequest,
-    reply: oneshot::Sender<Vec<u8>>,
+    reply: ReplyTo,
     _place: Place,
 }
 
@@ -167,7 +167,7 @@ impl Passage {
     pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
         let encoded = EncodedRequest::new(request);
         let (_, coming) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
-        match coming.blocking_recv().as_deref() {
+        match coming.wait().as_deref() {
             Ok([function, code]) if function & 0x80 != 0 => Err(*code),
             Ok(_) => Ok(()),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),
@@ -185,7 +185,7 @@ impl Passage {
         if self.waiting.fetch_add(1, Ordering::Relaxed) >= MAX_WAITING {
             return Err(ExceptionCode::GatewayPathUnavailable);
         }
-        let (reply, coming) = oneshot::channel();
+        let (reply, coming) = coming();
         let passed = PassedWrite {
             memory: Arc::clone(&self.memory),
             range: range.clone(),
@@ -227,8 +227,7 @@ impl PassedWrite {
     /// Refuses it without a try.
     pub(super) fn refuse(self, code: ExceptionCode) {
         let pdu = self.exception(code);
-        // The client may have gone.
-        let _ = self.reply.send(pdu);
+        self.reply.send(pdu);
     }
 
     /// Carries it out. Returns what has changed in the device, if that is known.
@@ -238,7 +237,7 @@ impl PassedWrite {
         unit_id: u8,
         timeout: Duration,
     ) -> Option<Change> {
-        if self.reply.is_closed() {
+        if self.reply.is_unwanted() {
             return None;
         }
         if link.retry_at().is_some() {
@@ -290,7 +289,7 @@ impl PassedWrite {
             }
             Err(_) => self.exception(ExceptionCode::GatewayTargetFailedToRespond),
         };
-        let _ = self.reply.send(pdu);
+        self.reply.send(pdu);
         None
     }
 
@@ -322,7 +321,7 @@ impl PassedWrite {
             // The reply repeats the request.
             _ => &self.pdu,
         };
-        let _ = self.reply.send(reply.to_vec());
+        self.reply.send(reply.to_vec());
         change
     }
 

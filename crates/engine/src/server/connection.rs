@@ -148,9 +148,10 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
         let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer);
         // The engine waits until all receivers are dropped.
-        let _running = stop.clone();
+        let running = stop.clone();
         match self.serve(stop).await {
             Some(end) => {
+                self.answering.give_up(running);
                 context.ended(end, peer);
                 // After replies that were cut off, a closing message would be misread.
                 if self.unsent.is_empty() {
@@ -454,6 +455,27 @@ impl<F: Framing> Answering<F> {
             }
         }
         len
+    }
+
+    /// The peer has gone. What devices still answer is recorded.
+    fn give_up(&mut self, running: watch::Receiver<bool>) {
+        let Some(deferred) = self.deferred.take().filter(|deferred| !deferred.is_empty()) else {
+            return;
+        };
+        let (context, unit_server) = (Arc::clone(&self.context), Arc::clone(&self.unit_server));
+        let (peer, given_up) = (self.peer, deferred.give_up());
+        tokio::spawn(async move {
+            for waiting in given_up {
+                let completed = waiting.complete(&unit_server).await;
+                if let (Some(completed), Some(auditor)) = (completed, &context.auditor) {
+                    let Completed { unit_id, route, request, reply, .. } = completed;
+                    let passed = (route.as_ref(), &request[..], &reply[..]);
+                    auditor.note_forwarded(&context.name, Some(peer), unit_id, passed);
+                }
+            }
+            // The engine waits for this until all receivers are dropped.
+            drop(running);
+        });
     }
 
     /// Copies what waited for replies to the start of `input`. Returns its length.

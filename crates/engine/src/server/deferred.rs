@@ -31,7 +31,7 @@ pub(super) struct Deferred {
 }
 
 /// A request without its reply.
-struct Waiting {
+pub(super) struct Waiting {
     tag: u16,
     unit_id: u8,
     route: Option<Arc<str>>,
@@ -111,6 +111,17 @@ impl Deferred {
         Deferral::Later
     }
 
+    /// The client has gone. Requests that wait for their turn are not sent. Returns the others, whose
+    /// replies still come.
+    pub(super) fn give_up(self) -> VecDeque<Waiting> {
+        for waiting in &self.waiting {
+            if let Expected::Coming(coming) = &waiting.reply {
+                coming.give_up();
+            }
+        }
+        self.waiting
+    }
+
     /// Keeps received bytes until there is room.
     pub(super) fn leave(&mut self, bytes: &[u8]) {
         debug_assert!(self.behind.is_empty() && !bytes.is_empty());
@@ -141,6 +152,18 @@ impl Deferred {
             unreachable!("the first reply is known")
         };
         Poll::Ready(Completed { tag, unit_id, route, request, reply })
+    }
+}
+
+impl Waiting {
+    /// Waits for the reply. `None` if the request was not sent.
+    pub(super) async fn complete(self, unit_server: &UnitServer) -> Option<Completed> {
+        let Waiting { tag, unit_id, route, request, reply } = self;
+        let reply = match reply {
+            Expected::Coming(coming) => come(unit_server, &request, Some(coming.await.ok()?)),
+            Expected::Known(reply) => reply,
+        };
+        Some(Completed { tag, unit_id, route, request, reply })
     }
 }
 

@@ -179,6 +179,21 @@ ROUTES = (
                         "timeouts": 1,
                     }
                 },
+                "links": {
+                    "bus_1": {
+                        "requests": 5000,
+                        "replies": 4100,
+                        "exceptions": 3,
+                        "timeouts": 2,
+                        "failures": 0,
+                        "refused_full": 0,
+                        "refused_down": 1,
+                        "coalesced": 896,
+                        "cached": 0,
+                        "withdrawn": 0,
+                        "waiting": 1,
+                    }
+                },
                 "adapters": {
                     "rest": {
                         "state": "running",

@@ -1,0 +1,63 @@
+//! A reply that comes later, and whether somebody waits for it.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll};
+
+use tokio::sync::oneshot;
+use tokio::sync::oneshot::error::RecvError;
+
+/// A request and the PDU of its reply, empty after a broadcast.
+pub(crate) fn coming() -> (ReplyTo, Coming) {
+    let (to, from) = oneshot::channel();
+    let unwanted = Arc::new(AtomicBool::new(false));
+    (ReplyTo { to, unwanted: Arc::clone(&unwanted) }, Coming { from, unwanted })
+}
+
+/// Where a reply goes.
+pub(crate) struct ReplyTo {
+    to: oneshot::Sender<Vec<u8>>,
+    unwanted: Arc<AtomicBool>,
+}
+
+/// A reply that comes later. An error means that the request was not sent, or that its link has ended.
+#[derive(Debug)]
+pub(crate) struct Coming {
+    from: oneshot::Receiver<Vec<u8>>,
+    unwanted: Arc<AtomicBool>,
+}
+
+impl ReplyTo {
+    pub(crate) fn send(self, pdu: Vec<u8>) {
+        // The client may have gone.
+        let _ = self.to.send(pdu);
+    }
+
+    /// Whether the request need not be sent any more.
+    pub(crate) fn is_unwanted(&self) -> bool {
+        self.to.is_closed() || self.unwanted.load(Ordering::Relaxed)
+    }
+}
+
+impl Coming {
+    /// The client has gone: a request that waits for its turn is not sent. The reply to one that was
+    /// sent still comes.
+    pub(crate) fn give_up(&self) {
+        self.unwanted.store(true, Ordering::Relaxed);
+    }
+
+    /// Blocks the calling thread until the reply comes.
+    pub(crate) fn wait(self) -> Result<Vec<u8>, RecvError> {
+        self.from.blocking_recv()
+    }
+}
+
+impl Future for Coming {
+    type Output = Result<Vec<u8>, RecvError>;
+
+    fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
+        Pin::new(&mut self.from).poll(context)
+    }
+}
