@@ -151,9 +151,9 @@ def test_a_listener_for_rtu_over_tcp_is_checked_like_modbus_tcp(folder: Folder) 
         ("{device: a, silence: }",
          "serial.silence: found nothing, allowed: a number from 0.0001 to 10"),
         ("{device: a, sillence: 1}", "serial.sillence: unknown key, allowed: device, baud, parity, "
-         "stop_bits, data_bits, silence; did you mean 'silence'?"),
+         "stop_bits, data_bits, rs485, silence; did you mean 'silence'?"),
         ("/dev/ttyUSB0", "serial: found '/dev/ttyUSB0', allowed: a mapping with the keys device, "
-         "baud, parity, stop_bits, data_bits, silence"),
+         "baud, parity, stop_bits, data_bits, rs485, silence"),
     ],
 )  # fmt: skip
 def test_an_rtu_line_is_checked(folder: Folder, serial: str, problem: str) -> None:
@@ -165,7 +165,10 @@ def test_an_rtu_line_is_checked(folder: Folder, serial: str, problem: str) -> No
     ("serial", "problem"),
     [
         ("data_bits: 6", "data_bits: found 6, allowed: 7 or 8"),
-        ("silence: 1", "silence: unknown key, allowed: device, baud, parity, stop_bits, data_bits"),
+        (
+            "silence: 1",
+            "silence: unknown key, allowed: device, baud, parity, stop_bits, data_bits, rs485",
+        ),
     ],
 )
 def test_an_ascii_line_is_checked(folder: Folder, serial: str, problem: str) -> None:
