@@ -6,7 +6,7 @@ import sys
 
 from holdfast import _core
 from holdfast.client.endpoint import endpoint
-from holdfast.client.target import parse
+from holdfast.client.url import parse
 
 poller = _core.Poller([])
 url, in_flight, reads = sys.argv[1:]

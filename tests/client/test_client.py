@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.client.target import NetworkTarget, SerialTarget, Tls, parse
 from holdfast.client.tolerance import Tolerance
+from holdfast.client.url import NetworkTarget, SerialTarget, Tls, parse
 from holdfast.server import Identity
 from holdfast.types import AREAS
 from support import lines, transports, wire

@@ -22,7 +22,7 @@ from pymodbus.server import ModbusTlsServer
 import holdfast
 from holdfast import _core
 from holdfast.client.endpoint import endpoint
-from holdfast.client.target import parse
+from holdfast.client.url import parse
 from support import wire
 from support.cli import answer, done, failure, usage_error
 from support.faces import FACES, dialling, run

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import pytest
 from hypothesis import given, settings
 
-from holdfast.client.target import parse
+from holdfast.client.url import parse
 from holdfast.config import (
     AuditConfig,
     Config,

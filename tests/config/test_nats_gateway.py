@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.appliance import assembly
-from holdfast.client.target import Tls
+from holdfast.client.url import Tls
 from holdfast.config.scanning import written_pollable
 from holdfast.gateway import GatewayLimits
 from holdfast.scanner import Defaults, Ping, ScannerLimits, Servers

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.client.target import parse
 from holdfast.client.tolerance import Tolerance
+from holdfast.client.url import parse
 from holdfast.config import LinkConfig, ModbusTcpListener, RouteConfig
 from support.config_folder import Folder
 

@@ -7,7 +7,7 @@ import shlex
 
 import pytest
 
-from holdfast.client.target import parse
+from holdfast.client.url import parse
 from holdfast.config import load
 from holdfast.config.links import LinkConfig
 from support.brokers import free_port

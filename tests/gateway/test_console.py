@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 from playwright.sync_api import expect
 
-from holdfast.client.target import Tls
+from holdfast.client.url import Tls
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.gateway_pages import DESK, PHONE, Opened, View, browsing, floats, opening

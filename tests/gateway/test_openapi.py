@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from schemathesis import Case
 
-    from holdfast.client.target import NetworkTarget
+    from holdfast.client.url import NetworkTarget
     from support.gateways import Running
 
 EXAMPLES = 25

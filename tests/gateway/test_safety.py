@@ -21,7 +21,7 @@ from click.testing import CliRunner
 import holdfast
 from holdfast.cli import main
 from holdfast.cli.gateway import _greeting
-from holdfast.client.target import NetworkTarget
+from holdfast.client.url import NetworkTarget
 from holdfast.config.egress import parse_allowed
 from holdfast.gateway import Settings, tokens
 from support import cli, gateways, web, wire

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import holdfast
 from holdfast.appliance import Appliance
 from holdfast.cli import main
-from holdfast.client.target import NetworkTarget, Tls
+from holdfast.client.url import NetworkTarget, Tls
 from holdfast.config import load
 from support import gateways, web
 from support.cli import usage_error

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.client.target import in_folder, parse
+from holdfast.client.url import in_folder, parse
 from holdfast.net.tls import NO_FILES, Tls, alone
 
 

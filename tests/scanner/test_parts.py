@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.client.target import NetworkTarget
+from holdfast.client.url import NetworkTarget
 from holdfast.scanner import outbox as outboxes
 from holdfast.scanner.browsing import browsed
 from holdfast.scanner.decoding import decoder

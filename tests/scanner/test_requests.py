@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jsonschema_rs
 import pytest
 
-from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.config.scanning import parse_pollable
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.errors import Refused

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from holdfast.client import Client
-    from holdfast.client.target import NetworkTarget
+    from holdfast.client.url import NetworkTarget
     from holdfast.net.resolver import Resolve
 
 API = "/api/modbus"

@@ -13,7 +13,7 @@ import pytest
 import holdfast
 from holdfast import _core, logs
 from holdfast.client.endpoint import endpoint
-from holdfast.client.target import parse
+from holdfast.client.url import parse
 from support import wire
 from support.certificate_cases import ACCEPTED, CASES, KEYS, OWN_KEYS, SERVED, Mint
 from support.certificates import Issued, openssl

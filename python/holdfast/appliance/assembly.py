@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast._core import Memory
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.config import (
         Config,
         DestinationConfig,

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from holdfast.adapters import Adapter
-    from holdfast.client.target import Tls
+    from holdfast.client.url import Tls
     from holdfast.config import (
         Bind,
         Config,

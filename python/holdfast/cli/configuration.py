@@ -14,7 +14,7 @@ from holdfast.config import ConfigError, ModbusTlsListener, load, source
 from holdfast.config.report import Report
 
 if TYPE_CHECKING:
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.config import Config
     from holdfast.config.source import KeyPath
 

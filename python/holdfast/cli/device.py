@@ -12,7 +12,7 @@ import click
 
 from holdfast.client import SyncClient
 from holdfast.client.base import MAX_TIMEOUT
-from holdfast.client.target import parse
+from holdfast.client.url import parse
 from holdfast.errors import (
     ConnectionLost,
     InvalidResponse,

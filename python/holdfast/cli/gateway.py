@@ -17,8 +17,8 @@ from holdfast.cli.parsing import by
 from holdfast.cli.run import JOIN_TIMEOUT, Signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.client.endpoint import check_files
-from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.egress import parse_allowed
+from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.gateway import Gateway, GatewayLimits, Settings, tokens
 from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
 from holdfast.net.tls import NO_FILES
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import socket
     from concurrent.futures import Future
 
-    from holdfast.config.addresses import Bind
+    from holdfast.config.ip_addresses import Bind
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork
     from holdfast.net.tls import Tls

@@ -10,9 +10,9 @@ from holdfast.cli.device import checked_url, usable
 from holdfast.cli.parsing import by
 from holdfast.cli.run import serve
 from holdfast.client.endpoint import endpoint
-from holdfast.client.target import MAX_IN_FLIGHT, SerialTarget, parse
+from holdfast.client.url import MAX_IN_FLIGHT, SerialTarget, parse
 from holdfast.config import Config
-from holdfast.config.addresses import parse_bind, parse_source
+from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.scalars import MAX_TIME, MIN_TIME
 from holdfast.net.addresses import LOOPBACK, joined, reachable
 from holdfast.protocol import (
@@ -26,8 +26,8 @@ from holdfast.protocol import (
 
 if TYPE_CHECKING:
     from holdfast.appliance import Appliance
-    from holdfast.client.target import Target
-    from holdfast.config.addresses import Bind
+    from holdfast.client.url import Target
+    from holdfast.config.ip_addresses import Bind
     from holdfast.net.addresses import Network
 
 LISTENER = "proxy"

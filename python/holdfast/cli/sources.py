@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from holdfast.client import SyncClient
     from holdfast.config import Config
-    from holdfast.config.addresses import Bind
+    from holdfast.config.ip_addresses import Bind
     from holdfast.types import Area
 
 MAX_ADDRESSES = 8192

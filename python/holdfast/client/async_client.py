@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 from holdfast._core import Request
 from holdfast.client import requests
+from holdfast.client.asyncio_connection import AsyncConnection
 from holdfast.client.base import BaseClient
-from holdfast.client.connection import AsyncConnection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.one_at_a_time import OneAtATime
-from holdfast.client.target import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
+from holdfast.client.url import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
 from holdfast.errors import InvalidResponse, ModbusException
 
 if TYPE_CHECKING:

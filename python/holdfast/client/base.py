@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from holdfast._core import Request
-from holdfast.client.target import SerialTarget, parse
+from holdfast.client.url import SerialTarget, parse
 from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
 
 MAX_TIMEOUT = 86_400.0

@@ -6,11 +6,11 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from holdfast._core import BlockingClient, Endpoint
-from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.protocol import TLS_PORT
 
 if TYPE_CHECKING:
-    from holdfast.client.target import Target, Tls
+    from holdfast.client.url import Target, Tls
 
 
 def blocking(target: Target) -> BlockingClient:

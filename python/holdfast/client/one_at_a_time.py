@@ -6,13 +6,13 @@ import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-from holdfast.client.connection import CLOSED
+from holdfast.client.asyncio_connection import CLOSED
 from holdfast.client.endpoint import blocking
 from holdfast.errors import ConnectionLost
 
 if TYPE_CHECKING:
     from holdfast._core import Request
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
 
 
 class OneAtATime:

@@ -7,7 +7,6 @@ native core.
 
 from __future__ import annotations
 
-from holdfast.config.addresses import Bind
 from holdfast.config.devices import (
     CostConfig,
     DestinationConfig,
@@ -18,6 +17,7 @@ from holdfast.config.devices import (
     StatusConfig,
 )
 from holdfast.config.initial import InitialRun
+from holdfast.config.ip_addresses import Bind
 from holdfast.config.links import LinkConfig
 from holdfast.config.listeners import (
     AsciiSerialConfig,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, Strict
 
-from holdfast.client.target import MAX_IN_FLIGHT, Target, parse
 from holdfast.client.tolerance import MAX_CLOSE_AFTER, MAX_PAUSE, MAX_RETRIES, Tolerance
+from holdfast.client.url import MAX_IN_FLIGHT, Target, parse
 from holdfast.config.base import Model
 from holdfast.config.memories import Register, Size
 from holdfast.config.receiver import Receiver, parse_receiver

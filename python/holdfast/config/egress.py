@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from holdfast.config.addresses import parse_source
+from holdfast.config.ip_addresses import parse_source
 from holdfast.config.words import show
 from holdfast.net.addresses import LAST_PORT
 from holdfast.net.allow_list import ALL_PORTS, AllowedNetwork

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from holdfast.client.target import Target, parse
+from holdfast.client.url import Target, parse
 from holdfast.config.base import Model
 from holdfast.config.devices import InFlight, ToleranceConfig, tolerating
 from holdfast.config.scalars import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.addresses import parse_source
 from holdfast.config.allowed import allowed
+from holdfast.config.ip_addresses import parse_source
 from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
 from holdfast.config.route_checks import has_route

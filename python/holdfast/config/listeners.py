@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from pydantic import Discriminator, Field, Strict, Tag
 
-from holdfast.client.target import Rs485
+from holdfast.client.url import Rs485
 from holdfast.config.base import Model
 from holdfast.config.scalars import (
     RAW_UNIT_KEYS,

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.config import source
-from holdfast.config.address_checks import AddressChecks
 from holdfast.config.allowed import allowed
 from holdfast.config.device_checks import DeviceChecks
 from holdfast.config.grant_checks import GrantChecks, doubt_grants
@@ -22,6 +21,7 @@ from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.report import Report
 from holdfast.config.route_checks import RouteChecks, doubt_routes
 from holdfast.config.service_checks import ServiceChecks
+from holdfast.config.shared_connection_checks import AddressChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
 from holdfast.config.words import show

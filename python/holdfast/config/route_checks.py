@@ -6,17 +6,17 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.client.target import SerialTarget
-from holdfast.config.address_checks import target_of
+from holdfast.client.url import SerialTarget
 from holdfast.config.lenient import mapping, parsed
 from holdfast.config.listeners import RouteConfig
 from holdfast.config.scalars import is_name
+from holdfast.config.shared_connection_checks import target_of
 from holdfast.config.unit_keys import parse_unit_key, unit_ids
 from holdfast.config.words import guess, listing, show
 from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
 
 if TYPE_CHECKING:
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.config.grant_checks import GrantChecks
     from holdfast.config.model import Config
     from holdfast.config.report import Report

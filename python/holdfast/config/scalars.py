@@ -28,10 +28,10 @@ from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue, WithJsonSchema
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from holdfast.client.target import FORMS, in_folder, parse
-from holdfast.config.addresses import Bind, parse_bind, parse_peer, parse_source
+from holdfast.client.url import FORMS, in_folder, parse
 from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
 from holdfast.config.egress import parse_allowed
+from holdfast.config.ip_addresses import Bind, parse_bind, parse_peer, parse_source
 from holdfast.config.receiver import parse_receiver
 from holdfast.config.scanning import (
     PREFIX,

@@ -6,7 +6,7 @@ import re
 from ipaddress import IPv4Network, IPv6Network
 from typing import TYPE_CHECKING, Literal
 
-from holdfast.config.addresses import SOURCE_FORM, parse_source
+from holdfast.config.ip_addresses import SOURCE_FORM, parse_source
 from holdfast.config.remote import parse_remote
 from holdfast.config.words import show
 from holdfast.net.allow_list import ALL_PORTS, AllowedDevice, AllowedNetwork

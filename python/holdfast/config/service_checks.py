@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.addresses import parse_bind, parse_source
 from holdfast.config.broker import parse_broker, parse_topic_filter
 from holdfast.config.files import check_readable
+from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.scanning import parse_server

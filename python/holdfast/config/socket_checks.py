@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.config.addresses import Bind, parse_bind
+from holdfast.config.ip_addresses import Bind, parse_bind
 from holdfast.config.lenient import mapping, parsed
 from holdfast.config.listeners import CONNECTION_TYPES, DATAGRAM_TYPES, SERIAL_TYPES
 from holdfast.config.unique import Owners

@@ -7,8 +7,8 @@ import contextlib
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast.client import Client
-from holdfast.client.connection import explained
-from holdfast.client.target import NetworkTarget
+from holdfast.client.asyncio_connection import explained
+from holdfast.client.url import NetworkTarget
 from holdfast.errors import ConnectFailed, ConnectionLost, InvalidResponse
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from holdfast.client import Client
 from holdfast.client.endpoint import check_files
-from holdfast.client.target import IN_FLIGHT, NetworkTarget
+from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException
 from holdfast.net.tls import NO_FILES
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.config.addresses import Bind, parse_bind
+from holdfast.config.ip_addresses import Bind, parse_bind
 from holdfast.config.words import show
 
 if TYPE_CHECKING:

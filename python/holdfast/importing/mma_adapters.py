@@ -17,7 +17,7 @@ from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD
 
 if TYPE_CHECKING:
-    from holdfast.config.addresses import Bind
+    from holdfast.config.ip_addresses import Bind
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
     from holdfast.importing.draft import Draft

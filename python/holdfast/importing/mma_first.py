@@ -16,7 +16,7 @@ from holdfast.importing.sections import Section, section
 from holdfast.protocol import LAST_ADDRESS, WRITING_CODES
 
 if TYPE_CHECKING:
-    from holdfast.config.addresses import Bind
+    from holdfast.config.ip_addresses import Bind
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
     from holdfast.importing.draft import Draft

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.config.addresses import SOURCE_FORM
+from holdfast.config.ip_addresses import SOURCE_FORM
 from holdfast.config.words import show
 from holdfast.net.addresses import MAPPED, Network, unmapped
 

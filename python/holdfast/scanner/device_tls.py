@@ -10,13 +10,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from holdfast.client.endpoint import check_files, endpoint
-from holdfast.client.target import NetworkTarget
+from holdfast.client.url import NetworkTarget
 from holdfast.net.tls import NO_FILES
 from holdfast.scanner.errors import Refused
 
 if TYPE_CHECKING:
     from holdfast._core import Endpoint
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.net.tls import Tls
 
 

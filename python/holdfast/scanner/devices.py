@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
     from holdfast._core import Endpoint
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.config.scanning import Publish, Writes
     from holdfast.scanner.health import Health
     from holdfast.scanner.messages import PlanRequest, Range

@@ -6,7 +6,7 @@ from dataclasses import replace
 from ipaddress import ip_network
 from typing import TYPE_CHECKING
 
-from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.net.addresses import certificate_name
 from holdfast.net.allow_list import ALL_PORTS, AllowedNetwork, AllowList, NotAllowed
 from holdfast.net.resolver import NoSuchName, Resolver
@@ -16,7 +16,7 @@ from holdfast.scanner.errors import Refused
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.net.allow_list import AllowEntry
 
 PRIVATE = tuple(

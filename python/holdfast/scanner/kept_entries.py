@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast.client.target import NetworkTarget
+from holdfast.client.url import NetworkTarget
 from holdfast.scanner.messages import SubscribeRequest, TagRequest, decode
 from holdfast.scanner.subjects import subject_id
 from holdfast.scanner.tags import CODE_OF_AREA

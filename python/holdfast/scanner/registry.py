@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlsplit
 
-from holdfast.client import target as targets
-from holdfast.client.target import NetworkTarget, SerialTarget
+from holdfast.client import url as urls
 from holdfast.client.tolerance import STRICT
+from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.net.addresses import address_in, unbracketed
 from holdfast.protocol import usual_port
 from holdfast.scanner.adjusting import Adjustments
@@ -26,7 +26,7 @@ from holdfast.types import SERIAL_FRAMES
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.config.scanning import Publish, Writes
     from holdfast.scanner.limits import ScannerLimits
     from holdfast.scanner.messages import SubscribeRequest, UnsubscribeRequest
@@ -148,7 +148,7 @@ def _target(request: SubscribeRequest) -> Target:
                 if parts.scheme == "tls" and key != "name" and key not in asdict(STRICT):
                     allowed = "allowed are name and the tolerance options; files are the scanner's"
                     raise Refused(f"url: {key} is given, {allowed}")
-            return targets.parse(request.url)
+            return urls.parse(request.url)
         except ValueError as error:
             raise Refused(f"url: {error}") from None
     if request.host is None:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     from holdfast._core import Endpoint
-    from holdfast.client.target import Target
+    from holdfast.client.url import Target
     from holdfast.config.scanning import Writes
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.adjusting import Asked

@@ -15,7 +15,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from holdfast.client import Client
-from holdfast.client.target import IN_FLIGHT, NetworkTarget, SerialTarget, parse
+from holdfast.client.url import IN_FLIGHT, NetworkTarget, SerialTarget, parse
 from holdfast.errors import (
     ConnectionLost,
     InvalidResponse,

@@ -3,9 +3,9 @@
 use core::time::Duration;
 
 use super::flights::{Call, Done, Flights, Ticket};
-use super::line::{Framing, OneAtATime};
-use super::tcp::Stream;
-use super::udp::Datagrams;
+use super::mbap_datagrams::Datagrams;
+use super::mbap_stream::Stream;
+use super::rtu_and_ascii::{Framing, OneAtATime};
 use super::{Attempt, Closed, Time, Tolerance, Transport};
 use crate::pdu::EncodedRequest;
 

@@ -21,10 +21,10 @@
 
 mod connection;
 mod flights;
-mod line;
-mod tcp;
+mod mbap_datagrams;
+mod mbap_stream;
+mod rtu_and_ascii;
 mod tolerance;
-mod udp;
 
 pub use connection::Connection;
 pub use flights::{Done, Ticket};

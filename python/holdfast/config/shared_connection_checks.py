@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
-from holdfast.client.target import SerialTarget, parse
 from holdfast.client.tolerance import STRICT, Tolerance
+from holdfast.client.url import SerialTarget, parse
 from holdfast.config.devices import ToleranceConfig
 from holdfast.config.files import check_readable
 from holdfast.config.lenient import entries, fitting, integer, mapping, parsed
@@ -27,7 +27,7 @@ from holdfast.types import SERIAL_FRAMES
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.client.target import NetworkTarget, Target
+    from holdfast.client.url import NetworkTarget, Target
     from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable
 
     from holdfast._core import Endpoint, Request
-    from holdfast.client.target import NetworkTarget
+    from holdfast.client.url import NetworkTarget
 
 CLOSED = "connection lost: closed by this side"
 

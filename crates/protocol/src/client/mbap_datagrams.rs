@@ -3,7 +3,7 @@
 use core::time::Duration;
 
 use super::flights::{Call, Done, Flights, Ticket};
-use super::tcp;
+use super::mbap_stream;
 use super::{Closed, Failure, InvalidResponse, Time, Tolerance, UDP_ATTEMPTS};
 use crate::frame::mbap::{self, Next};
 
@@ -45,7 +45,7 @@ impl Datagrams {
         sink: &mut impl FnMut(Done<'_>),
     ) {
         let Tolerance { pad, accept_unit, .. } = flights.tolerance;
-        let invalid = match tcp::next(datagram, pad).0 {
+        let invalid = match mbap_stream::next(datagram, pad).0 {
             Next::Frame { transaction_id, unit_id, pdu, len } if pad || len == datagram.len() => {
                 let is_expected = flights.position(transaction_id).is_some()
                     && flights.first().is_some_and(|one| accept_unit.accepts(one.unit_id, unit_id));
