@@ -55,6 +55,10 @@ format: .venv/dev.stamp
 
 # NAME is a benchmark of benches/, BENCH its options.
 NAME ?= server
+# Long runs of tests that `make test` does in short.
+torture:
+	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-engine --test route
+
 bench: .venv/core.stamp .venv/dev.stamp
 	cargo build --locked --quiet --release -p holdfast-benches
 	$(BIN)/python benches/$(NAME).py $(BENCH)

@@ -16,7 +16,9 @@ mod handshake;
 mod pace;
 mod queue;
 mod route;
-mod routing;
+mod serving;
+mod shared_reads;
+mod silence;
 mod tcp;
 
 pub(crate) use access::Link;
@@ -26,4 +28,4 @@ pub use pace::InFlight;
 pub(crate) use queue::Priority;
 pub(crate) use route::{Asker, Call};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
-pub(crate) use routing::serve;
+pub(crate) use serving::serve;

@@ -25,9 +25,9 @@ use tokio::time::{Instant, sleep, sleep_until};
 
 use super::caught::{Panicked, caught};
 use super::cost::Samples;
-use super::forward::{Forward, ForwardSettings};
 use super::learned::{Learned, Unreadable};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
+use super::raw_ingest::{Forward, ForwardSettings};
 use super::results::{BlockResult, Poll, Results};
 use super::search;
 use super::sink::Destination;

@@ -9,11 +9,10 @@
 mod caught;
 mod cost;
 mod device;
-mod forward;
 mod health;
 mod learned;
-mod passage;
 pub mod plan;
+mod raw_ingest;
 mod results;
 mod search;
 mod sink;
@@ -21,12 +20,13 @@ mod state;
 mod status;
 mod thread;
 mod turn;
+mod write_through;
 
 pub use device::{DeviceSettings, ReadSettings};
-pub use forward::{ForwardCounters, ForwardSettings};
-pub use passage::{Passage, PassedRange};
+pub use raw_ingest::{ForwardCounters, ForwardSettings};
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};
 pub use status::StatusSettings;
 pub use thread::{Polled, Poller, PollerError};
+pub use write_through::{Passage, PassedRange};

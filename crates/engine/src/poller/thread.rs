@@ -17,12 +17,12 @@ use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned};
-use super::forward::{Forward, ForwardCounters};
-use super::passage::{Passage, PassedRange, PassedWrite};
 use super::plan::{PlanError, PlanLimits};
+use super::raw_ingest::{Forward, ForwardCounters};
 use super::results::{Results, Written};
 use super::state::DeviceState;
 use super::turn::Turn;
+use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, SharedLink, serve};
 use crate::tls::client::Identity;

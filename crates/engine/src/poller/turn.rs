@@ -5,7 +5,7 @@ use std::cell::{Cell, RefCell};
 use holdfast_memory::Area;
 use tokio::sync::{Mutex, MutexGuard};
 
-use super::passage::Change;
+use super::write_through::Change;
 
 #[derive(Default)]
 pub(super) struct Turn {
