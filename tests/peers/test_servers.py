@@ -1,6 +1,7 @@
 """Real clients of others: `mbpoll` (libmodbus) and pymodbus, synchronous and asyncio.
 
-What they wrote is looked up in memory, what they read was put there.
+What they wrote is looked up in memory, what they read was put there. Each test runs twice: against
+a Modbus TCP server, and through a route to an RTU server with the same memory.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import pytest
 from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
 
 from holdfast.server import Identity
+from support import routed
 from support.machine import tool
 from support.pymodbus_peer import OPTIONS, Patient, connected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     import holdfast
     from holdfast.types import Area
@@ -25,6 +28,21 @@ if TYPE_CHECKING:
 
 BITS = [1, 0, 1, 1, 0, 0, 1, 1, 1, 0, 1]
 REGISTERS = [0, 1, 255, 256, 32767, 32768, 65535]
+
+
+IDENTITY = Identity(vendor_name="Acme", product_code="P1", revision="1.2", product_name="Pump")
+
+
+@pytest.fixture(params=["direct", "route"])
+def address(
+    request: pytest.FixtureRequest, memory: holdfast.Memory, serve: Serve, tmp_path: Path
+) -> Iterator[tuple[str, int]]:
+    """Where clients reach the memory as unit 1."""
+    if request.param == "direct":
+        yield serve({1: memory}, identity=IDENTITY).address
+    else:
+        with routed.to_rtu_server(memory, IDENTITY, tmp_path) as at:
+            yield at
 
 
 # mbpoll
@@ -35,9 +53,9 @@ COIL, DISCRETE_INPUT, INPUT_REGISTER, HOLDING_REGISTER = "0", "1", "3", "4"
 class Mbpoll:
     """Runs mbpoll against a server. Its references count from 1."""
 
-    def __init__(self, server: holdfast.Server) -> None:
+    def __init__(self, address: tuple[str, int]) -> None:
         self._program = tool("mbpoll")
-        self._host, self._port = server.address
+        self._host, self._port = address
 
     def _run(self, kind: str, reference: int, unit: int, *more: str) -> str:
         server = ["-m", "tcp", "-p", str(self._port), "-a", str(unit)]
@@ -66,8 +84,8 @@ class Mbpoll:
 
 
 @pytest.fixture
-def mbpoll(server: holdfast.Server) -> Mbpoll:
-    return Mbpoll(server)
+def mbpoll(address: tuple[str, int]) -> Mbpoll:
+    return Mbpoll(address)
 
 
 @pytest.mark.parametrize(
@@ -118,29 +136,20 @@ def test_mbpoll_is_told_that_a_unit_does_not_respond(mbpoll: Mbpoll) -> None:
 # pymodbus
 
 
-@pytest.fixture
-def named_server(memory: holdfast.Memory, serve: Serve) -> holdfast.Server:
-    identity = Identity(vendor_name="Acme", product_code="P1", revision="1.2", product_name="Pump")
-    return serve({1: memory}, identity=identity)
+@pytest.fixture(params=["sync", "asyncio"])
+def pymodbus(request: pytest.FixtureRequest, address: tuple[str, int]) -> Iterator[Any]:
+    host, port = address
+    if request.param == "sync":
+        with connected(ModbusTcpClient(host, port=port, **OPTIONS)) as client:
+            yield client
+    else:
+        with patient(address) as client:
+            yield client
 
 
-@pytest.fixture
-def sync_client(named_server: holdfast.Server) -> Iterator[ModbusTcpClient]:
-    host, port = named_server.address
-    with connected(ModbusTcpClient(host, port=port, **OPTIONS)) as client:
-        yield client
-
-
-@pytest.fixture
-def async_client(named_server: holdfast.Server) -> Iterator[Patient]:
-    host, port = named_server.address
-    with Patient(lambda: AsyncModbusTcpClient(host, port=port, **OPTIONS)) as client:
-        yield client
-
-
-@pytest.fixture(params=["sync_client", "async_client"], ids=["sync", "asyncio"])
-def pymodbus(request: pytest.FixtureRequest) -> Any:
-    return request.getfixturevalue(request.param)
+def patient(address: tuple[str, int]) -> Patient:
+    host, port = address
+    return Patient(lambda: AsyncModbusTcpClient(host, port=port, **OPTIONS))
 
 
 @pytest.mark.parametrize(
@@ -278,10 +287,11 @@ def test_pymodbus_is_told_of_an_exception(
 
 
 def test_pymodbus_may_have_many_requests_on_their_way(
-    memory: holdfast.Memory, async_client: Patient
+    memory: holdfast.Memory, address: tuple[str, int]
 ) -> None:
     memory.write("holding_registers", 0, range(1000))
 
-    replies = async_client.many("read_holding_registers", range(200))
+    with patient(address) as client:
+        replies = client.many("read_holding_registers", range(200))
 
     assert [reply.registers for reply in replies] == [[value] for value in range(200)]

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from typing import TYPE_CHECKING, Any
 
+from holdfast import _core
+from holdfast.client.endpoint import endpoint
+from holdfast.client.url import parse
 from support import wire
 from support.config_folder import written
+from support.lines import Cable
 from support.transports import TYPES
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
+    import holdfast
     from holdfast.appliance import Appliance
+    from holdfast.server import Identity
     from support.fake_device import Asked
 
 LOOPBACK = ["127.0.0.0/8"]
@@ -74,3 +82,35 @@ class Held:
 
     def release(self) -> None:
         self._released.set()
+
+
+@contextlib.contextmanager
+def to_rtu_server(
+    memory: holdfast.Memory, identity: Identity, folder: Path
+) -> Iterator[tuple[str, int]]:
+    """A Modbus TCP address whose unit 1 is an RTU server on a serial line, with this memory."""
+    with contextlib.ExitStack() as stack:
+        cable = stack.enter_context(Cable(folder))
+        poller = _core.Poller([])
+        stack.callback(poller.stop)
+        target = parse(f"rtu://{cable.devices[1]}?parity=none")
+        route = poller.link("line", endpoint(target)).route("line", timeout=wire.DEADLINE)
+        rules = [
+            _core.Rule({unit: behind}, sources=LOOPBACK, access="read-write")
+            for unit, behind in ((1, route), (1, memory))
+        ]
+        settings: dict[str, Any] = {"baud": 19200, "parity": "none", "stop_bits": 2, "data_bits": 8}
+        engine = _core.Engine(
+            [
+                _core.Listener("front", "127.0.0.1:0", rules[:1]),
+                _core.Listener.serial(
+                    "line", str(cable.devices[0]), rules[1], mode="rtu", **settings
+                ),
+            ],
+            identity=identity.objects(),
+            unit_names=identity.names(),
+            workers=1,
+        )
+        stack.callback(engine.stop)
+        host, port = engine.addresses[0] or ("", 0)
+        yield host, port
