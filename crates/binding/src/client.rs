@@ -408,17 +408,27 @@ impl Reply {
     }
 }
 
+/// The Python exception of an error, as an object.
+pub(crate) fn exception<'py>(py: Python<'py>, error: &ClientError) -> Bound<'py, PyAny> {
+    mapped(error).into_value(py).into_bound(py).into_any()
+}
+
 /// Maps an error to its Python exception.
 pub(crate) fn raised(error: ClientError) -> PyErr {
+    mapped(&error)
+}
+
+fn mapped(error: &ClientError) -> PyErr {
     let text = error.to_string();
     match error {
-        ClientError::Exception(code) => ModbusException::new_err((code, exception_name(code))),
+        ClientError::Exception(code) => ModbusException::new_err((*code, exception_name(*code))),
         ClientError::Timeout(_) | ClientError::ConnectTimeout { .. } => {
             RequestTimeout::new_err(text)
         }
-        ClientError::Connect { to, error } => ConnectFailed::new_err((to, told(&error))),
+        ClientError::Connect { to, error } => ConnectFailed::new_err((to.clone(), told(error))),
         ClientError::Tls { to, failure, maybe_sent } => {
-            TlsFailed::new_err((failure.reason(), to, failure.to_string(), maybe_sent))
+            let of = (failure.reason(), to.clone(), failure.to_string(), *maybe_sent);
+            TlsFailed::new_err(of)
         }
         ClientError::Lost(_) => ConnectionLost::new_err(text),
         ClientError::Invalid(invalid) => InvalidResponse::new_err((text, invalid.reason())),

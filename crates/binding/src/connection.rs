@@ -16,7 +16,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arguments::{byte, seconds};
-use crate::client::{Endpoint, Reply, Request, raised};
+use crate::client::{Endpoint, Reply, Request, exception, raised};
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Connection {
@@ -218,7 +218,7 @@ impl Connection {
     fn closed<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyAny>> {
         let state = self.state();
         let failure = state.core.closed()?.failure();
-        Some(exception(py, self.error(&state.ending, failure, Duration::ZERO)))
+        Some(exception(py, &self.error(&state.ending, failure, Duration::ZERO)))
     }
 
     /// The number of replies that came after their request had ended.
@@ -273,7 +273,7 @@ impl<'py> Completions<'py> {
             Ok(response) => Reply::new(response).into_python(self.py),
             Err(failure) => match done.again {
                 Some(core) => Bound::new(self.py, Attempt { core }).map(Bound::into_any),
-                None => Ok(exception(self.py, connection.error(ending, failure, done.timeout))),
+                None => Ok(exception(self.py, &connection.error(ending, failure, done.timeout))),
             },
         };
         match (&mut self.all, value) {
@@ -282,10 +282,6 @@ impl<'py> Completions<'py> {
             (Err(_), Ok(_)) => {}
         }
     }
-}
-
-fn exception(py: Python<'_>, error: ClientError) -> Bound<'_, PyAny> {
-    raised(error).into_value(py).into_bound(py).into_any()
 }
 
 /// Converts the time of an event loop.

@@ -32,7 +32,7 @@ mod _core {
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]
-    use super::link::{Link, Passage, Route};
+    use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule, ServerTls};
     #[pymodule_export]

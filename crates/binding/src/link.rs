@@ -1,18 +1,22 @@
-//! `Link`, `Route` and `Passage`: devices that listeners pass requests on to.
+//! `Link`, `Route`, `Passage` and `Caller`: devices that listeners and event loops ask.
 
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use holdfast_engine::link::{InFlight, LinkSettings, Route as CoreRoute, SharedLink};
+use holdfast_engine::client::ClientError;
+use holdfast_engine::link::{
+    Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink, Wakes,
+};
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
+use holdfast_protocol::client::InvalidResponse;
 use holdfast_protocol::pdu::{Bits, Registers, Request as CoreRequest, limit, pack_bits};
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arguments::{byte, seconds, within};
-use crate::client::Endpoint;
+use crate::client::{Endpoint, Reply, Request, exception};
 use crate::memory::named;
 
 /// The most requests in flight at one address.
@@ -72,6 +76,17 @@ impl Link {
         Ok(Route { core })
     }
 
+    fn call(
+        &self,
+        caller: PyRef<'_, Caller>,
+        request: PyRef<'_, Request>,
+        unit: i128,
+        timeout: f64,
+    ) -> PyResult<Option<u64>> {
+        let (unit_id, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
+        Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout))
+    }
+
     #[getter]
     fn name(&self) -> &str {
         &self.core.name
@@ -97,6 +112,63 @@ impl Link {
         all.set_item("waiting", self.core.waiting())?;
         Ok(all)
     }
+}
+
+/// Ticket, whether it was sent, and the result or an exception.
+type Called<'py> = (u64, bool, Bound<'py, PyAny>);
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Caller {
+    core: Arc<CoreCaller>,
+    wakes: Mutex<Option<Wakes>>,
+}
+
+#[pymethods]
+impl Caller {
+    #[new]
+    fn new() -> PyResult<Caller> {
+        let (core, wakes) = CoreCaller::new()?;
+        Ok(Caller { core, wakes: Mutex::new(Some(wakes)) })
+    }
+
+    fn detach(&self) -> PyResult<i64> {
+        let wakes = self.wakes.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let wakes = wakes.ok_or_else(|| PyRuntimeError::new_err("the socket has been detached"))?;
+        Ok(handle(wakes))
+    }
+
+    fn take<'py>(&self, py: Python<'py>) -> PyResult<Vec<Called<'py>>> {
+        let called = self.core.take().into_iter().map(|call| {
+            let result = match call.outcome {
+                // A broadcast has no reply.
+                Ok(pdu) if pdu.is_empty() => py.None().into_bound(py),
+                Ok(pdu) => match call.request.response(&pdu) {
+                    Ok(response) => Reply::new(response).into_python(py)?,
+                    Err(error) => {
+                        let invalid = ClientError::Invalid(InvalidResponse::Pdu(error));
+                        exception(py, &invalid)
+                    }
+                },
+                Err(error) => exception(py, &error),
+            };
+            Ok((call.ticket, call.is_sent, result))
+        });
+        called.collect()
+    }
+
+    fn withdraw(&self, ticket: u64) -> bool {
+        self.core.withdraw(ticket)
+    }
+}
+
+#[cfg(unix)]
+fn handle(wakes: Wakes) -> i64 {
+    i64::from(std::os::fd::IntoRawFd::into_raw_fd(wakes))
+}
+
+#[cfg(windows)]
+fn handle(wakes: Wakes) -> i64 {
+    std::os::windows::io::IntoRawSocket::into_raw_socket(wakes) as i64
 }
 
 /// Area, address, count, device, first address of the device, and whether function 22 is emulated.

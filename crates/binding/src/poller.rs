@@ -145,6 +145,12 @@ impl Poller {
         Ok(Link { core: self.core.link(settings).map_err(raised)? })
     }
 
+    fn known_link(&self, name: String, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
+        let settings = link::settings(name, &endpoint, Some(1), 256, true, 0.0, Vec::new())?;
+        let known = self.core.known_link(settings).map_err(raised)?;
+        Ok(known.map(|core| Link { core }))
+    }
+
     fn passage(
         &self,
         memory: PyRef<'_, Memory>,
@@ -160,7 +166,7 @@ impl Poller {
 
     fn results<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Taken<'py>>> {
         let timeout = seconds("timeout", timeout)?;
-        let Batch { polls, writes, ended } = py.detach(|| self.core.results().take(timeout));
+        let Batch { polls, writes, ended, .. } = py.detach(|| self.core.results().take(timeout));
         if ended && polls.is_empty() && writes.is_empty() {
             return Ok(None);
         }
@@ -170,14 +176,20 @@ impl Poller {
         Ok(Some((polls, writes.collect())))
     }
 
+    fn wake(&self) {
+        self.core.results().wake();
+    }
+
     #[getter]
     fn dropped(&self) -> u64 {
         self.core.results().dropped()
     }
 
-    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+    #[pyo3(signature = (*, report=None))]
+    fn counters<'py>(&self, py: Python<'py>, report: Option<bool>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
-        for device in self.core.devices() {
+        let devices = self.core.devices().into_iter();
+        for device in devices.filter(|device| report.is_none_or(|only| device.report == only)) {
             let counted = state(py, &device.state)?;
             let mut forwards = Vec::new();
             for forward in &device.forwards {

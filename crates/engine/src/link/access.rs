@@ -8,7 +8,7 @@ use holdfast_protocol::pdu::EncodedRequest;
 use tokio::time::Instant;
 
 use super::blocking::BlockingLink;
-use super::fault::Answer;
+use super::fault::{Answer, Exchanged, fault};
 use super::pace::{InFlight, Pace, Place as Turn};
 use super::queue::Priority;
 use super::tcp::TcpLink;
@@ -33,10 +33,11 @@ impl Link {
     /// Must be called in the context of a `LocalSet`.
     pub(crate) fn new(endpoint: Endpoint, in_flight: InFlight) -> Rc<Link> {
         let one = InFlight::Fixed(1);
+        let url = endpoint.to_string();
         let (wire, in_flight) = match endpoint.place {
             Place::Tcp { host, port, tls } => {
                 let is_one = endpoint.tolerance.is_one_at_a_time();
-                let link = TcpLink::new((host, port), tls, endpoint.tolerance);
+                let link = TcpLink::new((host, port), tls, endpoint.tolerance, url);
                 (Wire::Tcp(Box::new(link)), if is_one { one } else { in_flight })
             }
             _ => (Wire::Blocking(BlockingLink::new(endpoint)), one),
@@ -55,7 +56,8 @@ impl Link {
     ) -> Answer {
         let _turn = self.turn(POLLER, priority).await;
         let eager = priority == Priority::Urgent;
-        self.exchange(unit_id, request, timeout, eager).await
+        let answer = self.exchange(unit_id, request, timeout, eager).await;
+        answer.map_err(|error| fault(&error))
     }
 
     /// Waits for a turn, which lasts as long as the result.
@@ -71,7 +73,7 @@ impl Link {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
-    ) -> Answer {
+    ) -> Exchanged {
         self.note_change(request);
         let answer = match &self.wire {
             Wire::Tcp(link) => link.exchange(&self.pace, unit_id, request, timeout, eager).await,

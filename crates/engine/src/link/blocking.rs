@@ -1,20 +1,28 @@
 //! A link that sends one request at a time, by blocking calls in a thread that ends with the link.
 
 use std::cell::Cell;
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
+use holdfast_protocol::client::Closed;
 use holdfast_protocol::pdu::EncodedRequest;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 
 use super::backoff;
-use super::fault::{Answer, Fault};
-use crate::client::{BlockingClient, ClientError, Endpoint};
+use super::fault::{Exchanged, Fault, fault};
+use crate::client::{BlockingClient, ClientError, Endpoint, Lost};
 
 pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
     retry_at: Cell<Option<Instant>>,
+}
+
+/// An endpoint that could not be opened: since how many attempts, when it is tried again, and why.
+struct Failed {
+    attempts: u32,
+    until: Instant,
+    error: Arc<ClientError>,
 }
 
 enum Job {
@@ -28,7 +36,7 @@ struct Call {
     timeout: Duration,
     eager: bool,
     /// The result, and when an endpoint that could not be opened is tried again.
-    answer: oneshot::Sender<(Answer, Option<Instant>)>,
+    answer: oneshot::Sender<(Exchanged, Option<Instant>)>,
 }
 
 impl BlockingLink {
@@ -36,13 +44,14 @@ impl BlockingLink {
         let (jobs, queue) = mpsc::channel::<Job>();
         let client = BlockingClient::new(endpoint);
         let work = move || {
-            let (mut failures, mut retry_at) = (0, None);
+            let mut failed = None;
             for job in queue {
                 match job {
                     // A stopped device no longer waits for its read.
                     Job::Call(call) if call.answer.is_closed() => {}
                     Job::Call(call) => {
-                        let answer = carried_out(&client, &call, &mut failures, &mut retry_at);
+                        let answer = carried_out(&client, &call, &mut failed);
+                        let retry_at = failed.as_ref().map(|failed| failed.until);
                         let _ = call.answer.send((answer, retry_at));
                     }
                     Job::Release => client.close(),
@@ -60,12 +69,13 @@ impl BlockingLink {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
-    ) -> Answer {
+    ) -> Exchanged {
+        let ended = || Arc::new(ClientError::Lost(Lost::Closed(Closed::BySelf)));
         let (answer, answered) = oneshot::channel();
         let request = Box::new(request.clone());
         let call = Call { unit_id, request, timeout, eager, answer };
-        self.jobs.send(Job::Call(call)).or(Err(Fault::Reset))?;
-        let (answer, retry_at) = answered.await.unwrap_or((Err(Fault::Reset), None));
+        self.jobs.send(Job::Call(call)).map_err(|_| ended())?;
+        let (answer, retry_at) = answered.await.unwrap_or_else(|_| (Err(ended()), None));
         self.retry_at.set(retry_at);
         answer
     }
@@ -81,27 +91,22 @@ impl BlockingLink {
     }
 }
 
-fn carried_out(
-    client: &BlockingClient,
-    call: &Call,
-    failures: &mut u32,
-    retry_at: &mut Option<Instant>,
-) -> Answer {
-    if !call.eager && retry_at.is_some_and(|time| Instant::now() < time) {
-        return Err(Fault::Refused);
+fn carried_out(client: &BlockingClient, call: &Call, failed: &mut Option<Failed>) -> Exchanged {
+    if let Some(Failed { until, error, .. }) = failed
+        && !call.eager
+        && Instant::now() < *until
+    {
+        return Err(Arc::clone(error));
     }
     let answer = client.call(call.unit_id, &call.request, call.timeout, |_, pdu| pdu.to_vec());
-    let fault = match &answer {
-        Err(ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. }) => {
-            *failures = failures.saturating_add(1);
-            *retry_at = Some(Instant::now() + backoff::pause(*failures, backoff::MAX_PAUSE));
-            return Err(Fault::Refused);
+    let answer = answer.map_err(Arc::new);
+    *failed = match &answer {
+        Err(error) if fault(error) == Fault::Refused => {
+            let attempts = failed.take().map_or(0, |failed| failed.attempts).saturating_add(1);
+            let until = Instant::now() + backoff::pause(attempts, backoff::MAX_PAUSE);
+            Some(Failed { attempts, until, error: Arc::clone(error) })
         }
-        Err(ClientError::Exception(code)) => Fault::Exception(*code),
-        Err(ClientError::Timeout(_) | ClientError::ConnectTimeout { .. }) => Fault::Timeout,
-        Err(ClientError::Invalid(_)) => Fault::Invalid,
-        Ok(_) | Err(ClientError::Lost(_) | ClientError::Tls { .. }) => Fault::Reset,
+        _ => None,
     };
-    (*failures, *retry_at) = (0, None);
-    answer.or(Err(fault))
+    answer
 }

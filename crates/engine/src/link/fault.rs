@@ -1,6 +1,8 @@
 //! Why a request to a device failed.
 
-use holdfast_protocol::client::Failure;
+use std::sync::Arc;
+
+use crate::client::ClientError;
 
 /// Errors from this code on are not exceptions.
 const NO_EXCEPTION: u16 = 0x8000;
@@ -47,12 +49,16 @@ impl Fault {
 /// The PDU of a reply, empty after a broadcast; or the fault.
 pub(crate) type Answer = Result<Vec<u8>, Fault>;
 
+/// As [`Answer`], with the error.
+pub(super) type Exchanged = Result<Vec<u8>, Arc<ClientError>>;
+
 /// The fault that a failed request counts as.
-pub(super) fn fault(failure: Failure) -> Fault {
-    match failure {
-        Failure::Exception(code) => Fault::Exception(code),
-        Failure::Timeout => Fault::Timeout,
-        Failure::Invalid(_) => Fault::Invalid,
-        _ => Fault::Reset,
+pub(super) fn fault(error: &ClientError) -> Fault {
+    match error {
+        ClientError::Exception(code) => Fault::Exception(*code),
+        ClientError::Timeout(_) | ClientError::ConnectTimeout { .. } => Fault::Timeout,
+        ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. } => Fault::Refused,
+        ClientError::Invalid(_) => Fault::Invalid,
+        ClientError::Lost(_) | ClientError::Tls { .. } => Fault::Reset,
     }
 }

@@ -27,7 +27,7 @@ pub(super) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result
         }
         let len = stream.read(&mut chunk).await?;
         if len == 0 {
-            return Err(ErrorKind::UnexpectedEof.into());
+            return Err(io::Error::other(TlsFailure::ClosedDuringHandshake));
         }
         if let Err(error) = channel.receive(&chunk[..len], &mut plain, &mut out) {
             let _ = stream.try_write(&out);

@@ -1,6 +1,7 @@
 //! Links: one connection or one serial line each, shared by all that ask the devices behind it.
 //!
-//! The poller asks by [`Link::call`], listeners through a [`Route`]. Over Modbus TCP, several requests
+//! The poller asks by [`Link::call`], listeners through a [`Route`], event loops by
+//! [`SharedLink::call`]. Over Modbus TCP, several requests
 //! can be in flight, if the settings allow it. Other transports carry one request at a time, in a
 //! thread of their own. Who waits for a place is served in a fair order ([`queue`]).
 //!
@@ -10,6 +11,7 @@
 mod access;
 pub(crate) mod backoff;
 mod blocking;
+mod caller;
 mod coming;
 mod fault;
 mod handshake;
@@ -22,10 +24,11 @@ mod silence;
 mod tcp;
 
 pub(crate) use access::Link;
+pub use caller::{Called, Caller, Wakes};
 pub(crate) use coming::{Coming, ReplyTo, coming};
 pub use fault::Fault;
 pub use pace::InFlight;
-pub(crate) use queue::Priority;
+pub(crate) use queue::{Priority, source};
 pub(crate) use route::{Asker, Call};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
 pub(crate) use serving::serve;

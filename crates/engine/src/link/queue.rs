@@ -3,11 +3,20 @@
 //! passed over [`MAX_PASSED_OVER`] times goes first, so that no rank starves.
 
 use std::collections::VecDeque;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// How often a rank is passed over in favour of higher ones.
 const MAX_PASSED_OVER: u32 = 4;
 
 const RANKS: usize = 3;
+
+/// Numbers the sources of requests. 0 is the poller.
+static SOURCES: AtomicU64 = AtomicU64::new(1);
+
+/// A number of a new source of requests.
+pub(crate) fn source() -> u64 {
+    SOURCES.fetch_add(1, Ordering::Relaxed)
+}
 
 /// How much a request matters beside others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! A link as the listeners see it, from any thread.
+//! A link as listeners and event loops see it, from any thread.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -8,20 +8,21 @@ use std::time::Duration;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use tokio::sync::mpsc;
 
+use super::caller::{Caller, Waiting};
 use super::coming::{Coming, ReplyTo, coming};
 use super::pace::InFlight;
 use super::queue::Priority;
-use crate::client::Endpoint;
+use crate::client::{ClientError, Endpoint};
 use crate::counter::Counter;
 
-/// Settings of a link that listeners use.
+/// Settings of a link that listeners or event loops use.
 #[derive(Debug, Clone)]
 pub struct LinkSettings {
     pub name: String,
     pub endpoint: Endpoint,
     /// Requests in flight, over TCP.
     pub in_flight: InFlight,
-    /// The most requests of listeners that wait or are in flight.
+    /// The most requests that wait or are in flight, without those of the poller.
     pub queue: usize,
     /// Whether equal reads that wait at the same time are answered by one request.
     pub coalesce: bool,
@@ -31,7 +32,7 @@ pub struct LinkSettings {
     pub preferred: Vec<IpAddr>,
 }
 
-/// Requests of listeners since the start.
+/// Requests since the start, without those of the poller.
 #[derive(Debug, Default)]
 pub struct LinkCounters {
     /// All, however they ended.
@@ -63,14 +64,15 @@ pub struct SharedLink {
     calls: mpsc::UnboundedSender<Call>,
     max_waiting: usize,
     waiting: AtomicUsize,
+    /// Requests of event loops among those.
+    called: AtomicUsize,
     preferred: Vec<IpAddr>,
 }
 
-/// A request of a listener.
+/// A request of a listener or of an event loop.
 pub(crate) struct Call {
     pub(super) unit_id: u8,
     pub(super) request: EncodedRequest,
-    pub(super) timeout: Duration,
     pub(super) source: u64,
     pub(super) priority: Priority,
     pub(super) reply: Reply,
@@ -79,12 +81,21 @@ pub(crate) struct Call {
 /// Where the reply to a request goes: a PDU, empty after a broadcast. The request has left the queue
 /// when this is dropped.
 pub(super) struct Reply {
-    to: ReplyTo,
+    to: Receiver,
     _place: Place,
 }
 
+enum Receiver {
+    /// With the timeout after the request was sent.
+    Listener(ReplyTo, Duration),
+    EventLoop(Waiting),
+}
+
 /// A place in the queue of a link.
-struct Place(Arc<SharedLink>);
+struct Place {
+    link: Arc<SharedLink>,
+    is_called: bool,
+}
 
 /// Who asks.
 #[derive(Debug, Clone, Copy)]
@@ -116,11 +127,12 @@ impl SharedLink {
             calls,
             max_waiting: settings.queue,
             waiting: AtomicUsize::new(0),
+            called: AtomicUsize::new(0),
             preferred: settings.preferred.clone(),
         }
     }
 
-    /// Requests of listeners that wait or are in flight.
+    /// Requests that wait or are in flight, without those of the poller.
     pub fn waiting(&self) -> usize {
         self.waiting.load(Ordering::Relaxed)
     }
@@ -132,6 +144,42 @@ impl SharedLink {
             Some(peer) if !self.preferred.is_empty() && preferred(peer) => Priority::Preferred,
             _ => Priority::Usual,
         }
+    }
+}
+
+impl SharedLink {
+    /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. Returns
+    /// the ticket of the call; `None` when the queue is full. Event loops together may fill no more of
+    /// the queue than they leave to others.
+    pub fn call(
+        self: &Arc<SharedLink>,
+        caller: &Arc<Caller>,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+    ) -> Option<u64> {
+        self.counters.requests.add();
+        let called = self.called.load(Ordering::Relaxed);
+        let place = self.place(called, true)?;
+        let priority = self.priority(request, None);
+        let (ticket, waiting) = caller.begin(request, timeout);
+        let (request, source) = (request.clone(), caller.source);
+        let reply = Reply { to: Receiver::EventLoop(waiting), _place: place };
+        // If the link has ended, the call ends as lost.
+        let _ = self.calls.send(Call { unit_id, request, source, priority, reply });
+        Some(ticket)
+    }
+
+    /// A place in the queue, for a source with so many requests there.
+    fn place(self: &Arc<SharedLink>, own: usize, is_called: bool) -> Option<Place> {
+        let before = self.waiting.fetch_add(1, Ordering::Relaxed);
+        self.called.fetch_add(usize::from(is_called), Ordering::Relaxed);
+        let place = Place { link: Arc::clone(self), is_called };
+        if self.max_waiting.saturating_sub(before) <= own {
+            self.counters.refused_full.add();
+            return None;
+        }
+        Some(place)
     }
 }
 
@@ -150,21 +198,15 @@ impl Route {
         let link = &self.link;
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
-        let before = link.waiting.fetch_add(1, Ordering::Relaxed);
-        let place = Place(Arc::clone(link));
-        if link.max_waiting.saturating_sub(before) <= asker.waiting {
-            link.counters.refused_full.add();
-            return Err(ExceptionCode::ServerDeviceBusy);
-        }
+        let place = link.place(asker.waiting, false).ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = link.priority(&request, asker.peer);
         let (to, coming) = coming();
         let call = Call {
             unit_id: self.unit_id.unwrap_or(unit_id),
             request,
-            timeout: self.timeout,
             source: asker.source,
             priority,
-            reply: Reply { to, _place: place },
+            reply: Reply { to: Receiver::Listener(to, self.timeout), _place: place },
         };
         match link.calls.send(call) {
             Ok(()) => Ok(coming),
@@ -174,18 +216,46 @@ impl Route {
 }
 
 impl Reply {
-    pub(super) fn send(self, pdu: Vec<u8>) {
-        self.to.send(pdu);
+    /// Passes a reply on, or the error of a request, which is an exception for listeners.
+    pub(super) fn send(self, outcome: Result<&[u8], (&Arc<ClientError>, &[u8])>) {
+        match (self.to, outcome) {
+            (Receiver::Listener(to, _), Ok(pdu) | Err((_, pdu))) => to.send(pdu.to_vec()),
+            (Receiver::EventLoop(to), Ok(pdu)) => to.end(Ok(pdu.to_vec())),
+            (Receiver::EventLoop(to), Err((error, _))) => to.end(Err(Arc::clone(error))),
+        }
     }
 
     /// Whether nobody waits for the reply any more.
     pub(super) fn is_unwanted(&self) -> bool {
-        self.to.is_unwanted()
+        match &self.to {
+            Receiver::Listener(to, _) => to.is_unwanted(),
+            Receiver::EventLoop(to) => to.is_unwanted(),
+        }
+    }
+
+    pub(super) fn is_of_listener(&self) -> bool {
+        matches!(self.to, Receiver::Listener(..))
+    }
+
+    /// How long to wait for a reply to a request that is sent now.
+    pub(super) fn timeout(&self) -> Duration {
+        match &self.to {
+            Receiver::Listener(_, timeout) => *timeout,
+            Receiver::EventLoop(to) => to.left(),
+        }
+    }
+
+    /// The request is sent now.
+    pub(super) fn note_sent(&self) {
+        if let Receiver::EventLoop(to) = &self.to {
+            to.note_sent();
+        }
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        self.0.waiting.fetch_sub(1, Ordering::Relaxed);
+        self.link.waiting.fetch_sub(1, Ordering::Relaxed);
+        self.link.called.fetch_sub(usize::from(self.is_called), Ordering::Relaxed);
     }
 }

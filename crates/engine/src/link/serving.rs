@@ -1,6 +1,7 @@
-//! Carries out the requests of listeners, on the thread of the link. Every failure becomes the exception
-//! of a gateway (V1.1b3, 7).
+//! Carries out the requests of listeners and event loops, on the thread of the link. For listeners, every
+//! failure becomes the exception of a gateway (V1.1b3, 7); event loops get the error itself.
 
+use std::cell::RefCell;
 use std::rc::Rc;
 use std::sync::{Arc, Weak};
 
@@ -9,12 +10,13 @@ use tokio::sync::mpsc;
 use tokio::task::spawn_local;
 
 use super::access::Link;
-use super::fault::Fault;
-use super::route::{Call, LinkSettings, Reply, SharedLink};
+use super::fault::{Exchanged, Fault, fault};
+use super::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
 use super::shared_reads::{SharedReads, shareable};
 use super::silence::Silence;
+use crate::client::ClientError;
 
-/// Carries out the requests of listeners until all routes to the link are dropped.
+/// Carries out the requests to a link until all that could send some are dropped.
 pub(crate) async fn serve(
     link: Rc<Link>,
     settings: LinkSettings,
@@ -22,7 +24,8 @@ pub(crate) async fn serve(
     mut calls: mpsc::UnboundedReceiver<Call>,
 ) {
     let reads = SharedReads::new(settings.coalesce, settings.cache);
-    let serving = Rc::new(Serving { link, reads, silence: Silence::default() });
+    let serving =
+        Rc::new(Serving { link, reads, silence: Silence::default(), error: RefCell::default() });
     while let Some(call) = calls.recv().await {
         let Some(shared) = shared.upgrade() else { return };
         spawn_local(Rc::clone(&serving).carry_out(call, shared));
@@ -33,22 +36,23 @@ struct Serving {
     link: Rc<Link>,
     reads: SharedReads,
     silence: Silence,
+    /// Why the address could not be reached the last time.
+    error: RefCell<Option<Arc<ClientError>>>,
 }
 
 impl Serving {
     async fn carry_out(self: Rc<Self>, call: Call, shared: Arc<SharedLink>) {
-        let Call { unit_id, request, timeout, source, priority, reply } = call;
+        let Call { unit_id, request, source, priority, reply } = call;
         let counters = &shared.counters;
         let read = shareable(unit_id, &request);
         let changes = self.link.changes.get();
         if let Some(pdu) = read.as_ref().and_then(|read| self.reads.cached(read, changes)) {
             counters.cached.add();
-            return reply.send(pdu);
+            return reply.send(Ok(&pdu));
         }
-        if let Err(code) = self.silence.refuse(unit_id) {
-            counters.refused_down.add();
-            return reply.send(exception(&request, code));
-        }
+        let Some(reply) = self.admitted(unit_id, &request, vec![reply], counters).pop() else {
+            return;
+        };
         let Some(joining) = self.reads.join(read.clone(), reply) else {
             return counters.coalesced.add();
         };
@@ -58,45 +62,86 @@ impl Serving {
             return counters.withdrawn.add();
         }
         // Others may have found out while this request waited.
-        if let Err(code) = self.silence.refuse(unit_id) {
-            counters.refused_down.add();
-            return answer(replies, exception(&request, code));
-        }
+        let replies = self.admitted(unit_id, &request, replies, counters);
+        let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
+        replies.iter().for_each(Reply::note_sent);
         let changes = self.link.changes.get();
         let answered = self.link.exchange(unit_id, &request, timeout, true).await;
         drop(turn);
-        self.silence.learn(unit_id, &answered, self.link.retry_at().is_some());
-        match &answered {
-            Ok(_) => counters.replies.add(),
-            Err(Fault::Exception(_)) => {
-                counters.replies.add();
-                counters.exceptions.add();
-            }
-            Err(Fault::Timeout) => counters.timeouts.add(),
-            Err(_) => counters.failures.add(),
-        }
-        let pdu = match answered {
+        self.learn(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
+        let error = match answered {
             Ok(pdu) => {
+                counters.replies.add();
                 if let Some(read) = read {
                     self.reads.keep(read, &pdu, changes);
                 }
-                pdu
+                return replies.into_iter().for_each(|reply| reply.send(Ok(&pdu)));
             }
-            Err(Fault::Exception(code)) => vec![request.pdu()[0] | 0x80, code],
-            Err(_) => exception(&request, self.silence.exception()),
+            Err(error) => error,
         };
-        answer(replies, pdu);
+        let pdu = match fault(&error) {
+            Fault::Exception(code) => {
+                counters.replies.add();
+                counters.exceptions.add();
+                vec![request.pdu()[0] | 0x80, code]
+            }
+            Fault::Timeout => {
+                counters.timeouts.add();
+                exception(&request, self.silence.exception())
+            }
+            _ => {
+                counters.failures.add();
+                exception(&request, self.silence.exception())
+            }
+        };
+        replies.into_iter().for_each(|reply| reply.send(Err((&error, &pdu))));
     }
-}
 
-fn answer(replies: Vec<Reply>, pdu: Vec<u8>) {
-    let mut replies = replies.into_iter();
-    let last = replies.next_back();
-    for reply in replies {
-        reply.send(pdu.clone());
+    /// Refuses what is not tried, and returns the others. Event loops choose their timeouts and look for
+    /// silent addresses: they are refused only if the address can't be reached.
+    fn admitted(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        replies: Vec<Reply>,
+        counters: &LinkCounters,
+    ) -> Vec<Reply> {
+        let Err(code) = self.silence.refuse(unit_id) else { return replies };
+        let pdu = exception(request, code);
+        let error = self.error.borrow();
+        let error = error.as_ref().filter(|_| code == ExceptionCode::GatewayPathUnavailable);
+        let mut admitted = Vec::new();
+        let mut is_refused = false;
+        for reply in replies {
+            match error {
+                Some(error) => reply.send(Err((error, &pdu))),
+                None if reply.is_of_listener() => reply.send(Ok(&pdu)),
+                None => {
+                    admitted.push(reply);
+                    continue;
+                }
+            }
+            is_refused = true;
+        }
+        if is_refused {
+            counters.refused_down.add();
+        }
+        admitted
     }
-    if let Some(reply) = last {
-        reply.send(pdu);
+
+    /// Draws conclusions for the next requests. The timeouts of event loops alone say nothing of a unit:
+    /// they may be short.
+    fn learn(&self, unit_id: u8, answered: &Exchanged, from_listener: bool) {
+        let is_unreachable = self.link.retry_at().is_some();
+        if let Err(error) = answered
+            && is_unreachable
+        {
+            self.error.replace(Some(Arc::clone(error)));
+        }
+        let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
+        if outcome != Err(Fault::Timeout) || from_listener || is_unreachable {
+            self.silence.learn(unit_id, outcome, is_unreachable);
+        }
     }
 }
 

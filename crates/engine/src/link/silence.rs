@@ -9,7 +9,7 @@ use holdfast_protocol::pdu::ExceptionCode;
 use tokio::time::Instant;
 
 use super::backoff;
-use super::fault::{Answer, Fault};
+use super::fault::Fault;
 
 /// Timeouts in a row after which requests to a unit are refused for a while.
 const SILENT_AFTER: u32 = 3;
@@ -60,13 +60,13 @@ impl Silence {
 
     /// Draws conclusions for the next requests. `is_unreachable` says that the address could not be
     /// reached.
-    pub(super) fn learn(&self, unit_id: u8, answered: &Answer, is_unreachable: bool) {
+    pub(super) fn learn(&self, unit_id: u8, answered: Result<(), Fault>, is_unreachable: bool) {
         if answered.is_err() && is_unreachable {
             return self.address.set(Some(Pause::longer(self.address.get(), 0)));
         }
         self.address.set(None);
         let mut units = self.units.borrow_mut();
-        if *answered == Err(Fault::Timeout) {
+        if answered == Err(Fault::Timeout) {
             let pause = Pause::longer(units.get(&unit_id).copied(), SILENT_AFTER - 1);
             units.insert(unit_id, pause);
         } else {
@@ -87,20 +87,20 @@ impl Silence {
 mod tests {
     use super::*;
 
-    const SILENT: Answer = Err(Fault::Timeout);
+    const SILENT: Result<(), Fault> = Err(Fault::Timeout);
 
     #[test]
     fn a_unit_is_left_alone_after_some_timeouts_and_others_are_not() {
         let silence = Silence::default();
         for _ in 1..SILENT_AFTER {
-            silence.learn(7, &SILENT, false);
+            silence.learn(7, SILENT, false);
             assert_eq!(silence.refuse(7), Ok(()));
         }
-        silence.learn(7, &SILENT, false);
+        silence.learn(7, SILENT, false);
         assert_eq!(silence.refuse(7), Err(ExceptionCode::GatewayTargetFailedToRespond));
         assert_eq!(silence.refuse(8), Ok(()));
-        for answer in [Ok(vec![3, 2, 0, 0]), Err(Fault::Exception(2))] {
-            silence.learn(7, &answer, false);
+        for answer in [Ok(()), Err(Fault::Exception(2))] {
+            silence.learn(7, answer, false);
             assert_eq!(silence.refuse(7), Ok(()));
         }
     }
@@ -108,9 +108,9 @@ mod tests {
     #[test]
     fn an_address_that_can_not_be_reached_is_left_alone_at_once() {
         let silence = Silence::default();
-        silence.learn(7, &Err(Fault::Refused), true);
+        silence.learn(7, Err(Fault::Refused), true);
         assert_eq!(silence.refuse(8), Err(ExceptionCode::GatewayPathUnavailable));
-        silence.learn(8, &Ok(Vec::new()), false);
+        silence.learn(8, Ok(()), false);
         assert_eq!(silence.refuse(7), Ok(()));
     }
 }

@@ -7,7 +7,9 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Ticket, Tolerance, Transport};
+use holdfast_protocol::client::{
+    Attempt, Closed, Connection, Done, Failure, Ticket, Tolerance, Transport,
+};
 use holdfast_protocol::pdu::EncodedRequest;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
@@ -17,11 +19,15 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff;
-use super::fault::{Answer, Fault, fault};
+use super::fault::Exchanged;
 use super::handshake;
 use super::pace::Pace;
-use crate::tls::Channel;
+use crate::client::ClientError;
 use crate::tls::client::ClientTls;
+use crate::tls::{Channel, TlsFailure};
+
+/// The connection has ended before a request could be sent, or before its reply.
+const LOST: Failure = Failure::Closed(Closed::ByPeer);
 
 /// Bytes per read of a socket.
 const CHUNK: usize = 16 * 1024;
@@ -31,17 +37,19 @@ pub(super) struct TcpLink {
     port: u16,
     tls: Option<Arc<ClientTls>>,
     tolerance: Tolerance,
+    /// For errors.
+    url: String,
     connecting: Mutex<()>,
     failures: Cell<u32>,
-    /// The earliest time of the next attempt after a failed one, and the fault.
-    failed: Cell<Option<(Instant, Fault)>>,
+    /// The earliest time of the next attempt after a failed one, and the error.
+    failed: RefCell<Option<(Instant, Arc<ClientError>)>>,
     /// When the last connection ended.
     ended: Rc<Cell<Option<Instant>>>,
     open: Rc<RefCell<Option<Open>>>,
 }
 
 /// The result of a request, and its next attempt, if there is one.
-type Outcome = (Answer, Option<Attempt>);
+type Outcome = (Result<Vec<u8>, Failure>, Option<Attempt>);
 
 /// An open connection.
 struct Open {
@@ -62,15 +70,17 @@ impl TcpLink {
         (host, port): (String, u16),
         tls: Option<Arc<ClientTls>>,
         tolerance: Tolerance,
+        url: String,
     ) -> TcpLink {
         TcpLink {
             host,
             port,
             tls,
             tolerance,
+            url,
             connecting: Mutex::default(),
             failures: Cell::default(),
-            failed: Cell::default(),
+            failed: RefCell::default(),
             ended: Rc::default(),
             open: Rc::default(),
         }
@@ -83,19 +93,21 @@ impl TcpLink {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
-    ) -> Answer {
+    ) -> Exchanged {
         let mut deadline = Instant::now() + timeout;
+        let failed = |failure| Arc::new(ClientError::new(failure, timeout));
         let mut attempt = Attempt::default();
         loop {
             if self.open.borrow().is_none() {
-                self.connect(deadline, eager).await?;
+                self.connect(deadline, timeout, eager).await?;
             }
             let began = pace.began();
-            let (answer, again) = self.carry_out(unit_id, request, deadline, attempt).await?;
+            let (answer, again) =
+                self.carry_out(unit_id, request, deadline, attempt).await.map_err(failed)?;
             if let Some(began) = began {
-                pace.ended(began, answer == Err(Fault::Timeout));
+                pace.ended(began, answer == Err(Failure::Timeout));
             }
-            let Some(next) = again else { return answer };
+            let Some(next) = again else { return answer.map_err(failed) };
             sleep(next.pause()).await;
             if next.has_own_timeout() {
                 deadline = Instant::now() + timeout;
@@ -111,13 +123,13 @@ impl TcpLink {
         request: &EncodedRequest,
         deadline: Instant,
         attempt: Attempt,
-    ) -> Result<Outcome, Fault> {
+    ) -> Result<Outcome, Failure> {
         let mut sent = self.send(unit_id, request, deadline, attempt)?;
         loop {
             match timeout_at(self.due(), &mut sent.outcome).await {
                 Ok(outcome) => {
                     sent.is_over = true;
-                    return outcome.or(Err(Fault::Reset));
+                    return outcome.or(Err(LOST));
                 }
                 Err(_) => self.advance(),
             }
@@ -125,16 +137,23 @@ impl TcpLink {
     }
 
     /// Opens the connection, once for all requests that wait for it.
-    async fn connect(&self, deadline: Instant, eager: bool) -> Result<(), Fault> {
-        let _alone = timeout_at(deadline, self.connecting.lock()).await.or(Err(Fault::Timeout))?;
+    async fn connect(
+        &self,
+        deadline: Instant,
+        timeout: Duration,
+        eager: bool,
+    ) -> Result<(), Arc<ClientError>> {
+        let too_late = || ClientError::ConnectTimeout { to: self.url.clone(), after: timeout };
+        let alone = timeout_at(deadline, self.connecting.lock()).await;
+        let _alone = alone.map_err(|_| Arc::new(too_late()))?;
         if self.open.borrow().is_some() {
             return Ok(());
         }
-        if let Some((until, fault)) = self.failed.get()
-            && Instant::now() < until
+        if let Some((until, error)) = &*self.failed.borrow()
+            && Instant::now() < *until
             && !eager
         {
-            return Err(fault);
+            return Err(Arc::clone(error));
         }
         if let Some(ended) = self.ended.get() {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
@@ -148,20 +167,30 @@ impl TcpLink {
             };
             Ok::<_, io::Error>((stream, tls))
         });
-        let fault = match connected.await {
+        let error = match connected.await {
             Ok(Ok((stream, tls))) => {
                 self.failures.set(0);
-                self.failed.set(None);
+                self.failed.replace(None);
                 self.take(stream, tls);
                 return Ok(());
             }
-            Ok(Err(_)) => Fault::Refused,
-            Err(_) => Fault::Timeout,
+            Ok(Err(error)) => self.refused(error),
+            Err(_) => too_late(),
         };
+        let error = Arc::new(error);
         self.failures.set(self.failures.get().saturating_add(1));
         let pause = backoff::pause(self.failures.get(), backoff::MAX_PAUSE);
-        self.failed.set(Some((Instant::now() + pause, fault)));
-        Err(fault)
+        self.failed.replace(Some((Instant::now() + pause, Arc::clone(&error))));
+        Err(error)
+    }
+
+    /// Why the connection could not be made.
+    fn refused(&self, error: io::Error) -> ClientError {
+        let to = self.url.clone();
+        match error.get_ref().and_then(|inner| inner.downcast_ref::<TlsFailure>()) {
+            Some(failure) => ClientError::Tls { to, failure: failure.clone(), maybe_sent: false },
+            None => ClientError::Connect { to, error },
+        }
     }
 
     fn take(&self, stream: TcpStream, tls: Option<Channel>) {
@@ -190,9 +219,9 @@ impl TcpLink {
         request: &EncodedRequest,
         deadline: Instant,
         attempt: Attempt,
-    ) -> Result<Sent<'_>, Fault> {
+    ) -> Result<Sent<'_>, Failure> {
         let mut open = self.open.borrow_mut();
-        let found = open.as_mut().ok_or(Fault::Reset)?;
+        let found = open.as_mut().ok_or(LOST)?;
         let now = Instant::now();
         let timeout = deadline.saturating_duration_since(now);
         let sent = now - found.epoch;
@@ -205,14 +234,14 @@ impl TcpLink {
             }
             _ => {
                 *open = None;
-                Err(Fault::Reset)
+                Err(LOST)
             }
         }
     }
 
     /// The end of the pause after the last failed attempt to connect.
     pub(super) fn retry_at(&self) -> Option<Instant> {
-        self.failed.get().map(|(until, _)| until)
+        self.failed.borrow().as_ref().map(|(until, _)| *until)
     }
 
     /// Closes the connection if no request is in flight.
@@ -271,7 +300,7 @@ impl Drop for Sent<'_> {
 fn hand_on(waiting: &mut HashMap<Ticket, oneshot::Sender<Outcome>>, done: &Done<'_>) {
     if let Some(sender) = waiting.remove(&done.ticket) {
         // A device that was stopped does not wait.
-        let answer = done.outcome.map(|_| done.pdu.to_vec()).map_err(fault);
+        let answer = done.outcome.map(|_| done.pdu.to_vec());
         let _ = sender.send((answer, done.again));
     }
 }

@@ -53,11 +53,13 @@ pub struct Batch {
     pub writes: Vec<Written>,
     /// Whether the poller has ended: no more results will come.
     pub ended: bool,
+    /// Whether the receiver was woken.
+    woken: bool,
 }
 
 impl Batch {
     fn is_empty(&self) -> bool {
-        self.polls.is_empty() && self.writes.is_empty() && !self.ended
+        self.polls.is_empty() && self.writes.is_empty() && !self.ended && !self.woken
     }
 }
 
@@ -115,6 +117,15 @@ impl Results {
         if first {
             self.ready.notify_one();
         }
+    }
+
+    /// Ends the current or the next wait of the receiver, without results.
+    pub fn wake(&self) {
+        // The end wakes it too.
+        let mut batch = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+        batch.woken = true;
+        drop(batch);
+        self.ready.notify_one();
     }
 
     /// Takes all results that wait. If there are none, waits up to `timeout` for the first.

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::io;
+use std::net::IpAddr;
 use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -59,13 +60,17 @@ pub struct Polled {
     pub name: String,
     pub state: Arc<DeviceState>,
     pub forwards: Vec<Arc<ForwardCounters>>,
+    /// Whether its polls are in [`Poller::results`].
+    pub report: bool,
+    address: Arc<Address>,
 }
 
 impl Polled {
     fn new(device: &DeviceSettings, state: Arc<DeviceState>) -> Polled {
         state.set_stale_after(device.interval, device.timeout);
         let forwards = device.forward.iter().map(|_| Arc::default()).collect();
-        Polled { name: device.name.clone(), state, forwards }
+        let address = Arc::new(address(&device.endpoint));
+        Polled { name: device.name.clone(), state, forwards, report: device.report, address }
     }
 }
 
@@ -214,6 +219,23 @@ impl Poller {
         all.retain(|(_, link)| link.strong_count() > 0);
         all.push((address, Arc::downgrade(&link)));
         Ok(link)
+    }
+
+    /// The link to an address that a device or another user of a link already has; `None` if nobody
+    /// has it.
+    ///
+    /// # Errors
+    /// [`PollerError::Stopped`].
+    pub fn known_link(
+        &self,
+        settings: LinkSettings,
+    ) -> Result<Option<Arc<SharedLink>>, PollerError> {
+        let address = address(&settings.endpoint);
+        let is_known = self.polled().iter().any(|device| *device.address == address) || {
+            let all = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+            all.iter().any(|(other, link)| *other == address && link.strong_count() > 0)
+        };
+        is_known.then(|| self.link(settings)).transpose()
     }
 
     /// Passes writes into ranges of a memory on to the devices that they are read from.
@@ -531,11 +553,20 @@ fn address(endpoint: &Endpoint) -> Address {
         Place::Tcp { tls: Some(tls), .. } => Some(Arc::clone(tls.identity())),
         _ => None,
     };
-    match &endpoint.place {
-        Place::Serial(line) => (format!("serial:{}", line.device), None),
-        Place::Tcp { host, port, .. } => (format!("tcp://{host}:{port}"), identity),
-        _ => (endpoint.to_string(), None),
-    }
+    let (scheme, host, port) = match &endpoint.place {
+        Place::Serial(line) => return (format!("serial:{}", line.device), None),
+        Place::Tcp { host, port, .. } => ("tcp", host, port),
+        Place::RtuOverTcp { host, port } => ("rtu+tcp", host, port),
+        Place::AsciiOverTcp { host, port } => ("ascii+tcp", host, port),
+        Place::Udp { host, port } => ("udp", host, port),
+        Place::RtuOverUdp { host, port } => ("rtu+udp", host, port),
+    };
+    // The same address can be written in several ways.
+    let host = match host.parse::<IpAddr>() {
+        Ok(address) => address.to_canonical().to_string(),
+        Err(_) => host.to_ascii_lowercase(),
+    };
+    (format!("{scheme}://{host}:{port}"), identity)
 }
 
 /// Checks the settings of a device and plans its reads.
@@ -606,6 +637,18 @@ mod tests {
             report: false,
             release: false,
         }
+    }
+
+    #[test]
+    fn an_address_can_be_written_in_several_ways() {
+        let written =
+            |host: &str| address(&Place::Tcp { host: host.into(), port: 502, tls: None }.into());
+        assert_eq!(written("PLC.local"), written("plc.local"));
+        assert_eq!(written("::FFFF:10.0.0.5"), written("10.0.0.5"));
+        assert_eq!(written("fd00:0::1"), written("fd00::1"));
+        assert_ne!(written("10.0.0.5"), written("10.0.0.50"));
+        let other = Place::RtuOverTcp { host: "10.0.0.5".into(), port: 502 }.into();
+        assert_ne!(written("10.0.0.5"), address(&other));
     }
 
     fn refused(change: impl FnOnce(&mut DeviceSettings)) -> String {

@@ -8,20 +8,16 @@ use std::collections::VecDeque;
 use std::net::IpAddr;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Context, Poll};
 
 use holdfast_protocol::pdu::{self, ExceptionCode, reply};
 
 use super::policy::{Elsewhere, PeerRights};
 use super::unit_server::UnitServer;
-use crate::link::{Asker, Coming};
+use crate::link::{Asker, Coming, source};
 
 /// The most requests of a connection that wait for replies.
 pub(super) const MAX_WAITING: usize = 16;
-
-/// Numbers the sources of requests. 0 is none of them.
-static SOURCES: AtomicU64 = AtomicU64::new(1);
 
 pub(super) struct Deferred {
     source: u64,
@@ -69,11 +65,6 @@ impl Default for Deferred {
     fn default() -> Deferred {
         Deferred { source: source(), waiting: VecDeque::new(), behind: Vec::new() }
     }
-}
-
-/// A number of a new source of requests.
-pub(super) fn source() -> u64 {
-    SOURCES.fetch_add(1, Ordering::Relaxed)
 }
 
 impl Deferred {

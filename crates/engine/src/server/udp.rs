@@ -14,12 +14,12 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::deferred::{come, source};
+use super::deferred::come;
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::policy::{PeerRights, Policy, Rule};
 use super::unit_server::UnitServer;
-use crate::link::Asker;
+use crate::link::{Asker, source};
 
 /// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
 const INPUT: usize = 64 * 1024;

@@ -1,0 +1,176 @@
+//! Calls over links from an event loop in another thread.
+//!
+//! The thread of the link never waits for the event loop: it puts results into a queue, and a byte into
+//! a socket when the queue was empty. The event loop reads the socket and takes all results.
+
+use std::collections::HashMap;
+use std::io::{self, Write};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use holdfast_protocol::client::Closed;
+use holdfast_protocol::pdu::EncodedRequest;
+
+use super::queue::source;
+use crate::client::{ClientError, Lost};
+
+#[cfg(not(unix))]
+pub use std::net::TcpStream as Wakes;
+#[cfg(unix)]
+pub use std::os::unix::net::UnixStream as Wakes;
+
+/// An event loop that calls devices: one source of requests, however many callers it has.
+#[derive(Debug)]
+pub struct Caller {
+    pub(super) source: u64,
+    state: Mutex<State>,
+    wake: Wakes,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    next: u64,
+    pending: HashMap<u64, Pending>,
+    done: Vec<Called>,
+}
+
+#[derive(Debug)]
+struct Pending {
+    request: EncodedRequest,
+    is_sent: bool,
+}
+
+/// A call that has ended.
+#[derive(Debug)]
+pub struct Called {
+    /// The number that [`super::SharedLink::call`] returned.
+    pub ticket: u64,
+    pub request: EncodedRequest,
+    /// The PDU of a reply, empty after a broadcast.
+    pub outcome: Result<Vec<u8>, Arc<ClientError>>,
+    /// Whether the turn of the request had come, so that the device may have received it.
+    pub is_sent: bool,
+}
+
+/// A call that has not ended. It ends as lost when this is dropped.
+#[derive(Debug)]
+pub(super) struct Waiting {
+    caller: Arc<Caller>,
+    ticket: u64,
+    timeout: Duration,
+    until: Instant,
+    has_ended: bool,
+}
+
+impl Caller {
+    /// The second result becomes readable when there are results, for the event loop.
+    ///
+    /// # Errors
+    /// The system has no sockets left.
+    pub fn new() -> io::Result<(Arc<Caller>, Wakes)> {
+        let (wake, wakes) = pair()?;
+        wake.set_nonblocking(true)?;
+        wakes.set_nonblocking(true)?;
+        let caller = Caller { source: source(), state: Mutex::default(), wake };
+        Ok((Arc::new(caller), wakes))
+    }
+
+    /// A new call, which ends at the end of its timeout at the latest.
+    pub(super) fn begin(
+        self: &Arc<Caller>,
+        request: &EncodedRequest,
+        timeout: Duration,
+    ) -> (u64, Waiting) {
+        let mut state = self.state();
+        let ticket = state.next;
+        state.next += 1;
+        state.pending.insert(ticket, Pending { request: request.clone(), is_sent: false });
+        drop(state);
+        let (caller, until) = (Arc::clone(self), Instant::now() + timeout);
+        (ticket, Waiting { caller, ticket, timeout, until, has_ended: false })
+    }
+
+    /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come.
+    pub fn withdraw(&self, ticket: u64) -> bool {
+        let pending = self.state().pending.remove(&ticket);
+        pending.is_none_or(|pending| pending.is_sent)
+    }
+
+    /// Takes all calls that have ended.
+    pub fn take(&self) -> Vec<Called> {
+        std::mem::take(&mut self.state().done)
+    }
+
+    fn end(&self, ticket: u64, outcome: Result<Vec<u8>, Arc<ClientError>>) {
+        let mut state = self.state();
+        let Some(Pending { request, is_sent }) = state.pending.remove(&ticket) else { return };
+        let was_empty = state.done.is_empty();
+        state.done.push(Called { ticket, request, outcome, is_sent });
+        drop(state);
+        if was_empty {
+            // A full socket wakes the event loop too, and a closed one has no event loop.
+            let _ = (&self.wake).write(&[0]);
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Waiting {
+    /// The time that is left.
+    pub(super) fn left(&self) -> Duration {
+        self.until.saturating_duration_since(Instant::now())
+    }
+
+    pub(super) fn is_unwanted(&self) -> bool {
+        self.left().is_zero() || !self.caller.state().pending.contains_key(&self.ticket)
+    }
+
+    /// Its turn has come.
+    pub(super) fn note_sent(&self) {
+        if let Some(pending) = self.caller.state().pending.get_mut(&self.ticket) {
+            pending.is_sent = true;
+        }
+    }
+
+    pub(super) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {
+        self.has_ended = true;
+        self.caller.end(self.ticket, outcome);
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        if self.has_ended {
+            return;
+        }
+        let error = match self.left().is_zero() {
+            true => ClientError::Timeout(self.timeout),
+            false => ClientError::Lost(Lost::Closed(Closed::BySelf)),
+        };
+        self.caller.end(self.ticket, Err(Arc::new(error)));
+    }
+}
+
+#[cfg(unix)]
+fn pair() -> io::Result<(Wakes, Wakes)> {
+    Wakes::pair()
+}
+
+/// Other systems have no pairs of sockets: a connection over the loopback interface.
+#[cfg(not(unix))]
+fn pair() -> io::Result<(Wakes, Wakes)> {
+    let listener = std::net::TcpListener::bind((std::net::Ipv4Addr::LOCALHOST, 0))?;
+    let wake = Wakes::connect(listener.local_addr()?)?;
+    let own = wake.local_addr()?;
+    loop {
+        // Another program may have connected first.
+        let (wakes, peer) = listener.accept()?;
+        if peer == own {
+            wake.set_nodelay(true)?;
+            return Ok((wake, wakes));
+        }
+    }
+}
