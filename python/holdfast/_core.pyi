@@ -585,8 +585,48 @@ class Link:
         request is sent.
         """
 
+    def call(
+        self,
+        caller: Caller,
+        request: Request,
+        unit: int,
+        timeout: float,
+        *,
+        broadcast: bool = False,
+    ) -> int | None:
+        """Sends a request when its turn comes; its ticket in `Caller.take`.
+
+        `timeout` is in seconds and includes the wait for the turn. A `broadcast` has no reply: it
+        ends when the devices had time to carry it out. Returns `None` when the queue is full.
+        """
+
     def counters(self) -> dict[str, int]:
-        """The requests of listeners by their fate, and how many wait now."""
+        """The requests by their fate, without those of the poller, and how many wait now."""
+
+@final
+class Caller:
+    """Calls over links from an event loop, which reads a socket to learn of results.
+
+    Raises `OSError` without a free socket.
+    """
+
+    def __new__(cls) -> Caller: ...
+    def detach(self) -> int:
+        """The file descriptor or handle of the socket, which the caller then owns.
+
+        It becomes readable when calls have ended. Raises `RuntimeError` the second time.
+        """
+
+    def take(self) -> list[tuple[int, bool, Any]]:
+        """The calls that have ended: tickets, whether the device may have received the request,
+        and results as of `Connection.receive`.
+        """
+
+    def withdraw(self, ticket: int) -> bool:
+        """Gives a call up: it is not sent if its turn has not come.
+
+        Returns whether its turn has come, so that the device may have received the request.
+        """
 
 @final
 class Passage:
@@ -657,6 +697,12 @@ class Poller:
         `RuntimeError` after `stop`.
         """
 
+    def known_link(self, name: str, endpoint: Endpoint) -> Link | None:
+        """The link to an address that a device or another link uses, with the same certificates.
+
+        Returns `None` if none does. Raises `RuntimeError` after `stop`.
+        """
+
     def passage(
         self,
         memory: Memory,
@@ -691,12 +737,17 @@ class Poller:
         poller has stopped and no results are left.
         """
 
+    def wake(self) -> None:
+        """Ends the current or the next wait of `results`."""
+
     @property
     def dropped(self) -> int:
         """Polls missing from `results` because the queue was full."""
 
-    def counters(self) -> dict[str, dict[str, Any]]:
+    def counters(self, *, report: bool | None = None) -> dict[str, dict[str, Any]]:
         """The health and counters of each device and of its forwards, by device name.
+
+        `report` selects the devices with this value of `report`; `None` selects all.
 
         `age` is the age of the last valid reply, `None` before the first. `plan_error` is the
         reason why the device has no plan, `None` if it has one. `unplanned` counts polls skipped

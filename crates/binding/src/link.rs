@@ -76,15 +76,17 @@ impl Link {
         Ok(Route { core })
     }
 
+    #[pyo3(signature = (caller, request, unit, timeout, *, broadcast=false))]
     fn call(
         &self,
         caller: PyRef<'_, Caller>,
         request: PyRef<'_, Request>,
         unit: i128,
         timeout: f64,
+        broadcast: bool,
     ) -> PyResult<Option<u64>> {
         let (unit_id, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
-        Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout))
+        Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout, broadcast))
     }
 
     #[getter]

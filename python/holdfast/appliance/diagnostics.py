@@ -58,7 +58,7 @@ class Diagnostics:
 
     def devices(self) -> dict[str, dict[str, Any]]:
         """Returns the health and the counters of each device."""
-        polled = {} if self.poller is None else self.poller.counters()
+        polled = {} if self.poller is None else self.poller.counters(report=False)
         return {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
 
     def adapter(self, name: str) -> dict[str, Any] | None:

@@ -159,9 +159,9 @@ class _Running:
             self._audit = self._opened_audit(undo)
             self._sockets = sockets = self._bound_sockets(undo)
             # The links of listeners come first: the first use of an address decides its settings.
-            self._poller = None
+            self._poller: _core.Poller | None = None
             links = assembly.Links()
-            if devices or config.links or routed(config):
+            if devices or config.links or routed(config) or config.nats is not None:
                 self._poller = _core.Poller([])
                 undo.callback(self._poller.stop)
                 links = assembly.links(config, memories, self._poller)
@@ -189,16 +189,17 @@ class _Running:
     def stop(self) -> None:
         """Requests the stop of all parts, then waits for each.
 
-        Links stop after the listeners, which still answer the requests that they have passed on.
+        Links stop after all that use them: listeners and the gateway still answer the requests that
+        they have passed on.
         """
         for supervisor in self._supervisors:
             supervisor.stop()
         self._engine.stop()
-        if self._poller is not None:
-            self._poller.stop()
         self._stopped.set()
         for supervisor in self._supervisors:
             supervisor.join()
+        if self._poller is not None:
+            self._poller.stop()
         for bound in self._sockets.values():
             bound.close()
         if self._audit is not None:
@@ -224,7 +225,7 @@ class _Running:
                 )
         if self._poller is not None and time.monotonic() - self._looked >= HEALTH_CHECK_INTERVAL:
             self._looked = time.monotonic()
-            for name, told in self._poller.counters().items():
+            for name, told in self._poller.counters(report=False).items():
                 self._log_device(name, told)
 
     def _log_device(self, name: str, told: Mapping[str, Any]) -> None:
@@ -329,13 +330,13 @@ class _Running:
         if config.nats is not None:
             from holdfast.scanner.adapter import ScannerAdapter
 
-            scanner = assembly.scanner(config.nats)
-            self._add("nats", None, lambda: ScannerAdapter(scanner), may_end=True)
+            scanner, poller = assembly.scanner(config.nats), self._poller
+            self._add("nats", None, lambda: ScannerAdapter(scanner, poller), may_end=True)
         if config.gateway is not None:
             from holdfast.gateway import Gateway
 
             gateway, gateway_at = assembly.gateway(config.gateway), sockets["gateway"]
-            self._add("gateway", None, lambda: Gateway(gateway, gateway_at))
+            self._add("gateway", None, lambda: Gateway(gateway, gateway_at, poller=self._poller))
         if config.metrics is not None:
             from holdfast.adapters.metrics import Metrics
 

@@ -15,9 +15,26 @@ from holdfast.errors import InvalidResponse, ModbusException
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
+    from typing import Protocol
 
     from holdfast.client.requests import Identification, Plan, Result, ServerId, Steps
     from holdfast.types import Area
+
+    class Transport(Protocol):
+        """Carries calls to a device."""
+
+        def call(self, request: Request, unit: int, timeout: float) -> Awaitable[Any]:
+            """Sends a request, and waits for the result."""
+            ...
+
+        async def close(self) -> None:
+            """Closes the connection."""
+            ...
+
+        @property
+        def late(self) -> int:
+            """How many replies arrived after their timeout."""
+            ...
 
 
 class Client(BaseClient):
@@ -43,7 +60,7 @@ class Client(BaseClient):
         super().__init__(url, unit, timeout)
         if type(max_in_flight) is not int or not 1 <= max_in_flight <= MAX_IN_FLIGHT:
             raise ValueError(f"max_in_flight is {max_in_flight!r}, allowed: 1 to {MAX_IN_FLIGHT}")
-        self._transport: AsyncConnection | OneAtATime
+        self._transport: Transport
         if isinstance(self.target, NetworkTarget) and self.target.transport in IN_FLIGHT:
             self._transport = AsyncConnection(self.target, endpoint(self.target), max_in_flight)
         else:

@@ -13,6 +13,7 @@ from holdfast.web.host import Host, address_of
 if TYPE_CHECKING:
     import socket
 
+    from holdfast._core import Poller
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
     from holdfast.stop import Stop
@@ -23,7 +24,8 @@ __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 class Gateway:
     """A gateway on a listening socket.
 
-    `resolve` resolves names, `dial` creates the client for an address.
+    `resolve` resolves names, `dial` creates the client for an address. Devices that `poller` uses
+    are asked over its connections.
     """
 
     def __init__(
@@ -33,11 +35,12 @@ class Gateway:
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,
+        poller: Poller | None = None,
     ) -> None:
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
         """The address it listens on."""
-        self._app = App(settings, self.address, resolve=resolve, dial=dial)
+        self._app = App(settings, self.address, resolve=resolve, dial=dial, poller=poller)
         self._host = Host(
             "gateway",
             self._app,

@@ -22,6 +22,7 @@ from holdfast.gateway.events import Stream
 from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
 from holdfast.gateway.refusals import FAILURE, REFUSALS
+from holdfast.gateway.sharing import Shared
 from holdfast.net.allow_list import AllowList
 from holdfast.net.resolver import Resolver
 from holdfast.web import openapi_page as page
@@ -33,6 +34,7 @@ from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respo
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterator
 
+    from holdfast._core import Poller
     from holdfast.gateway.endpoint import Operation
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
@@ -62,6 +64,7 @@ class App:
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,
+        poller: Poller | None = None,
     ) -> None:
         self._settings = settings
         limits = self._limits = settings.limits
@@ -74,6 +77,7 @@ class App:
             longest=limits.timeout,
             tls=settings.tls,
             dial=dial,
+            shared=None if poller is None else Shared(poller),
         )
         self._running = {"requests": 0, "streams": 0}
         self._shares: dict[tuple[str, int], int] = {}

@@ -10,6 +10,7 @@ from holdfast.client import Client
 from holdfast.client.asyncio_connection import explained
 from holdfast.client.url import NetworkTarget
 from holdfast.errors import ConnectFailed, ConnectionLost, InvalidResponse
+from holdfast.gateway.sharing import SharedClient
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -27,9 +28,12 @@ NOTE = "the broadcast was sent; devices do not confirm broadcasts"
 def broadcast(
     call: Callable[[Client], Awaitable[Result]],
 ) -> Callable[[Client], Awaitable[Result]]:
-    """Wraps a call so that it only sends the request, on a new connection."""
+    """Wraps a call so that it only sends the request, on a new or on the shared connection."""
 
     async def send(client: Client) -> Result:
+        if isinstance(client, SharedClient):
+            client.broadcasts()
+            return await call(client)
         await client.close()  # The peer may accept only one connection.
         assert isinstance(client.target, NetworkTarget)
         return await call(_Broadcaster(client.target))

@@ -19,6 +19,7 @@ from holdfast.gateway.broadcasting import broadcast
 from holdfast.gateway.egress import Refused
 from holdfast.gateway.fields import listed, malformed
 from holdfast.gateway.pool import Full, Unusable
+from holdfast.gateway.sharing import QueueFull, SharedClient
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
 from holdfast.types import SERIAL_FRAMES
@@ -107,8 +108,11 @@ class RequestedDevice:
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
         began = time.monotonic()
+        asked_before, shared = self.asked, None
 
         def turn(client: Client) -> Awaitable[Result]:
+            nonlocal shared
+            shared = client if isinstance(client, SharedClient) else None
             self.asked, self._waits = True, False
             return call(client)
 
@@ -124,6 +128,9 @@ class RequestedDevice:
             raise Failed("no_such_name", str(error)) from None
         except Full:
             raise BadRequest("busy", "too many devices are in use, try again later") from None
+        except QueueFull:
+            detail = f"too many requests wait for {self.host}:{self.port}, try again later"
+            raise BadRequest("busy", detail) from None
         except Unusable as error:
             logs.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))
             detail = "the gateway's TLS files can't be used, see the log of the gateway"
@@ -133,6 +140,8 @@ class RequestedDevice:
         except ValueError as error:  # A check of the client, before anything is sent.
             raise malformed(str(error)) from None
         finally:
+            if shared is not None and not shared.is_sent:
+                self.asked, self._waits = asked_before, True
             self.rtt = round(1000 * (time.monotonic() - began))
 
     def _timed_out(self) -> str:

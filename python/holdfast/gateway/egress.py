@@ -26,6 +26,8 @@ class Route:
     """The allowed addresses of a device, and how to connect to them."""
 
     transport: Transport
+    host: str
+    """The name or address in the request."""
     addresses: tuple[str, ...]
     port: int
     name: str | None = None
@@ -54,4 +56,5 @@ class Egress:
                 f"{host}{where}, port {port}, is not in the egress list of this gateway"
             ) from None
         secure = transport == "tls"
-        return Route(transport, addresses, port, certificate_name(name or host) if secure else None)
+        expected = certificate_name(name or host) if secure else None
+        return Route(transport, host, addresses, port, expected)

@@ -1,5 +1,7 @@
 """A pool of connections to devices. All requests to one device share one connection.
 
+In an appliance, devices that it uses itself are asked over its own connections (`sharing`).
+
 A connection is opened when it is needed. It is closed when it is idle for some time, and when the
 last request on it had no response, because the state of the connection is then unknown.
 """
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from typing import Protocol
 
     from holdfast.gateway.egress import Route
+    from holdfast.gateway.sharing import Shared
     from holdfast.net.tls import Tls
 
     class Dial(Protocol):
@@ -91,6 +94,7 @@ class Pool:
         longest: float,
         tls: Tls = NO_FILES,
         dial: Dial = dial,
+        shared: Shared | None = None,
     ) -> None:
         self._most = most
         self._in_flight = in_flight
@@ -98,6 +102,7 @@ class Pool:
         self._longest = longest
         self._tls = tls
         self._dial = dial
+        self._shared = shared
         self._entries: dict[NetworkTarget, _Entry] = {}
         self._keeper: asyncio.Task[None] | None = None
 
@@ -112,11 +117,21 @@ class Pool:
     ) -> Result:
         """Runs a call on the connection to a device, trying its addresses in turn.
 
+        The connection is that of the appliance, if it uses the host or one of the addresses.
+
         `timeout` is in seconds; the caller must cancel the call when it expires. Raises `Full`,
         `Unusable`, `ValueError` for an invalid certificate name, and the exceptions of the call.
         """
+        if self._keeper is None:
+            self._keeper = asyncio.create_task(self._keep())
         tls = NO_FILES if route.name is None else replace(self._tls, name=route.name)
         keys = [NetworkTarget(route.transport, each, route.port, tls) for each in route.addresses]
+        if self._shared is not None:
+            hosts = dict.fromkeys((route.host, *route.addresses))
+            for target in (NetworkTarget(route.transport, host, route.port, tls) for host in hosts):
+                client = await self._shared.client(target, timeout)
+                if client is not None:
+                    return await call(client)
         keys.sort(key=lambda key: key not in self._entries)
         for key in keys[:-1]:
             try:
@@ -158,8 +173,6 @@ class Pool:
         return result
 
     async def _entry(self, key: NetworkTarget, timeout: float) -> _Entry:
-        if self._keeper is None:
-            self._keeper = asyncio.create_task(self._keep())
         if key not in self._entries:
             made = await self._client(key, timeout)
         entry = self._entries.get(key)  # Another request may have created it meanwhile.
@@ -230,10 +243,18 @@ class Pool:
             for entry in self._entries.values():
                 with contextlib.suppress(Exception):
                     await entry.client.close()
+            if self._shared is not None:
+                self._shared.close()
 
     async def _close_unused(self) -> None:
         latest = time.monotonic() - self._idle
+        if self._shared is not None:
+            self._shared.forget_unused(latest)
         for key, entry in list(self._entries.items()):
-            if entry.users == 0 and (entry.doubtful or entry.used < latest):
+            if entry.users == 0 and (entry.doubtful or entry.used < latest or self._is_shared(key)):
                 del self._entries[key]
                 await entry.client.close()
+
+    def _is_shared(self, key: NetworkTarget) -> bool:
+        """Returns whether the appliance has begun to use the device, which may accept no more."""
+        return self._shared is not None and self._shared.knows(key)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
+    from holdfast._core import Poller
     from holdfast.scanner.service import Settings
     from holdfast.stop import Stop
 
@@ -17,12 +18,13 @@ class ScannerAdapter:
     """A scanner with the interface of an adapter.
 
     It returns when a shutdown message arrives. The URLs in `settings.servers` must not contain
-    secrets, because `status` shows them.
+    secrets, because `status` shows them. Devices are polled by `poller`, if it is given; no other
+    scanner may use it then.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, poller: Poller | None = None) -> None:
         self._settings = settings
-        self._scanner = Scanner(settings)
+        self._scanner = Scanner(settings, poller)
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set, or until a shutdown message.

@@ -1,5 +1,8 @@
 """The native poller, and the thread that passes its results to the event loop.
 
+In an appliance, the poller is that of the appliance, so that devices at one address share one
+connection.
+
 The thread passes all waiting results at once, and fetches no more until they are handled. If the
 event loop can't keep up, results stay in the poller, which drops the oldest.
 """
@@ -13,6 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import _core
+from holdfast.scanner.errors import Refused
 from holdfast.types import PolledBlock
 
 if TYPE_CHECKING:
@@ -24,11 +28,20 @@ Poll: TypeAlias = tuple[str, float, list[PolledBlock]]
 RESULTS_TIMEOUT = 60.0
 """Seconds of one wait for results. Stopping the poller ends the wait."""
 
+WAKE_INTERVAL = 0.1
+"""Seconds between wake-ups of a thread that has to end."""
+
 GATHERED = 0.005
 """The shortest time in seconds between two batches, so that batches have a useful size."""
 
 FIRST_WITHIN = 1.0
 """Seconds over which the first polls of new devices are spread."""
+
+PREFIX = "nats/"
+"""The beginning of the names of devices in the poller. Names in a configuration have no slash."""
+
+NUMBERS = itertools.count()
+"""A restarted scanner continues with the next number."""
 
 RENEWED = 0.1
 """The shortest time in seconds between two changes of a device in the poller. Each change starts a
@@ -38,10 +51,15 @@ poll, and a caller may subscribe to a thousand tags one by one."""
 class Polling:
     """Polls devices. Calls `take` in the event loop for each poll.
 
-    Its arguments are the device, the scheduled time in seconds, and the blocks.
+    Its arguments are the device, the scheduled time in seconds, and the blocks. Of a `poller` that
+    is given, the devices with reports and the results must belong to this object.
     """
 
-    def __init__(self, take: Callable[[ScannedDevice, float, list[PolledBlock]], None]) -> None:
+    def __init__(
+        self,
+        take: Callable[[ScannedDevice, float, list[PolledBlock]], None],
+        poller: _core.Poller | None = None,
+    ) -> None:
         self._take = take
         self._devices: dict[str, ScannedDevice] = {}
         """The devices by their name in the poller."""
@@ -52,8 +70,9 @@ class Polling:
         self._writes: dict[int, asyncio.Future[int]] = {}
         """Futures of the faults of pending writes, by the number from the poller."""
         self._loop = asyncio.get_running_loop()
-        self._poller = _core.Poller([])
-        self._names = map(str, itertools.count())
+        self._is_own = poller is None
+        self._poller = _core.Poller([]) if poller is None else poller
+        self._dropped_before = self._poller.dropped
         self._stopping = threading.Event()
         self._taken = threading.Semaphore(1)
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
@@ -62,8 +81,11 @@ class Polling:
     def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
         """Updates a device in the poller, at most every `RENEWED` seconds.
 
-        With `at_once`, it is then polled immediately, otherwise at its next scheduled time.
+        With `at_once`, it is then polled immediately, otherwise at its next scheduled time. Raises
+        `Refused` after `stop`.
         """
+        if self._stopping.is_set():
+            raise Refused("the scanner is stopping")
         if at_once:
             self._urgent.add(device)
         if device in self._waiting:
@@ -82,7 +104,7 @@ class Polling:
         self._waiting.pop(device, None)
         at_once = device in self._urgent
         self._urgent.discard(device)
-        old, name = device.polled_as, next(self._names)
+        old, name = device.polled_as, f"{PREFIX}{next(NUMBERS)}"
         if old:
             self._poller.replace(old, _made(device, name), at_once=at_once)
             del self._devices[old]
@@ -104,6 +126,8 @@ class Polling:
 
     async def write(self, device: ScannedDevice, request: _core.Request) -> int:
         """Sends a write between two reads. Returns the fault, or 0 when the device confirmed it."""
+        if self._stopping.is_set():
+            raise Refused("the scanner is stopping")
         number = self._poller.write(device.polled_as, request)
         done: asyncio.Future[int] = self._loop.create_future()
         self._writes[number] = done
@@ -114,27 +138,37 @@ class Polling:
 
     def counters(self) -> dict[str, dict[str, Any]]:
         """Returns the poller's counters of each device, by its name in the poller."""
-        return self._poller.counters()
+        return self._poller.counters(report=True)
 
     @property
     def dropped(self) -> int:
         """Polls lost because the event loop did not keep up."""
-        return self._poller.dropped
+        return self._poller.dropped - self._dropped_before
 
     async def stop(self) -> None:
-        """Stops polling and closes all connections."""
+        """Stops polling its devices, and closes the connections that nobody else uses."""
         self._stopping.set()
         self._taken.release()
         for waiting in self._waiting.values():
             waiting.cancel()
+        for name in self._devices:
+            self._poller.remove(name)
         await asyncio.to_thread(self._end)
 
     def _end(self) -> None:
-        self._poller.stop()
-        self._thread.join()
+        if self._is_own:
+            self._poller.stop()
+        while self._thread.is_alive():
+            # A wake-up that comes before the wait may have ended another one.
+            self._poller.wake()
+            self._thread.join(WAKE_INTERVAL)
 
     def _run(self) -> None:
         while (taken := self._poller.results(RESULTS_TIMEOUT)) is not None:
+            if not any(taken):
+                if self._stopping.is_set():
+                    return
+                continue
             self._taken.acquire()
             if self._stopping.is_set():
                 return

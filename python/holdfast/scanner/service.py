@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
-    from holdfast._core import Endpoint
+    from holdfast._core import Endpoint, Poller
     from holdfast.client.url import Target
     from holdfast.config.scanning import Writes
     from holdfast.net.allow_list import AllowEntry
@@ -111,7 +111,9 @@ class Settings:
 class Scanner:
     """One service, from `run` to its end."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, poller: Poller | None = None) -> None:
+        """Without `poller`, it has a poller of its own."""
+        self._poller = poller
         self._settings = settings
         self._allowed = Allowed(settings.allow)
         self._ended = asyncio.Event()
@@ -140,7 +142,7 @@ class Scanner:
         Raises `OSError` for a file of the settings that can't be used.
         """
         device_tls.check(self._settings.device_tls)
-        self._polling = Polling(self._take)
+        self._polling = Polling(self._take, self._poller)
         works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
         if self._settings.keep_subscriptions:
             works += [self._kept.keeper.run(), self._kept.restore(self._ready)]
@@ -339,8 +341,21 @@ class Scanner:
         device = self._registry.known(asked)
         if device is None:
             address = await self._allowed.address(asked.source.target)
-            return address, device_tls.endpoint_of(address, self._settings.device_tls)
+            return address, self._endpoint(asked.source.target, address)
         return device.address, device.endpoint
+
+    def _endpoint(self, target: Target, address: Target) -> Endpoint:
+        """Returns the endpoint of an allowed address.
+
+        It is that of the target itself, if the appliance uses the device by this name: a device may
+        accept no second connection. Raises `Refused`.
+        """
+        tls = self._settings.device_tls
+        if self._poller is not None and target != address:
+            by_name = device_tls.endpoint_of(target, tls)
+            if self._poller.known_link(str(target), by_name) is not None:
+                return by_name
+        return device_tls.endpoint_of(address, tls)
 
     async def _unsubscribe(self, message: Msg) -> Answer:
         async with self._in_order(message):
@@ -467,7 +482,7 @@ class Scanner:
                 return
             try:
                 address = await self._allowed.address(device.source.target, after=device.address)
-                endpoint = device_tls.endpoint_of(address, self._settings.device_tls)
+                endpoint = self._endpoint(device.source.target, address)
             except Refused as refused:
                 logs.refused("not_found", kind="name", device=device.id, reason=str(refused))
                 return

@@ -19,6 +19,10 @@ pub use std::net::TcpStream as Wakes;
 #[cfg(unix)]
 pub use std::os::unix::net::UnixStream as Wakes;
 
+/// How long a link waits after a broadcast, which has no reply: the time to connect, if it is not
+/// connected, and for devices to carry it out (Modbus over Serial Line V1.02, 2.4.1).
+const BROADCAST_TIMEOUT: Duration = Duration::from_millis(500);
+
 /// An event loop that calls devices: one source of requests, however many callers it has.
 #[derive(Debug)]
 pub struct Caller {
@@ -59,6 +63,7 @@ pub(super) struct Waiting {
     ticket: u64,
     timeout: Duration,
     until: Instant,
+    is_broadcast: bool,
     has_ended: bool,
 }
 
@@ -80,6 +85,7 @@ impl Caller {
         self: &Arc<Caller>,
         request: &EncodedRequest,
         timeout: Duration,
+        is_broadcast: bool,
     ) -> (u64, Waiting) {
         let mut state = self.state();
         let ticket = state.next;
@@ -87,7 +93,7 @@ impl Caller {
         state.pending.insert(ticket, Pending { request: request.clone(), is_sent: false });
         drop(state);
         let (caller, until) = (Arc::clone(self), Instant::now() + timeout);
-        (ticket, Waiting { caller, ticket, timeout, until, has_ended: false })
+        (ticket, Waiting { caller, ticket, timeout, until, is_broadcast, has_ended: false })
     }
 
     /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come.
@@ -119,6 +125,11 @@ impl Caller {
 }
 
 impl Waiting {
+    /// How long to wait for a reply to a request that is sent now.
+    pub(super) fn reply_timeout(&self) -> Duration {
+        if self.is_broadcast { self.left().min(BROADCAST_TIMEOUT) } else { self.left() }
+    }
+
     /// The time that is left.
     pub(super) fn left(&self) -> Duration {
         self.until.saturating_duration_since(Instant::now())
@@ -137,6 +148,8 @@ impl Waiting {
 
     pub(super) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {
         self.has_ended = true;
+        let is_over = matches!(&outcome, Err(error) if matches!(**error, ClientError::Timeout(_)));
+        let outcome = if self.is_broadcast && is_over { Ok(Vec::new()) } else { outcome };
         self.caller.end(self.ticket, outcome);
     }
 }

@@ -148,8 +148,8 @@ impl SharedLink {
 }
 
 impl SharedLink {
-    /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. Returns
-    /// the ticket of the call; `None` when the queue is full. Event loops together may fill no more of
+    /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. A
+    /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full. Event loops together may fill no more of
     /// the queue than they leave to others.
     pub fn call(
         self: &Arc<SharedLink>,
@@ -157,12 +157,13 @@ impl SharedLink {
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
+        is_broadcast: bool,
     ) -> Option<u64> {
         self.counters.requests.add();
         let called = self.called.load(Ordering::Relaxed);
         let place = self.place(called, true)?;
         let priority = self.priority(request, None);
-        let (ticket, waiting) = caller.begin(request, timeout);
+        let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let (request, source) = (request.clone(), caller.source);
         let reply = Reply { to: Receiver::EventLoop(waiting), _place: place };
         // If the link has ended, the call ends as lost.
@@ -241,7 +242,7 @@ impl Reply {
     pub(super) fn timeout(&self) -> Duration {
         match &self.to {
             Receiver::Listener(_, timeout) => *timeout,
-            Receiver::EventLoop(to) => to.left(),
+            Receiver::EventLoop(to) => to.reply_timeout(),
         }
     }
 
