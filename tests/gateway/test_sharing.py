@@ -1,0 +1,268 @@
+"""The gateway of an appliance: devices that the appliance uses are asked over its connections."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from support import wire
+from support.fake_device import HANG_UP, FakeDevice, Stream, exception, silent
+from support.routed import Held, await_count, counters
+from support.running import endpoint
+from support.shared import Careful, ask, polled, read, unanswered, with_gateway
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from holdfast.appliance import Appliance
+    from support.fake_device import Asked
+    from support.running import Connect, Run
+
+READ = bytes.fromhex("0300050001")
+WAITED = (
+    "Connection timeout: the request waited behind other requests to this device, and was not sent"
+)
+
+
+@pytest.fixture
+def threads() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(16) as made:
+        yield made
+
+
+def failure(answer: Any) -> tuple[int, str, str]:
+    return answer.status, answer.headers["holdfast-reason"], answer.json["error"]
+
+
+def held_back(appliance: Appliance, threads: ThreadPoolExecutor, held: Stream) -> Any:
+    """A read that is in flight until the device is released, so that others wait."""
+    first = threads.submit(read, appliance, held.port, 100)
+    held.await_requests(1)
+    return first
+
+
+def test_polls_routes_and_the_gateway_share_one_connection(
+    run: Run, connect: Connect, threads: ThreadPoolExecutor
+) -> None:
+    careful = Careful()
+    with Stream("tcp", then=careful, in_turn=True) as device:
+        appliance = run(with_gateway(device.url, **polled(device.url)))
+        front = connect(endpoint(appliance, "scada"))
+        asked = [threads.submit(read, appliance, device.port, number) for number in range(60)]
+        for number in range(60):
+            assert front.ask(b"\3" + number.to_bytes(2) + b"\0\1")[2:] == number.to_bytes(2)
+        answers = [each.result().json["values"] for each in asked]
+        wire.until(lambda: appliance.memories["plant"].read("holding_registers", 9, 1) == [9], "it")
+    assert answers == [[number] for number in range(60)]
+    assert (device.connections, careful.overlaps) == (1, 0)
+
+
+def test_a_device_that_is_only_polled_is_shared_too(run: Run) -> None:
+    with Stream("tcp", in_turn=True) as device, Stream("tcp") as other:
+        appliance = run(with_gateway(other.url, **polled(device.url)))
+        wire.until(lambda: device.requests, "it is polled")
+        assert read(appliance, device.port, 7).json["values"] == [7]
+    assert device.connections == 1
+
+
+def test_another_device_is_asked_over_a_connection_of_the_gateway(run: Run) -> None:
+    with Stream("tcp") as device, Stream("tcp") as other:
+        appliance = run(with_gateway(device.url))
+        assert read(appliance, other.port, 7).json["values"] == [7]
+        assert (device.connections, other.connections) == (0, 1)
+    assert counters(appliance)["requests"] == 0
+
+
+def test_a_device_that_is_configured_by_its_name_is_shared_when_asked_by_it(run: Run) -> None:
+    with Stream("tcp", in_turn=True) as device:
+        url = f"tcp://LOCALHOST:{device.port}"
+        appliance = run(with_gateway(url, **polled(url)))
+        wire.until(lambda: device.requests, "it is polled")
+        body = {"host": "localhost", "functionCode": 3, "address": 7}
+        assert ask(appliance, "/read", device.port, **body).json["values"] == [7]
+    assert device.connections == 1
+
+
+def test_all_writes_take_the_shared_connection(run: Run) -> None:
+    with Stream("tcp", in_turn=True) as device:
+        appliance = run(with_gateway(device.url))
+        for path, body in (
+            ("/write/register", {"address": 1, "value": 51}),
+            ("/write/registers", {"address": 2, "values": [52, 53]}),
+            ("/write/mask", {"address": 3, "andMask": 0xFFF0, "orMask": 2}),
+            ("/write/coil", {"address": 4, "value": True}),
+            ("/write/coils", {"address": 5, "values": [1, 1]}),
+        ):
+            assert ask(appliance, path, device.port, **body).json["success"], path
+        assert read(appliance, device.port, 1, quantity=3).json["values"] == [51, 52, 50]
+    assert device.connections == 1
+    assert counters(appliance)["requests"] == 6
+
+
+FAULTS: dict[str, tuple[Callable[[Asked], object], int, str, str]] = {
+    "silence": (silent, 500, "timeout", "Connection timeout"),
+    "the end of the connection": (
+        lambda asked: asked.end_with(HANG_UP),
+        500,
+        "connection_lost",
+        "connection lost: closed by the peer",
+    ),
+    "another function": (
+        lambda asked: asked.answer(b"\x04\x02\0\7"),
+        500,
+        "invalid_reply",
+        "invalid response: function code 0x04, expected 0x03",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_failures_are_those_of_a_connection_of_its_own(
+    run: Run, fault: tuple[Callable[[Asked], object], int, str, str]
+) -> None:
+    behaviour, *expected = fault
+    with Stream("tcp", then=behaviour) as device, Stream("tcp", then=behaviour) as other:
+        appliance = run(with_gateway(device.url))
+        found = [
+            failure(read(appliance, port, 5, timeout=300)) for port in (device.port, other.port)
+        ]
+    assert found == [tuple(expected)] * 2
+    assert counters(appliance)["requests"] == 1
+
+
+@pytest.mark.parametrize("code", [1, 2, 4, 6, 10, 11, 0x55])
+def test_an_exception_is_that_of_the_device(run: Run, code: int) -> None:
+    with FakeDevice(lambda pdu: exception(pdu, code)) as device:
+        appliance = run(with_gateway(device.url))
+        answer = read(appliance, device.port, 5)
+    assert answer.status == 200
+    assert answer.json["success"] is False
+    assert f"(code 0x{code:x})" in answer.json["error"]
+
+
+def test_a_refused_connection_is_explained_before_and_during_the_pause(run: Run) -> None:
+    device = Stream("tcp")
+    device.release()
+    appliance = run(with_gateway(device.url))
+    refused = f"can't connect to 127.0.0.1:{device.port}: Connection refused"
+    for _ in range(3):
+        found = failure(read(appliance, device.port, 5))
+        assert found == (500, "no_connection", refused)
+    assert counters(appliance)["requests"] == 3
+
+
+def test_a_silent_unit_is_asked_whenever_the_gateway_wants(run: Run, connect: Connect) -> None:
+    """A survey must find out for each address; its timeouts do not count for others."""
+    with Stream("tcp", *[silent] * 5) as device:
+        appliance = run(with_gateway(device.url))
+        for _ in range(5):
+            assert failure(read(appliance, device.port, 5, timeout=50))[1] == "timeout"
+        front = connect(endpoint(appliance, "scada"))
+        assert front.ask(READ) == bytes.fromhex("03020005")
+    assert counters(appliance)["refused_down"] == 0
+
+
+def test_a_write_that_was_given_up_before_its_turn_is_never_sent(
+    run: Run, threads: ThreadPoolExecutor
+) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(device.url))
+        first = held_back(appliance, threads, device)
+        late = ask(appliance, "/write/register", device.port, address=5, value=1, timeout=50)
+        assert failure(late) == (500, "timeout", WAITED)
+        held.release()
+        assert first.result().json["values"] == [100]
+        assert read(appliance, device.port, 6).json["values"] == [6]
+        await_count(appliance, "withdrawn", 1)
+    assert [asked.pdu[0] for asked in device.requests] == [3, 3]
+
+
+def test_a_write_goes_before_reads_that_wait(run: Run, threads: ThreadPoolExecutor) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(device.url))
+        first = held_back(appliance, threads, device)
+        later = []
+        for number in range(3):
+            later.append(threads.submit(read, appliance, device.port, number))
+            await_count(appliance, "waiting", 2 + number)
+        body = {"address": 5, "value": 1}
+        later.append(threads.submit(ask, appliance, "/write/register", device.port, **body))
+        await_count(appliance, "waiting", 5)
+        held.release()
+        assert all(each.result().json["success"] for each in [first, *later])
+    assert [asked.pdu[0] for asked in device.requests] == [3, 6, 3, 3, 3]
+
+
+def test_equal_reads_that_wait_are_answered_by_one_request(
+    run: Run, connect: Connect, threads: ThreadPoolExecutor
+) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(device.url))
+        first = held_back(appliance, threads, device)
+        equal = [threads.submit(read, appliance, device.port, 5) for _ in range(8)]
+        front = connect(endpoint(appliance, "scada"))
+        routed = threads.submit(front.ask, READ)
+        await_count(appliance, "waiting", 10)
+        held.release()
+        assert first.result().json["values"] == [100]
+        assert [each.result().json["values"] for each in equal] == [[5]] * 8
+        assert routed.result() == bytes.fromhex("03020005")
+    assert len(device.requests) == 2
+    assert counters(appliance)["coalesced"] == 8
+
+
+def test_the_gateway_leaves_room_in_the_queue(run: Run, threads: ThreadPoolExecutor) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(device.url, link={"queue": 8}))
+        first = held_back(appliance, threads, device)
+        more = []
+        for number in range(3):
+            more.append(threads.submit(read, appliance, device.port, number))
+            await_count(appliance, "waiting", 2 + number)
+        full = f"too many requests wait for 127.0.0.1:{device.port}, try again later"
+        assert failure(read(appliance, device.port, 50)) == (503, "busy", full)
+        held.release()
+        assert all(each.result().json["success"] for each in [first, *more])
+
+
+def test_a_broadcast_takes_the_shared_connection(run: Run) -> None:
+    with Stream("rtu+tcp", silent, in_turn=True) as device:
+        appliance = run(with_gateway(device.url))
+        body = {"transport": "rtu+tcp", "unitId": 0, "address": 5, "value": 1}
+        answer = ask(appliance, "/write/register", device.port, **body)
+        assert answer.json["note"] == "the broadcast was sent; devices do not confirm broadcasts"
+        more = {"transport": "rtu+tcp"}
+        assert read(appliance, device.port, 6, **more).json["values"] == [6]
+    assert [(asked.unit, asked.pdu[0]) for asked in device.requests] == [(0, 6), (1, 3)]
+
+
+def test_a_request_in_flight_is_answered_when_the_appliance_stops(
+    run: Run, threads: ThreadPoolExecutor
+) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(device.url))
+        first = held_back(appliance, threads, device)
+        stopped = threads.submit(appliance.stop)
+        held.release()
+        assert first.result().json["values"] == [100]
+        stopped.result()
+
+
+def test_a_client_that_goes_away_leaves_the_connection_to_others(run: Run) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(device.url))
+        body = {"host": "127.0.0.1", "port": device.port, "functionCode": 3, "address": 1}
+        left = unanswered(appliance, "/read", body)
+        device.await_requests(1)
+        left.close()
+        held.release()
+        assert read(appliance, device.port, 6).json["values"] == [6]
+    assert device.connections == 1
