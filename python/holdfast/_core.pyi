@@ -20,6 +20,7 @@ __all__ = [
     "Attempt",
     "BatchRefused",
     "BlockingClient",
+    "Caller",
     "Connection",
     "Endpoint",
     "Engine",
