@@ -952,8 +952,8 @@ class Altered:
         self._poller = poller
         self.counters_instead: dict[str, Any] = {}
 
-    def counters(self) -> dict[str, dict[str, Any]]:
-        told: dict[str, dict[str, Any]] = self._poller.counters()
+    def counters(self, *, report: bool | None = None) -> dict[str, dict[str, Any]]:
+        told: dict[str, dict[str, Any]] = self._poller.counters(report=report)
         return {name: {**counted, **self.counters_instead} for name, counted in told.items()}
 
     def stop(self) -> None:

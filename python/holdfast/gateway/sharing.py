@@ -20,7 +20,7 @@ from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, Modbus
 
 if TYPE_CHECKING:
     from holdfast._core import Endpoint, Link, Poller, Request
-    from holdfast.client.target import NetworkTarget
+    from holdfast.client.url import NetworkTarget
 
 
 SHORTEST = 0.001
