@@ -35,7 +35,7 @@ def status(appliance: Appliance) -> dict[str, Any]:
 
 
 def until_connected(appliance: Appliance) -> None:
-    wire.until(lambda: status(appliance)["connected"], "the scanner is connected")
+    wire.until(lambda: status(appliance).get("connected"), "the scanner is connected")
 
 
 def wanted(device: Stream, *tags: dict[str, Any], **more: Any) -> dict[str, Any]:
