@@ -187,3 +187,77 @@ fn pair() -> io::Result<(Wakes, Wakes)> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use holdfast_protocol::pdu::{Range, Request};
+
+    use super::*;
+
+    const TIMEOUT: Duration = Duration::from_secs(60);
+
+    fn read() -> EncodedRequest {
+        let range = Range::new(0, 1).expect("one register is a valid range");
+        EncodedRequest::new(&Request::ReadHoldingRegisters(range))
+    }
+
+    fn woken(mut wakes: &Wakes) -> usize {
+        wakes.read(&mut [0; 16]).unwrap_or(0)
+    }
+
+    #[test]
+    fn several_results_cause_one_wake_up() {
+        let (caller, wakes) = Caller::new().unwrap();
+        let calls: Vec<_> = (0..3).map(|_| caller.begin(&read(), TIMEOUT, false)).collect();
+        assert_eq!(woken(&wakes), 0);
+        for (_, waiting) in calls {
+            waiting.note_sent();
+            waiting.end(Ok(vec![3, 2, 0, 7]));
+        }
+        assert_eq!(woken(&wakes), 1);
+        let tickets: Vec<_> =
+            caller.take().iter().map(|call| (call.ticket, call.is_sent)).collect();
+        assert_eq!(tickets, [(0, true), (1, true), (2, true)]);
+        let (_, waiting) = caller.begin(&read(), TIMEOUT, false);
+        waiting.end(Ok(vec![3, 2, 0, 7]));
+        assert_eq!(woken(&wakes), 1);
+    }
+
+    #[test]
+    fn a_call_that_was_given_up_is_unwanted_and_has_no_result() {
+        let (caller, wakes) = Caller::new().unwrap();
+        let (ticket, waiting) = caller.begin(&read(), TIMEOUT, false);
+        assert!(!waiting.is_unwanted());
+        assert!(!caller.withdraw(ticket), "its turn has not come");
+        assert!(waiting.is_unwanted());
+        waiting.end(Ok(vec![3, 2, 0, 7]));
+        assert!(caller.take().is_empty());
+        assert_eq!(woken(&wakes), 0);
+    }
+
+    #[test]
+    fn a_call_that_nobody_carries_out_ends_as_lost_or_as_too_late() {
+        let (caller, _wakes) = Caller::new().unwrap();
+        drop(caller.begin(&read(), TIMEOUT, false));
+        drop(caller.begin(&read(), Duration::ZERO, false));
+        let ended = caller.take();
+        assert!(
+            matches!(ended[0].outcome.as_deref(), Err(error) if matches!(**error, ClientError::Lost(_)))
+        );
+        assert!(
+            matches!(ended[1].outcome.as_deref(), Err(error) if matches!(**error, ClientError::Timeout(_)))
+        );
+        assert!(ended.iter().all(|call| !call.is_sent));
+    }
+
+    #[test]
+    fn a_broadcast_without_a_reply_has_succeeded() {
+        let (caller, _wakes) = Caller::new().unwrap();
+        let (_, waiting) = caller.begin(&read(), TIMEOUT, true);
+        assert_eq!(waiting.reply_timeout(), BROADCAST_TIMEOUT);
+        waiting.end(Err(Arc::new(ClientError::Timeout(BROADCAST_TIMEOUT))));
+        assert_eq!(caller.take()[0].outcome.as_ref().ok(), Some(&Vec::new()));
+    }
+}
