@@ -108,7 +108,9 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
     mqtt: Any = SimpleNamespace(status=lambda: status)
     made.adapters = {"rest": (rest, memory_access), "mqtt": (mqtt, None)}
     polled: Any = SimpleNamespace(
-        counters=lambda: {"meter": METER, "fresh": {**METER, "health": "unknown", "age": None}}
+        counters=lambda *, report: (
+            {} if report else {"meter": METER, "fresh": {**METER, "health": "unknown", "age": None}}
+        )
     )
     made.poller = polled
     made.disabled = ["spare"]
