@@ -548,6 +548,9 @@ def test_reads_of_preferred_clients_and_writes_go_first(
     for number, (front, pdu) in enumerate([(usual, seven), (preferred, eight), (writer, WRITE)]):
         front.send(wire.frame(pdu))
         await_count(appliance, "waiting", number + 2)
+    # The link takes requests in order: once it has this one, it has them all.
+    connect(to).send(wire.frame(eight))
+    await_count(appliance, "coalesced", 1)
     held.release()
 
     assert usual.receive().pdu == bytes.fromhex("03020007")
