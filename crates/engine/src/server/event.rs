@@ -113,14 +113,17 @@ pub(crate) struct Reporter {
 #[derive(Debug)]
 pub(crate) struct Events {
     receiver: Mutex<Receiver<Event>>,
+    /// Without listeners, nobody else can send: whoever waits must still wait.
+    _sender: SyncSender<Event>,
     lost: Arc<AtomicU64>,
 }
 
 pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
     let (sender, receiver) = sync_channel(CAPACITY);
     let lost = Arc::new(AtomicU64::new(0));
-    let reporter = Reporter { verbosity, sender, lost: Arc::clone(&lost) };
-    (reporter, Events { receiver: Mutex::new(receiver), lost })
+    let events =
+        Events { receiver: Mutex::new(receiver), _sender: sender.clone(), lost: Arc::clone(&lost) };
+    (Reporter { verbosity, sender, lost }, events)
 }
 
 impl Reporter {
@@ -148,7 +151,7 @@ impl Reporter {
 }
 
 impl Events {
-    /// The next event; `None` when none arrives within `timeout`, or no more will come.
+    /// The next event; `None` when none arrives within `timeout`.
     pub(crate) fn next(&self, timeout: Duration) -> Option<Event> {
         self.receiver.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout).ok()
     }
@@ -156,5 +159,21 @@ impl Events {
     /// The number of dropped events.
     pub(crate) fn lost(&self) -> u64 {
         self.lost.load(Ordering::Relaxed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    #[test]
+    fn whoever_waits_for_events_waits_even_if_there_are_no_listeners() {
+        let (reporter, events) = channel(Verbosity::All);
+        drop(reporter);
+        let (began, timeout) = (Instant::now(), Duration::from_millis(20));
+        assert_eq!(events.next(timeout), None);
+        assert!(began.elapsed() >= timeout);
     }
 }
