@@ -52,6 +52,8 @@ pub(crate) struct Auditor {
 #[derive(Debug)]
 pub(crate) struct Records {
     receiver: Mutex<Receiver<Record>>,
+    /// Without listeners, nobody else can send: whoever waits must still wait.
+    _sender: Sender<Record>,
     shared: Arc<Shared>,
 }
 
@@ -64,8 +66,12 @@ struct Shared {
 pub(crate) fn auditing() -> (Auditor, Records) {
     let (sender, receiver) = channel();
     let shared = Arc::new(Shared::default());
-    let auditor = Auditor { sender, shared: Arc::clone(&shared) };
-    (auditor, Records { receiver: Mutex::new(receiver), shared })
+    let records = Records {
+        receiver: Mutex::new(receiver),
+        _sender: sender.clone(),
+        shared: Arc::clone(&shared),
+    };
+    (Auditor { sender, shared }, records)
 }
 
 impl Auditor {
@@ -162,5 +168,21 @@ impl Records {
     /// The number of dropped records.
     pub(crate) fn lost(&self) -> u64 {
         self.shared.lost.load(Ordering::Relaxed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    #[test]
+    fn whoever_waits_for_writes_waits_even_if_there_are_no_listeners() {
+        let (auditor, records) = auditing();
+        drop(auditor);
+        let (began, timeout) = (Instant::now(), Duration::from_millis(20));
+        assert_eq!(records.take(timeout, 10), []);
+        assert!(began.elapsed() >= timeout);
     }
 }
