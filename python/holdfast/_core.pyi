@@ -7,7 +7,16 @@ from os import PathLike
 from typing import Any, Final, Literal, final
 
 from holdfast.errors import ModbusError
-from holdfast.types import Access, Area, Extent, ListenerCounters, PolledBlock, Seal, WhenFull
+from holdfast.types import (
+    Access,
+    Area,
+    Extent,
+    ListenerCounters,
+    NarrowedRights,
+    PolledBlock,
+    Seal,
+    WhenFull,
+)
 
 __all__ = [
     "ADDRESSES",
@@ -174,7 +183,9 @@ class Rule:
     addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set
     `functions`, the allowed function codes, or `deny`, the codes that are not allowed, but not
     both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
-    certificate without a role, `None` is any role.
+    certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
+    access, functions, denied functions, and the ranges that they may read and write, each an area,
+    its first address and a count; `None` is everything.
 
     Raises `ValueError` for an invalid source or access.
     """
@@ -188,6 +199,7 @@ class Rule:
         functions: Sequence[int] | None = None,
         deny: Sequence[int] | None = None,
         roles: Sequence[str] | None = None,
+        narrowed: Mapping[int, NarrowedRights] | None = None,
     ) -> Rule: ...
 
 @final

@@ -14,6 +14,14 @@ RegisterArea: TypeAlias = Literal["holding_registers", "input_registers"]
 BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 
+Ranges: TypeAlias = "list[tuple[Area, int, int]]"
+"""Areas, first addresses and counts."""
+
+NarrowedRights: TypeAlias = (
+    "tuple[Access, list[int] | None, list[int] | None, tuple[Ranges | None, Ranges | None]]"
+)
+"""Access, functions, denied functions, and the ranges to read and to write; `None` is everything."""
+
 Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp"]
 """How a device with an address is talked to."""
 

@@ -1,10 +1,13 @@
 //! `Rule`, `RawRule`, `ServerTls` and `Listener`: settings of listeners.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_engine::server::policy::{AccessMode, Elsewhere, Functions, Rule as CoreRule};
+use holdfast_engine::server::policy::{
+    AccessMode, Elsewhere, Functions, Items, Narrowed, Ranges, Rule as CoreRule,
+};
 use holdfast_engine::server::{
     ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, RawRule as CoreRawRule,
     RawSettings, SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
@@ -22,6 +25,19 @@ use crate::client::line;
 use crate::link::{Passage, Route};
 use crate::memory::{Memory, named};
 
+/// The access of rules.
+const ACCESS: [(&str, AccessMode); 2] =
+    [("read-only", AccessMode::ReadOnly), ("read-write", AccessMode::ReadWrite)];
+
+/// Area, first address, how many items.
+type Range = (String, u16, u32);
+
+/// What may be read, and what may be written; `None` is everything.
+type Limits = (Option<Vec<Range>>, Option<Vec<Range>>);
+
+/// The rights of a unit: access, functions, denied functions, ranges.
+type Narrow = (String, Option<Vec<i128>>, Option<Vec<i128>>, Limits);
+
 #[pyclass(frozen, module = "holdfast")]
 pub struct Rule {
     core: CoreRule,
@@ -30,7 +46,7 @@ pub struct Rule {
 #[pymethods]
 impl Rule {
     #[new]
-    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None))]
+    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None, narrowed=None))]
     fn new(
         units: &Bound<'_, PyMapping>,
         sources: Vec<String>,
@@ -38,24 +54,20 @@ impl Rule {
         functions: Option<Vec<i128>>,
         deny: Option<Vec<i128>>,
         roles: Option<Vec<String>>,
+        narrowed: Option<BTreeMap<i128, Narrow>>,
     ) -> PyResult<Rule> {
-        let allowed = [("read-only", AccessMode::ReadOnly), ("read-write", AccessMode::ReadWrite)];
-        let access = word("access", access, &allowed)?;
-        let codes = |codes: Option<Vec<i128>>| {
-            let codes =
-                codes.map(|codes| codes.into_iter().map(|code| byte("function code", code)));
-            codes.map(Iterator::collect::<PyResult<Vec<u8>>>).transpose()
-        };
-        let functions = match (codes(functions)?, codes(deny)?) {
-            (None, None) => Functions::All,
-            (Some(codes), None) => Functions::Only(codes),
-            (None, Some(codes)) => Functions::Except(codes),
-            (Some(_), Some(_)) => {
-                return Err(PyValueError::new_err(
-                    "functions and deny: give one of them, or neither",
-                ));
-            }
-        };
+        let access = word("access", access, &ACCESS)?;
+        let functions = self::functions(functions, deny)?;
+        let narrowed = narrowed.unwrap_or_default().into_iter().map(|(unit, own)| {
+            let (access, functions, deny, (read, write)) = own;
+            let narrowed = Narrowed {
+                access: word("access", &access, &ACCESS)?,
+                functions: self::functions(functions, deny)?,
+                ranges: Ranges::new(ranges(read)?, ranges(write)?),
+            };
+            Ok((byte("unit id", unit)?, narrowed))
+        });
+        let narrowed = narrowed.collect::<PyResult<_>>()?;
         let (mut memories, mut elsewhere) = (Vec::new(), Vec::new());
         for item in units.items()?.iter() {
             let (unit, target): (i128, Bound<'_, PyAny>) = item.extract()?;
@@ -71,7 +83,9 @@ impl Rule {
             }
         }
         let (sources, units) = (networks(&sources)?, memories);
-        Ok(Rule { core: CoreRule { sources, roles, units, elsewhere, access, functions } })
+        Ok(Rule {
+            core: CoreRule { sources, roles, units, elsewhere, access, functions, narrowed },
+        })
     }
 }
 
@@ -223,6 +237,26 @@ impl Listener {
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }
+}
+
+fn functions(only: Option<Vec<i128>>, deny: Option<Vec<i128>>) -> PyResult<Functions> {
+    let codes = |codes: Option<Vec<i128>>| {
+        let codes = codes.map(|codes| codes.into_iter().map(|code| byte("function code", code)));
+        codes.map(Iterator::collect::<PyResult<Vec<u8>>>).transpose()
+    };
+    match (codes(only)?, codes(deny)?) {
+        (None, None) => Ok(Functions::All),
+        (Some(codes), None) => Ok(Functions::Only(codes)),
+        (None, Some(codes)) => Ok(Functions::Except(codes)),
+        (Some(_), Some(_)) => {
+            Err(PyValueError::new_err("functions and deny: give one of them, or neither"))
+        }
+    }
+}
+
+fn ranges(given: Option<Vec<Range>>) -> PyResult<Option<Vec<Items>>> {
+    let items = |(area, address, count): Range| Ok(Items { area: named(&area)?, address, count });
+    given.map(|given| given.into_iter().map(items).collect()).transpose()
 }
 
 fn cores(rules: &[PyRef<'_, Rule>]) -> Vec<CoreRule> {

@@ -3,7 +3,7 @@
 use std::net::IpAddr;
 use std::sync::Arc;
 
-use holdfast_engine::server::policy::{AccessMode, Functions, Policy, Rule};
+use holdfast_engine::server::policy::{AccessMode, Functions, PeerRights, Policy, Rule};
 use holdfast_memory::{Layout, Memory};
 
 fn rule(sources: &[&str], unit: u8, rights: AccessMode, functions: Functions) -> Rule {
@@ -14,6 +14,7 @@ fn rule(sources: &[&str], unit: u8, rights: AccessMode, functions: Functions) ->
         elsewhere: Vec::new(),
         access: rights,
         functions,
+        narrowed: Vec::new(),
     }
 }
 
@@ -21,24 +22,49 @@ fn peer(text: &str) -> IpAddr {
     text.parse().unwrap()
 }
 
+fn units_of(rights: Option<Arc<PeerRights>>) -> Option<Vec<u8>> {
+    rights.map(|rights| rights.one_unit_of_each_memory(|_| true))
+}
+
 #[test]
-fn the_first_rule_that_names_a_peer_applies() {
+fn a_peer_has_the_units_of_all_rules_that_name_it() {
     let policy = Policy::of(&[
         rule(&["10.0.0.0/24", "fd00::/64"], 1, AccessMode::ReadWrite, Functions::All),
         rule(&["10.0.0.0/8"], 2, AccessMode::ReadOnly, Functions::All),
     ]);
-    for (address, unit) in [("10.0.0.255", 1), ("10.0.1.0", 2), ("fd00::ffff", 1)] {
-        let rights = policy.rights(peer(address)).unwrap();
-        assert!(rights.memory(unit).is_some(), "{address}");
-        assert!(rights.memory(3 - unit).is_none(), "{address}");
+    for (address, units) in
+        [("10.0.0.255", vec![1, 2]), ("10.0.1.0", vec![2]), ("fd00::ffff", vec![1])]
+    {
+        assert_eq!(units_of(policy.rights(peer(address))), Some(units), "{address}");
     }
     for stranger in ["11.0.0.1", "fd00:0:0:1::1", "::1", "127.0.0.1"] {
-        assert!(policy.rights(peer(stranger)).is_none(), "{stranger}");
+        assert_eq!(units_of(policy.rights(peer(stranger))), None, "{stranger}");
     }
 }
 
 #[test]
-fn the_first_rule_that_names_peer_and_role_applies() {
+fn the_first_rule_that_names_peer_and_unit_decides() {
+    let first = rule(&["10.0.0.7/32"], 1, AccessMode::ReadWrite, Functions::Only(vec![3, 6]));
+    let policy = Policy::of(&[
+        first.clone(),
+        rule(&["10.0.0.0/8"], 1, AccessMode::ReadOnly, Functions::All),
+        rule(&["10.0.0.0/8"], 2, AccessMode::ReadOnly, Functions::Only(vec![4])),
+    ]);
+    let rights = policy.rights(peer("10.0.0.7")).unwrap();
+    assert!(std::ptr::eq(rights.memory(1).unwrap(), Arc::as_ptr(&first.units[0].1)));
+    let allowed =
+        |unit| -> Vec<u8> { (0..=255).filter(|code| rights.allows(unit, *code)).collect() };
+    assert_eq!((allowed(1), allowed(2)), (vec![3, 6], vec![4]));
+    // A unit that the peer does not have shows what it may do elsewhere.
+    assert_eq!(allowed(3), [3, 4, 6]);
+    assert!(!rights.is_read_only(1) && rights.is_read_only(2) && !rights.is_read_only(3));
+    let other = policy.rights(peer("10.0.0.8")).unwrap();
+    assert!(!other.allows(1, 6) && other.allows(1, 1));
+    assert!(Arc::ptr_eq(&rights, &policy.rights(peer("10.0.0.7")).unwrap()));
+}
+
+#[test]
+fn rules_apply_to_roles() {
     let of_roles = |roles: &[&str], rule: Rule| Rule {
         roles: Some(roles.iter().map(|role| (*role).to_owned()).collect()),
         ..rule
@@ -48,19 +74,18 @@ fn the_first_rule_that_names_peer_and_role_applies() {
         of_roles(&["b", ""], rule(&["10.0.0.0/24"], 2, AccessMode::ReadOnly, Functions::All)),
         rule(&["10.0.1.0/24"], 3, AccessMode::ReadOnly, Functions::All),
     ]);
-    for (address, role, unit) in [
-        ("10.0.0.1", "a", Some(1)),
-        ("10.0.0.1", "b", Some(1)),
-        ("10.0.0.1", "", Some(2)),
+    for (address, role, units) in [
+        ("10.0.0.1", "a", Some(vec![1])),
+        ("10.0.0.1", "b", Some(vec![1, 2])),
+        ("10.0.0.1", "", Some(vec![2])),
         ("10.0.0.1", "A", None),
-        ("10.0.1.1", "", Some(3)),
-        ("10.0.1.1", "x", Some(3)),
+        ("10.0.1.1", "", Some(vec![3])),
+        ("10.0.1.1", "x", Some(vec![3])),
         ("10.0.2.1", "x", None),
         ("11.0.0.1", "a", None),
     ] {
-        let rights = policy.grant_of_role(peer(address), role);
-        let units: Option<Vec<u8>> = rights.map(|rights| rights.one_unit_of_each_memory(|_| true));
-        assert_eq!(units, unit.map(|unit| vec![unit]), "{address} {role:?}");
+        let rights = policy.rights_of_role(peer(address), role);
+        assert_eq!(units_of(rights), units, "{address} {role:?}");
     }
     assert!(policy.rights(peer("10.0.2.1")).is_some());
     assert!(policy.rights(peer("11.0.0.1")).is_none());
@@ -79,7 +104,7 @@ fn a_function_must_be_known_listed_and_within_the_access_mode() {
     let allowed = |rights, functions| -> Vec<u8> {
         let policy = Policy::of(&[rule(&["::/0"], 1, rights, functions)]);
         let rights = policy.rights(peer("::1")).unwrap();
-        (0..=255).filter(|code| rights.allows(*code)).collect()
+        (0..=255).filter(|code| rights.allows(1, *code)).collect()
     };
     let all = [1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23, 43];
     assert_eq!(allowed(AccessMode::ReadWrite, Functions::All), all);

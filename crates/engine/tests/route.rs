@@ -111,6 +111,7 @@ impl Front {
             elsewhere: vec![(1, Elsewhere::Device(route))],
             access: AccessMode::ReadWrite,
             functions: Functions::All,
+            narrowed: Vec::new(),
         };
         let stream = StreamSettings {
             bind: "127.0.0.1:0".parse().unwrap(),

@@ -4,9 +4,11 @@ use std::sync::Arc;
 
 use holdfast_engine::server::counters::Bus;
 use holdfast_engine::server::identity::Identity;
-use holdfast_engine::server::policy::{AccessMode, Functions, PeerRights, Rule};
+use holdfast_engine::server::policy::{
+    AccessMode, Functions, Items, Narrowed, PeerRights, Ranges, Rule,
+};
 use holdfast_engine::server::unit_server::UnitServer;
-use holdfast_memory::{Area, Layout, Memory, Span};
+use holdfast_memory::{Area, Gate, GateMode, Layout, Memory, Span};
 use holdfast_protocol::pdu;
 
 const READ: &[u8] = &[3, 0, 0, 0, 1];
@@ -28,6 +30,34 @@ fn rights(units: &[(u8, &Arc<Memory>)], rights: AccessMode) -> PeerRights {
         elsewhere: Vec::new(),
         access: rights,
         functions: Functions::All,
+        narrowed: Vec::new(),
+    })
+}
+
+/// Rights for unit 7, within ranges of holding registers: address and count.
+fn within(memory: &Arc<Memory>, read: &[(u16, u32)], write: &[(u16, u32)]) -> PeerRights {
+    let items = |ranges: &[(u16, u32)]| {
+        let area = Area::HoldingRegisters;
+        Some(
+            ranges
+                .iter()
+                .map(|(address, count)| Items { area, address: *address, count: *count })
+                .collect(),
+        )
+    };
+    let own = Narrowed {
+        access: AccessMode::ReadWrite,
+        functions: Functions::Except(vec![4]),
+        ranges: Ranges::new(items(read), items(write)),
+    };
+    PeerRights::new(&Rule {
+        sources: Vec::new(),
+        roles: None,
+        units: vec![(7, Arc::clone(memory)), (8, Arc::clone(memory))],
+        elsewhere: Vec::new(),
+        access: AccessMode::ReadOnly,
+        functions: Functions::All,
+        narrowed: vec![(7, own)],
     })
 }
 
@@ -118,4 +148,42 @@ fn damaged_frames_count_as_errors_not_as_messages() {
         unit_server.counters.bus(),
         Bus { messages: 2, communication_errors: 3, ..Bus::default() }
     );
+}
+
+#[test]
+fn a_unit_can_have_ranges_and_functions_of_its_own() {
+    let (memory, unit_server) = (memory(100), unit_server());
+    // Two ranges that meet are one.
+    let rights = within(&memory, &[(0, 10), (10, 10)], &[(15, 10)]);
+    let ask = |unit: u8, pdu: &[u8]| ask(&unit_server, &rights, unit, pdu).unwrap();
+    let refused = |code: u8| vec![code | 0x80, 2];
+    assert_eq!(ask(7, &[3, 0, 5, 0, 10])[..2], [3, 20]);
+    assert_eq!(ask(7, &[3, 0, 15, 0, 6]), refused(3));
+    assert_eq!(ask(7, &[6, 0, 15, 0, 1]), [6, 0, 15, 0, 1]);
+    assert_eq!(ask(7, &[6, 0, 14, 0, 1]), refused(6));
+    assert_eq!(ask(7, &[22, 0, 25, 0, 1, 0, 1]), refused(22));
+    assert_eq!(ask(7, &[16, 0, 24, 0, 2, 4, 0, 1, 0, 1]), refused(16));
+    assert_eq!(ask(7, &[23, 0, 0, 0, 1, 0, 15, 0, 1, 2, 0, 1])[..2], [23, 2]);
+    assert_eq!(ask(7, &[23, 0, 20, 0, 1, 0, 15, 0, 1, 2, 0, 1]), refused(23));
+    assert_eq!(ask(7, &[23, 0, 0, 0, 1, 0, 14, 0, 1, 2, 0, 1]), refused(23));
+    assert_eq!(ask(7, &[4, 0, 0, 0, 1]), [0x84, 1]);
+    // The other unit has the rights of the rule.
+    assert_eq!(ask(8, &[3, 0, 50, 0, 1])[..2], [3, 2]);
+    assert_eq!(ask(8, &[6, 0, 15, 0, 1]), [0x86, 1]);
+    let registers = ask(8, &[3, 0, 14, 0, 2]);
+    assert_eq!(registers, [3, 4, 0, 0, 0, 1]);
+}
+
+#[test]
+fn a_sealed_memory_does_not_show_which_ranges_a_peer_has() {
+    let layout = Layout::default()
+        .with(Area::HoldingRegisters, Span::new(0, 10).unwrap())
+        .with(Area::Coils, Span::new(0, 1).unwrap());
+    let gate = Gate { area: Area::Coils, address: 0, mode: GateMode::Once };
+    let memory = Arc::new(Memory::new(layout, Some(gate)).unwrap());
+    let rights = within(&memory, &[(0, 1)], &[]);
+    for address in [0, 5] {
+        let reply = ask(&unit_server(), &rights, 7, &[3, 0, address, 0, 1]);
+        assert_eq!(reply.unwrap(), [0x83, 6]);
+    }
 }

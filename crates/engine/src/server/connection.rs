@@ -544,6 +544,7 @@ mod tests {
             elsewhere: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
+            narrowed: Vec::new(),
         };
         let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
         Answering::new(

@@ -104,7 +104,7 @@ pub(crate) struct Admitted<G> {
 pub(crate) trait Service: Send + Sync + Sized + 'static {
     type PeerRights: Send + Sync + 'static;
 
-    fn rights(&self, peer: IpAddr) -> Option<&Arc<Self::PeerRights>>;
+    fn rights(&self, peer: IpAddr) -> Option<Arc<Self::PeerRights>>;
 
     /// Serves the connection immediately if that is possible without waiting. Otherwise returns it.
     fn serve_at_once(
@@ -179,7 +179,6 @@ fn admit<S: Service>(
     context.connections.accepted.add();
     context.report(Kind::Opened, Some(peer));
     let id = ticket.id();
-    let rights = Arc::clone(rights);
     let connection = Admitted { stream, peer, rights, received: Vec::new(), ticket };
     let Some(connection) = service.serve_at_once(context, connection) else {
         return;

@@ -25,7 +25,7 @@ use super::audit::{Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
 use super::listener::{Admitted, ListenerContext, Service, drain};
-use super::policy::Policy;
+use super::policy::Grants;
 
 /// Bytes per read of a new connection.
 const CHUNK: usize = 16 * 1024;
@@ -60,7 +60,7 @@ pub(crate) struct RawGrant {
 #[derive(Debug)]
 pub(crate) struct RawIngest {
     pub(crate) packets: PacketCounters,
-    policy: Policy<RawGrant>,
+    policy: Grants<RawGrant>,
     format: Format,
     request_timeout: Duration,
 }
@@ -93,7 +93,7 @@ impl RawIngest {
         });
         RawIngest {
             packets: PacketCounters::default(),
-            policy: Policy::new(rules),
+            policy: Grants::new(rules),
             format: settings.format,
             request_timeout: settings.request_timeout,
         }
@@ -216,7 +216,7 @@ impl RawIngest {
 impl Service for RawIngest {
     type PeerRights = RawGrant;
 
-    fn rights(&self, peer: IpAddr) -> Option<&Arc<RawGrant>> {
+    fn rights(&self, peer: IpAddr) -> Option<Arc<RawGrant>> {
         self.policy.rights(peer)
     }
 

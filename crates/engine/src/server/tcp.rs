@@ -52,7 +52,7 @@ pub struct StreamSettings {
 
 pub(crate) struct ModbusStream {
     unit_server: Arc<UnitServer>,
-    policy: Policy<PeerRights>,
+    policy: Policy,
     timeouts: Timeouts,
     framing: StreamFraming,
     tls: Option<Arc<ServerTls>>,
@@ -120,8 +120,7 @@ impl ModbusStream {
         };
         match role {
             Ok(role) => {
-                if let Some(rights) = self.policy.grant_of_role(peer.ip(), &role) {
-                    let rights = Arc::clone(rights);
+                if let Some(rights) = self.policy.rights_of_role(peer.ip(), &role) {
                     return self
                         .modbus::<F, _>(context, (stream, peer), rights, ticket, stop)
                         .await;
@@ -152,7 +151,7 @@ impl ModbusStream {
 impl Service for ModbusStream {
     type PeerRights = PeerRights;
 
-    fn rights(&self, peer: IpAddr) -> Option<&Arc<PeerRights>> {
+    fn rights(&self, peer: IpAddr) -> Option<Arc<PeerRights>> {
         self.policy.rights(peer)
     }
 

@@ -17,7 +17,7 @@ use tokio::task::JoinSet;
 use super::deferred::come;
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
-use super::policy::{PeerRights, Policy, Rule};
+use super::policy::{Policy, Rule};
 use super::unit_server::UnitServer;
 use crate::link::{Asker, source};
 
@@ -55,7 +55,7 @@ pub struct UdpSettings {
 
 pub(crate) struct ModbusUdp {
     unit_server: Arc<UnitServer>,
-    policy: Policy<PeerRights>,
+    policy: Policy,
     framing: DatagramFraming,
 }
 
@@ -197,11 +197,11 @@ impl ModbusUdp {
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
-        if let Some(place) = self.unit_server.elsewhere(rights, unit_id, request) {
+        if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let waiting = later.replies.len();
             let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
             let coming = if waiting < MAX_LATER {
-                self.unit_server.forward(rights, place, &asker, unit_id, request)
+                self.unit_server.forward(&rights, place, &asker, unit_id, request)
             } else {
                 Err(ExceptionCode::ServerDeviceBusy)
             };
@@ -225,7 +225,7 @@ impl ModbusUdp {
                 }
             };
         }
-        let len = self.unit_server.answer(rights, unit_id, request, buffer);
+        let len = self.unit_server.answer(&rights, unit_id, request, buffer);
         if let Some(auditor) = &context.auditor {
             let reply = &buffer[..len.unwrap_or_default()];
             auditor.note(&context.name, Some(peer), unit_id, request, reply);

@@ -101,10 +101,15 @@ impl UnitServer {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         let sent = match place {
-            _ if !rights.allows(function_code) => Err(ExceptionCode::IllegalFunction),
-            Elsewhere::Device(_) if rights.denies(request) => Err(ExceptionCode::IllegalFunction),
+            _ if !rights.allows(unit_id, function_code) => Err(ExceptionCode::IllegalFunction),
+            Elsewhere::Device(_) if rights.denies(unit_id, request) => {
+                Err(ExceptionCode::IllegalFunction)
+            }
             Elsewhere::Device(route) => {
                 route.ask(asker, unit_id, request).map(|coming| (Arc::clone(&route.name), coming))
+            }
+            Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
+                Err(out_of_ranges(&passage.memory))
             }
             Elsewhere::Mirror(passage) => passage.ask(request),
         };
@@ -171,7 +176,8 @@ impl UnitServer {
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
-        let denied = !rights.allows(function_code) || denied(rights, pdu, &request);
+        let denied =
+            !rights.allows(unit_id, function_code) || denied(rights, unit_id, pdu, &request);
         let memory = rights.memory(unit_id);
         if memory.is_some() && self.is_silent(unit_id) {
             if !denied {
@@ -183,7 +189,11 @@ impl UnitServer {
             return Err(ExceptionCode::IllegalFunction);
         }
         let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
-        match request? {
+        let request = request?;
+        if rights.ranges(unit_id).is_some_and(|ranges| !ranges.allow(&request)) {
+            return Err(out_of_ranges(memory));
+        }
+        match request {
             Request::ReadCoils(range) => {
                 read(memory, Area::Coils, range, reply::read_coils(range, reply))
             }
@@ -300,14 +310,35 @@ impl UnitServer {
 
 /// Whether a sub-function is unknown, or not allowed for a read-only peer. Like the function, it is
 /// checked before anything else.
-fn denied(rights: &PeerRights, pdu: &[u8], request: &Result<Request<'_>, ExceptionCode>) -> bool {
+fn denied(
+    rights: &PeerRights,
+    unit_id: u8,
+    pdu: &[u8],
+    request: &Result<Request<'_>, ExceptionCode>,
+) -> bool {
     if *request == Err(ExceptionCode::IllegalFunction) {
         return true;
     }
     let diagnostics = pdu.first() == Some(&Function::Diagnostics.code());
     diagnostics
-        && rights.read_only()
+        && rights.is_read_only(unit_id)
         && SubFunction::from_pdu(pdu).is_some_and(SubFunction::changes_state)
+}
+
+/// Whether a request reads or writes what the rights of a peer leave out.
+fn outside(rights: &PeerRights, unit_id: u8, request: &[u8]) -> bool {
+    rights
+        .ranges(unit_id)
+        .is_some_and(|ranges| Request::parse(request).is_ok_and(|request| !ranges.allow(&request)))
+}
+
+/// The refusal of such a request: a sealed memory is busy for every request.
+fn out_of_ranges(memory: &Memory) -> ExceptionCode {
+    if memory.sealed() {
+        ExceptionCode::ServerDeviceBusy
+    } else {
+        ExceptionCode::IllegalDataAddress
+    }
 }
 
 fn reading<const MAX: u16>(area: Area, range: Range<MAX>, out: &mut [u8]) -> Read<'_> {
