@@ -130,14 +130,17 @@ def test_a_role_grants_what_its_rule_says(secure: Appliance, party: Party, versi
 
 
 @versions
-def test_a_role_that_no_rule_names_is_refused_and_told(
+def test_a_role_that_no_rule_names_keeps_its_session_without_rights(
     run: Run, party: Party, version: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     appliance = run(configuration(party.files(), BY_ROLE))
     stranger = party.client("stranger", named("Engineer"))
     for issued in (stranger, party.nobody):
-        trust = context(party.authority.ca, issued, version)
-        assert verdict(appliance, trust) == "close_notify"
+        with peer(appliance, context(party.authority.ca, issued, version)) as client:
+            client.shake()
+            assert [client.ask(pdu) for pdu in (READ, WRITE, b"\x11", READ)] == [
+                *(bytes([pdu[0] | 0x80, 1]) for pdu in (READ, WRITE, b"\x11", READ))
+            ]
 
     counted = connections(appliance)
     assert (counted["refused_role"], counted["tls_failed"], counted["accepted"]) == (2, 0, 2)
@@ -160,7 +163,7 @@ def test_the_null_role_has_a_name_in_rules(run: Run, party: Party) -> None:
     assert verdict(appliance, context(party.authority.ca, party.nobody)) == "served"
     empty = party.client("empty", f"{ROLE}=DER:0c00")
     assert verdict(appliance, context(party.authority.ca, empty)) == "served"
-    assert verdict(appliance, context(party.authority.ca, party.operator)) == "close_notify"
+    assert verdict(appliance, context(party.authority.ca, party.operator)) == "without rights"
 
 
 def test_a_rule_without_roles_holds_any_and_the_first_that_holds_settles(

@@ -209,10 +209,14 @@ def address(appliance: Appliance) -> tuple[str, int]:
 
 
 def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
-    """Returns `served` or the reason. Over TLS 1.3 a refusal follows the client's handshake."""
+    """Returns `served`, `without rights` for exception 01, or the reason of a refusal.
+
+    Over TLS 1.3, a refusal follows the client's handshake.
+    """
+    verdicts = {ZERO: "served", bytes([READ[0] | 0x80, 1]): "without rights"}
     with Peer(address(appliance), trust) as client:
         try:
-            return "served" if client.shake().ask(READ) == ZERO else "answered"
+            return verdicts.get(client.shake().ask(READ), "answered")
         except Refused as refused:
             return str(refused)
 

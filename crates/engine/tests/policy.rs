@@ -113,3 +113,13 @@ fn a_function_must_be_known_listed_and_within_the_access_mode() {
     assert_eq!(allowed(AccessMode::ReadWrite, Functions::Only(vec![3, 6, 99])), [3, 6]);
     assert_eq!(allowed(AccessMode::ReadOnly, Functions::Except(vec![3, 43])), [1, 2, 4, 8, 11, 17]);
 }
+
+#[test]
+fn a_peer_without_rights_may_do_nothing() {
+    let nobody = PeerRights::none();
+    for unit_id in 0..=u8::MAX {
+        assert!(nobody.memory(unit_id).is_none());
+        assert!((0..=u8::MAX).all(|code| !nobody.allows(unit_id, code)));
+        assert!(nobody.is_read_only(unit_id));
+    }
+}

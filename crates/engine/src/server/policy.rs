@@ -301,6 +301,11 @@ impl PeerRights {
         PeerRights::of([rule])
     }
 
+    /// The rights of a peer that may do nothing: every request is answered with exception 01.
+    pub fn none() -> PeerRights {
+        PeerRights::of([])
+    }
+
     /// The rights by some rules; for each unit id, the first one that names it decides.
     fn of<'r>(rules: impl IntoIterator<Item = &'r Rule>) -> PeerRights {
         let mut units = Box::new([const { None }; 256]);

@@ -53,6 +53,8 @@ pub struct StreamSettings {
 pub(crate) struct ModbusStream {
     unit_server: Arc<UnitServer>,
     policy: Policy,
+    /// The rights of a peer that no rule names, by its role.
+    nobody: Arc<PeerRights>,
     timeouts: Timeouts,
     framing: StreamFraming,
     tls: Option<Arc<ServerTls>>,
@@ -63,6 +65,7 @@ impl ModbusStream {
         ModbusStream {
             unit_server,
             policy: Policy::of(&settings.rules),
+            nobody: Arc::new(PeerRights::none()),
             timeouts: Timeouts {
                 idle: settings.idle_timeout,
                 request: settings.request_timeout,
@@ -118,19 +121,19 @@ impl ModbusStream {
             Ok(Err(end)) => Err(end),
             Err(_) => return context.ended(Kind::TlsFailed("timeout"), peer),
         };
-        match role {
-            Ok(role) => {
-                if let Some(rights) = self.policy.rights_of_role(peer.ip(), &role) {
-                    return self
-                        .modbus::<F, _>(context, (stream, peer), rights, ticket, stop)
-                        .await;
-                }
-                context.refuse_role(peer, &role);
-                stream.say_end();
+        let role = match role {
+            Ok(role) => role,
+            Err(end) => {
+                context.ended(end, peer);
+                return drain(&stream.into_socket(), stop).await;
             }
-            Err(end) => context.ended(end, peer),
-        }
-        drain(&stream.into_socket(), stop).await;
+        };
+        let rights = self.policy.rights_of_role(peer.ip(), &role).unwrap_or_else(|| {
+            // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
+            context.refuse_role(peer, &role);
+            Arc::clone(&self.nobody)
+        });
+        self.modbus::<F, _>(context, (stream, peer), rights, ticket, stop).await;
     }
 
     async fn modbus<F: Framing, S: Stream>(

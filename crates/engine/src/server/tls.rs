@@ -78,13 +78,6 @@ impl ServerTlsStream {
         server::role(&self.channel).map_err(|error| failed(&error))
     }
 
-    /// Announces the end to the peer, without waiting.
-    pub(crate) fn say_end(&mut self) {
-        let mut unsent = Vec::new();
-        self.end(&mut unsent);
-        let _ = stream::write(&self.socket, &mut unsent);
-    }
-
     pub(crate) fn into_socket(self) -> TcpStream {
         self.socket
     }
