@@ -20,7 +20,10 @@ Ranges: TypeAlias = "list[tuple[Area, int, int]]"
 NarrowedRights: TypeAlias = (
     "tuple[Access, list[int] | None, list[int] | None, tuple[Ranges | None, Ranges | None]]"
 )
-"""Access, functions, denied functions, and the ranges to read and to write; `None` is everything."""
+"""Access, functions, denied functions, and the ranges to read and to write.
+
+`None` is everything.
+"""
 
 Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp"]
 """How a device with an address is talked to."""

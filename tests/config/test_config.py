@@ -651,6 +651,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "TlsRuleConfig": ["sources", "units", "access"],
         "TokenConfig": ["name", "sha256", "memories", "areas", "access"],
         "ToleranceConfig": None,
+        "UnitMemoryConfig": ["memory"],
     }
     assert "required" not in json_schema()
 

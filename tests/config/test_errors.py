@@ -291,16 +291,16 @@ def rule(sources: str) -> str:
 
 def test_a_rule_that_an_earlier_one_covers_is_a_warning(folder: Folder) -> None:
     assert folder.warnings(GOOD + rule("10.1.0.0/16, 10.2.0.3")) == [
-        "p.yaml:11: listeners.scada.rules[1]: never matches: all its sources are covered by "
-        "rules[0] in line 8"
+        "p.yaml:11: listeners.scada.rules[1]: never matches: all its sources and units are covered "
+        "by rules[0] in line 8"
     ]
 
 
 def test_a_rule_that_earlier_ones_cover_together_is_a_warning(folder: Folder) -> None:
     text = GOOD + rule("11.0.0.0/9") + rule("11.128.0.0/9") + rule("11.0.0.0/8")
     assert folder.warnings(text) == [
-        "p.yaml:13: listeners.scada.rules[3]: never matches: all its sources are covered by "
-        "rules[1] in line 11 and rules[2] in line 12"
+        "p.yaml:13: listeners.scada.rules[3]: never matches: all its sources and units are covered "
+        "by rules[1] in line 11 and rules[2] in line 12"
     ]
 
 

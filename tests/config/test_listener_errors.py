@@ -205,10 +205,10 @@ def test_a_rule_of_a_serial_line_is_checked(
 
 
 def test_a_second_rule_of_a_serial_line_is_a_warning(folder: Folder) -> None:
-    text = MEMORIES + RTU + "      - {units: {2: other}, access: read-write}\n"
+    text = MEMORIES + RTU + "      - {units: {1: other}, access: read-write}\n"
     assert folder.warnings(text) == [
-        "p.yaml:10: listeners.rtu.rules[1]: never matches: rules[0] in line 9 "
-        "matches the whole serial line"
+        "p.yaml:10: listeners.rtu.rules[1]: never matches: all its units are "
+        "covered by rules[0] in line 9"
     ]
 
 
@@ -391,7 +391,7 @@ def test_roles_are_for_tls_only(folder: Folder) -> None:
 @pytest.mark.parametrize(
     ("roles", "never"),
     [
-        ("roles: [engineer], ", "its sources and roles are covered by rules[0] in line 10"),
+        ("roles: [engineer], ", "its sources, roles and units are covered by rules[0] in line 10"),
         ("roles: [engineer, operator], ", None),
         ("roles: [''], ", None),
         ("", None),
@@ -416,6 +416,6 @@ def test_a_rule_for_any_role_covers_those_for_one(folder: Folder) -> None:
         "access: read-only}\n"
     )
     assert folder.warnings(MEMORIES + TLS + rules) == [
-        "p.yaml:12: listeners.tls.rules[2]: never matches: its sources and roles are covered by "
-        "rules[0] in line 10 and rules[1] in line 11"
+        "p.yaml:12: listeners.tls.rules[2]: never matches: its sources, roles and units are "
+        "covered by rules[0] in line 10 and rules[1] in line 11"
     ]

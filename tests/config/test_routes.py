@@ -8,7 +8,7 @@ import pytest
 
 from holdfast.client.tolerance import Tolerance
 from holdfast.client.url import parse
-from holdfast.config import LinkConfig, ModbusTcpListener, RouteConfig
+from holdfast.config import LinkConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def told(folder: Folder, text: str) -> list[str]:
     return [problem.removeprefix("p.yaml:") for problem in folder.problems(text)]
 
 
-def units_of(folder: Folder, text: str) -> dict[int | str, str | RouteConfig]:
+def units_of(folder: Folder, text: str) -> dict[int | str, str | UnitMemoryConfig | RouteConfig]:
     listener = folder.config(text).listeners["scada"]
     assert isinstance(listener, ModbusTcpListener)
     return dict(listener.rules[0].units)
@@ -135,7 +135,8 @@ def test_a_serial_listener_has_routes_too(folder: Folder) -> None:
         ("{route: drive}", "{}", "13: listeners.scada.rules[0].units.7.route: missing, allowed: "
          "text"),
         ("{route: drive}", "{route: drive, unit: 1}",
-         "13: listeners.scada.rules[0].units.7.unit: unknown key, allowed: route"),
+         "13: listeners.scada.rules[0].units.7.unit: unknown key, allowed: route, access, "
+         "functions, deny"),
         ("{route: drive}", "drive", "13: listeners.scada.rules[0].units.7: found 'drive', the name "
          "of a device, allowed: a memory, or {route: drive}"),
         ("{route: drive}", "[drive]", "13: listeners.scada.rules[0].units.7: found a list, "

@@ -197,12 +197,50 @@ def test_a_narrower_rule_behind_a_wider_one_has_no_say(start: Start) -> None:
 
 
 @needs_127_0_0_2
-def test_rules_do_not_add_up(start: Start) -> None:
-    plant = start(rule(["127.0.0.2"], 1), rule(["127.0.0.0/8"], 2))
+def test_for_each_unit_the_first_rule_that_names_peer_and_unit_decides(start: Start) -> None:
+    plant = start(
+        rule(["127.0.0.2"], 1, access="read-only"),
+        {**rule(["127.0.0.0/8"]), "units": {"1-2": "plant"}},
+    )
     first, second = plant.peer("127.0.0.2"), plant.peer("127.0.0.3")
 
-    assert (first.ask(READ, 1), first.ask(READ, 2)) == (ZERO, b"\x83\x0b")
-    assert (second.ask(READ, 1), second.ask(READ, 2)) == (b"\x83\x0b", ZERO)
+    assert (first.ask(WRITE, 1), first.ask(WRITE, 2)) == (b"\x86\x01", WRITE)
+    assert (second.ask(WRITE, 1), second.ask(WRITE, 2)) == (WRITE, WRITE)
+    assert (first.ask(READ, 3), second.ask(READ, 3)) == (b"\x83\x0b", b"\x83\x0b")
+
+
+def test_a_unit_can_have_fewer_rights_than_its_rule(start: Start) -> None:
+    units = {
+        1: "plant",
+        2: {"memory": "plant", "access": "read-only"},
+        3: {"memory": "plant", "functions": [6]},
+        4: {"memory": "plant", "deny": [3]},
+    }
+    peer = start({**rule(["127.0.0.1"]), "units": units}).peer()
+
+    replies = {unit: (peer.ask(WRITE, unit), peer.ask(READ, unit)) for unit in units}
+    assert replies == {
+        1: (WRITE, bytes.fromhex("03021234")),
+        2: (b"\x86\x01", bytes.fromhex("03021234")),
+        3: (WRITE, b"\x83\x01"),
+        4: (WRITE, b"\x83\x01"),
+    }
+
+
+def test_ranges_of_a_unit_limit_whole_requests(start: Start) -> None:
+    ranges = {
+        "read": [{"area": "holding_registers", "start": 0, "end": 3}],
+        "write": [{"area": "holding_registers", "start": 2, "count": 3}],
+    }
+    units = {1: {"memory": "plant", **ranges}}
+    peer = start({**rule(["127.0.0.1"]), "units": units}).peer()
+
+    assert peer.ask(bytes.fromhex("0300000004")) == bytes.fromhex("03080000000000000000")
+    assert peer.ask(bytes.fromhex("0300000005")) == b"\x83\x02"
+    assert peer.ask(bytes.fromhex("0100000001")) == b"\x81\x02"
+    assert peer.ask(bytes.fromhex("0600040001")) == bytes.fromhex("0600040001")
+    assert peer.ask(bytes.fromhex("0600010001")) == b"\x86\x02"
+    assert peer.ask(bytes.fromhex("080000a537")) == bytes.fromhex("080000a537")
 
 
 @needs_127_0_0_2

@@ -22,17 +22,16 @@ from holdfast.config import (
     ModbusTlsListener,
     ModbusUdpListener,
     RawIngestListener,
-    RouteConfig,
 )
 from holdfast.config.devices import STATUS_BLOCK
-from holdfast.config.listeners import unit_targets
+from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
 from holdfast.net.tls import NO_FILES
 from holdfast.server import Identity
 from holdfast.tools import planning
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from holdfast._core import Memory
     from holdfast.client.url import Target
@@ -49,10 +48,11 @@ if TYPE_CHECKING:
         SerialRuleConfig,
         ServerTlsConfig,
     )
+    from holdfast.config.rights import UnitRights
     from holdfast.gateway import Settings as GatewaySettings
     from holdfast.net.tls import Tls
     from holdfast.scanner import Settings as ScannerSettings
-    from holdfast.types import Area
+    from holdfast.types import Area, NarrowedRights
 
 _FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
     "modbus-tcp": "mbap",
@@ -194,7 +194,7 @@ def listener(
             return _core.Listener.serial(
                 name,
                 line.device,
-                _rule(settings.rules[0], memories, links),
+                _serial_rule(settings.rules, memories, links),
                 mode="rtu" if settings.type == "modbus-rtu" else "ascii",
                 baud=line.baud,
                 parity=line.parity,
@@ -340,22 +340,57 @@ def _place(
     return None if into is None else (memories[into.memory], into.area, into.address)
 
 
-def _rule(
-    rule: RuleConfig | SerialRuleConfig, memories: Mapping[str, Memory], links: Links
-) -> _core.Rule:
+def _rule(rule: RuleConfig, memories: Mapping[str, Memory], links: Links) -> _core.Rule:
+    own = {
+        unit: rights
+        for unit, rights in unit_rights(rule)
+        if (rights.access, rights.functions, rights.deny)
+        != (rule.access, rule.functions, rule.deny)
+        or rights.has_ranges
+    }
     return _core.Rule(
-        {
-            unit: links.routes[target.route]
-            if isinstance(target, RouteConfig)
-            else links.passages.get(target, memories[target])
-            for unit, target in unit_targets(rule.units)
-        },
-        sources=[str(source) for source in getattr(rule, "sources", ())],
+        _targets(dict(unit_rights(rule)), memories, links),
+        sources=[str(source) for source in rule.sources],
         access=rule.access,
         functions=rule.functions,
         deny=rule.deny,
         roles=getattr(rule, "roles", None),
+        narrowed={unit: _narrowed(rights) for unit, rights in own.items()},
     )
+
+
+def _serial_rule(
+    rules: Sequence[SerialRuleConfig], memories: Mapping[str, Memory], links: Links
+) -> _core.Rule:
+    """The rule of a serial line, which is that of all rules together."""
+    units = together(rules)
+    return _core.Rule(
+        _targets(units, memories, links),
+        sources=[],
+        access=rules[0].access,
+        narrowed={unit: _narrowed(rights) for unit, rights in units.items()},
+    )
+
+
+def _targets(
+    units: Mapping[int, UnitRights], memories: Mapping[str, Memory], links: Links
+) -> dict[int, Memory | _core.Route | _core.Passage]:
+    found: dict[int, Memory | _core.Route | _core.Passage] = {}
+    for unit, rights in units.items():
+        if rights.memory is None:
+            assert rights.route is not None, "a unit has a memory or a route"
+            found[unit] = links.routes[rights.route]
+        else:
+            found[unit] = links.passages.get(rights.memory, memories[rights.memory])
+    return found
+
+
+def _narrowed(rights: UnitRights) -> NarrowedRights:
+    read = None if rights.read is None else items(rights.read)
+    write = None if rights.write is None else items(rights.write)
+    functions = None if rights.functions is None else list(rights.functions)
+    deny = None if rights.deny is None else list(rights.deny)
+    return rights.access, functions, deny, (read, write)
 
 
 def _raw_rule(rule: RawRuleConfig, config: Config, memories: Mapping[str, Memory]) -> _core.RawRule:

@@ -20,15 +20,16 @@ from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
-from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig
+from holdfast.cli.showing import ranges_shown
+from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
+from holdfast.config.rights import unit_rights
 from holdfast.config.scanning import written_pollable
-from holdfast.config.unit_keys import unit_ids
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from types import FrameType
 
     from holdfast.appliance.running import ListenAddress
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
         RuleConfig,
         SerialRuleConfig,
     )
+    from holdfast.config.rights import UnitRights
+    from holdfast.types import Area
 
 # Maximum delay of the reaction to a signal, in seconds.
 JOIN_TIMEOUT = 0.2
@@ -191,8 +194,19 @@ def _granted(rule: RuleConfig | SerialRuleConfig | RawRuleConfig) -> str:
     return f"{to}; {rights} for {sources or 'the line'}{of}"
 
 
-def _behind(target: str | RouteConfig) -> str:
-    return target.route if isinstance(target, RouteConfig) else target
+def _behind(target: str | UnitMemoryConfig | RouteConfig) -> str:
+    """What is behind a unit id, with the rights of its own."""
+    if isinstance(target, str):
+        return target
+    name = target.route if isinstance(target, RouteConfig) else target.memory
+    own: list[str] = [] if target.access is None else [target.access]
+    for key in ("functions", "deny"):
+        codes = getattr(target, key)
+        own += [] if codes is None else [f"{key} {', '.join(map(str, codes))}"]
+    if isinstance(target, UnitMemoryConfig):
+        own += [] if target.read is None else [f"reads {ranges_shown(target.read)}"]
+        own += [] if target.write is None else [f"writes {ranges_shown(target.write)}"]
+    return f"{name} ({'; '.join(own)})" if own else name
 
 
 def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Path) -> list[str]:
@@ -202,22 +216,27 @@ def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Pat
         if not isinstance(endpoint.settings, ModbusTcpListener):
             continue
         for rule in endpoint.settings.rules:
-            key, target = next(iter(rule.units.items()))
-            place = f"mbpoll -m tcp -p {endpoint.port} -a {unit_ids(key)[0]} -0"
+            unit, rights = next(unit_rights(rule))
+            place = f"mbpoll -m tcp -p {endpoint.port} -a {unit} -0"
             host = reachable(endpoint.host)
-            if isinstance(target, RouteConfig):
+            if rights.memory is None:
                 return [f"{place} -t 4 -r 0 -c 1 -1 {host}", check]
-            areas = appliance.memories[target].areas
-            area, addresses = next(iter(areas.items()))
-            for preferred in MBPOLL_TYPES:
-                if preferred in areas:
-                    area, addresses = preferred, areas[preferred]
-                    break
+            area, addresses = _example(appliance.memories[rights.memory].areas, rights)
             command = f"{place} -t {MBPOLL_TYPES[area]} -r {addresses.start}"
             read = f"{command} -c {min(len(addresses), 5)} -1 {host}"
-            writable = rule.access == "read-write" and area in WRITE_LIMITS
+            writable = rights.access == "read-write" and area in WRITE_LIMITS
+            writable = writable and rights.write is None
             return [read, f"{command} {host} 1", check] if writable else [read, check]
     return [check]
+
+
+def _example(areas: Mapping[Area, range], rights: UnitRights) -> tuple[Area, range]:
+    """The area, and addresses of it, of the command that reads."""
+    if rights.read is not None:
+        return rights.read[0].area, rights.read[0].addresses
+    preferred = next((area for area in MBPOLL_TYPES if area in areas), None)
+    area = next(iter(areas)) if preferred is None else preferred
+    return area, areas[area]
 
 
 def _program() -> str:

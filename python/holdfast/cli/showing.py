@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast import logs
+from holdfast.config.initial import extent
 from holdfast.tools.inference import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
+    from holdfast.config import RangeConfig
 
 
 def styled(text: str, **style: Any) -> str:
@@ -49,6 +52,11 @@ def counted(count: int, noun: str) -> str:
 def words(area: str) -> str:
     """The name of an area or key, with spaces."""
     return area.replace("_", " ")
+
+
+def ranges_shown(ranges: Iterable[RangeConfig]) -> str:
+    """Ranges of addresses: `coils 0-7, holding registers 5`."""
+    return ", ".join(f"{words(each.area)} {extent(each.addresses)}" for each in ranges)
 
 
 def plain(text: str) -> str:

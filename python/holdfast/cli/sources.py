@@ -11,8 +11,8 @@ from urllib.parse import urlencode
 
 from holdfast.cli.device import read_raw
 from holdfast.config import ModbusTcpListener
-from holdfast.config.listeners import unit_targets
-from holdfast.net.addresses import holds, joined, parse_address, reachable
+from holdfast.config.rights import items, matching, together
+from holdfast.net.addresses import joined, parse_address, reachable
 from holdfast.protocol import READ_FUNCTIONS
 from holdfast.types import AREAS
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from holdfast.client import SyncClient
     from holdfast.config import Config
     from holdfast.config.ip_addresses import Bind
+    from holdfast.config.rights import UnitRights
     from holdfast.types import Area
 
 MAX_ADDRESSES = 8192
@@ -162,20 +163,15 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
     name, listener = found[0]
     _check_port(f"listener {name}", listener.bind)
     host = parse_address(reachable(listener.bind.host))
-    rules = [rule for rule in listener.rules if holds(rule.sources, host)]
+    rules = matching(listener.rules, host)
     if not rules:
         raise Unwatchable(f"no rule of listener {name} admits {host}")
-    rule = rules[0]
     blocks: list[WatchedRange] = []
     seen: set[str] = set()
-    for unit, memory in unit_targets(rule.units):
-        if isinstance(memory, str) and memory not in seen:
-            seen.add(memory)
-            blocks += [
-                block
-                for block in _areas(config, memory, unit)
-                if _may_read(block.area, rule.functions, rule.deny)
-            ]
+    for unit, rights in together(rules).items():
+        if rights.memory is not None and rights.memory not in seen:
+            seen.add(rights.memory)
+            blocks += _readable(_areas(config, rights.memory, unit), rights)
     return name, listener.bind, blocks
 
 
@@ -225,6 +221,13 @@ def _areas(config: Config, memory: str, unit: int) -> list[WatchedRange]:
     return [WatchedRange(memory, unit, area, span.start, span.size) for area, span in spans if span]
 
 
-def _may_read(area: Area, functions: Sequence[int] | None, deny: Sequence[int] | None) -> bool:
-    function = READ_FUNCTIONS[area].code
-    return (functions is None or function in functions) and function not in (deny or ())
+def _readable(blocks: Sequence[WatchedRange], rights: UnitRights) -> list[WatchedRange]:
+    """The parts of blocks that may be read."""
+    allowed = [block for block in blocks if rights.allows(READ_FUNCTIONS[block.area].code)]
+    if rights.read is None:
+        return allowed
+    return [
+        part
+        for area, first, count in items(rights.read)
+        for part in within(allowed, area, first, count)
+    ]

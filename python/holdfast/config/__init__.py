@@ -39,6 +39,7 @@ from holdfast.config.listeners import (
     SerialRuleConfig,
     ServerTlsConfig,
     TlsRuleConfig,
+    UnitMemoryConfig,
 )
 from holdfast.config.load import load
 from holdfast.config.memories import MemoryConfig, Seal, Span
@@ -116,6 +117,7 @@ __all__ = [
     "SubscriptionConfig",
     "TlsRuleConfig",
     "TokenConfig",
+    "UnitMemoryConfig",
     "json_schema",
     "load",
 ]

@@ -63,13 +63,15 @@ def _children(node: Node, part: Key, value: object) -> Iterator[Node]:
 
 
 def _kinds(node: Node, value: object) -> list[Node]:
-    """The alternatives of a node; only the one that the value's discriminator selects, if any."""
+    """The alternatives of a node; only those that the value's discriminator or keys select."""
     kinds: list[Node] = [*node.get("anyOf", ()), *node.get("oneOf", ())]
     if "discriminator" in node:
         named = mapping(value).get(node["discriminator"]["propertyName"])
         refs = node["discriminator"]["mapping"]
         return [{"$ref": refs[named]}] if isinstance(named, str) and named in refs else kinds
-    return kinds
+    keys = mapping(value).keys()
+    fitting = [kind for kind in kinds if keys & _resolved(kind).get("required", ())]
+    return fitting[:1] or kinds
 
 
 def _resolved(node: Node) -> Node:

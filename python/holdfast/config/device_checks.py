@@ -9,8 +9,9 @@ from holdfast.config.allowed import allowed
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, takes_writes
 from holdfast.config.initial import extent
 from holdfast.config.lenient import entries, integer, mapping
-from holdfast.config.memory_checks import addresses
-from holdfast.config.words import choice, listing, show
+from holdfast.config.memory_checks import area_of
+from holdfast.config.range_checks import check_ranges, counted
+from holdfast.config.words import choice, show
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, Area
 
@@ -71,8 +72,8 @@ class DeviceChecks:
         if device.get("readable") and not device.get("max_gap") and "cost" not in device:
             message = "has no effect: gaps are read only with max_gap or cost"
             self.report.doubt((*path, "readable"), message)
-        self._ranges((*path, "readable"), device.get("readable"))
-        forbidden = self._ranges((*path, "forbidden"), device.get("forbidden"))
+        check_ranges((*path, "readable"), device.get("readable"), self.report)
+        forbidden = check_ranges((*path, "forbidden"), device.get("forbidden"), self.report)
         for index, forward in enumerate(entries(device.get("forward"))):
             self._forward((*path, "forward", index), mapping(forward))
         for index, read in enumerate(entries(device.get("reads"))):
@@ -106,49 +107,6 @@ class DeviceChecks:
             message = "pass has no effect: no coils are read into coils, and no holding registers"
             self.report.doubt((*path, "writes"), f"{message} into holding registers")
 
-    def _ranges(self, path: KeyPath, ranges: object) -> list[tuple[KeyPath, object, range]]:
-        """The valid ranges, each with its path and its area."""
-        found = []
-        for index, each in enumerate(entries(ranges)):
-            if not isinstance(each, dict):
-                continue
-            here = (*path, index)
-            if "end" in each and "count" in each:
-                message = "found together with end, allowed: only one of them"
-                self.report.add((*here, "count"), message, of_key=True)
-            elif not each.keys() & {"end", "count"}:
-                message = "found neither end nor count, allowed: one of them"
-                self.report.add(here, message, of_key=True)
-            else:
-                span = self._range(here, each)
-                if span is not None:
-                    found.append((here, each.get("area"), span))
-        return found
-
-    def _range(self, path: KeyPath, each: dict[Any, Any]) -> range | None:
-        start = integer(each.get("start"), 0, LAST_ADDRESS)
-        if "count" in each:
-            return self._sum(path, start, each["count"], "start")
-        end = integer(each["end"], 0, LAST_ADDRESS)
-        if start is None or end is None:
-            return None
-        if end < start:
-            message = f"found {end}, allowed: the last address, {start} or more"
-            self.report.add((*path, "end"), message)
-            return None
-        return range(start, end + 1)
-
-    def _sum(self, path: KeyPath, first: int | None, count: object, key: str) -> range | None:
-        """The `count` addresses from `first` on, `None` if they are not valid."""
-        number = integer(count, 1, ADDRESSES)
-        if first is None or number is None:
-            return None
-        if first + number > ADDRESSES:
-            message = f"found {key} {first} and count {number}, allowed: a sum up to {ADDRESSES}"
-            self.report.add((*path, "count"), message)
-            return None
-        return range(first, first + number)
-
     def _forward(self, path: KeyPath, forward: dict[Any, Any]) -> None:
         form = forward.get("format", "v1")
         if "crc" in forward and form == "v1":
@@ -174,7 +132,7 @@ class DeviceChecks:
     ) -> None:
         area = read.get("area")
         address = integer(read.get("address"), 0, LAST_ADDRESS)
-        asked = self._sum(path, address, read.get("count"), "address")
+        asked = counted(path, address, read.get("count"), "address", self.report)
         count = integer(read.get("count"), 1, ADDRESSES)
         for where, of, span in forbidden:
             if asked is not None and of == area and _meet(asked, span):
@@ -202,7 +160,7 @@ class DeviceChecks:
                 message = f"found {show(area)}, allowed for {of}: {choice(kin)}"
                 self.report.add((*path, "area"), message)
             return
-        there = self._there(path, into.get("memory"), area)
+        there = area_of(self.memories, path, into.get("memory"), area, self.report)
         if there is None or address is None or count is None:
             return
         if address not in there or address + count - 1 not in there:
@@ -218,7 +176,7 @@ class DeviceChecks:
         area, slot = status.get("area"), integer(status.get("slot"), 0, LAST_SLOT)
         if area not in REGISTER_AREAS:
             return
-        there = self._there(path, status.get("memory"), area)
+        there = area_of(self.memories, path, status.get("memory"), area, self.report)
         if there is None or slot is None:
             return
         block = range(slot * STATUS_BLOCK, (slot + 1) * STATUS_BLOCK)
@@ -228,19 +186,6 @@ class DeviceChecks:
             self.report.add((*path, "slot"), f"{found}, {allowed}")
             return
         self._claims.append(Claim(path, status["memory"], area, block))
-
-    def _there(self, path: KeyPath, name: object, area: Any) -> range | None:
-        """The addresses of an area of a memory, `None` if the memory or area is not valid."""
-        memory = self.memories.get(name) if isinstance(name, str) else None
-        if not isinstance(memory, dict):
-            return None
-        if area not in memory:
-            areas = [each for each in AREAS if each in memory]
-            allowed = f"allowed: {listing(areas)}" if areas else "and it has no other area"
-            message = f"found {show(area)}, an area that {name} does not have, {allowed}"
-            self.report.add((*path, "area"), message)
-            return None
-        return addresses(memory[area])
 
     def _overlaps(self) -> None:
         """Reports reads and blocks that write an address twice, at the later one in the file."""

@@ -60,7 +60,7 @@ class ReadConfig(Model):
 
 
 class RangeConfig(Model):
-    """Addresses of a device: start and end, or start and count."""
+    """A range of addresses: start and end, or start and count."""
 
     area: Area
     """The area."""

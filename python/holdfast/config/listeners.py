@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.client.url import Rs485
 from holdfast.config.base import Model
+from holdfast.config.devices import RangeConfig
 from holdfast.config.scalars import (
     RAW_UNIT_KEYS,
     SERIAL_UNITS_KEYS,
@@ -35,14 +36,14 @@ from holdfast.config.scalars import (
     StopBits,
     UnitIds,
 )
-from holdfast.config.unit_keys import unit_ids
 from holdfast.types import Access
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 FunctionList: TypeAlias = Annotated[Annotated[Codes, Field(min_length=1)] | None, NotNull()]
 DenyList: TypeAlias = Annotated[Codes | None, NotNull()]
+OwnAccess: TypeAlias = Annotated[Access | None, NotNull()]
+RangeList: TypeAlias = Annotated[
+    Annotated[tuple[RangeConfig, ...], Strict(False), Field(min_length=1)] | None, NotNull()
+]
 
 
 class RouteConfig(Model):
@@ -50,30 +51,48 @@ class RouteConfig(Model):
 
     route: Name
     """A device, or a link. A link keeps the unit id of the request."""
+    access: OwnAccess = None
+    """Whether these peers may write to this unit. Default: as the rule."""
+    functions: FunctionList = None
+    """The allowed function codes of this unit. Default: those of the rule."""
+    deny: DenyList = None
+    """Function codes that are not allowed for this unit, in addition to those of the rule."""
 
 
-UNIT_TAGS = ("memory", "route")
+class UnitMemoryConfig(Model):
+    """A memory behind a unit id, with fewer rights than the rule gives."""
+
+    memory: Name
+    """The memory."""
+    access: OwnAccess = None
+    """Whether these peers may write to this unit. Default: as the rule."""
+    functions: FunctionList = None
+    """The allowed function codes of this unit. Default: those of the rule."""
+    deny: DenyList = None
+    """Function codes that are not allowed for this unit, in addition to those of the rule."""
+    read: RangeList = None
+    """The ranges that may be read. Default: everything."""
+    write: RangeList = None
+    """The ranges that may be written. Default: everything."""
+
+
+UNIT_TAGS = ("memory", "long", "route")
 
 
 def _tag_of(value: object) -> str:
-    memory, route = UNIT_TAGS
+    memory, long, route = UNIT_TAGS
+    if isinstance(value, UnitMemoryConfig) or (isinstance(value, dict) and "memory" in value):
+        return long
     return route if isinstance(value, dict | RouteConfig) else memory
 
 
 Target: TypeAlias = Annotated[
-    Annotated[Name, Tag("memory")] | Annotated[RouteConfig, Tag("route")],
+    Annotated[Name, Tag("memory")]
+    | Annotated[UnitMemoryConfig, Tag("long")]
+    | Annotated[RouteConfig, Tag("route")],
     Discriminator(_tag_of),
 ]
-"""What is behind a unit id: a memory, or a route."""
-
-
-def unit_targets(
-    units: Mapping[Any, str | RouteConfig],
-) -> Iterator[tuple[int, str | RouteConfig]]:
-    """The memory or route behind each unit id of a rule; ranges are taken apart."""
-    for key, target in units.items():
-        for unit in unit_ids(key):
-            yield unit, target
+"""What is behind a unit id: a memory, or a route; both with rights of their own, or without."""
 
 
 class RuleConfig(Model):
@@ -82,7 +101,8 @@ class RuleConfig(Model):
     sources: Sources
     """Networks and addresses of the peers, IPv4 or IPv6."""
     units: dict[UnitIds, Target] = Field(min_length=1, json_schema_extra=UNITS_KEYS)
-    """What is behind each unit id, or range of unit ids: a memory, or a route to devices."""
+    """What is behind each unit id, or range of unit ids: a memory, or a route to devices. With a
+    mapping, the unit can have fewer rights than the rule."""
     access: Access
     """Whether these peers may write."""
     functions: FunctionList = None
@@ -104,7 +124,8 @@ class SerialRuleConfig(Model):
     """What the client of a serial line may do."""
 
     units: dict[SerialUnitIds, Target] = Field(min_length=1, json_schema_extra=SERIAL_UNITS_KEYS)
-    """What is behind each unit id, or range of unit ids, 1 to 247: a memory, or a route."""
+    """What is behind each unit id, or range of unit ids, 1 to 247: a memory, or a route. With a
+    mapping, the unit can have fewer rights than the rule."""
     access: Access
     """Whether the client may write."""
     functions: FunctionList = None
@@ -146,7 +167,7 @@ class _ConnectionListener(Model):
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources contain the peer applies."""
+    """For each unit id, the first rule whose sources contain the peer and that names it applies."""
 
 
 class ModbusTcpListener(_ConnectionListener):
@@ -179,7 +200,7 @@ class ModbusTlsListener(_ConnectionListener):
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last, and for the handshake."""
     rules: Annotated[tuple[TlsRuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources and roles match the peer applies."""
+    """For each unit id, the first rule that matches the peer and names the unit id applies."""
 
 
 class ModbusRtuOverTcpListener(_ConnectionListener):
@@ -206,7 +227,8 @@ class ModbusUdpListener(Model):
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources contain the sender applies."""
+    """For each unit id, the first rule whose sources contain the sender and that names it applies.
+    """
 
 
 class ModbusRtuOverUdpListener(Model):
@@ -217,7 +239,8 @@ class ModbusRtuOverUdpListener(Model):
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources contain the sender applies."""
+    """For each unit id, the first rule whose sources contain the sender and that names it applies.
+    """
 
 
 def _stop_bits(data: dict[str, Any]) -> Literal[1, 2]:
@@ -268,7 +291,7 @@ class _SerialListener(Model):
     serial: SerialConfig
     """The serial port."""
     rules: Annotated[tuple[SerialRuleConfig, ...], Strict(False), Field(min_length=1)]
-    """What the client may do. Only the first rule applies: a serial line has no addresses."""
+    """What the client may do. For each unit id, the first rule that names it applies."""
 
 
 class ModbusRtuListener(_SerialListener):

@@ -34,6 +34,25 @@ def addresses(extent: object) -> range | None:
     return None if span is None or span.start + span.size > ADDRESSES else span.addresses
 
 
+def area_of(
+    memories: dict[Any, Any], path: KeyPath, name: object, area: Any, report: Report
+) -> range | None:
+    """The addresses of an area of a memory, `None` if the memory or area is not valid.
+
+    Reports an area that the memory does not have, at the key `area` of `path`.
+    """
+    memory = memories.get(name) if isinstance(name, str) else None
+    if not isinstance(memory, dict):
+        return None
+    if area not in memory:
+        areas = [each for each in AREAS if each in memory]
+        allowed = f"allowed: {listing(areas)}" if areas else "and it has no other area"
+        message = f"found {show(area)}, an area that {name} does not have, {allowed}"
+        report.add((*path, "area"), message)
+        return None
+    return addresses(memory[area])
+
+
 @dataclass
 class MemoryChecks:
     """Checks the memories of one file, and reads the files with their initial values."""

@@ -46,14 +46,20 @@ class RouteChecks:
         for key, target in mapping(units).items():
             here = (*path, key)
             self._once(here, key, taken)
-            if isinstance(target, dict):
-                self._route(here, key, target.get("route"))
-            elif self._is_known(target) and target not in self.grants.names:
-                kind = "device" if target in self.devices else "link"
-                message = f"found {show(target)}, the name of a {kind}"
-                self.report.add(here, f"{message}, allowed: a memory, or {{route: {target}}}")
+            if not isinstance(target, dict):
+                self._memory(here, target)
+            elif "memory" in target:
+                self._memory((*here, "memory"), target["memory"])
             else:
-                self.grants.memory(here, target)
+                self._route(here, key, target.get("route"))
+
+    def _memory(self, path: KeyPath, name: object) -> None:
+        if self._is_known(name) and name not in self.grants.names:
+            kind = "device" if name in self.devices else "link"
+            message = f"found {show(name)}, the name of a {kind}"
+            self.report.add(path, f"{message}, allowed: a memory, or {{route: {name}}}")
+        else:
+            self.grants.memory(path, name)
 
     def _once(self, path: KeyPath, key: Key, taken: dict[int, Key]) -> None:
         """Reports a key that has unit ids of an earlier one."""
@@ -100,7 +106,9 @@ class RouteChecks:
 
 def has_route(units: object) -> bool:
     """Whether a rule has a route, from data that is not validated."""
-    return any(isinstance(target, dict) for target in mapping(units).values())
+    return any(
+        isinstance(target, dict) and "memory" not in target for target in mapping(units).values()
+    )
 
 
 def routed(config: Config) -> dict[str, None]:
