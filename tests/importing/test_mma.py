@@ -25,7 +25,7 @@ from holdfast.importing.filters import read_filter
 from holdfast.importing.functions import ALL, SOURCE, touching
 from holdfast.importing.notes import Desk
 from holdfast.importing.peers import EVERYBODY, Peers, parse_network
-from holdfast.importing.policies import Merger, Policy
+from holdfast.importing.policies import Policy, merged
 from holdfast.importing.sections import Section
 from holdfast.types import AREAS
 from support.paths import DATA, DOCS
@@ -416,18 +416,19 @@ def test_a_memory_without_a_policy_is_served_to_nobody(imported: Import) -> None
     assert noted(found, "10: listeners[0].memory[1]: check: no policy")
 
 
-def test_the_narrower_network_comes_first() -> None:
-    listener = read_mma(MMA / "policies.yaml").data["listeners"]["ems"]
-    order = [one["sources"][0] for one in listener["rules"]]
-    assert order.index("10.20.1.10") < order.index("10.20.0.0/16") < order.index("0.0.0.0/0")
-
-
-def test_functions_of_areas_that_a_memory_lacks_do_not_count() -> None:
-    found = read_mma(MMA / "policies.yaml")
-    rules = {one["sources"][0]: one for one in found.data["listeners"]["ems"]["rules"]}
-    assert rules["10.20.1.10"]["units"] == {1: "inverter", 2: "setpoints", 3: "status"}
-    assert rules["10.20.1.10"]["functions"] == [1, 2, 3, 4, 5, 6, 15, 16, 22, 23]
-    assert not noted(found, "different functions")
+def test_each_unit_of_a_sample_has_rules_of_its_own() -> None:
+    rules = read_mma(MMA / "policies.yaml").data["listeners"]["ems"]["rules"]
+    assert [(one["units"], one["access"], one.get("functions")) for one in rules] == [
+        ({1: "inverter"}, "read-only", None),
+        ({2: "setpoints"}, "read-write", None),
+        ({2: "setpoints"}, "read-write", [5, 6, 15, 16]),
+        ({3: "status"}, "read-only", [2]),
+    ]
+    assert [one["sources"] for one in rules[1:]] == [["10.20.1.10"], ["10.20.1.11"], ["0.0.0.0/0"]]
+    blocked = [ipaddress.ip_network(source) for source in rules[0]["sources"]]
+    assert Peers.of(map(parse_network, ["10.20.0.0/16", "fd00:20::/32"])) - Peers.of(
+        blocked
+    ) == Peers.of([parse_network("10.20.5.0/28")])
 
 
 def test_a_unit_that_allows_nothing_is_noted(imported: Import) -> None:
@@ -438,24 +439,27 @@ def test_a_unit_that_allows_nothing_is_noted(imported: Import) -> None:
     assert noted(found, "listeners[0]: check: no rule serves unit 2")
 
 
-def test_units_that_are_treated_otherwise_get_what_all_have(imported: Import) -> None:
+def test_each_unit_keeps_its_own_rules(imported: Import) -> None:
     rules = "{source_ip: [10.1.0.0/16], allow_fc: [3]}, {source_ip: [10.0.0.0/8], allow: rw}"
     other = "{unit_id: 2, holding_registers: {start: 0, count: 1}, policy: {rules: [" + RULE + "]}}"
     found = imported(SECOND % (rules, "") + f"      - {other}\n")
     both = {1: "main-1", 2: "main-2"}
     assert port(found, "main")["rules"] == [
-        {"sources": ["10.1.0.0/16"], "units": both, "access": "read-only", "functions": [3]},
+        {
+            "sources": ["10.1.0.0/16"],
+            "units": {1: "main-1"},
+            "access": "read-only",
+            "functions": [3],
+        },
         {"sources": ["10.0.0.0/8"], "units": both, "access": "read-write"},
     ]
-    assert noted(found, "listeners[0]: changed: peers in 10.1.0.0/16", "for all its units: 3")
+    assert not noted(found, "listeners[0]: changed")
 
 
-def test_a_unit_with_nothing_in_common_is_not_served(imported: Import) -> None:
-    other = "{unit_id: 2, holding_registers: {start: 0, count: 1}, policy: {rules: [%s]}}"
-    text = SECOND % (RULE.replace("rw", "ro"), "") + f"      - {other % RULE.replace('rw', 'wo')}\n"
-    found = imported(text)
-    assert rule(found, "main")["units"] == {1: "main-1"}
-    assert noted(found, "unit 2 is not served to them")
+def test_a_rule_that_allows_nothing_is_cut_out_of_later_ones(imported: Import) -> None:
+    rules = "{source_ip: [10.0.0.0/9], allow_fc: []}, {source_ip: [10.0.0.0/8], allow: rw}"
+    found = imported(SECOND % (rules, ""))
+    assert rule(found, "main")["sources"] == ["10.128.0.0/9"]
 
 
 def test_same_names_in_two_listeners_are_two_memories(imported: Import) -> None:
@@ -877,8 +881,7 @@ TOUCHING = touching(AREAS)
 POLICY = st.lists(st.tuples(st.lists(networks(), min_size=1, max_size=3), RIGHTS), max_size=4)
 
 
-def merged(policies: list[PolicyRules]) -> list[dict[str, Any]]:
-    document, _ = parse("listeners: []", "mma.yaml")
+def rules_of(policies: list[PolicyRules]) -> list[dict[str, Any]]:
     read = [
         Policy(
             unit,
@@ -888,7 +891,7 @@ def merged(policies: list[PolicyRules]) -> list[dict[str, Any]]:
         )
         for unit, rules in enumerate(policies)
     ]
-    return Merger(Desk(document), ("listeners",), read).rules(Peers.of(EVERYBODY))
+    return merged(read, Peers.of(EVERYBODY))
 
 
 def source_says(rules: PolicyRules, peer: Address) -> frozenset[int]:
@@ -900,40 +903,34 @@ def source_says(rules: PolicyRules, peer: Address) -> frozenset[int]:
 
 def rules_say(rules: list[dict[str, Any]], unit: int, peer: Address) -> frozenset[int]:
     for one in rules:
-        if admits(one["sources"], peer):
-            if unit not in one["units"]:
-                return frozenset()
+        if admits(one["sources"], peer) and unit in one["units"]:
             access = ALL if one["access"] == "read-write" else ALL - {5, 6, 15, 16, 22, 23}
             return access & frozenset(one.get("functions", ALL))
     return frozenset()
 
 
-@given(POLICY, peers())
-def test_a_single_unit_keeps_its_rights_exactly(policy: PolicyRules, peer: Address) -> None:
-    assert rules_say(merged([policy]), 0, peer) == source_says(policy, peer)
-
-
-@given(st.lists(POLICY, min_size=2, max_size=3), peers())
-def test_units_of_one_listener_get_the_rights_that_they_share(
-    policies: list[PolicyRules], peer: Address
-) -> None:
-    had = [source_says(policy, peer) for policy in policies]
-    common = frozenset.intersection(*[codes for codes in had if codes] or [frozenset()])
-    rules = merged(policies)
-    for unit, codes in enumerate(had):
-        got = rules_say(rules, unit, peer)
-        assert got <= codes
-        if common:
-            assert got == (common if codes else frozenset())
+@given(st.lists(POLICY, min_size=1, max_size=3), peers())
+def test_every_unit_keeps_its_rights_exactly(policies: list[PolicyRules], peer: Address) -> None:
+    rules = rules_of(policies)
+    for unit, policy in enumerate(policies):
+        assert rules_say(rules, unit, peer) == source_says(policy, peer)
 
 
 @given(st.lists(POLICY, min_size=1, max_size=3))
 def test_no_rule_is_hidden_by_those_before_it(policies: list[PolicyRules]) -> None:
-    before: list[Network] = []
-    for one in merged(policies):
+    before: dict[int, list[Network]] = {unit: [] for unit in range(len(policies))}
+    for one in rules_of(policies):
         own = [ipaddress.ip_network(source) for source in one["sources"]]
-        assert Peers.of(own) - Peers.of(before)
-        before += own
+        for unit in one["units"]:
+            assert Peers.of(own) - Peers.of(before[unit])
+            before[unit] += own
+
+
+@given(POLICY, st.integers(2, 3))
+def test_units_with_equal_policies_share_their_rules(policy: PolicyRules, count: int) -> None:
+    alone = rules_of([policy])
+    units = {unit: f"m{unit}" for unit in range(count)}
+    assert rules_of([policy] * count) == [{**one, "units": units} for one in alone]
 
 
 # Any mistake in a sample.

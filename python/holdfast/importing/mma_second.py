@@ -9,7 +9,7 @@ from holdfast.importing import functions
 from holdfast.importing.filters import ALL, read_networks
 from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
-from holdfast.importing.policies import Merger, Policy, unserved
+from holdfast.importing.policies import Policy, merged, unserved
 from holdfast.importing.sections import Section, section
 from holdfast.protocol import LAST_ADDRESS
 
@@ -123,9 +123,7 @@ class SecondGeneration:
         listener.close()
         policies = [self._memory(memory) for memory in memories]
         known = [policy for policy in policies if policy is not None]
-        rules = Merger(self.desk, listener.path, known).rules(
-            ALL if self.admitted is None else self.admitted
-        )
+        rules = merged(known, ALL if self.admitted is None else self.admitted)
         if not rules:
             message = "the listener is left out: no policy allows a function for its areas"
             self.desk.note("left out", listener.path, message)
