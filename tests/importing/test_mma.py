@@ -9,7 +9,7 @@ import json
 import operator
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 from click.testing import CliRunner
@@ -38,7 +38,13 @@ if TYPE_CHECKING:
     from holdfast.importing import Imported
     from holdfast.net.addresses import Address, Network
 
-    Import = Callable[[str], Imported]
+    class Import(Protocol):
+        """Imports a text."""
+
+        def __call__(
+            self, text: str, *, as_meant: bool = False, keep_published_tokens: bool = False
+        ) -> Imported: ...
+
 
 MMA = DATA / "mma"
 SAMPLES = sorted(MMA.glob("*.yaml"))
@@ -76,10 +82,10 @@ NUMBERED = FIRST.replace("{plant:", "{5:").replace("plant", "5")
 
 @pytest.fixture
 def imported(tmp_path: Path) -> Import:
-    def read(text: str) -> Imported:
+    def read(text: str, *, as_meant: bool = False, keep_published_tokens: bool = False) -> Imported:
         path = tmp_path / "mma.yaml"
         path.write_text(text, encoding="utf-8")
-        return read_mma(path)
+        return read_mma(path, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
 
     return read
 
@@ -213,9 +219,21 @@ def test_a_seal_of_one_memory_opens_once(imported: Import) -> None:
     assert found.data["memories"]["plant"]["seal"] == seal
 
 
-def test_a_seal_of_all_memories_is_that_of_each(imported: Import) -> None:
-    found = imported(SEALED.replace("memory: {", f"memory: {{{SEAL}, "))
-    assert found.data["memories"]["plant"]["seal"]["address"] == 3
+def test_a_seal_of_all_memories_had_no_effect(imported: Import) -> None:
+    text = SEALED.replace("memory: {", f"memory: {{{SEAL}, ")
+    ran, meant = imported(text), imported(text, as_meant=True)
+    assert "seal" not in ran.data["memories"]["plant"]
+    assert noted(
+        ran,
+        "1: memory.state_sealing: left out: as it ran: it had no effect; as it was meant: it seals "
+        "every memory without a seal of its own (--as-it-was-meant)",
+    )
+    assert meant.data["memories"]["plant"]["seal"]["address"] == 3
+    assert noted(
+        meant,
+        "1: memory.state_sealing: changed: as it was meant: it seals every memory without a seal "
+        "of its own; as it ran: it had no effect (--as-it-ran)",
+    )
 
 
 def test_a_seal_of_its_own_stands_before_that_of_all(imported: Import) -> None:
@@ -253,17 +271,29 @@ def test_a_port_that_serves_no_unit_is_left_out(imported: Import) -> None:
 @pytest.mark.parametrize(
     ("key", "bind", "note"),
     [
-        ("502", "0.0.0.0:502", "listens on all IPv4 addresses"),
-        ("':502'", "0.0.0.0:502", "listens on all IPv4 addresses"),
+        ("502", "[::]:502", "check: listens on all addresses, [::]:502; without IPv6"),
+        ("':502'", "[::]:502", "check: listens on all addresses, [::]:502; without IPv6"),
+        ("'0.0.0.0:502'", "[::]:502", "left out: as it ran: IPv4 and IPv6, [::]:502; as it was"),
         ("'10.0.0.1:502'", "10.0.0.1:502", ""),
         ("'[::]:502'", "[::]:502", ""),
-        ("localhost:502", "127.0.0.1:502", "host names are not allowed"),
+        ("localhost:502", "127.0.0.1:502", "changed: listens on 127.0.0.1:502: host names are"),
     ],
 )
 def test_a_port_is_a_number_or_an_address(imported: Import, key: str, bind: str, note: str) -> None:
     found = imported(FIRST.replace("{502:", f"{{{key}:"))
     assert port(found)["bind"] == bind
-    assert noted(found, ": changed: ", note) == bool(note)
+    assert noted(found, note or "listens on") == bool(note)
+
+
+def test_ipv4_addresses_are_ipv4_only_if_that_was_meant(imported: Import) -> None:
+    found = imported(FIRST.replace("{502:", "{'0.0.0.0:502':"), as_meant=True)
+    assert port(found)["bind"] == "0.0.0.0:502"
+    assert noted(found, "changed: as it was meant: IPv4 only; as it ran: IPv4 and IPv6")
+
+
+def test_a_full_port_closes_the_connection_that_is_idle_longest(imported: Import) -> None:
+    assert port(imported(FIRST))["when_full"] == "evict"
+    assert port(imported(SECOND % (RULE, "")), "main")["when_full"] == "evict"
 
 
 @pytest.mark.parametrize(
@@ -321,8 +351,18 @@ def test_denied_addresses_are_cut_out(imported: Import) -> None:
 
 def test_both_filters_must_let_a_peer_in(imported: Import) -> None:
     filters = "ip_filter: {allow: [10.0.0.0/8]}"
-    found = imported(MEMORY + ROUTING + PORT % f", {filters}" + "ip_filter: {deny: [10.128.0.0/9]}")
-    assert rule(found)["sources"] == ["10.0.0.0/9"]
+    text = MEMORY + ROUTING + PORT % f", {filters}" + "ip_filter: {deny: [10.128.0.0/9]}"
+    assert rule(imported(text, as_meant=True))["sources"] == ["10.0.0.0/9"]
+
+
+def test_a_filter_of_the_whole_file_had_no_effect(imported: Import) -> None:
+    found = imported(FIRST + "ip_filter: {allow: [10.0.0.0/8]}")
+    assert rule(found)["sources"] == ["0.0.0.0/0", "::/0"]
+    assert noted(
+        found,
+        "4: ip_filter: left out: as it ran: it had no effect; as it was meant: only the addresses "
+        "that it allows have access (--as-it-was-meant)",
+    )
 
 
 def test_without_a_filter_everybody_is_let_in_and_that_is_noted(imported: Import) -> None:
@@ -340,7 +380,7 @@ def test_an_ipv4_address_mapped_into_ipv6_becomes_ipv4(imported: Import) -> None
 def test_a_filter_that_lets_nobody_in_leaves_the_port_out(imported: Import) -> None:
     other = "503: {unit_ids: all, memories: all, access: read-only, ip_filter: {deny: [0.0.0.0/0]}}"
     text = FIRST.replace("ports: {", f"ports: {{{other}, ") + "ip_filter: {allow: [10.0.0.0/8]}"
-    found = imported(text)
+    found = imported(text, as_meant=True)
     assert list(found.data["listeners"]) == ["port-502"]
     assert noted(found, "ports.503: left out: the port is left out: its ip_filter")
 
@@ -371,6 +411,7 @@ def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> Non
     assert port(found, "main") == {
         "type": "modbus-tcp",
         "bind": "127.0.0.1:502",
+        "when_full": "evict",
         "rules": [{"sources": ["10.0.0.0/8"], "units": {1: "main-1"}, "access": "read-write"}],
     }
 
@@ -490,7 +531,7 @@ def test_raw_ingest_on_the_same_port_is_noted(imported: Import) -> None:
 
 
 def test_tokens_are_hashed(imported: Import) -> None:
-    found = imported(FIRST + REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate"))
+    found = imported(SEALED + REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate"))
     assert found.data["rest"] == {
         "bind": "127.0.0.1:8080",
         "sources": ["127.0.0.0/8", "::1"],
@@ -499,11 +540,48 @@ def test_tokens_are_hashed(imported: Import) -> None:
                 "name": "gate",
                 "sha256": hashlib.sha256(b"a-long-secret-token-of-a-gate").hexdigest(),
                 "memories": ["plant"],
-                "areas": ["coils"],
+                "areas": ["discrete_inputs"],
                 "access": "read-write",
             }
         ],
     }
+    assert noted(
+        found, "rest.auth: check: each token may write discrete inputs and input registers"
+    )
+    assert noted(found, "rest.auth: check: as it ran: these tokens had no effect")
+
+
+def test_tokens_only_read_where_there_is_nothing_that_rest_could_write(imported: Import) -> None:
+    found = imported(FIRST + REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate"))
+    (token,) = found.data["rest"]["tokens"]
+    assert (token["areas"], token["access"]) == (["coils"], "read-only")
+    assert noted(found, "rest.auth: check: no memory has discrete inputs or input registers")
+
+
+@pytest.mark.parametrize("token", ["CHANGE_ME_LONG_RANDOM", "INGEST_ONLY_TOKEN"])
+def test_published_tokens_are_left_out_unless_they_are_to_be_kept(
+    imported: Import, token: str
+) -> None:
+    text = SEALED + REST % ("127.0.0.1:8080", token)
+    found = imported(text)
+    assert "rest" not in found.data
+    assert noted(
+        found, "tokens[0]: left out: everybody knows this token", "--keep-published-tokens"
+    )
+    digest = hashlib.sha256(token.encode()).hexdigest()
+    kept = imported(text, as_meant=True, keep_published_tokens=True)
+    assert [each["sha256"] for each in kept.data["rest"]["tokens"]] == [digest]
+
+
+@pytest.mark.parametrize("auth", ["", ", auth: {enabled: false}"])
+def test_the_token_that_was_always_accepted_can_be_kept(imported: Import, auth: str) -> None:
+    text = f"{SEALED}rest: {{enabled: true, address: ':8080'{auth}}}\n"
+    assert "rest" not in imported(text).data
+    rest = imported(text, keep_published_tokens=True).data["rest"]
+    assert rest["bind"] == "[::]:8080"
+    assert [(each["name"], each["sha256"], each["areas"]) for each in rest["tokens"]] == [
+        ("published", hashlib.sha256(b"INGEST_ONLY_TOKEN").hexdigest(), ["discrete_inputs"])
+    ]
 
 
 def test_rest_admits_those_of_the_filter(imported: Import) -> None:
@@ -511,7 +589,7 @@ def test_rest_admits_those_of_the_filter(imported: Import) -> None:
     everybody = imported(text)
     assert everybody.data["rest"]["sources"] == ["0.0.0.0/0", "::/0"]
     assert noted(everybody, "rest: check: sources are all addresses")
-    found = imported(text + "ip_filter: {allow: [10.0.0.0/8]}\n")
+    found = imported(text + "ip_filter: {allow: [10.0.0.0/8]}\n", as_meant=True)
     assert found.data["rest"]["sources"] == ["10.0.0.0/8"]
     assert noted(found, "rest: check: sources are from ip_filter")
 
@@ -550,12 +628,20 @@ def test_a_short_or_repeated_token_is_noted(imported: Import) -> None:
     ],
 )
 def test_the_broker_becomes_a_url(imported: Import, broker: str, url: str) -> None:
-    assert imported(FIRST + MQTT % (broker, "")).data["mqtt"] == {
+    assert imported(SEALED + MQTT % (broker, "")).data["mqtt"] == {
         "url": url,
         "version": "3.1.1",
         "client_id": "c",
-        "subscriptions": [{"topic": "t", "qos": 0, "memories": ["plant"], "areas": ["coils"]}],
+        "subscriptions": [
+            {"topic": "t", "qos": 0, "memories": ["plant"], "areas": ["discrete_inputs"]}
+        ],
     }
+
+
+def test_mqtt_that_could_write_nothing_is_left_out(imported: Import) -> None:
+    found = imported(FIRST + MQTT % ("b", ""))
+    assert "mqtt" not in found.data
+    assert noted(found, "mqtt: left out: MQTT is left out: no memory has discrete inputs")
 
 
 def test_a_broker_by_websocket_leaves_mqtt_out(imported: Import) -> None:
@@ -565,23 +651,24 @@ def test_a_broker_by_websocket_leaves_mqtt_out(imported: Import) -> None:
 
 
 def test_the_password_is_to_be_put_in_a_file(imported: Import) -> None:
-    found = imported(FIRST + MQTT % ("b", ", username: u, password: geheim"))
+    found = imported(SEALED + MQTT % ("b", ", username: u, password: geheim"))
     assert found.data["mqtt"]["username"] == "u"
     assert found.data["mqtt"]["password_file"] == "mqtt.password"
     assert noted(found, "mqtt.password: check: write the password into the file mqtt.password")
 
 
 def test_a_password_without_a_username_is_left_out(imported: Import) -> None:
-    found = imported(FIRST + MQTT % ("b", ", username: '', password: geheim"))
+    found = imported(SEALED + MQTT % ("b", ", username: '', password: geheim"))
     assert "password_file" not in found.data["mqtt"]
     assert noted(found, "mqtt.password: left out")
 
 
 def test_raw_ingest_becomes_a_listener_without_crc(imported: Import) -> None:
-    found = imported(NUMBERED + RAW + "ip_filter: {allow: [10.0.0.0/8]}\n")
+    text = NUMBERED + RAW + "ip_filter: {allow: [10.0.0.0/8]}\n"
+    found = imported(text, as_meant=True)
     assert port(found, "raw-ingest") == {
         "type": "raw-ingest",
-        "bind": "0.0.0.0:9000",
+        "bind": "[::]:9000",
         "format": "crc",
         "crc": "none",
         "request_timeout": 1.5,

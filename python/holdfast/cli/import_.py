@@ -35,7 +35,24 @@ def import_() -> None:
 )
 @click.option("--force", is_flag=True, help="Overwrite OUT if it exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
-def mma(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+@click.option(
+    "--as-it-was-meant/--as-it-ran",
+    "as_meant",
+    help="Convert keys that the source ignored as documented, or as they ran. Default: as it ran.",
+)
+@click.option(
+    "--keep-published-tokens",
+    is_flag=True,
+    help="Keep REST tokens that are in the documentation of the source.",
+)
+def mma(
+    file: Path,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    as_meant: bool,
+    keep_published_tokens: bool,
+) -> None:
     """Convert FILE, a configuration of the Modbus Memory Appliance, to a Holdfast configuration.
 
     Prints the new configuration. Notes on standard error, and comments in the configuration, say
@@ -45,7 +62,7 @@ def mma(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
     if output is not None and _same(file, output):
         raise click.UsageError("OUT and FILE are the same file.")
     try:
-        imported = read_mma(file)
+        imported = read_mma(file, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
     except ConfigError as error:
         _refuse(error, as_json)
     if output is not None:

@@ -9,6 +9,7 @@ from holdfast.config.words import show
 
 if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
+    from holdfast.importing.choices import Choices
     from holdfast.importing.notes import Desk
 
 FORM = "a port, :port or address:port with an IP address"
@@ -17,8 +18,9 @@ FORM = "a port, :port or address:port with an IP address"
 class Binds:
     """Reads listen addresses, and refuses two that can't be open at once."""
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, desk: Desk, choices: Choices) -> None:
         self._desk = desk
+        self._choices = choices
         self._taken: list[tuple[KeyPath, Bind]] = []
 
     def read(self, path: KeyPath, value: object, *, of_key: bool = False) -> Bind | None:
@@ -38,7 +40,7 @@ class Binds:
     def _parsed(self, path: KeyPath, value: object, of_key: bool) -> Bind | None:
         text = str(value) if type(value) is int else value
         host, _, port = text.strip().rpartition(":") if isinstance(text, str) else ("", "", "")
-        numeric = {"": "0.0.0.0", "*": "0.0.0.0", "localhost": "127.0.0.1"}.get(host.lower(), host)
+        numeric = {"": "[::]", "*": "[::]", "localhost": "127.0.0.1"}.get(host.lower(), host)
         try:
             bind = parse_bind(f"{numeric}:{port}")
         except ValueError:
@@ -47,8 +49,12 @@ class Binds:
             self._desk.problem(path, f"found {show(value)}, allowed: {FORM}", of_key=of_key)
             return None
         if host in ("", "*"):
-            other = f"for IPv4 and IPv6, write [::]:{port}"
-            self._desk.note("changed", path, f"listens on all IPv4 addresses, {bind}; {other}")
+            other = f"without IPv6 on the machine, write 0.0.0.0:{port}"
+            self._desk.note("check", path, f"listens on all addresses, {bind}; {other}")
+        elif host == "0.0.0.0":
+            ran, meant = f"IPv4 and IPv6, [::]:{port}", "IPv4 only"
+            self._choices.note(self._desk, path, ran=ran, meant=meant)
+            return bind if self._choices.as_meant else parse_bind(f"[::]:{port}")
         elif host != numeric:
             self._desk.note("changed", path, f"listens on {bind}: host names are not allowed")
         return bind

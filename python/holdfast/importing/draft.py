@@ -7,6 +7,9 @@ from typing import Any
 
 from holdfast.types import AREAS
 
+_INGEST = {"discrete_inputs", "input_registers"}
+"""The areas that REST and MQTT could write in the source."""
+
 
 @dataclass
 class Draft:
@@ -32,6 +35,16 @@ class Draft:
         """A grant for these memories and for all areas that at least one of them has."""
         there = {area for name in memories for area in self.memories[name]}
         return {"memories": memories, "areas": [area for area in AREAS if area in there]}
+
+    def ingest_grant(self) -> dict[str, Any]:
+        """A grant of what REST and MQTT may write, for the memories that have some of it.
+
+        Empty if no memory has these areas.
+        """
+        names = [name for name, memory in self.memories.items() if _INGEST & memory.keys()]
+        grant = self.grant(names)
+        areas = [area for area in grant["areas"] if area in _INGEST]
+        return {**grant, "areas": areas} if areas else {}
 
     def written_by_raw_ingest(self) -> list[str]:
         """The memories with an id, which Raw Ingest packets with memory ids can write."""

@@ -15,6 +15,7 @@ from holdfast.config.dump import to_yaml
 from holdfast.config.problems import ConfigError
 from holdfast.config.words import show
 from holdfast.importing.binds import Binds
+from holdfast.importing.choices import Choices
 from holdfast.importing.draft import Draft
 from holdfast.importing.filters import read_filter
 from holdfast.importing.mma_adapters import Adapters
@@ -67,8 +68,14 @@ class NotImportable(ConfigError):
         self.notes = notes
 
 
-def read_mma(path: Path | str) -> Imported:
+def read_mma(
+    path: Path | str, *, as_meant: bool = False, keep_published_tokens: bool = False
+) -> Imported:
     """Converts a configuration of either generation.
+
+    The source ignores some keys. By default, the result does what it did; with `as_meant`, these
+    keys have an effect. Tokens that its documentation publishes are left out, unless
+    `keep_published_tokens` is set.
 
     Raises `ConfigError` with every problem that prevents the import.
     """
@@ -83,7 +90,7 @@ def read_mma(path: Path | str) -> Imported:
     generation = _generation(desk)
     draft = Draft()
     if generation is not None:
-        _read(desk, draft, generation)
+        _read(desk, draft, generation, Choices(as_meant, keep_published_tokens))
         if not (draft.listeners or draft.rest or draft.mqtt or desk.report.problems):
             desk.problem((), "nothing to serve, allowed: at least one listener, REST or MQTT")
     problems += desk.report.problems
@@ -119,13 +126,17 @@ def _generation(desk: Desk) -> Generation | None:
     return None
 
 
-def _read(desk: Desk, draft: Draft, generation: Generation) -> None:
+def _read(desk: Desk, draft: Draft, generation: Generation, choices: Choices) -> None:
     root = Section(desk, (), desk.document.data)
     admitted = read_filter(root)
-    binds = Binds(desk)
+    if admitted is not None:
+        ran, meant = "it had no effect", "only the addresses that it allows have access"
+        choices.note(desk, root.at("ip_filter"), ran=ran, meant=meant)
+        admitted = admitted if choices.as_meant else None
+    binds = Binds(desk, choices)
     if generation == 1:
-        FirstGeneration(desk, draft, binds, admitted).read(root)
+        FirstGeneration(desk, draft, binds, admitted, choices).read(root)
     else:
         SecondGeneration(desk, draft, binds, admitted).read(root)
-    Adapters(desk, draft, binds, admitted).read(root)
+    Adapters(desk, draft, binds, admitted, choices).read(root)
     root.close(TOP_REASONS if generation == 2 else None)

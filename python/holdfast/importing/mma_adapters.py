@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from holdfast.config.ip_addresses import Bind
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
+    from holdfast.importing.choices import Choices
     from holdfast.importing.draft import Draft
     from holdfast.importing.notes import Desk
     from holdfast.importing.sections import Section
@@ -34,7 +35,16 @@ _SCHEMES = {"tcp": "mqtt", "mqtt": "mqtt", "ssl": "mqtts", "tls": "mqtts", "mqtt
 _BROKER = re.compile(
     r"((?P<scheme>[A-Za-z]{1,8})://)?(?P<user>.*@)?(?P<host>[^/?#@]+)(?P<more>([/?#].*)?)"
 )
-_AREAS_TOLD = "may write all areas of all memories; list only those that it needs"
+_INGEST_TOLD = (
+    "may write discrete inputs and input registers of all memories, as it ran; list only those"
+    " that it needs"
+)
+
+INGEST_TOKEN = "INGEST_ONLY_TOKEN"
+"""The only token that the source accepted, whatever its configuration says."""
+
+PUBLISHED = (INGEST_TOKEN, "CHANGE_ME_LONG_RANDOM")
+"""Tokens in the documentation of the source."""
 
 
 @dataclass
@@ -45,6 +55,7 @@ class Adapters:
     draft: Draft
     binds: Binds
     admitted: Peers | None
+    choices: Choices
 
     def read(self, root: Section) -> None:
         """Reads the sections that exist and are enabled."""
@@ -88,6 +99,9 @@ class Adapters:
             told = f"{message} 127.0.0.1 with tokens: none, or create tokens with `holdfast token`"
             self.desk.note("left out", rest.path, told)
         elif sources:
+            if not tokens:
+                message = "without tokens, every client on this machine may write all areas"
+                self.desk.note("check", rest.path, message)
             found = {"bind": str(bind), "sources": sources, "tokens": tokens or "none"}
             self.draft.rest = found
 
@@ -114,7 +128,7 @@ class Adapters:
         """The tokens; empty without authentication, `None` if no client could have access."""
         auth = rest.mapping("auth")
         if auth is None:
-            return []
+            return self._token_list(rest, []) if self._keeps_ingest_token else []
         enabled = auth.flag("enabled")
         auth.word("type", ["bearer"], required=bool(enabled))
         bearer = auth.mapping("bearer", required=bool(enabled))
@@ -124,15 +138,28 @@ class Adapters:
         auth.close()
         if not enabled:
             self.desk.note("left out", auth.path, "not enabled")
-            return []
-        tokens = self._token_list(entries)
+            return self._token_list(rest, []) if self._keeps_ingest_token else []
+        tokens = self._token_list(rest, entries)
         if not tokens:
             self.desk.note("left out", rest.path, "REST is left out: it has no usable token")
             return None
-        self.desk.note("check", auth.path, f"each token {_AREAS_TOLD}")
+        if self.draft.ingest_grant():
+            message = f"each token {_INGEST_TOLD}. To read other areas, create another token with"
+            self.desk.note("check", auth.path, f"{message} `holdfast token`")
+        else:
+            message = "no memory has discrete inputs or input registers, so each token only reads"
+            self.desk.note("check", auth.path, message)
+        ran = "these tokens had no effect: everybody could read, and one published token wrote"
+        self.desk.note("check", auth.path, f"as it ran: {ran}; as it was meant: each has access")
         return tokens
 
-    def _token_list(self, entries: list[tuple[KeyPath, Any]]) -> list[dict[str, Any]]:
+    @property
+    def _keeps_ingest_token(self) -> bool:
+        return self.choices.keep_published_tokens and not self.choices.as_meant
+
+    def _token_list(
+        self, rest: Section, entries: list[tuple[KeyPath, Any]]
+    ) -> list[dict[str, Any]]:
         found: dict[str, tuple[KeyPath, str]] = {}
         for path, value in entries:
             token = section(self.desk, path, value)
@@ -143,6 +170,9 @@ class Adapters:
             digest = hashlib.sha256(secret.encode()).hexdigest()
             if not secret:
                 self.desk.note("left out", path, "the token is empty")
+            elif secret in PUBLISHED and not self.choices.keep_published_tokens:
+                message = "everybody knows this token from the documentation of the source;"
+                self.desk.note("left out", path, f"{message} --keep-published-tokens keeps it")
             elif digest in found:
                 message = "the token repeats an earlier one"
                 self.desk.note("left out", path, message)
@@ -152,8 +182,15 @@ class Adapters:
                     message = f"the token has fewer than {SHORT} characters and can be guessed"
                     told = f"{message}; create one with `holdfast token`"
                     self.desk.note("check", token.at("token"), told)
+        digest = hashlib.sha256(INGEST_TOKEN.encode()).hexdigest()
+        if self._keeps_ingest_token and digest not in found:
+            found[digest] = (rest.path, "published")
+            message = "the token of the documentation that the source always accepted is kept"
+            self.desk.note("check", rest.path, f"{message}, as published; everybody knows it")
         names = unique_names(self.desk, list(found.values()))
-        grant = {**self.draft.grant(list(self.draft.memories)), "access": "read-write"}
+        grant: dict[str, Any] = {**self.draft.ingest_grant(), "access": "read-write"}
+        if "memories" not in grant:
+            grant = {**self.draft.grant(list(self.draft.memories)), "access": "read-only"}
         return [
             {"name": name, "sha256": digest, **grant}
             for digest, name in zip(found, names, strict=True)
@@ -178,9 +215,13 @@ class Adapters:
             message = f"no client_id: set to {CLIENT_ID}, which must be unique at the broker"
             self.desk.note("changed", mqtt.path, message)
         found["client_id"] = client_id or CLIENT_ID
-        grant = self.draft.grant(list(self.draft.memories))
+        grant = self.draft.ingest_grant()
+        if not grant:
+            message = "MQTT is left out: no memory has discrete inputs or input registers, and"
+            self.desk.note("left out", mqtt.path, f"{message} it could write nothing else")
+            return
         found["subscriptions"] = [{"topic": topic, "qos": QOS, **grant}]
-        self.desk.note("check", mqtt.at("topic"), f"the topic {_AREAS_TOLD}")
+        self.desk.note("check", mqtt.at("topic"), f"the topic {_INGEST_TOLD}")
         self.draft.mqtt = found
 
     def _is_topic(self, path: KeyPath, topic: str) -> bool:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from holdfast.config.ip_addresses import Bind
     from holdfast.config.source import KeyPath
     from holdfast.importing.binds import Binds
+    from holdfast.importing.choices import Choices
     from holdfast.importing.draft import Draft
     from holdfast.importing.notes import Desk
     from holdfast.importing.peers import Peers
@@ -35,6 +36,7 @@ class FirstGeneration:
     binds: Binds
     admitted: Peers | None
     """The peers that the filter of the whole file admits, `None` without a filter."""
+    choices: Choices
 
     def read(self, root: Section) -> None:
         """Reads all sections."""
@@ -69,6 +71,10 @@ class FirstGeneration:
             for (_, text), name in zip(wanted, unique_names(self.desk, wanted), strict=True)
         }
         for_all = self._gate(memory)
+        if for_all is not None:
+            ran, meant = "it had no effect", "it seals every memory without a seal of its own"
+            self.choices.note(self.desk, memory.at("state_sealing"), ran=ran, meant=meant)
+            for_all = for_all if self.choices.as_meant else None
         for key in memories.data:
             one = memories.mapping(key)
             if one is None:
@@ -160,7 +166,8 @@ class FirstGeneration:
         if sources is None or not units or rights is None:
             return None
         rule = {"sources": sources, "units": units, **rights}
-        return {"type": "modbus-tcp", "bind": bind, "max_connections": most, "rules": [rule]}
+        limits = {"max_connections": most, "when_full": "evict"}
+        return {"type": "modbus-tcp", "bind": bind, **limits, "rules": [rule]}
 
     def _sources(self, policy: Section) -> list[str] | None:
         own = read_filter(policy)

@@ -131,7 +131,8 @@ class SecondGeneration:
         for policy in unserved(known, rules):
             message = f"no rule serves unit {policy.unit}: it allows no function for its areas"
             self.desk.note("check", listener.path, message)
-        self.draft.listeners[name] = {"type": "modbus-tcp", "bind": str(bind), "rules": rules}
+        listen = {"type": "modbus-tcp", "bind": str(bind), "when_full": "evict"}
+        self.draft.listeners[name] = {**listen, "rules": rules}
 
     def _memory(self, memory: _Memory) -> Policy | None:
         one = memory.section

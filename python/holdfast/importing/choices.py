@@ -1,0 +1,25 @@
+"""What the caller of an import chooses where the source did something else than it was meant to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.notes import Desk
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How keys that the source ignored are converted, and whether published tokens are kept."""
+
+    as_meant: bool = False
+    keep_published_tokens: bool = False
+
+    def note(self, desk: Desk, path: KeyPath, *, ran: str, meant: str) -> None:
+        """Adds a note about a key with two meanings, which says the one that is used."""
+        used, other = ("it was meant", "it ran") if self.as_meant else ("it ran", "it was meant")
+        told, rest = (meant, ran) if self.as_meant else (ran, meant)
+        message = f"as {used}: {told}; as {other}: {rest} (--as-{other.replace(' ', '-')})"
+        desk.note("changed" if self.as_meant else "left out", path, message)
