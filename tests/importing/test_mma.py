@@ -126,10 +126,14 @@ def run(*arguments: object) -> Result:
 # What loads.
 
 
+@pytest.mark.parametrize("as_meant", [False, True])
 @pytest.mark.parametrize("sample", SAMPLES, ids=lambda path: path.stem)
-def test_every_sample_becomes_a_configuration_that_loads(sample: Path, tmp_path: Path) -> None:
+def test_every_sample_becomes_a_configuration_that_loads(
+    sample: Path, as_meant: bool, tmp_path: Path
+) -> None:
     (tmp_path / "mqtt.password").write_text("x")
-    (tmp_path / "new.yaml").write_text(read_mma(sample).to_yaml(), encoding="utf-8")
+    text = read_mma(sample, as_meant=as_meant, keep_published_tokens=as_meant).to_yaml()
+    (tmp_path / "new.yaml").write_text(text, encoding="utf-8")
     config = load(tmp_path / "new.yaml")
     doubts = [doubt for doubt in config.warnings if "can never be opened" not in str(doubt)]
     assert doubts == []
@@ -171,11 +175,20 @@ def test_the_example_of_the_page_is_what_the_command_makes(
 
 def test_areas_take_the_short_form_where_they_start_at_0(imported: Import) -> None:
     text = FIRST.replace("size: 8}", "size: 8}, input_registers: {start: 100, size: 20}")
-    found = imported(text)
-    assert found.data["memories"] == {
+    assert imported(text, as_meant=True).data["memories"] == {
         "plant": {"coils": 8, "input_registers": {"start": 100, "size": 20}}
     }
-    assert noted(found, "plant.input_registers.start", "check")
+
+
+def test_the_start_of_an_area_had_no_effect(imported: Import) -> None:
+    text = FIRST.replace("size: 8}", "size: 8}, input_registers: {start: 100, size: 20}")
+    found = imported(text)
+    assert found.data["memories"] == {"plant": {"coils": 8, "input_registers": 20}}
+    assert noted(
+        found,
+        "1: memory.memories.plant.input_registers.start: left out: as it ran: addresses start at "
+        "0; as it was meant: addresses start at 100 (--as-it-was-meant)",
+    )
 
 
 def test_an_area_of_no_size_is_left_out(imported: Import) -> None:
@@ -864,6 +877,20 @@ def test_a_file_that_cannot_be_written_is_a_failure(tmp_path: Path) -> None:
     result = run(MMA / "minimal.yaml", "--output", tmp_path / "none" / "new.yaml")
     assert result.exit_code == 1
     assert "can't be written: No such file or directory" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "sealed"),
+    [([], False), (["--as-it-ran"], False), (["--as-it-was-meant"], True)],
+)
+def test_options_choose_between_the_meanings(options: list[str], sealed: bool) -> None:
+    found = json.loads(run(MMA / "plant.yaml", "--json", *options).stdout)
+    assert ("seal" in found["config"]["memories"]["plant_a"]) == sealed
+    assert "CHANGE_ME_LONG_RANDOM" not in json.dumps(found)
+    digest = hashlib.sha256(b"CHANGE_ME_LONG_RANDOM").hexdigest()
+    assert digest not in json.dumps(found)
+    kept = run(MMA / "plant.yaml", "--json", "--keep-published-tokens", *options).stdout
+    assert digest in kept
 
 
 def test_programs_get_json() -> None:

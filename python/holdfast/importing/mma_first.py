@@ -85,12 +85,11 @@ class FirstGeneration:
 
     def _memory(self, one: Section, text: str, for_all: tuple[KeyPath, int] | None) -> None:
         name = self.names[text]
-        areas = read_areas(one, "size")
+        areas = {
+            area: self._area(one.at(area, "start"), extent)
+            for area, extent in read_areas(one, "size").items()
+        }
         found: dict[str, Any] = {**read_id(text), **areas}
-        for area in areas:
-            if isinstance(areas[area], dict):
-                message = "addresses start at `start`; releases that ignored it started at 0"
-                self.desk.note("check", one.at(area, "start"), message)
         gate = self._gate(one) if "state_sealing" in one.data else for_all
         if gate is not None:
             path, address = gate
@@ -99,6 +98,14 @@ class FirstGeneration:
                 self.draft.seals[name] = path
         one.close({"default": "there is no default memory: an unmapped unit id has no memory"})
         self.draft.memories[name] = found
+
+    def _area(self, start: KeyPath, extent: Any) -> Any:
+        """An area, from 0 or from its start; `read_areas` returns an integer if both are equal."""
+        if isinstance(extent, int):
+            return extent
+        ran, meant = "addresses start at 0", f"addresses start at {extent['start']}"
+        self.choices.note(self.desk, start, ran=ran, meant=meant)
+        return extent if self.choices.as_meant else extent["size"]
 
     def _gate(self, parent: Section) -> tuple[KeyPath, int] | None:
         """The path and address of the gate bit, if `state_sealing` exists and is enabled."""
