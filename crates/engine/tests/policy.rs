@@ -23,7 +23,7 @@ fn peer(text: &str) -> IpAddr {
 }
 
 fn units_of(rights: Option<Arc<PeerRights>>) -> Option<Vec<u8>> {
-    rights.map(|rights| rights.one_unit_of_each_memory(|_| true))
+    rights.map(|rights| rights.one_unit_of_each_memory(|_| true, |_| true))
 }
 
 #[test]

@@ -109,6 +109,31 @@ fn a_broadcast_that_some_memories_refuse_counts_one_exception_and_no_event() {
 }
 
 #[test]
+fn a_broadcast_reaches_a_memory_by_the_unit_that_may_write() {
+    let (unit_server, shared) = (unit_server(), memory(9));
+    // Unit 7 may write registers 0 to 3, unit 8 none.
+    let rights = within(&shared, &[(0, 9)], &[(0, 4)]);
+    assert_eq!(broadcast(&unit_server, &rights, WRITE), [WRITE]);
+    assert_eq!(broadcast(&unit_server, &rights, &[6, 0, 5, 0, 1]), [[0x86, 2]]);
+
+    let own = Narrowed {
+        access: AccessMode::ReadOnly,
+        functions: Functions::All,
+        ranges: Ranges::default(),
+    };
+    let rights = PeerRights::new(&Rule {
+        sources: Vec::new(),
+        roles: None,
+        units: vec![(1, Arc::clone(&shared)), (2, Arc::clone(&shared))],
+        elsewhere: Vec::new(),
+        access: AccessMode::ReadWrite,
+        functions: Functions::All,
+        narrowed: vec![(1, own)],
+    });
+    assert_eq!(broadcast(&unit_server, &rights, WRITE), [WRITE]);
+}
+
+#[test]
 fn a_broadcast_skips_units_in_listen_only_mode() {
     let (one, other, unit_server) = (memory(1), memory(1), unit_server());
     let rights = rights(&[(7, &one), (8, &other), (9, &other)], AccessMode::ReadWrite);

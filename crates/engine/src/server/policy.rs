@@ -376,15 +376,25 @@ impl PeerRights {
             && !Request::parse(request).is_ok_and(|request| request.is_read())
     }
 
-    /// One unit id per memory, chosen among the `wanted` unit ids.
-    pub fn one_unit_of_each_memory(&self, wanted: impl Fn(u8) -> bool) -> Vec<u8> {
+    /// One unit id per memory, chosen among the `wanted` unit ids: the first one that may do what is
+    /// asked, or else the first one.
+    pub fn one_unit_of_each_memory(
+        &self,
+        wanted: impl Fn(u8) -> bool,
+        may: impl Fn(u8) -> bool,
+    ) -> Vec<u8> {
         let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
         for (unit_id, unit) in (0..=u8::MAX).zip(self.units.iter()) {
-            if let Some(memory) = unit.as_ref().and_then(|unit| unit.memory.as_ref())
-                && wanted(unit_id)
-                && !found.iter().any(|(_, known)| Arc::ptr_eq(known, memory))
-            {
-                found.push((unit_id, memory));
+            let Some(memory) = unit.as_ref().and_then(|unit| unit.memory.as_ref()) else {
+                continue;
+            };
+            if !wanted(unit_id) {
+                continue;
+            }
+            match found.iter_mut().find(|(_, known)| Arc::ptr_eq(known, memory)) {
+                None => found.push((unit_id, memory)),
+                Some((chosen, _)) if !may(*chosen) && may(unit_id) => *chosen = unit_id,
+                Some(_) => {}
             }
         }
         found.into_iter().map(|(unit_id, _)| unit_id).collect()

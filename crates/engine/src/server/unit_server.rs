@@ -140,7 +140,9 @@ impl UnitServer {
         self.counters.request(function_code);
         self.counters.unanswered.add();
         let (mut carried_out, mut refused) = (false, None);
-        for unit_id in rights.one_unit_of_each_memory(|unit_id| !self.is_silent(unit_id)) {
+        let may =
+            |unit_id| rights.allows(unit_id, function_code) && !outside(rights, unit_id, request);
+        for unit_id in rights.one_unit_of_each_memory(|unit_id| !self.is_silent(unit_id), may) {
             let mut reply = [0; pdu::MAX_LEN];
             let len = match self.serve(rights, unit_id, function_code, request, &mut reply) {
                 Ok(len) => {
