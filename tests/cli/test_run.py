@@ -92,6 +92,32 @@ def test_it_says_what_is_polled(
     assert "meter10" not in running.greeting
 
 
+def test_it_says_what_rights_a_unit_has_of_its_own(
+    tmp_path: Path, run: Callable[[Path], RunCommand]
+) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text("""
+memories: {plant: {coils: 8, holding_registers: 10}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules:
+      - sources: [127.0.0.0/8]
+        access: read-write
+        units:
+          1: {memory: plant, deny: [6], read: [{area: holding_registers, start: 2, count: 3}]}
+          2: {memory: plant, access: read-only, functions: [1, 3]}
+""")
+    running = run(file)
+    _, port = running.wait_until_it_serves()
+    assert (
+        "    units 1 = plant (deny 6; reads holding registers 2 to 4), 2 = plant (read-only; "
+        "functions 1, 3); read-write for 127.0.0.0/8\n"
+    ) in running.greeting
+    assert f"  mbpoll -m tcp -p {port} -a 1 -0 -t 4 -r 2 -c 3 -1 127.0.0.1\n" in running.greeting
+
+
 def test_it_says_what_routes_lead_to(tmp_path: Path, run: Callable[[Path], RunCommand]) -> None:
     file = tmp_path / "plant.yaml"
     file.write_text("""

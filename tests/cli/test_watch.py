@@ -277,6 +277,19 @@ def test_units_that_are_devices_are_not_watched(tmp_path: Path) -> None:
     assert [(block.memory, block.unit) for block in blocks] == [("pumps", 3)]
 
 
+def test_what_a_unit_may_not_read_is_not_watched(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    units = (
+        "{1: {memory: pumps, functions: [6]}, 2: {memory: pumps, read: [{area: holding_registers, "
+        "start: 2, count: 3}]}}"
+    )
+    listener = LISTENER.replace("{3: boiler, 4: boiler, 5: pumps}", units)
+    memories = "memories: {pumps: {coils: 8, holding_registers: 10}}\n"
+    file.write_text(memories + listener.replace("SCADA", "5020"))
+    _, _, blocks = by_modbus(load(file))
+    assert blocks == [WatchedRange("pumps", 2, "holding_registers", 2, 3)]
+
+
 def test_the_first_reading_must_succeed(server: holdfast.Server, tmp_path: Path) -> None:
     url = cli.url(server)
     assert failure("watch", url, "hr", "999", "2") == [

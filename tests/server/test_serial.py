@@ -642,6 +642,17 @@ def test_the_rule_holds_on_a_line_too(start: Start) -> None:
     assert plant.line.ask(CLEAR) == b"\x88\x01"
 
 
+def test_each_unit_of_a_line_has_its_own_rights(start: Start) -> None:
+    units = {1: "plant", 2: {"memory": "plant", "functions": [3]}}
+    more = {"units": {2: "plant", 3: "plant"}, "access": "read-only"}
+    plant = start(units=units, more_rules=[more])
+
+    replies = {unit: plant.line.ask(WRITE, unit) for unit in (1, 2, 3)}
+    assert replies == {1: WRITE, 2: b"\x86\x01", 3: b"\x86\x01"}
+    assert plant.line.ask(b"\x11", 2) == b"\x91\x01"
+    assert plant.line.ask(b"\x11", 3)[:1] == b"\x11"
+
+
 def test_each_unit_of_a_line_has_its_own_memory(start: Start) -> None:
     plant = start(units={1: "plant", 247: "other"}, memories={"plant": ALL, "other": ALL})
     assert plant.line.ask(WRITE, 247) == WRITE

@@ -22,7 +22,7 @@ from support import wire
 from support.config_folder import written
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
     from typing import Any, Self
@@ -140,9 +140,10 @@ def configuration(
     mode: Mode,
     device: Path,
     *,
-    units: dict[int, str] | None = None,
+    units: Mapping[int, str | dict[str, Any]] | None = None,
     memories: dict[str, Any] | None = None,
     rule: dict[str, Any] | None = None,
+    more_rules: Sequence[dict[str, Any]] = (),
     serial: dict[str, Any] | None = None,
     **more: Any,
 ) -> str:
@@ -150,12 +151,13 @@ def configuration(
     everything = dict.fromkeys(
         ("coils", "discrete_inputs", "holding_registers", "input_registers"), 1000
     )
-    rules = {"units": units or {UNIT: "plant"}, "access": "read-write", **(rule or {})}
+    first = {"units": dict(units or {UNIT: "plant"}), "access": "read-write", **(rule or {})}
+    rules = [first, *more_rules]
     line = {"device": str(device), "parity": "none", **(serial or {})}
     return written(
         {
             "memories": memories or {"plant": everything},
-            "listeners": {"line": {"type": mode.listener, "serial": line, "rules": [rules]}},
+            "listeners": {"line": {"type": mode.listener, "serial": line, "rules": rules}},
             **more,
         }
     )

@@ -169,9 +169,12 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
     blocks: list[WatchedRange] = []
     seen: set[str] = set()
     for unit, rights in together(rules).items():
-        if rights.memory is not None and rights.memory not in seen:
+        if rights.memory is None or rights.memory in seen:
+            continue
+        readable = _readable(_areas(config, rights.memory, unit), rights)
+        if readable:
             seen.add(rights.memory)
-            blocks += _readable(_areas(config, rights.memory, unit), rights)
+            blocks += readable
     return name, listener.bind, blocks
 
 
