@@ -119,6 +119,8 @@ class Subscriber:
     publish: Publish
     deadband: float
     tags: dict[str, Wanted] = field(default_factory=dict)
+    ttl: int | None = None
+    """Seconds after which the subscription ends, unless a request renews it."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,9 @@ Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)
 Ranges = Annotated[list[Range], Meta(max_length=32)]
 Marker = bool | int | float | str
 
+MAX_TTL = 31_536_000
+"""The longest `ttl` in seconds: a year."""
+
 EXACT = 2.0**53
 """Floats below this represent every integer exactly."""
 
@@ -109,6 +112,8 @@ class SubscribeRequest(_Request):
     plan: PlanRequest | None = None
     release: bool | None = None
     """Whether the connection is closed after each scan."""
+    ttl: Annotated[int, Meta(ge=1, le=MAX_TTL)] | None = None
+    """Seconds after which the subscription ends, unless a request renews it. Default: it stays."""
 
 
 class UnsubscribeRequest(_Request):
@@ -263,6 +268,8 @@ class SubscriberReport(_Message, omit_defaults=True):
     publish: Publish
     tag_ids: list[str]
     deadband: float | None = None
+    ttl: int | None = None
+    """Seconds after which the subscription ends, unless a request renews it."""
 
 
 class PlanReport(_Message, rename=None, omit_defaults=True):

@@ -54,6 +54,8 @@ class Subscription:
     rate: int
     publish: Publish
     deadband: float
+    ttl: int | None
+    """Seconds."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,7 @@ def understood(
         _rate(request, rules, changes),
         publish,
         deadband if publish == "change" else 0.0,
+        request.ttl,
     )
 
 
@@ -225,6 +228,7 @@ class Registry:
         subscriber.rate = asked.rate
         subscriber.publish = asked.publish
         subscriber.deadband = asked.deadband
+        subscriber.ttl = asked.ttl
         subscriber.tags |= asked.wanted
         redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
         device.tags |= asked.tags

@@ -23,6 +23,7 @@ from holdfast.scanner.adjusting import Adjustments, adjusted
 from holdfast.scanner.broker import Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.expiring import Expiring
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
 from holdfast.scanner.hosts import Allowed
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.adjusting import Asked
     from holdfast.scanner.devices import ScannedDevice
+    from holdfast.scanner.keeping import Unit
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.registry import Subscription
     from holdfast.types import PolledBlock
@@ -129,6 +131,7 @@ class Scanner:
         self._heart = Heart(settings.prefix, self._metadata, self._rival)
         self._rivals = Rivals(self._heart.started)
         self.outbox = Outbox()
+        self._expiring = Expiring()
         self._kept = Kept(settings.prefix, self._registry, self._restore_request)
         self._ready = asyncio.Event()
         """Set when the kept subscriptions are restored, or can't be."""
@@ -144,6 +147,7 @@ class Scanner:
         device_tls.check(self._settings.device_tls)
         self._polling = Polling(self._take, self._poller)
         works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
+        works.append(self._expiring.run(self._expire))
         if self._settings.keep_subscriptions:
             works += [self._kept.keeper.run(), self._kept.restore(self._ready)]
         else:
@@ -182,6 +186,7 @@ class Scanner:
         """
         self.outbox.connected(client)
         self._kept.keeper.connected(client)
+        self._expiring.connected(client is not None)
         self._due.set()
         if client is not None:
             for device in self._registry.devices.values():
@@ -302,6 +307,7 @@ class Scanner:
         device = change.device
         if device is None or asked.subscriber not in device.subscribers:
             return
+        self._expiring.renew(device.id, asked.subscriber, asked.ttl)
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
@@ -362,16 +368,7 @@ class Scanner:
             changes = Adjustments()
             request = self._decoded(message.data, UnsubscribeRequest, changes)
         async with self._turn(request.device_id):
-            self._kept.unsubscribed(request)
-            device, changed = self._registry.unsubscribe(request)
-            if device is not None:
-                if device.subscribers:
-                    self._publishers[device.id].want(lambda: grouped(device))
-                    if changed:
-                        self._polling.renew(device, at_once=False)
-                elif changed:
-                    self._drop(device)
-                    self._kept.state_changed(device.id)
+            self._remove(request)
         await self._kept.settled(request.device_id, request.subscriber_id)
         self._log_adjustments(request.subscriber_id, request.device_id, changes)
         logs.write(
@@ -382,6 +379,32 @@ class Scanner:
             tags="all" if request.tag_ids is None else len(request.tag_ids),
         )
         return Answer(success=True)
+
+    def _remove(self, request: UnsubscribeRequest) -> None:
+        """Removes tags of a subscription, and polls and publishes accordingly."""
+        self._kept.unsubscribed(request)
+        device, changed = self._registry.unsubscribe(request)
+        if device is None:
+            return
+        if request.subscriber_id not in device.subscribers:
+            self._expiring.renew(device.id, request.subscriber_id, None)
+        if device.subscribers:
+            self._publishers[device.id].want(lambda: grouped(device))
+            if changed:
+                self._polling.renew(device, at_once=False)
+        elif changed:
+            self._drop(device)
+            self._kept.state_changed(device.id)
+
+    async def _expire(self, unit: Unit) -> None:
+        """Ends a subscription that was not renewed within its `ttl`."""
+        assert unit.subscriber is not None
+        async with self._turn(unit.device):
+            if not self._expiring.is_due(unit):  # It was renewed while this waited.
+                return
+            self._expiring.renew(unit.device, unit.subscriber, None)
+            self._remove(UnsubscribeRequest(unit.device, unit.subscriber))
+        logs.write(logging.INFO, "expired", device=unit.device, subscriber=unit.subscriber)
 
     @contextlib.asynccontextmanager
     async def _in_order(self, message: Msg, *, is_large: bool = False) -> AsyncIterator[None]:
