@@ -185,7 +185,7 @@ class Heartbeat(_Message):
     metadata: HeartbeatMetadata
 
 
-class HeartbeatMetadata(_Message):
+class HeartbeatMetadata(_Message, omit_defaults=True):
     """What a heartbeat tells about the service."""
 
     device_count: int
@@ -193,6 +193,8 @@ class HeartbeatMetadata(_Message):
     """Tags of all devices."""
     version: str
     """The version of Holdfast."""
+    enabled: bool | None = None
+    """Whether the scanner is enabled in `service_enabled`; only with dialect `tentacle-next`."""
 
 
 class LogEntry(_Message):
@@ -231,6 +233,8 @@ class Variable(_Message, omit_defaults=True):
     last_updated: int | None = None
     """Time of the device's response, in milliseconds since 1970."""
     description: str | None = None
+    error: str | None = None
+    """Why the entry that has the tag is refused; only with dialect `tentacle-next`."""
 
 
 class BlockReport(_Message, omit_defaults=True):
@@ -325,6 +329,13 @@ class OtherScanner(_Message):
     """In milliseconds since 1970."""
 
 
+class EntryReport(_Message):
+    """An entry of the bucket of subscriptions that is refused."""
+
+    key: str
+    error: str
+
+
 class ServiceReport(_Message, omit_defaults=True):
     """The counts of messages since the start."""
 
@@ -339,6 +350,10 @@ class ServiceReport(_Message, omit_defaults=True):
     """Scans lost because this process did not keep up."""
     other_scanners: list[OtherScanner] | None = None
     """Other scanners on the same subjects; each of them handles every request, too."""
+    enabled: bool | None = None
+    """Whether the scanner is enabled in `service_enabled`; only with dialect `tentacle-next`."""
+    refused_entries: list[EntryReport] | None = None
+    """The first refused entries of the bucket of subscriptions, by key."""
 
 
 class BrowseAnswer(_Message, omit_defaults=True):
