@@ -674,6 +674,9 @@ class Scanner:
 
     async def _stop(self, running: Sequence[asyncio.Task[object]]) -> None:
         """Stops all parts, each with a timeout."""
+        for part in (self._enabling, self._configured):
+            if part is not None:
+                part.connected(None)
         await _within(self._polling.stop())
         for request in list(self._tasks):
             request.cancel()
