@@ -486,6 +486,21 @@ def test_an_entry_takes_over_the_subscription_of_a_request(
 
 
 @pytest.mark.usefixtures("scanner")
+def test_a_refused_entry_does_not_end_the_subscription_of_a_request(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    other = subscription(server, tag("a", 0), subscriberId="hmi")
+    assert caller.request("modbus.subscribe", other)["success"]
+    request = gateway_entry(server, gateway_tag("a", 0))
+    assert caller.request("modbus.subscribe", request)["success"]
+    caller.put(BUCKET, key(), gateway_entry(server, gateway_tag("a", 7)))
+    wire.until(lambda: key() in refused(caller), "it is refused")
+    [device] = devices(caller).values()
+    assert {each["id"] for each in device["subscribers"]} == {"hmi", "gateway-gateway"}
+    assert [each["address"] for each in device["tags"]] == [0]
+
+
+@pytest.mark.usefixtures("scanner")
 def test_an_entry_has_no_ttl(caller: Caller, server: holdfast.Server) -> None:
     host, port = server.address
     value = {

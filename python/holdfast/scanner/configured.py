@@ -193,7 +193,7 @@ class Configured:
     async def _one(self, key: str, written: Written) -> bool | None:
         """Carries out an entry. If it is refused, returns whether it had a subscription."""
         entry = self._entries[key]
-        former = entry.unit
+        had_subscription = entry.unit is not None
         try:
             asked = self._understand(key, written.value)
             unit = Unit(asked.device, asked.subscriber)
@@ -203,18 +203,27 @@ class Configured:
             self._keys[unit] = key
             await self._subscribe(asked)
         except Refused as refused:
-            await self._refuse(key, entry, written, str(refused))
-            return former is not None
+            reason = str(refused)
         except Exception as error:  # An error in one entry must not affect the others.
             logs.problem("entry_failed", key=key)
-            await self._refuse(key, entry, written, f"internal error: {type(error).__name__}")
-            return former is not None
-        self._set_refused(entry, None)
-        entry.written = _identity(written)
-        return None
+            reason = f"internal error: {type(error).__name__}"
+        else:
+            self._set_refused(entry, None)
+            entry.written = _identity(written)
+            return None
+        await self._refuse(key, written, reason, had_subscription=had_subscription)
+        return had_subscription
 
-    async def _refuse(self, key: str, entry: Entry, written: Written, reason: str) -> None:
-        await self._release(entry)
+    async def _refuse(
+        self, key: str, written: Written, reason: str, *, had_subscription: bool
+    ) -> None:
+        """Refuses an entry. A subscription of its subscriber by request goes on."""
+        entry = self._entries[key]
+        if had_subscription:
+            await self._release(entry)
+        elif entry.unit is not None:  # What was refused has changed nothing.
+            del self._keys[entry.unit]
+            entry.unit = None
         before = entry.refused
         self._set_refused(entry, None)
         kept = written if self._held_bytes + len(written.value) <= MAX_HELD else None
