@@ -133,6 +133,23 @@ def test_options_say_what_requests_leave_out_and_what_is_written(
     assert logs.take() == []
 
 
+def test_it_serves_the_programs_of_tentacle_next(
+    start: Start, nats: NatsServer, caller: Caller, server: holdfast.Server
+) -> None:
+    data = caller.listen("plant.data.plc1.a")
+    entry = {**subscription(server), "tags": [tag("a", 0)]}
+    caller.put("scanner_config_plant", "hmi.plc1", entry)
+    process = start("--nats", nats.url, "--dialect", "tentacle-next", "--prefix", "plant")
+    said = greeting(process)
+    assert "plant.data.DEVICE.TAG" in said
+    assert "entries    bucket scanner_config_plant" in said
+    assert data.next()["value"] == 0
+    process.terminate()
+    process.communicate(timeout=wire.DEADLINE)
+    caller.forget("scanner_config_plant")
+    caller.forget("service_enabled")
+
+
 def _answers(caller: Caller) -> bool:
     try:
         return bool(caller.request("modbus.browse", b"")["success"])
@@ -148,6 +165,11 @@ def _answers(caller: Caller) -> bool:
         ("--scan-rate 49", "49 is not in the range 50<=x<=86400000"),
         ("--publish always", "'always' is not one of 'scan', 'change'"),
         ("--writes all", "'all' is not one of 'tags', 'explicit', 'none'"),
+        ("--dialect next", "'next' is not one of 'tentacle', 'tentacle-next'"),
+        (
+            "--dialect tentacle-next --prefix a.b",
+            "'--prefix': found 'a.b', allowed with dialect tentacle-next: no dots.",
+        ),
         ("--ping-interval 0", "0.0 is not in the range 0.1<=x<=3600.0"),
         ("--ping-outstanding 0", "0 is not in the range 1<=x<=100"),
     ],

@@ -91,7 +91,7 @@ def test_the_scanner_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
         "  username: scanner\n  password_file: secret\n"
         "  tls: {ca_file: p.yaml, cert_file: p.yaml, key_file: p.yaml}\n"
         "  device_tls: {ca_file: ca.pem, cert_file: p.yaml, key_file: secret}\n"
-        "  prefix: plant.modbus-1\n  limits: {devices: 7, tags: 8}\n"
+        "  prefix: plant.modbus-1\n  limits: {devices: 7, tags: 8}\n  dialect: tentacle\n"
         "  defaults: {timeout: 500, publish: change, deadband: 0.5, scan_rate: 100}\n"
         "  writes: explicit\n  strict: true\n  ping: {interval: 0.5, outstanding: 7}\n"
         "  publish_logs: false\n  keep_subscriptions: false\n"
@@ -134,6 +134,12 @@ def test_the_scanner_has_the_documented_defaults(folder: Folder) -> None:
     assert assembly.scanner(nats).ping == Ping()
     assert (nats.writes, nats.strict) == ("tags", False)
     assert (nats.publish_logs, nats.keep_subscriptions) == (True, True)
+    assert assembly.scanner(nats).dialect == "tentacle"
+
+
+def test_the_scanner_serves_the_programs_of_tentacle_next(folder: Folder) -> None:
+    settings = assembly.scanner(nats_of(folder, NATS + "  dialect: tentacle-next\n"))
+    assert settings.dialect == "tentacle-next"
 
 
 def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) -> None:
@@ -162,6 +168,7 @@ def test_the_effective_configuration_shows_every_default(folder: Folder) -> None
         "  servers: [tls://nats.example]\n"
         "  devices: [10.0.0.0/8]\n"
         "  prefix: modbus\n"
+        "  dialect: tentacle\n"
         "  defaults: {timeout: 3000, publish: scan, deadband: 0, scan_rate: 1000}\n"
         "  writes: tags\n"
         "  strict: false\n"
@@ -274,7 +281,7 @@ def test_everything_else_needs_memories(
          "3: limits.tag: unknown key, allowed: devices, tags; did you mean 'tags'?"),
         ("  devices", "  embedded: true\n  devices", "3: embedded: unknown key, allowed: servers, "
          "devices, username, password_file, token_file, credentials_file, tls, device_tls, prefix, "
-         "defaults, writes, strict, ping, publish_logs, keep_subscriptions, limits"),
+         "dialect, defaults, writes, strict, ping, publish_logs, keep_subscriptions, limits"),
         ("  devices", "  defaults: {timeout: 3}\n  devices",
          "3: defaults.timeout: found 3, allowed: an integer from 10 to 30000"),
         ("  devices", "  defaults: {scan_rate: 49}\n  devices",
@@ -283,6 +290,10 @@ def test_everything_else_needs_memories(
          "3: defaults.publish: found 'always', allowed: scan or change"),
         ("  devices", "  defaults: {deadband: 1}\n  devices",
          "3: defaults.deadband: found without publish: change, allowed: only with it"),
+        ("  devices", "  dialect: next\n  devices",
+         "3: dialect: found 'next', allowed: tentacle or tentacle-next"),
+        ("  devices", "  dialect: tentacle-next\n  prefix: a.b\n  devices",
+         "4: prefix: found 'a.b', allowed with dialect tentacle-next: no dots"),
         ("  devices", "  writes: all\n  devices",
          "3: writes: found 'all', allowed: tags, explicit or none"),
         ("  devices", "  ping: {interval: 0}\n  devices",

@@ -171,6 +171,32 @@ class Caller:
                 entries[key] = json.loads((await found.get(key)).value or b"")
         return entries
 
+    def text(self, bucket: str, key: str) -> str:
+        """Returns the value of a key as text."""
+        return self._loop.do(self._text(bucket, key)).decode()
+
+    async def _text(self, bucket: str, key: str) -> bytes:
+        return (await (await self.client.jetstream().key_value(bucket)).get(key)).value or b""
+
+    def put(self, bucket: str, key: str, value: object) -> None:
+        """Writes a key of a bucket; creates the bucket. A string is written as is."""
+        self._loop.do(self._put(bucket, key, _bytes(value)))
+
+    async def _put(self, bucket: str, key: str, value: bytes) -> None:
+        jetstream = self.client.jetstream()
+        try:
+            found = await jetstream.key_value(bucket)
+        except NotFoundError:
+            found = await jetstream.create_key_value(bucket=bucket, history=1)
+        await found.put(key, value)
+
+    def delete(self, bucket: str, key: str) -> None:
+        """Deletes a key of a bucket, as `nats kv del` does."""
+        self._loop.do(self._deleted(bucket, key))
+
+    async def _deleted(self, bucket: str, key: str) -> None:
+        await (await self.client.jetstream().key_value(bucket)).delete(key)
+
     def forget(self, bucket: str) -> None:
         """Deletes a key-value bucket, if there is one."""
         with contextlib.suppress(NotFoundError):

@@ -323,6 +323,7 @@ def scanner(settings: NatsConfig) -> ScannerSettings:
         ping=Ping(settings.ping.interval, settings.ping.outstanding),
         publish_logs=settings.publish_logs,
         keep_subscriptions=settings.keep_subscriptions,
+        dialect=settings.dialect,
     )
 
 

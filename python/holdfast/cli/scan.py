@@ -33,8 +33,10 @@ from holdfast.config.scanning import (
     SCAN_RATE,
     SERVER_PORT,
     TIMEOUT,
+    Dialect,
     Publish,
     Writes,
+    check_dialect,
     parse_pollable,
     parse_prefix,
     parse_server,
@@ -42,6 +44,7 @@ from holdfast.config.scanning import (
 )
 from holdfast.net.allow_list import AllowedNetwork
 from holdfast.scanner import Defaults, Ping, Scanner, ScannerLimits, Servers, Settings, device_tls
+from holdfast.scanner.configured import BUCKET
 from holdfast.scanner.embedded import HOST, Embedded, EmbeddedFailed
 from holdfast.scanner.hosts import PRIVATE
 from holdfast.scanner.schema import json_schema
@@ -126,6 +129,13 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     show_default=True,
     metavar="SUBJECT",
     help="First part of all subjects.",
+)
+@click.option(
+    "--dialect",
+    type=click.Choice(get_args(Dialect)),
+    default="tentacle",
+    show_default=True,
+    help="Programs to serve: those of tentacle-modbus, or of tentacle-next.",
 )
 @click.option(
     "--writes",
@@ -251,6 +261,10 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     allow = _allowed(options["allow"])
     if options["deadband"] and options["publish"] != "change":
         raise click.UsageError("--deadband requires --publish change.")
+    try:
+        check_dialect(options["dialect"], options["prefix"])
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.", param_hint="'--prefix'") from None
     if store is not None and not embedded:
         raise click.UsageError("--store requires --embedded.")
     logs.configure(options["log_level"], options["log_format"])
@@ -292,6 +306,7 @@ def _settings(
         ping=Ping(options["ping_interval"], options["ping_outstanding"]),
         publish_logs=options["publish_logs"],
         keep_subscriptions=options["keep_subscriptions"],
+        dialect=options["dialect"],
     )
 
 
@@ -363,13 +378,16 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
 
 def _greeting(settings: Settings) -> str:
     prefix = settings.prefix
+    is_next = settings.dialect == "tentacle-next"
+    data = f"{prefix}.data.DEVICE.TAG" if is_next else f"{prefix}.data.DEVICE"
     lines = [
         f"Scanning for subscribers at {', '.join(_without_secrets(settings.servers))}.",
         "",
         f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse, "
         f"{prefix}.variables",
         f"  commands   {prefix}.command.TAG, {prefix}.command.DEVICE.TAG",
-        f"  published  {prefix}.data.DEVICE, {prefix}.status.DEVICE",
+        f"  published  {data}, {prefix}.status.DEVICE",
+        *([f"  entries    bucket {BUCKET}{prefix}"] if is_next else []),
         f"  devices    {_places(settings.allow)}",
         "",
         "Ctrl-C stops it.",

@@ -25,6 +25,9 @@ MAX_DEVICES = 5000
 MAX_TAGS = 500_000
 """Default limits of the scanner; `MAX_TAGS` counts the tags of all devices."""
 
+Dialect = Literal["tentacle", "tentacle-next"]
+"""The programs that the scanner serves; `tentacle` is tentacle-modbus and its callers."""
+
 Publish = Literal["scan", "change"]
 Writes = Literal["tags", "explicit", "none"]
 """Tags that may be written: all not declared read-only, those declared writable, or none."""
@@ -60,6 +63,12 @@ def parse_prefix(text: object) -> str:
     if isinstance(text, str) and _PREFIX.fullmatch(text):
         return text
     raise ValueError(f"found {show(text)}, allowed: {PREFIX_FORM}")
+
+
+def check_dialect(dialect: Dialect, prefix: str) -> None:
+    """Raises `ValueError` if the prefix can't be a part of the bucket that the dialect watches."""
+    if dialect == "tentacle-next" and "." in prefix:
+        raise ValueError(f"found {show(prefix)}, allowed with dialect tentacle-next: no dots")
 
 
 def parse_pollable(text: object) -> AllowEntry:

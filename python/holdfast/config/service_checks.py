@@ -11,7 +11,7 @@ from holdfast.config.files import check_readable
 from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.scalars import parse_sha256
-from holdfast.config.scanning import parse_server
+from holdfast.config.scanning import check_dialect, parse_server
 from holdfast.config.tls_checks import check_client_tls
 from holdfast.config.unique import Owners
 from holdfast.config.words import choice, listing, show
@@ -125,6 +125,11 @@ class ServiceChecks:
         if defaults.get("deadband") and defaults.get("publish") != "change":
             message = "found without publish: change, allowed: only with it"
             self.report.add(("nats", "defaults", "deadband"), message, of_key=True)
+        if nats.get("dialect") == "tentacle-next" and isinstance(nats.get("prefix"), str):
+            try:
+                check_dialect("tentacle-next", nats["prefix"])
+            except ValueError as error:
+                self.report.add(("nats", "prefix"), str(error))
 
     def _password(self, section: str, settings: dict[Any, Any]) -> None:
         if "password_file" in settings and "username" not in settings:

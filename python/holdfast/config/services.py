@@ -47,6 +47,7 @@ from holdfast.config.scanning import (
     PREFIX,
     SCAN_RATE,
     TIMEOUT,
+    Dialect,
     Publish,
     Writes,
 )
@@ -228,6 +229,8 @@ class NatsConfig(Model):
     """Certificates for TLS connections to devices."""
     prefix: SubjectPrefix = PREFIX
     """The first part of all subjects."""
+    dialect: Dialect = "tentacle"
+    """The programs it serves: those of tentacle-modbus, or of tentacle-next."""
     defaults: NatsDefaultsConfig = Field(default_factory=NatsDefaultsConfig)
     """What subscribe requests leave out."""
     writes: Writes = "tags"

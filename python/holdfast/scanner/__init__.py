@@ -7,6 +7,10 @@ The modules: `service` connects the parts. `broker`, `receiving`, `outbox` and `
 with NATS, `polling` and `commands` with devices. `registry` holds the subscriptions. `groups`,
 `decoding` and `publishing` convert values to messages. `registry` and these three do no I/O.
 `adjusting` reads inexact requests. `keeping` and `kept` store subscriptions, and restore them.
+`expiring` ends those that are not renewed.
+
+For the programs of tentacle-next: `watching` follows buckets, `configured` carries out the
+subscriptions in one, `enabling` pauses polling, `tentacle_next` reads messages of another form.
 """
 
 from __future__ import annotations

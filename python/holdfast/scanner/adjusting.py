@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Asked = TypeVar("Asked", SubscribeRequest, UnsubscribeRequest)
 
-NUMBERS = ("port", "unitId", "scanRate", "timeout", "deadband", "address")
+NUMBERS = ("port", "unitId", "scanRate", "timeout", "deadband", "address", "ttl")
 """The keys of numbers, in requests and in their tags."""
 
 MAX_SHOWN = 5

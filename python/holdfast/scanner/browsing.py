@@ -151,6 +151,7 @@ class _Report:
                     scan_rate=subscriber.rate,
                     publish=subscriber.publish,
                     deadband=subscriber.deadband or None,
+                    ttl=subscriber.ttl,
                     tag_ids=[id for id in subscriber.tags if id in ids],
                 )
                 for id, subscriber in self._device.subscribers.items()

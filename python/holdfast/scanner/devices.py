@@ -10,7 +10,7 @@ from holdfast._core import plan_blocks
 from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.latest import LatestBlocks
-from holdfast.scanner.subjects import second_id, subject_id
+from holdfast.scanner.subjects import names
 from holdfast.scanner.tags import AREA_OF_CODE, Tag
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint
     from holdfast.client.url import Target
-    from holdfast.config.scanning import Publish, Writes
+    from holdfast.config.scanning import Dialect, Publish, Writes
     from holdfast.scanner.health import Health
     from holdfast.scanner.messages import PlanRequest, Range
     from holdfast.types import Area
@@ -119,6 +119,8 @@ class Subscriber:
     publish: Publish
     deadband: float
     tags: dict[str, Wanted] = field(default_factory=dict)
+    ttl: int | None = None
+    """Seconds after which the subscription ends, unless a request renews it."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +142,10 @@ class ScannedDevice:
         address: Target,
         health: Health,
         writes: Writes = "tags",
+        dialect: Dialect = "tentacle",
     ) -> None:
         self.id = id
-        self.subjects = tuple(filter(None, (subject_id(id), second_id(id))))
+        self.subjects = names(id, dialect)
         """The names of the device in subjects; nearly always one."""
         self.source = source
         self.address = address

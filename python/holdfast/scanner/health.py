@@ -65,6 +65,11 @@ class Health:
     blocks: list[PolledBlock] = field(default_factory=list)
     """Each block with the result of the last scan that read it."""
 
+    def disable(self) -> None:
+        """Records that the device is not polled any more."""
+        self.state, self.since, self.error = "offline", time.time(), "the scanner is disabled"
+        self.blocks = []
+
     def judge(self, blocks: list[PolledBlock]) -> bool:
         """Updates the health from a poll. Returns whether it must be published.
 

@@ -39,11 +39,16 @@ class Kept:
         prefix: str,
         registry: Registry,
         subscribe: Callable[[SubscribeRequest], Awaitable[None]],
+        is_kept_elsewhere: Callable[[Unit], bool],
     ) -> None:
-        """`subscribe` carries out a kept request, or raises `Refused`."""
+        """`subscribe` carries out a kept request, or raises `Refused`.
+
+        A unit that is kept elsewhere is not stored.
+        """
         self._prefix = prefix
         self._registry = registry
         self._subscribe = subscribe
+        self._is_kept_elsewhere = is_kept_elsewhere
         self._pending: dict[Unit, list[SubscribeRequest]] = {}
         """Kept requests that are not carried out yet."""
         self._logged: set[Unit] = set()
@@ -80,6 +85,8 @@ class Kept:
 
     def _entries(self, unit: Unit) -> Mapping[str, bytes]:
         """Returns what is to be stored for a unit."""
+        if self._is_kept_elsewhere(unit):
+            return {}
         if unit in self._pending:
             assert unit.subscriber is not None
             pending = map(msgspec.json.encode, self._pending[unit])

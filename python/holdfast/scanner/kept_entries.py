@@ -71,6 +71,7 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
         "publish": known.publish,
         "deadband": known.deadband if known.publish == "change" else None,
         "plan": device.source.plan.request,
+        "ttl": known.ttl,
     }
     before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
     part: list[bytes] = []

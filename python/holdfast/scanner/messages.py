@@ -29,6 +29,9 @@ Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)
 Ranges = Annotated[list[Range], Meta(max_length=32)]
 Marker = bool | int | float | str
 
+MAX_TTL = 31_536_000
+"""The longest `ttl` in seconds: a year."""
+
 EXACT = 2.0**53
 """Floats below this represent every integer exactly."""
 
@@ -109,6 +112,8 @@ class SubscribeRequest(_Request):
     plan: PlanRequest | None = None
     release: bool | None = None
     """Whether the connection is closed after each scan."""
+    ttl: Annotated[int, Meta(ge=1, le=MAX_TTL)] | None = None
+    """Seconds after which the subscription ends, unless a request renews it. Default: it stays."""
 
 
 class UnsubscribeRequest(_Request):
@@ -180,7 +185,7 @@ class Heartbeat(_Message):
     metadata: HeartbeatMetadata
 
 
-class HeartbeatMetadata(_Message):
+class HeartbeatMetadata(_Message, omit_defaults=True):
     """What a heartbeat tells about the service."""
 
     device_count: int
@@ -188,6 +193,8 @@ class HeartbeatMetadata(_Message):
     """Tags of all devices."""
     version: str
     """The version of Holdfast."""
+    enabled: bool | None = None
+    """Whether the scanner is enabled in `service_enabled`; only with dialect `tentacle-next`."""
 
 
 class LogEntry(_Message):
@@ -226,6 +233,8 @@ class Variable(_Message, omit_defaults=True):
     last_updated: int | None = None
     """Time of the device's response, in milliseconds since 1970."""
     description: str | None = None
+    error: str | None = None
+    """Why the entry that has the tag is refused; only with dialect `tentacle-next`."""
 
 
 class BlockReport(_Message, omit_defaults=True):
@@ -263,6 +272,8 @@ class SubscriberReport(_Message, omit_defaults=True):
     publish: Publish
     tag_ids: list[str]
     deadband: float | None = None
+    ttl: int | None = None
+    """Seconds after which the subscription ends, unless a request renews it."""
 
 
 class PlanReport(_Message, rename=None, omit_defaults=True):
@@ -318,6 +329,13 @@ class OtherScanner(_Message):
     """In milliseconds since 1970."""
 
 
+class EntryReport(_Message):
+    """An entry of the bucket of subscriptions that is refused."""
+
+    key: str
+    error: str
+
+
 class ServiceReport(_Message, omit_defaults=True):
     """The counts of messages since the start."""
 
@@ -332,6 +350,10 @@ class ServiceReport(_Message, omit_defaults=True):
     """Scans lost because this process did not keep up."""
     other_scanners: list[OtherScanner] | None = None
     """Other scanners on the same subjects; each of them handles every request, too."""
+    enabled: bool | None = None
+    """Whether the scanner is enabled in `service_enabled`; only with dialect `tentacle-next`."""
+    refused_entries: list[EntryReport] | None = None
+    """The first refused entries of the bucket of subscriptions, by key."""
 
 
 class BrowseAnswer(_Message, omit_defaults=True):

@@ -65,6 +65,8 @@ class Polling:
         """The devices by their name in the poller."""
         self._renewed: dict[ScannedDevice, float] = {}
         self._waiting: dict[ScannedDevice, asyncio.TimerHandle] = {}
+        self._paused: set[ScannedDevice] | None = None
+        """The devices to poll when polling is resumed; `None` while it is not paused."""
         self._urgent: set[ScannedDevice] = set()
         """Devices that must be polled immediately, because a new subscriber waits for values."""
         self._writes: dict[int, asyncio.Future[int]] = {}
@@ -81,11 +83,14 @@ class Polling:
     def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
         """Updates a device in the poller, at most every `RENEWED` seconds.
 
-        With `at_once`, it is then polled immediately, otherwise at its next scheduled time. Raises
-        `Refused` after `stop`.
+        With `at_once`, it is then polled immediately, otherwise at its next scheduled time. While
+        polling is paused, it is polled when that ends. Raises `Refused` after `stop`.
         """
         if self._stopping.is_set():
             raise Refused("the scanner is stopping")
+        if self._paused is not None:
+            self._paused.add(device)
+            return
         if at_once:
             self._urgent.add(device)
         if device in self._waiting:
@@ -116,6 +121,9 @@ class Polling:
 
     def drop(self, device: ScannedDevice) -> None:
         """Stops polling a device and closes its connection."""
+        if self._paused is not None:
+            self._paused.discard(device)
+            return
         waiting = self._waiting.pop(device, None)
         if waiting is not None:
             waiting.cancel()
@@ -124,10 +132,30 @@ class Polling:
         del self._devices[device.polled_as]
         del self._renewed[device]
 
+    def pause(self) -> None:
+        """Stops polling all devices and closes their connections, until `resume`."""
+        devices = set(self._devices.values())
+        for device in devices:
+            self.drop(device)
+            device.polled_as = ""
+        self._paused = devices if self._paused is None else self._paused | devices
+
+    def resume(self) -> None:
+        """Polls all devices again."""
+        devices, self._paused = self._paused, None
+        if devices and not self._stopping.is_set():
+            for device in devices:
+                self.renew(device)
+
     async def write(self, device: ScannedDevice, request: _core.Request) -> int:
-        """Sends a write between two reads. Returns the fault, or 0 when the device confirmed it."""
+        """Sends a write between two reads. Returns the fault, or 0 when the device confirmed it.
+
+        Raises `Refused` while polling is paused, and after `stop`.
+        """
         if self._stopping.is_set():
             raise Refused("the scanner is stopping")
+        if self._paused is not None:
+            raise Refused("not written: the scanner is disabled")
         number = self._poller.write(device.polled_as, request)
         done: asyncio.Future[int] = self._loop.create_future()
         self._writes[number] = done

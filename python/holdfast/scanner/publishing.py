@@ -15,12 +15,13 @@ import msgspec
 
 from holdfast.scanner.decoding import Undecoded, clean, decoder
 from holdfast.scanner.groups import Group
-from holdfast.scanner.subjects import subject_id
+from holdfast.scanner.subjects import data_subject
 from holdfast.scanner.tags import Places
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
+    from holdfast.config.scanning import Dialect
     from holdfast.scanner.decoding import Decoder
     from holdfast.scanner.tags import Tag
     from holdfast.types import Area, PolledBlock
@@ -45,10 +46,10 @@ _encode = msgspec.json.Encoder().encode
 class Publisher:
     """Creates the messages of one device."""
 
-    def __init__(self, prefix: str, device: str) -> None:
+    def __init__(self, prefix: str, device: str, dialect: Dialect = "tentacle") -> None:
         self._prefix = prefix
         self._device = device
-        self._subject = f"{prefix}.data.{subject_id(device)}"
+        self._dialect = dialect
         self._wanted: Callable[[], Sequence[Group]] | None = None
         """Returns the groups from the next poll on; `None` if they have not changed."""
         self._newcomers: set[str] = set()
@@ -203,7 +204,7 @@ class Publisher:
     def _part(self, due: _Due, tags: list[Tag], block: Place) -> _Part:
         _, address, count = block
         group = due.group
-        texts = [_template(self._prefix, self._device, self._subject, tag) for tag in tags]
+        texts = [self._template(tag) for tag in tags]
         infallible = all(tag.type in _INFALLIBLE for tag in tags)
         remembered = group.change or any(tag.id in self._last for tag in tags)
         return _Part(
@@ -218,6 +219,16 @@ class Publisher:
             change=group.change,
             picky=remembered or not infallible,
         )
+
+    def _template(self, tag: Tag) -> tuple[bytes, int]:
+        """Returns the text of a message, with placeholders, and the fixed part of its length."""
+        head = {"moduleId": self._prefix, "deviceId": self._device, "variableId": tag.id}
+        before = _encode(head)[:-1] + b',"value":'
+        after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
+        text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
+        subject = data_subject(self._prefix, self._device, tag.id, self._dialect).encode()
+        head_line = b"PUB %b %%d\r\n" % subject.replace(b"%", b"%%")
+        return head_line + text + b"\r\n", len(before) + len(after) + 1
 
 
 _INFALLIBLE = {
@@ -285,16 +296,6 @@ class _Due:
             return False
         self._last = due
         return True
-
-
-def _template(prefix: str, device: str, subject: str, tag: Tag) -> tuple[bytes, int]:
-    """Returns the text of a message, with placeholders, and the fixed part of its length."""
-    head = {"moduleId": prefix, "deviceId": device, "variableId": tag.id}
-    before = _encode(head)[:-1] + b',"value":'
-    after = b',"datatype":"%b","timestamp":' % tag.datatype.encode()
-    text = before.replace(b"%", b"%%") + b"%b" + after + b"%b}"
-    head_line = b"PUB %b %%d\r\n" % subject.encode()
-    return head_line + text + b"\r\n", len(before) + len(after) + 1
 
 
 def _differs(value: Any, last: Any, deadband: float) -> bool:

@@ -19,15 +19,15 @@ from holdfast.scanner.adjusting import Adjustments
 from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
-from holdfast.scanner.subjects import subject_id
+from holdfast.scanner.subjects import next_name, subject_id
 from holdfast.scanner.tags import ORDERS, tag
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from holdfast.client.url import Target
-    from holdfast.config.scanning import Publish, Writes
+    from holdfast.config.scanning import Dialect, Publish, Writes
     from holdfast.scanner.limits import ScannerLimits
     from holdfast.scanner.messages import SubscribeRequest, UnsubscribeRequest
     from holdfast.scanner.rules import Rules
@@ -54,6 +54,8 @@ class Subscription:
     rate: int
     publish: Publish
     deadband: float
+    ttl: int | None
+    """Seconds."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,9 @@ def understood(
         if made.id in tags:
             if rules.strict:
                 raise Refused(f"{where}: duplicate id {made.id!r}")
+            if rules.dialect == "tentacle-next" and made != tags[made.id]:
+                # Its gateway sends tags in random order, so no definition is the last one.
+                raise Refused(f"{where}: {made.id!r} is {made}, and already {tags[made.id]}")
             changes.add("tag_repeated", made.id)
         tags[made.id] = made
     source.plan.check(list(tags.values()))
@@ -117,6 +122,7 @@ def understood(
         _rate(request, rules, changes),
         publish,
         deadband if publish == "change" else 0.0,
+        request.ttl,
     )
 
 
@@ -169,13 +175,18 @@ def _within(key: str, value: int, least: int, most: int) -> int:
 class Registry:
     """The devices by id, with their subscribers."""
 
-    def __init__(self, limits: ScannerLimits, writes: Writes = "tags") -> None:
+    def __init__(
+        self, limits: ScannerLimits, writes: Writes = "tags", dialect: Dialect = "tentacle"
+    ) -> None:
         self.devices: dict[str, ScannedDevice] = {}
         self._limits = limits
         self._writes = writes
+        self._dialect = dialect
         self._tags = 0
         self._holders: dict[str, set[str]] = {}
         """The ids of the devices that have a tag id."""
+        self._spelled: dict[str, set[str]] = {}
+        """The tag ids, by their names in subjects; only with dialect `tentacle-next`."""
         self._subjects: dict[str, str] = {}
         """The ids of the devices, by their names in subjects."""
 
@@ -213,6 +224,9 @@ class Registry:
                 former = device
                 self._check_shared(asked)
             _check_tags(device, asked)
+        if self._dialect == "tentacle-next":
+            _check_tag_names(() if device is None else device.tags, asked)
+        if device is not None:
             source.plan.check(list((device.tags | dict(asked.tags)).values()))
         if not asked.tags and (device is None or asked.subscriber not in device.subscribers):
             return Change(device)
@@ -225,11 +239,14 @@ class Registry:
         subscriber.rate = asked.rate
         subscriber.publish = asked.publish
         subscriber.deadband = asked.deadband
+        subscriber.ttl = asked.ttl
         subscriber.tags |= asked.wanted
         redefined = any(device.tags.get(id, tag) != tag for id, tag in asked.tags.items())
         device.tags |= asked.tags
         for id in new:
             self._holders.setdefault(id, set()).add(device.id)
+            if self._dialect == "tentacle-next":
+                self._spelled.setdefault(next_name(id), set()).add(id)
         self._tags += len(new)
         return Change(device, bool(new) or redefined or device.rate != before, former)
 
@@ -237,11 +254,11 @@ class Registry:
         self, asked: Subscription, source: Source, address: Target, former: ScannedDevice | None
     ) -> ScannedDevice:
         """Adds a device; with the subscribers and the tags of the one that it replaces, if any."""
-        device = ScannedDevice(asked.device, source, address, Health(), self._writes)
+        device = ScannedDevice(asked.device, source, address, Health(), self._writes, self._dialect)
         if former is not None:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
         self.devices[device.id] = device
-        self._subjects |= dict.fromkeys(device.subjects, device.id)
+        self._subjects |= dict.fromkeys(_subjects(device), device.id)
         return device
 
     def unsubscribe(self, request: UnsubscribeRequest) -> tuple[ScannedDevice | None, bool]:
@@ -264,23 +281,25 @@ class Registry:
             self._holders[id].discard(device.id)
             if not self._holders[id]:
                 del self._holders[id]
+                self._forget_spelling(id)
         self._tags -= len(unwanted)
         if not device.subscribers:
             del self.devices[device.id]
-            for name in device.subjects:
+            for name in _subjects(device):
                 del self._subjects[name]
             return device, True
         return device, bool(unwanted) or device.rate != before
 
     def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
         """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
-        found = {(device, name) for device in self._holders.get(name, ())}
+        found = {(device, id) for id in self._ids(name) for device in self._holders.get(id, ())}
         parts = name.split(".")
         for at in range(1, len(parts)):
-            device, id = ".".join(parts[:at]), ".".join(parts[at:])
-            for named in {device, self._subjects.get(device, device)}:
-                if named in self._holders.get(id, ()):
-                    found.add((named, id))
+            device = ".".join(parts[:at])
+            for id in self._ids(".".join(parts[at:])):
+                for named in {device, self._subjects.get(device, device)}:
+                    if named in self._holders.get(id, ()):
+                        found.add((named, id))
         if not found:
             raise Refused(f"no tag {name!r}")
         if len(found) > 1:
@@ -288,6 +307,18 @@ class Registry:
             raise Refused(f"{name!r} is ambiguous: {known}")
         [(of, id)] = found
         return self.devices[of], self.devices[of].tags[id]
+
+    def _ids(self, name: str) -> set[str]:
+        """Returns the tag ids that a command may mean by a name."""
+        if self._dialect == "tentacle-next":
+            return {name} | self._spelled.get(name, set())
+        return {name}
+
+    def _forget_spelling(self, id: str) -> None:
+        ids = self._spelled.get(next_name(id), set())
+        ids.discard(id)
+        if not ids:
+            self._spelled.pop(next_name(id), None)
 
     def _check_subject(self, id: str) -> None:
         """Checks that no other device has the same name in subjects. Raises `Refused`."""
@@ -374,6 +405,25 @@ def _check_tags(device: ScannedDevice, asked: Subscription) -> None:
             found = f"tag {id!r} of {device.id} already has another definition: {difference}"
             users = [name for name in device.users(id) if name != asked.subscriber]
             _check_unused(found, users)
+
+
+def _check_tag_names(known: Iterable[str], asked: Subscription) -> None:
+    """Checks that each tag of a device has a subject of its own. Raises `Refused`."""
+    names = {next_name(id): id for id in known}
+    for id in asked.tags:
+        if not id.isprintable():
+            raise Refused(f"the tag id is {id!r}, allowed are printable characters and blanks")
+        other = names.setdefault(next_name(id), id)
+        if other != id:
+            raise Refused(
+                f"tag id {id!r} has the same name in subjects as {other!r}: {next_name(id)}; "
+                "give one of them another id"
+            )
+
+
+def _subjects(device: ScannedDevice) -> set[str]:
+    """Returns the names of a device in subjects and in kept entries."""
+    return {subject_id(device.id), *device.subjects}
 
 
 def _check_unused(found: str, users: list[str]) -> None:

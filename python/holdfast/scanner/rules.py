@@ -9,7 +9,7 @@ from holdfast.config.scanning import SCAN_RATE, TIMEOUT
 from holdfast.scanner.limits import ScannerLimits
 
 if TYPE_CHECKING:
-    from holdfast.config.scanning import Publish
+    from holdfast.config.scanning import Dialect, Publish
 
 
 @dataclass(frozen=True)
@@ -31,3 +31,4 @@ class Rules:
     defaults: Defaults = field(default_factory=Defaults)
     strict: bool = False
     """Whether a request is refused that would otherwise be adjusted, see `adjusting`."""
+    dialect: Dialect = "tentacle"

@@ -18,11 +18,14 @@ import msgspec
 
 from holdfast import _core, logs
 from holdfast.net.tls import NO_FILES, Tls
-from holdfast.scanner import commands, device_tls, wire
+from holdfast.scanner import commands, device_tls, tentacle_next, wire
 from holdfast.scanner.adjusting import Adjustments, adjusted
 from holdfast.scanner.broker import Broker, Ping, Servers
 from holdfast.scanner.browsing import browsed
+from holdfast.scanner.configured import Configured
+from holdfast.scanner.enabling import Enabling
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.expiring import Expiring
 from holdfast.scanner.groups import grouped
 from holdfast.scanner.heartbeat import EVERY, Heart
 from holdfast.scanner.hosts import Allowed
@@ -32,6 +35,7 @@ from holdfast.scanner.messages import (
     Announcement,
     Answer,
     BrowseRequest,
+    EntryReport,
     HeartbeatMetadata,
     ServiceReport,
     Status,
@@ -55,10 +59,11 @@ if TYPE_CHECKING:
 
     from holdfast._core import Endpoint, Poller
     from holdfast.client.url import Target
-    from holdfast.config.scanning import Writes
+    from holdfast.config.scanning import Dialect, Writes
     from holdfast.net.allow_list import AllowEntry
     from holdfast.scanner.adjusting import Asked
     from holdfast.scanner.devices import ScannedDevice
+    from holdfast.scanner.keeping import Unit
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.registry import Subscription
     from holdfast.types import PolledBlock
@@ -77,6 +82,9 @@ MAX_PAYLOAD = 2**20
 
 MAX_ADJUSTED = 10_000
 """Limit of remembered subscribers whose requests were adjusted."""
+
+MAX_REFUSED_SHOWN = 100
+"""Limit of refused entries in the answer to `browse`."""
 
 ENDING = 2.0
 """Timeout in seconds of each step of a stop."""
@@ -106,6 +114,8 @@ class Settings:
     """Whether the log is also published."""
     keep_subscriptions: bool = True
     """Whether subscriptions and states are kept in JetStream."""
+    dialect: Dialect = "tentacle"
+    """The programs that it serves."""
 
 
 class Scanner:
@@ -121,15 +131,28 @@ class Scanner:
         self._one_by_one = asyncio.Lock()
         """Held while a request is parsed and checked."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._rules = Rules(settings.limits, settings.defaults, settings.strict)
-        self._registry = Registry(settings.limits, settings.writes)
+        self._rules = Rules(settings.limits, settings.defaults, settings.strict, settings.dialect)
+        self._registry = Registry(settings.limits, settings.writes, settings.dialect)
         self._adjusted: set[tuple[str, str]] = set()
         """The subscribers, and the kinds of adjustments, that are already logged."""
         self._publishers: dict[str, Publisher] = {}
         self._heart = Heart(settings.prefix, self._metadata, self._rival)
         self._rivals = Rivals(self._heart.started)
         self.outbox = Outbox()
-        self._kept = Kept(settings.prefix, self._registry, self._restore_request)
+        self._expiring = Expiring()
+        self._configured: Configured | None = None
+        self._enabling: Enabling | None = None
+        if self._is_next:
+            self._configured = Configured(
+                settings.prefix, self._understand, self._carry_out, self._end_configured
+            )
+            self._enabling = Enabling(settings.prefix, self._enable)
+        self._kept = Kept(
+            settings.prefix,
+            self._registry,
+            self._restore_request,
+            lambda unit: self._key_of(unit.device, unit.subscriber) is not None,
+        )
         self._ready = asyncio.Event()
         """Set when the kept subscriptions are restored, or can't be."""
         self._broker = Broker(settings.servers, self._handlers(), self._connected, settings.ping)
@@ -144,10 +167,14 @@ class Scanner:
         device_tls.check(self._settings.device_tls)
         self._polling = Polling(self._take, self._poller)
         works = [self._broker.run(), self.outbox.run(), self._beat(), self._ended.wait()]
+        works.append(self._expiring.run(self._expire))
         if self._settings.keep_subscriptions:
             works += [self._kept.keeper.run(), self._kept.restore(self._ready)]
         else:
             self._ready.set()
+        if self._configured is not None and self._enabling is not None:
+            self._polling.pause()  # Until it is known that the scanner is enabled.
+            works += [self._configured.run(), self._enabling.run()]
         running: list[asyncio.Task[object]] = [asyncio.create_task(work) for work in works]
         published_log = PublishedLog(self._settings.prefix, self._publish_log)
         if self._settings.publish_logs:
@@ -182,6 +209,10 @@ class Scanner:
         """
         self.outbox.connected(client)
         self._kept.keeper.connected(client)
+        self._expiring.connected(client is not None)
+        for part in (self._enabling, self._configured):
+            if part is not None:
+                part.connected(client)
         self._due.set()
         if client is not None:
             for device in self._registry.devices.values():
@@ -195,7 +226,7 @@ class Scanner:
             logs.write(logging.INFO, "shutdown_asked")
             self.end()
 
-        return {
+        handlers = {
             f"{prefix}.subscribe": self._answering("subscribe", self._subscribe),
             f"{prefix}.unsubscribe": self._answering("unsubscribe", self._unsubscribe),
             f"{prefix}.command.>": self._answering("command", self._command),
@@ -204,6 +235,21 @@ class Scanner:
             f"{prefix}.scanner": self._announced,
             f"{prefix}.shutdown": shutdown,
         }
+        if self._is_next:  # Its PLC library sends commands here.
+            handlers[f"{prefix}.module.command.>"] = handlers[f"{prefix}.command.>"]
+        return handlers
+
+    @property
+    def _is_next(self) -> bool:
+        return self._settings.dialect == "tentacle-next"
+
+    @property
+    def _is_enabled(self) -> bool:
+        return self._enabling is None or self._enabling.enabled
+
+    def _key_of(self, device: str, subscriber: str | None) -> str | None:
+        """Returns the key of the entry that a subscription is from; `None` if it is from none."""
+        return None if self._configured is None else self._configured.key_of(device, subscriber)
 
     async def _announced(self, message: Msg) -> None:
         """Handles the announcement of another scanner, or of this one."""
@@ -229,6 +275,7 @@ class Scanner:
             device_count=len(self._registry.devices),
             tag_count=self._registry.tags,
             version=_core.__version__,
+            enabled=self._is_enabled if self._is_next else None,
         )
 
     def _answering(self, kind: str, handle: Handle) -> Callable[[Msg], Awaitable[None]]:
@@ -241,6 +288,9 @@ class Scanner:
                 if len(self._tasks) > most:
                     raise Refused(f"too many requests: {most} are pending, which is the limit")
                 await self._ready.wait()
+                for part in (self._enabling, self._configured):
+                    if part is not None:
+                        await part.read()
                 answer = await handle(message)
             except Refused as refused:
                 logs.refused(
@@ -270,10 +320,18 @@ class Scanner:
             changes = Adjustments()
             request = self._decoded(message.data, SubscribeRequest, changes)
             asked = understood(request, self._rules, changes)
+            self._check_not_configured(asked.device, asked.subscriber)
         async with self._turn(asked.device):
             await self._add(asked)
+            if self._is_next:
+                self._remove_others(asked)
         await self._kept.settled(asked.device, asked.subscriber)
         self._log_adjustments(asked.subscriber, asked.device, changes)
+        self._log_subscribed(asked)
+        return Answer(success=True, count=len(request.tags))
+
+    @staticmethod
+    def _log_subscribed(asked: Subscription) -> None:
         logs.write(
             logging.INFO,
             "subscribed",
@@ -282,10 +340,70 @@ class Scanner:
             tags=len(asked.tags),
             scan_rate=asked.rate,
         )
-        return Answer(success=True, count=len(request.tags))
+
+    def _check_not_configured(self, device: str, subscriber: str) -> None:
+        """Raises `Refused` for a subscription that is from an entry of the bucket."""
+        key = self._key_of(device, subscriber)
+        if key is not None and self._configured is not None:
+            raise Refused(
+                f"the subscription of {subscriber!r} to {device!r} is the entry {key!r} of the "
+                f"bucket {self._configured.bucket}: change that entry"
+            )
+
+    def _understand(self, key: str, value: bytes) -> Subscription:
+        """Checks the key and the value of an entry. Raises `Refused`."""
+        changes = Adjustments()
+        request = self._decoded(value, SubscribeRequest, changes)
+        tentacle_next.check_entry(key, request)
+        asked = understood(request, self._rules, changes)
+        self._log_adjustments(asked.subscriber, asked.device, changes)
+        return asked
+
+    async def _carry_out(self, asked: Subscription) -> None:
+        """Carries out an entry: the whole subscription of a subscriber. Raises `Refused`."""
+        async with self._turn(asked.device):
+            await self._add(asked)
+            self._remove_others(asked)
+        self._log_subscribed(asked)
+
+    def _remove_others(self, asked: Subscription) -> None:
+        """Removes the tags of a subscription that a request does not have."""
+        device = self._registry.devices.get(asked.device)
+        subscriber = None if device is None else device.subscribers.get(asked.subscriber)
+        others = (
+            [] if subscriber is None else [id for id in subscriber.tags if id not in asked.tags]
+        )
+        if others:
+            self._remove(UnsubscribeRequest(asked.device, asked.subscriber, others))
+
+    async def _end_configured(self, unit: Unit) -> None:
+        """Ends the subscription of an entry."""
+        assert unit.subscriber is not None
+        async with self._turn(unit.device):
+            self._remove(UnsubscribeRequest(unit.device, unit.subscriber))
+        logs.write(
+            logging.INFO,
+            "unsubscribed",
+            device=unit.device,
+            subscriber=unit.subscriber,
+            tags="all",
+        )
+
+    def _enable(self, enabled: bool) -> None:
+        """Begins or stops polling, as the bucket `service_enabled` has it."""
+        if enabled:
+            self._polling.resume()
+        else:
+            self._polling.pause()
+            for device in self._registry.devices.values():
+                device.health.disable()
+                self._publish_state(device)
+        self._due.set()
 
     async def _restore_request(self, request: SubscribeRequest) -> None:
-        """Carries out a kept request. Raises `Refused`."""
+        """Carries out a kept request, unless an entry has replaced it. Raises `Refused`."""
+        if self._key_of(request.device_id, request.subscriber_id) is not None:
+            return
         asked = understood(request, self._rules)
         async with self._turn(asked.device):
             await self._add(asked, kept=True)
@@ -302,6 +420,7 @@ class Scanner:
         device = change.device
         if device is None or asked.subscriber not in device.subscribers:
             return
+        self._expiring.renew(device.id, asked.subscriber, asked.ttl)
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
@@ -315,6 +434,8 @@ class Scanner:
 
     def _decoded(self, data: bytes, kind: type[Asked], changes: Adjustments) -> Asked:
         most = self._settings.limits.request
+        if self._is_next and kind is SubscribeRequest:
+            data = tentacle_next.request(data, most)
         if self._settings.strict:
             return decode(data, kind, most)
         return adjusted(data, kind, most, changes)
@@ -332,7 +453,7 @@ class Scanner:
     def _begin_publishing(self, device: ScannedDevice, asked: Subscription) -> None:
         publisher = self._publishers.get(device.id)
         if publisher is None:
-            publisher = Publisher(self._settings.prefix, device.id)
+            publisher = Publisher(self._settings.prefix, device.id, self._settings.dialect)
             self._publishers[device.id] = publisher
         publisher.want(lambda: grouped(device), asked.tags)
 
@@ -361,17 +482,9 @@ class Scanner:
         async with self._in_order(message):
             changes = Adjustments()
             request = self._decoded(message.data, UnsubscribeRequest, changes)
+            self._check_not_configured(request.device_id, request.subscriber_id)
         async with self._turn(request.device_id):
-            self._kept.unsubscribed(request)
-            device, changed = self._registry.unsubscribe(request)
-            if device is not None:
-                if device.subscribers:
-                    self._publishers[device.id].want(lambda: grouped(device))
-                    if changed:
-                        self._polling.renew(device, at_once=False)
-                elif changed:
-                    self._drop(device)
-                    self._kept.state_changed(device.id)
+            self._remove(request)
         await self._kept.settled(request.device_id, request.subscriber_id)
         self._log_adjustments(request.subscriber_id, request.device_id, changes)
         logs.write(
@@ -382,6 +495,32 @@ class Scanner:
             tags="all" if request.tag_ids is None else len(request.tag_ids),
         )
         return Answer(success=True)
+
+    def _remove(self, request: UnsubscribeRequest) -> None:
+        """Removes tags of a subscription, and polls and publishes accordingly."""
+        self._kept.unsubscribed(request)
+        device, changed = self._registry.unsubscribe(request)
+        if device is None:
+            return
+        if request.subscriber_id not in device.subscribers:
+            self._expiring.renew(device.id, request.subscriber_id, None)
+        if device.subscribers:
+            self._publishers[device.id].want(lambda: grouped(device))
+            if changed:
+                self._polling.renew(device, at_once=False)
+        elif changed:
+            self._drop(device)
+            self._kept.state_changed(device.id)
+
+    async def _expire(self, unit: Unit) -> None:
+        """Ends a subscription that was not renewed within its `ttl`."""
+        assert unit.subscriber is not None
+        async with self._turn(unit.device):
+            if not self._expiring.is_due(unit):  # It was renewed while this waited.
+                return
+            self._expiring.renew(unit.device, unit.subscriber, None)
+            self._remove(UnsubscribeRequest(unit.device, unit.subscriber))
+        logs.write(logging.INFO, "expired", device=unit.device, subscriber=unit.subscriber)
 
     @contextlib.asynccontextmanager
     async def _in_order(self, message: Msg, *, is_large: bool = False) -> AsyncIterator[None]:
@@ -401,7 +540,8 @@ class Scanner:
         return self._turns.setdefault(device, asyncio.Lock())
 
     async def _command(self, message: Msg) -> Answer:
-        name = message.subject.removeprefix(f"{self._settings.prefix}.command.")
+        name = message.subject.removeprefix(f"{self._settings.prefix}.")
+        name = name.removeprefix("module.").removeprefix("command.")
         most = self._settings.limits.command
         if len(message.data) > most:
             raise Refused(f"the value has {len(message.data)} bytes, allowed are {most}")
@@ -409,6 +549,8 @@ class Scanner:
             text = message.data.decode()
         except UnicodeDecodeError:
             raise Refused("the value is not UTF-8 text") from None
+        if self._is_next:
+            text = tentacle_next.command(message.data)
         async with self._in_order(message):
             device, tag = self._registry.commanded(name)
         await commands.write(self._polling, device, tag, text)
@@ -427,7 +569,8 @@ class Scanner:
             request = decode(message.data, VariablesRequest, self._settings.limits.request)
         async with self._in_order(message, is_large=True):
             prefix = self._settings.prefix
-            return variables(request, self._shown_devices(), prefix, self._most())
+            refused = () if self._configured is None else self._configured.refused
+            return variables(request, self._shown_devices(), refused, prefix, self._most())
 
     def _shown_devices(self) -> dict[str, tuple[ScannedDevice, Mapping[str, str]]]:
         """Returns each device with the errors of its tags that could not be decoded."""
@@ -450,6 +593,12 @@ class Scanner:
             lost_scans=self._polling.dropped,
             other_scanners=self._rivals.current() or None,
         )
+        if self._configured is not None:
+            service.enabled = self._is_enabled
+            service.refused_entries = [
+                EntryReport(key=entry.key, error=entry.reason)
+                for entry in self._configured.refused[:MAX_REFUSED_SHOWN]
+            ] or None
         counters = self._polling.counters()
         return browsed(request, self._shown_devices(), counters, service, self._most())
 
@@ -525,6 +674,9 @@ class Scanner:
 
     async def _stop(self, running: Sequence[asyncio.Task[object]]) -> None:
         """Stops all parts, each with a timeout."""
+        for part in (self._enabling, self._configured):
+            if part is not None:
+                part.connected(None)
         await _within(self._polling.stop())
         for request in list(self._tasks):
             request.cancel()

@@ -3,14 +3,21 @@
 A device id may have blanks and dots, a part of a subject may not. Callers of tentacle-modbus
 replace only the characters that NATS does not allow, and listen there. So the data of a device is
 published under both names if they differ.
+
+Programs of tentacle-next replace other characters, and listen to one subject for each tag.
 """
 
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.config.scanning import Dialect
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 _UNUSABLE = re.compile(r"[ .*>]")
+_REPLACED_BY_NEXT = re.compile(r"[ .:*>;=]")
 
 
 def subject_id(device: str) -> str:
@@ -25,3 +32,24 @@ def second_id(device: str) -> str | None:
     """
     kept = _UNUSABLE.sub("_", device)
     return kept if kept != subject_id(device) else None
+
+
+def next_name(id: str) -> str:
+    """Returns the part of subjects that stands for a device or tag in tentacle-next.
+
+    `id` must be printable.
+    """
+    return _REPLACED_BY_NEXT.sub("_", id)
+
+
+def names(device: str, dialect: Dialect) -> tuple[str, ...]:
+    """Returns the names of a device in the subjects of its messages."""
+    if dialect == "tentacle-next":
+        return (next_name(device),)
+    return tuple(filter(None, (subject_id(device), second_id(device))))
+
+
+def data_subject(prefix: str, device: str, tag: str, dialect: Dialect) -> str:
+    """Returns the subject of a tag's values."""
+    subject = f"{prefix}.data.{names(device, dialect)[0]}"
+    return f"{subject}.{next_name(tag)}" if dialect == "tentacle-next" else subject

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -11,6 +12,7 @@ from holdfast.scanner.messages import Variable
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
+    from holdfast.scanner.configured import RefusedEntry
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.messages import Quality, VariablesRequest
     from holdfast.scanner.tags import Tag
@@ -24,18 +26,26 @@ ENVELOPE = 2
 def variables(
     request: VariablesRequest,
     devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
+    refused: Iterable[RefusedEntry],
     module: str,
     most: int,
 ) -> bytes:
     """Returns the answer as JSON, with as many tags as fit into `most` bytes.
 
     `devices` holds each device with the errors of tags that could not be decoded. The tags are
-    sorted by device; `offset` of the request skips the first ones.
+    sorted by device; `offset` of the request skips the first ones. The tags of `refused` follow.
     """
     texts: list[bytes] = []
     room = most - ENVELOPE
-    for device, undecoded, tag in _requested(request, devices):
-        text = _encode(_variable(device, undecoded, tag, module))
+    known = sum(
+        len(device.tags) for id, (device, _) in devices.items() if request.device_id in (None, id)
+    )
+    skipped = max((request.offset or 0) - known, 0)
+    for variable in chain(
+        (_variable(*each, module) for each in _requested(request, devices)),
+        islice(_refused(request, devices, refused, module), skipped, None),
+    ):
+        text = _encode(variable)
         room -= len(text) + 1
         if room < 0:
             break
@@ -58,6 +68,31 @@ def _requested(
         for tag in list(device.tags.values())[left:]:
             yield device, undecoded, tag
         left = 0
+
+
+def _refused(
+    request: VariablesRequest,
+    devices: Mapping[str, tuple[ScannedDevice, Mapping[str, str]]],
+    refused: Iterable[RefusedEntry],
+    module: str,
+) -> Iterator[Variable]:
+    """Yields the tags of refused entries, except those that others have subscribed to."""
+    for entry in refused:
+        if entry.device is None or request.device_id not in (None, entry.device):
+            continue
+        known = devices[entry.device][0].tags if entry.device in devices else {}
+        for id in entry.tags:
+            if id not in known:
+                yield Variable(
+                    module_id=module,
+                    device_id=entry.device,
+                    variable_id=id,
+                    value=None,
+                    datatype="number",
+                    quality="bad",
+                    origin="modbus",
+                    error=entry.reason,
+                )
 
 
 def _variable(
