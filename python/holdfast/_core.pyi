@@ -237,8 +237,9 @@ class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
     `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
-    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. Raises `ValueError` for an
-    invalid address, limit or time.
+    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. `raw_ingest`, only with `mbap`
+    and without TLS, is a listener for packets whose connections come to the same port: its own bind
+    and limits are ignored. Raises `ValueError` for an invalid address, limit or time.
     """
 
     def __new__(
@@ -255,6 +256,7 @@ class Listener:
         request_timeout: float = 10.0,
         frame_timeout: float | None = None,
         tls: ServerTls | None = None,
+        raw_ingest: Listener | None = None,
     ) -> Listener: ...
     @staticmethod
     def udp(
@@ -296,8 +298,14 @@ class Listener:
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
         request_timeout: float = 10.0,
+        packets: Literal["one", "many"] = "one",
+        idle_timeout: float = 300.0,
     ) -> Listener:
-        """A listener for Raw Ingest packets."""
+        """A listener for Raw Ingest packets.
+
+        With `packets` many, a connection carries any number of them, until the sender closes, one
+        is refused, or none comes for `idle_timeout` seconds.
+        """
 
 @final
 class Engine:

@@ -1,5 +1,6 @@
 //! `Engine`: runs listeners; reports addresses, counters, events and writes.
 
+use holdfast_engine::server::counters::PacketCounters;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::{
     Engine as Core, ListenerCounters, ProtocolCounters, Settings, StartError,
@@ -107,10 +108,25 @@ impl Engine {
 /// role.
 type Event = (String, &'static str, Option<String>, Option<String>);
 
+fn counted_packets<'py>(
+    py: Python<'py>,
+    counters: &PacketCounters,
+) -> PyResult<Bound<'py, PyDict>> {
+    let refused = PyDict::new(py);
+    for (refusal, count) in counters.refused() {
+        refused.set_item(refusal.name(), count)?;
+    }
+    let packets = PyDict::new(py);
+    packets.set_item("accepted", counters.accepted.get())?;
+    packets.set_item("values", counters.values.get())?;
+    packets.set_item("refused", refused)?;
+    Ok(packets)
+}
+
 fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bound<'py, PyDict>> {
     let all = PyDict::new(py);
     match &listener.protocol {
-        ProtocolCounters::Modbus(counters) => {
+        ProtocolCounters::Modbus(counters, packets) => {
             let frames = PyDict::new(py);
             frames.set_item("foreign", counters.frames.foreign.get())?;
             frames.set_item("broken", counters.frames.broken.get())?;
@@ -120,17 +136,12 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bo
             all.set_item("exceptions", by_code(py, counters.exceptions())?)?;
             all.set_item("unanswered", counters.unanswered.get())?;
             all.set_item("frames", frames)?;
-        }
-        ProtocolCounters::Packets(counters) => {
-            let refused = PyDict::new(py);
-            for (refusal, count) in counters.refused() {
-                refused.set_item(refusal.name(), count)?;
+            if let Some(packets) = packets {
+                all.set_item("packets", counted_packets(py, packets)?)?;
             }
-            let packets = PyDict::new(py);
-            packets.set_item("accepted", counters.accepted.get())?;
-            packets.set_item("values", counters.values.get())?;
-            packets.set_item("refused", refused)?;
-            all.set_item("packets", packets)?;
+        }
+        ProtocolCounters::Packets(packets) => {
+            all.set_item("packets", counted_packets(py, packets)?)?;
         }
     }
     let counters = listener.connections;

@@ -9,8 +9,9 @@ use holdfast_engine::server::policy::{
     AccessMode, Elsewhere, Functions, Items, Narrowed, Ranges, Rule as CoreRule,
 };
 use holdfast_engine::server::{
-    ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, RawRule as CoreRawRule,
-    RawSettings, SerialSettings, StreamFraming, StreamSettings, UdpSettings, WhenFull,
+    ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, PacketsPerConnection,
+    RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming, StreamSettings,
+    UdpSettings, WhenFull,
 };
 use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
@@ -143,7 +144,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, tls=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, tls=None, raw_ingest=None))]
     fn new(
         name: String,
         bind: &str,
@@ -156,7 +157,19 @@ impl Listener {
         request_timeout: f64,
         frame_timeout: Option<f64>,
         tls: Option<PyRef<'_, ServerTls>>,
+        raw_ingest: Option<PyRef<'_, Listener>>,
     ) -> PyResult<Listener> {
+        let raw_ingest = match raw_ingest.map(|listener| listener.core.kind.clone()) {
+            None => None,
+            Some(ListenerKind::RawIngest(settings)) if framing == "mbap" && tls.is_none() => {
+                Some(settings)
+            }
+            Some(_) => {
+                let message =
+                    "raw_ingest: allowed is a Raw Ingest listener, with framing mbap and no tls";
+                return Err(PyValueError::new_err(message));
+            }
+        };
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
         let framings = [
             ("mbap", StreamFraming::Mbap),
@@ -174,6 +187,7 @@ impl Listener {
                 .map(|time| time_to_wait("frame_timeout", time))
                 .transpose()?,
             tls: tls.map(|tls| Arc::clone(&tls.core)),
+            raw_ingest,
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }
@@ -215,7 +229,7 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", max_connections=256, max_connections_per_source=None, request_timeout=10.0))]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", max_connections=256, max_connections_per_source=None, request_timeout=10.0, packets="one", idle_timeout=300.0))]
     fn raw_ingest(
         name: String,
         bind: &str,
@@ -225,7 +239,13 @@ impl Listener {
         max_connections: i128,
         max_connections_per_source: Option<i128>,
         request_timeout: f64,
+        packets: &str,
+        idle_timeout: f64,
     ) -> PyResult<Listener> {
+        let idle = time_to_wait("idle_timeout", idle_timeout)?;
+        let many = PacketsPerConnection::Many { idle };
+        let packets =
+            word("packets", packets, &[("one", PacketsPerConnection::One), ("many", many)])?;
         let required = word("crc", crc, &[("required", true), ("none", false)])?;
         let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
         let kind = ListenerKind::RawIngest(RawSettings {
@@ -234,6 +254,7 @@ impl Listener {
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
             limits: limits(max_connections, max_connections_per_source, "refuse")?,
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
+            packets,
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }

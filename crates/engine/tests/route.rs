@@ -126,6 +126,7 @@ impl Front {
             request_timeout: PATIENCE,
             frame_timeout: None,
             tls: None,
+            raw_ingest: None,
         };
         let kind = ListenerKind::ModbusStream(stream);
         let engine = Engine::start(Settings {

@@ -26,6 +26,7 @@ from holdfast.config import (
 from holdfast.config.devices import STATUS_BLOCK
 from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
+from holdfast.config.scalars import MAX_TIME
 from holdfast.net.tls import NO_FILES
 from holdfast.server import Identity
 from holdfast.tools import planning
@@ -180,6 +181,7 @@ def listener(
                 request_timeout=settings.request_timeout,
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
+                raw_ingest=_shared_port(name, settings, config, memories),
             )
         case ModbusUdpListener() | ModbusRtuOverUdpListener():
             rules = [_rule(rule, memories, links) for rule in settings.rules]
@@ -213,9 +215,30 @@ def listener(
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
                 request_timeout=settings.request_timeout,
+                packets=settings.packets,
+                idle_timeout=settings.idle_timeout,
             )
         case _:
             assert_never(settings)
+
+
+def _shared_port(
+    name: str, settings: Listener, config: Config, memories: Mapping[str, Memory]
+) -> _core.Listener | None:
+    """Raw ingest packets on the port of a Modbus listener."""
+    if not isinstance(settings, ModbusTcpListener) or settings.raw_ingest is None:
+        return None
+    part = settings.raw_ingest
+    return _core.Listener.raw_ingest(
+        name,
+        str(settings.bind),
+        [_raw_rule(rule, config, memories) for rule in part.rules],
+        format=part.format,
+        crc=part.crc or "required",
+        request_timeout=settings.request_timeout,
+        packets=part.packets,
+        idle_timeout=settings.idle_timeout or MAX_TIME,
+    )
 
 
 def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:

@@ -62,21 +62,22 @@ class WriterGrant(NamedTuple):
 def grants(config: Config) -> Iterator[WriterGrant]:
     """All grants except those of Modbus clients."""
     for name, listener in config.listeners.items():
-        if listener.type != "raw-ingest":
-            continue
-        for index, rule in enumerate(listener.rules):
+        path: KeyPath = ("listeners", name, "rules")
+        rules = listener.rules if listener.type == "raw-ingest" else ()
+        if listener.type == "modbus-tcp" and listener.raw_ingest is not None:
+            path, rules = ("listeners", name, "raw_ingest", "rules"), listener.raw_ingest.rules
+        for index, rule in enumerate(rules):
             memories = (*rule.units.values(), *rule.memories)
-            yield WriterGrant(
-                ("listeners", name, "rules", index), memories, rule.areas, writes=True
-            )
+            yield WriterGrant((*path, index), memories, rule.areas, writes=True)
     if config.rest is not None and config.rest.tokens != "none":
         for index, token in enumerate(config.rest.tokens):
             writes = token.access == "read-write"
             yield WriterGrant(("rest", "tokens", index), token.memories, token.areas, writes)
     if config.mqtt is not None:
         for index, topic in enumerate(config.mqtt.subscriptions):
-            path: KeyPath = ("mqtt", "subscriptions", index)
-            yield WriterGrant(path, topic.memories, topic.areas, writes=True)
+            yield WriterGrant(
+                ("mqtt", "subscriptions", index), topic.memories, topic.areas, writes=True
+            )
     for name, adapter in config.adapters.items():
         writes = adapter.access == "read-write"
         yield WriterGrant(("adapters", name), adapter.memories, adapter.areas, writes)

@@ -51,6 +51,8 @@ class ListenerChecks:
             self._limits(path, listener)
             if kind == "raw-ingest":
                 self._raw(path, listener)
+            if kind == "modbus-tcp" and isinstance(listener.get("raw_ingest"), dict):
+                self._shared_port((*path, "raw_ingest"), listener["raw_ingest"])
             if kind == "modbus-tls":
                 tls = mapping(listener.get("tls"))
                 check_server_tls((*path, "tls"), tls, self.folder, self.report)
@@ -94,6 +96,13 @@ class ListenerChecks:
                 known = "allowed: units, access, functions, deny"
                 message = f"not allowed on a serial line, {known}"
                 self.report.settle((*rule_path, "sources"), message, of_key=True)
+
+    def _shared_port(self, path: KeyPath, part: dict[Any, Any]) -> None:
+        """Checks raw ingest packets on the port of a Modbus listener."""
+        self._raw(path, part)
+        for rule_path, rule in self._rules(path, part):
+            self._raw_rule(rule_path, rule, part.get("format", "v1"))
+        self._shadows(path, part)
 
     def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         if "crc" in listener and listener.get("format", "v1") == "v1":

@@ -170,11 +170,30 @@ class _ConnectionListener(Model):
     """For each unit id, the first rule whose sources contain the peer and that names it applies."""
 
 
+def _crc(data: dict[str, Any]) -> Literal["required"] | None:
+    return "required" if data["format"] == "crc" else None
+
+
+class RawIngestConfig(Model):
+    """Raw ingest packets on the port of a Modbus TCP server: the first bytes of a connection decide."""
+
+    format: Literal["v1", "crc"] = "v1"
+    """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
+    crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
+    """Format crc: whether packets end with a CRC. Default: required."""
+    packets: Literal["one", "many"] = "one"
+    """Packets that a connection carries; many: until the sender closes, or one is refused."""
+    rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
+    """The first rule whose sources contain the sender applies."""
+
+
 class ModbusTcpListener(_ConnectionListener):
     """A Modbus TCP server."""
 
     type: Literal["modbus-tcp"]
     """The protocol."""
+    raw_ingest: Annotated[RawIngestConfig | None, NotNull()] = None
+    """Raw ingest packets on the same port. Default: none."""
 
 
 class ServerTlsConfig(Model):
@@ -312,10 +331,6 @@ class ModbusAsciiListener(_SerialListener):
     """The serial port."""
 
 
-def _crc(data: dict[str, Any]) -> Literal["required"] | None:
-    return "required" if data["format"] == "crc" else None
-
-
 class RawIngestListener(Model):
     """A server for raw ingest packets, which only write."""
 
@@ -333,6 +348,10 @@ class RawIngestListener(Model):
     """Maximum number of open connections from one address; null: unlimited."""
     request_timeout: Duration = 10.0
     """Seconds from the start of a connection to the last byte of its packet."""
+    packets: Literal["one", "many"] = "one"
+    """Packets that a connection carries; many: until the sender closes, or one is refused."""
+    idle_timeout: Duration = 300.0
+    """With packets: many, seconds without a packet after which a connection is closed."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
     """The first rule whose sources contain the sender applies."""
 

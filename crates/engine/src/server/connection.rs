@@ -144,6 +144,14 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         }
     }
 
+    /// Takes over bytes that were already read: the beginning of a request.
+    pub(crate) fn begin_with(&mut self, received: &[u8]) {
+        if !received.is_empty() {
+            self.answering.keep(received);
+            self.begun = Some(self.last_request);
+        }
+    }
+
     /// Serves until the connection ends. The end is counted before the peer can see it.
     pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
         let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer);
@@ -416,12 +424,16 @@ impl<F: Framing> Answering<F> {
             }
         }
         answered.consumed = input.len() - rest.len();
-        // An incomplete frame is shorter than the longest one.
+        self.keep(rest);
+        answered
+    }
+
+    /// Keeps an incomplete frame, which is shorter than the longest one.
+    fn keep(&mut self, rest: &[u8]) {
         let partial = self.partial.as_mut();
         let kept = rest.len().min(partial.len());
         partial[..kept].copy_from_slice(&rest[..kept]);
         self.partial_len = kept;
-        answered
     }
 
     /// Whether replies come later.

@@ -86,7 +86,8 @@ struct Listener {
 }
 
 enum Served {
-    Modbus(Arc<UnitServer>),
+    /// With the packets of the same port.
+    Modbus(Arc<UnitServer>, Option<Arc<RawIngest>>),
     Packets(Arc<RawIngest>),
 }
 
@@ -99,7 +100,8 @@ pub struct ListenerCounters<'e> {
 }
 
 pub enum ProtocolCounters<'e> {
-    Modbus(&'e Counters),
+    /// With those of packets on the same port.
+    Modbus(&'e Counters, Option<&'e PacketCounters>),
     Packets(&'e PacketCounters),
 }
 
@@ -138,6 +140,7 @@ impl Engine {
                     let (socket, address) = bound(&name, stream.bind, bind_tcp)?;
                     let (context, unit_server) = (context(Some(stream.limits)), unit_server()?);
                     let service = Arc::new(ModbusStream::new(&stream, Arc::clone(&unit_server)));
+                    let raw_ingest = service.raw_ingest.clone();
                     tasks.push(Box::pin(accept(
                         Arc::clone(&context),
                         service,
@@ -148,7 +151,7 @@ impl Engine {
                     Listener {
                         context,
                         address: Some(address),
-                        served: Served::Modbus(unit_server),
+                        served: Served::Modbus(unit_server, raw_ingest),
                     }
                 }
                 ListenerKind::RawIngest(raw) => {
@@ -172,7 +175,7 @@ impl Engine {
                     Listener {
                         context,
                         address: Some(address),
-                        served: Served::Modbus(unit_server),
+                        served: Served::Modbus(unit_server, None),
                     }
                 }
                 ListenerKind::ModbusSerial(serial) => {
@@ -186,7 +189,7 @@ impl Engine {
                     let (context, unit_server) = (context(None), unit_server()?);
                     let service = ModbusSerial::new(serial, Arc::clone(&unit_server));
                     tasks.push(Box::pin(service.serve(Arc::clone(&context), port, stopping)));
-                    Listener { context, address: None, served: Served::Modbus(unit_server) }
+                    Listener { context, address: None, served: Served::Modbus(unit_server, None) }
                 }
             };
             listeners.push(listener);
@@ -236,7 +239,10 @@ impl Engine {
             connections: &context.connections,
             open_connections: context.admission.open(),
             protocol: match served {
-                Served::Modbus(unit_server) => ProtocolCounters::Modbus(&unit_server.counters),
+                Served::Modbus(unit_server, raw) => {
+                    let packets = raw.as_ref().map(|raw| &raw.packets);
+                    ProtocolCounters::Modbus(&unit_server.counters, packets)
+                }
                 Served::Packets(service) => ProtocolCounters::Packets(&service.packets),
             },
         })

@@ -24,7 +24,7 @@ pub use engine::{
     Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
     StartError,
 };
-pub use raw_ingest::{RawRule, RawSettings};
+pub use raw_ingest::{PacketsPerConnection, RawRule, RawSettings};
 pub use serial::SerialSettings;
 pub use tcp::{StreamFraming, StreamSettings};
 pub use udp::{DatagramFraming, UdpSettings};

@@ -1,4 +1,5 @@
-//! A Raw Ingest listener: each connection carries one packet, one write, and one byte of reply.
+//! A Raw Ingest listener: each connection carries one packet, one write, and one byte of reply. If the
+//! settings allow it, it carries several packets one after another, each with its reply.
 //!
 //! The header is checked before the payload is read, and the whole packet before memory is written.
 //! After a refusal, the listener reads until the peer closes: closing a socket with unread bytes
@@ -27,6 +28,9 @@ use super::event::Kind;
 use super::listener::{Admitted, ListenerContext, Service, drain};
 use super::policy::Grants;
 
+/// Bytes that tell a packet from a Modbus frame.
+pub(crate) const DECISIVE: usize = 4;
+
 /// Bytes per read of a new connection.
 const CHUNK: usize = 16 * 1024;
 
@@ -49,6 +53,26 @@ pub struct RawSettings {
     pub limits: ConnectionLimits,
     /// The longest time from the start of a connection to the last byte of its packet.
     pub request_timeout: Duration,
+    pub packets: PacketsPerConnection,
+}
+
+/// How many packets a connection carries.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PacketsPerConnection {
+    One,
+    /// Any number, until the peer closes or one is refused. A connection ends after this time without
+    /// a packet.
+    Many {
+        idle: Duration,
+    },
+}
+
+/// Whether a connection begins with a packet.
+pub(crate) enum Beginning {
+    Packet,
+    SomethingElse,
+    /// More bytes are needed.
+    Unknown,
 }
 
 #[derive(Debug)]
@@ -63,6 +87,7 @@ pub(crate) struct RawIngest {
     policy: Grants<RawGrant>,
     format: Format,
     request_timeout: Duration,
+    many: Option<Duration>,
 }
 
 /// The state of a packet that is being received.
@@ -96,7 +121,36 @@ impl RawIngest {
             policy: Grants::new(rules),
             format: settings.format,
             request_timeout: settings.request_timeout,
+            many: match settings.packets {
+                PacketsPerConnection::One => None,
+                PacketsPerConnection::Many { idle } => Some(idle),
+            },
         }
+    }
+
+    /// Whether the first bytes of a connection are those of a packet. A Modbus frame never is: its
+    /// protocol id, bytes 3 and 4, is 0.
+    pub(crate) fn beginning(&self, bytes: &[u8]) -> Beginning {
+        match self.format.header(bytes) {
+            Err(Refusal::Magic | Refusal::Version | Refusal::Flags) => Beginning::SomethingElse,
+            Err(Refusal::Area) if bytes.len() <= DECISIVE => Beginning::SomethingElse,
+            _ if bytes.len() < DECISIVE => Beginning::Unknown,
+            _ => Beginning::Packet,
+        }
+    }
+
+    /// Refuses the packet that a connection begins with: no rule names its peer.
+    pub(crate) async fn refuse_peer(
+        &self,
+        context: &ListenerContext,
+        (stream, peer): (TcpStream, SocketAddr),
+        packet: &[u8],
+        stop: watch::Receiver<bool>,
+    ) {
+        self.refuse(context, peer, packet, Refusal::NotGranted);
+        let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
+        drain(&stream, stop).await;
+        context.ended(Kind::Closed, peer);
     }
 
     /// Checks the bytes received so far.
@@ -190,6 +244,82 @@ impl RawIngest {
         }
     }
 
+    /// Serves packets one after another.
+    async fn serve_many(
+        &self,
+        context: Arc<ListenerContext>,
+        Admitted { stream, peer, rights, received: mut bytes, ticket }: Admitted<RawGrant>,
+        idle: Duration,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let (mut end, mut begun) = (Kind::Closed, Instant::now());
+        loop {
+            let refusal = match self.first_of(&context, peer, &rights, &bytes) {
+                Ok(Some(len)) => {
+                    bytes.drain(..len);
+                    begun = Instant::now();
+                    ticket.touch(begun.into_std());
+                    if (&*SockRef::from(&stream)).write(&[DONE]).is_err() {
+                        break;
+                    }
+                    continue;
+                }
+                Ok(None) => {
+                    let patience = if bytes.is_empty() { idle } else { self.request_timeout };
+                    let was_empty = bytes.is_empty();
+                    let readable = tokio::select! {
+                        readable = timeout_at(begun + patience, stream.readable()) => readable,
+                        _ = stop.wait_for(|stop| *stop) => break,
+                    };
+                    match readable.map(|ready| ready.and_then(|()| stream.try_read_buf(&mut bytes)))
+                    {
+                        Ok(Ok(0)) if was_empty => break,
+                        Ok(Ok(0)) => Refusal::Short,
+                        Ok(Ok(_)) => {
+                            if was_empty {
+                                begun = Instant::now();
+                            }
+                            continue;
+                        }
+                        Ok(Err(error)) if error.kind() == ErrorKind::WouldBlock => continue,
+                        Ok(Err(_)) => break,
+                        Err(_) if was_empty => {
+                            end = Kind::Idle;
+                            break;
+                        }
+                        Err(_) => Refusal::Late,
+                    }
+                }
+                Err(refusal) => refusal,
+            };
+            self.refuse(&context, peer, &bytes, refusal);
+            let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
+            drain(&stream, stop).await;
+            break;
+        }
+        context.ended(end, peer);
+        drop(ticket);
+    }
+
+    /// Writes the packet that `bytes` begin with. Returns its length, `None` while more are needed.
+    fn first_of(
+        &self,
+        context: &ListenerContext,
+        peer: SocketAddr,
+        rights: &RawGrant,
+        bytes: &[u8],
+    ) -> Result<Option<usize>, Refusal> {
+        let len = self.format.header(bytes)?.map(|header| self.format.packet_len(&header));
+        let packet = len.and_then(|len| bytes.get(..len)).unwrap_or(bytes);
+        match self.judge(rights, packet)? {
+            Packet::Incomplete { .. } => Ok(None),
+            Packet::Whole { header, memory, payload } => {
+                self.write(context, peer, (header, memory, payload))?;
+                Ok(len)
+            }
+        }
+    }
+
     fn refuse(&self, context: &ListenerContext, peer: SocketAddr, packet: &[u8], refusal: Refusal) {
         self.packets.refuse(refusal);
         context.report(Kind::PacketRefused(refusal), Some(peer));
@@ -226,6 +356,9 @@ impl Service for RawIngest {
         context: &ListenerContext,
         mut connection: Admitted<RawGrant>,
     ) -> Option<Admitted<RawGrant>> {
+        if self.many.is_some() {
+            return Some(connection);
+        }
         let mut chunk = [0; CHUNK];
         let socket = SockRef::from(&connection.stream);
         let Ok(len) = (&*socket).read(&mut chunk) else {
@@ -251,6 +384,9 @@ impl Service for RawIngest {
         connection: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
     ) {
+        if let Some(idle) = self.many {
+            return self.serve_many(context, connection, idle, stop).await;
+        }
         let Admitted { stream, peer, rights, received: mut packet, ticket } = connection;
         let judged = match self.receive(&stream, &rights, &mut packet, stop.clone()).await {
             Err(Gone::Timeout) => return context.ended(Kind::RequestTimeout, peer),

@@ -1,11 +1,12 @@
 //! Listeners for Modbus TCP, with or without TLS, RTU over TCP and ASCII over TCP.
 
+use std::io::ErrorKind;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::watch;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout, timeout_at};
 
 use super::admission::ConnectionLimits;
 use super::admission::Ticket;
@@ -14,11 +15,15 @@ use super::event::Kind;
 use super::framing::{Ascii, Framing, Mbap, Rtu};
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::policy::{PeerRights, Policy, Rule};
+use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
 use super::stream::Stream;
 use super::tls::ServerTlsStream;
 use super::unit_server::UnitServer;
 use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
+
+/// The time that an unlimited wait lasts.
+const FOREVER: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 /// The framing of Modbus on a TCP stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,6 +53,8 @@ pub struct StreamSettings {
     pub frame_timeout: Option<Duration>,
     /// `None` is plain TCP.
     pub tls: Option<Arc<ServerTls>>,
+    /// Raw Ingest packets on the same port, only with MBAP frames over plain TCP.
+    pub raw_ingest: Option<RawSettings>,
 }
 
 pub(crate) struct ModbusStream {
@@ -58,11 +65,15 @@ pub(crate) struct ModbusStream {
     timeouts: Timeouts,
     framing: StreamFraming,
     tls: Option<Arc<ServerTls>>,
+    pub(crate) raw_ingest: Option<Arc<RawIngest>>,
 }
 
 impl ModbusStream {
     pub(crate) fn new(settings: &StreamSettings, unit_server: Arc<UnitServer>) -> ModbusStream {
+        let may_share = settings.framing == StreamFraming::Mbap && settings.tls.is_none();
+        debug_assert!(may_share || settings.raw_ingest.is_none());
         ModbusStream {
+            raw_ingest: settings.raw_ingest.as_ref().map(|raw| Arc::new(RawIngest::new(raw))),
             unit_server,
             policy: Policy::of(&settings.rules),
             nobody: Arc::new(PeerRights::none()),
@@ -84,8 +95,9 @@ impl ModbusStream {
     ) {
         match &self.tls {
             None => {
-                let Admitted { stream, peer, rights, ticket, .. } = admitted;
-                self.modbus::<F, _>(context, (stream, peer), rights, ticket, stop).await;
+                let Admitted { stream, peer, rights, ticket, received } = admitted;
+                self.modbus::<F, _>(context, (stream, peer), (rights, received), ticket, stop)
+                    .await;
             }
             // In a box of its own, so that plain connections do not reserve memory for it.
             Some(tls) => Box::pin(self.secure::<F>(tls, context, admitted, stop)).await,
@@ -133,21 +145,71 @@ impl ModbusStream {
             context.refuse_role(peer, &role);
             Arc::clone(&self.nobody)
         });
-        self.modbus::<F, _>(context, (stream, peer), rights, ticket, stop).await;
+        self.modbus::<F, _>(context, (stream, peer), (rights, Vec::new()), ticket, stop).await;
     }
 
     async fn modbus<F: Framing, S: Stream>(
         &self,
         context: Arc<ListenerContext>,
         stream: (S, SocketAddr),
-        rights: Arc<PeerRights>,
+        (rights, received): (Arc<PeerRights>, Vec<u8>),
         ticket: Ticket,
         stop: watch::Receiver<bool>,
     ) {
         let unit_server = Arc::clone(&self.unit_server);
-        let connection =
+        let mut connection =
             Connection::<F, S>::new(context, unit_server, stream, rights, self.timeouts, ticket);
+        connection.begin_with(&received);
         connection.run(stop).await;
+    }
+
+    /// Serves a connection that may begin with a packet: its first bytes decide.
+    async fn shared(
+        &self,
+        raw: &Arc<RawIngest>,
+        context: Arc<ListenerContext>,
+        mut admitted: Admitted<PeerRights>,
+        mut stop: watch::Receiver<bool>,
+    ) {
+        let peer = admitted.peer;
+        let begun = Instant::now();
+        loop {
+            match raw.beginning(&admitted.received) {
+                Beginning::Unknown => {}
+                Beginning::SomethingElse => {
+                    return self.connection::<Mbap>(context, admitted, stop).await;
+                }
+                Beginning::Packet => {
+                    let Admitted { stream, peer, received, ticket, .. } = admitted;
+                    let Some(rights) = raw.rights(peer.ip()) else {
+                        return raw.refuse_peer(&context, (stream, peer), &received, stop).await;
+                    };
+                    let admitted = Admitted { stream, peer, rights, received, ticket };
+                    return Arc::clone(raw).serve(context, admitted, stop).await;
+                }
+            }
+            let is_new = admitted.received.is_empty();
+            let patience = if is_new { self.timeouts.idle } else { Some(self.timeouts.request) };
+            let deadline = begun + patience.unwrap_or(FOREVER);
+            let readable = tokio::select! {
+                readable = timeout_at(deadline, admitted.stream.readable()) => readable,
+                _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
+            };
+            // No more than what decides: the rest is for whoever serves the connection.
+            let mut chunk = [0; DECISIVE];
+            let missing = DECISIVE - admitted.received.len();
+            match readable {
+                Err(_) if is_new => return context.ended(Kind::Idle, peer),
+                Err(_) => return context.ended(Kind::RequestTimeout, peer),
+                Ok(Err(_)) => return context.ended(Kind::Closed, peer),
+                Ok(Ok(())) => match admitted.stream.try_read(&mut chunk[..missing]) {
+                    Ok(0) => return context.ended(Kind::Closed, peer),
+                    Ok(len) => admitted.received.extend_from_slice(&chunk[..len]),
+                    Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+                    Err(_) => return context.ended(Kind::Closed, peer),
+                },
+            }
+        }
     }
 }
 
@@ -155,7 +217,11 @@ impl Service for ModbusStream {
     type PeerRights = PeerRights;
 
     fn rights(&self, peer: IpAddr) -> Option<Arc<PeerRights>> {
-        self.policy.rights(peer)
+        let rights = self.policy.rights(peer);
+        rights.or_else(|| {
+            let raw = self.raw_ingest.as_ref()?;
+            raw.rights(peer).map(|_| Arc::clone(&self.nobody))
+        })
     }
 
     async fn serve(
@@ -165,6 +231,9 @@ impl Service for ModbusStream {
         stop: watch::Receiver<bool>,
     ) {
         set_options(&connection.stream);
+        if let Some(raw) = &self.raw_ingest {
+            return self.shared(raw, context, connection, stop).await;
+        }
         match self.framing {
             StreamFraming::Mbap => self.connection::<Mbap>(context, connection, stop).await,
             StreamFraming::Rtu => self.connection::<Rtu>(context, connection, stop).await,

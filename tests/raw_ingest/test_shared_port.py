@@ -1,0 +1,185 @@
+"""Raw Ingest packets on the port of a Modbus TCP server, and several packets on one connection."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from support import wire
+from support.config_folder import written
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from holdfast.appliance import Appliance
+    from support.running import Connect, Run
+
+DONE, REFUSED = b"\x00", b"\x01"
+SOURCES = ["127.0.0.0/8"]
+READ = b"\x03\x00\x00\x00\x02"
+
+
+def packet(address: int, *values: int, area: int = 3, unit: int = 1) -> bytes:
+    head = struct.pack(">2sBBHHH", b"RI", 1, area, unit, address, len(values))
+    return head + struct.pack(f">{len(values)}H", *values)
+
+
+def configuration(
+    part: dict[str, Any] | None = None, *, kind: str = "modbus-tcp", **more: Any
+) -> str:
+    raw = {"sources": SOURCES, "units": {1: "plant"}, "areas": ["holding_registers"]}
+    rule: dict[str, Any] = {"sources": SOURCES, "units": {1: "plant"}, "access": "read-write"}
+    listener: dict[str, Any] = {"type": kind, "bind": "127.0.0.1:0", **more}
+    if kind == "modbus-tcp":
+        listener |= {"rules": [rule], "raw_ingest": {"rules": [raw], **(part or {})}}
+    else:
+        listener |= {"rules": [raw], **(part or {})}
+    return written(
+        {"memories": {"plant": {"holding_registers": 100}}, "listeners": {"both": listener}}
+    )
+
+
+@pytest.fixture
+def dial() -> Iterator[Any]:
+    with ExitStack() as opened:
+
+        def connect(appliance: Appliance) -> socket.socket:
+            made = socket.create_connection(endpoint(appliance, "both"), timeout=wire.DEADLINE)
+            return opened.enter_context(made)
+
+        yield connect
+
+
+def registers(appliance: Appliance, count: int = 4) -> list[int]:
+    return appliance.memories["plant"].read("holding_registers", 0, count)
+
+
+def counters(appliance: Appliance) -> dict[str, Any]:
+    counted: dict[str, Any] = appliance.diagnostics.stats()["listeners"]["both"]
+    return counted
+
+
+def test_both_protocols_have_one_port(run: Run, dial: Any, connect: Connect) -> None:
+    appliance = run(configuration())
+    sender = dial(appliance)
+    sender.sendall(packet(0, 7, 8))
+    assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
+    with connect(endpoint(appliance, "both")) as client:
+        assert client.ask(READ) == b"\x03\x04\x00\x07\x00\x08"
+    counted = counters(appliance)
+    assert (counted["packets"]["accepted"], counted["requests"]) == (1, {3: 1})
+
+
+def test_a_connection_may_begin_slowly(run: Run, dial: Any) -> None:
+    appliance = run(configuration())
+    sender, client = dial(appliance), dial(appliance)
+    for byte in packet(0, 7):
+        sender.sendall(bytes([byte]))
+    assert sender.recv(1) == DONE
+    for byte in wire.frame(READ, 1, 0x5249):
+        client.sendall(bytes([byte]))
+    assert client.recv(100) == wire.frame(b"\x03\x04\x00\x07\x00\x00", 1, 0x5249)
+
+
+def test_a_modbus_request_whose_transaction_id_is_that_of_a_packet_is_modbus(
+    run: Run, dial: Any
+) -> None:
+    appliance = run(configuration())
+    client = dial(appliance)
+    request = wire.frame(READ, 1, 0x5249)
+    client.sendall(request[:2])
+    client.sendall(request[2:] + request)
+    expected = wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 0x5249) * 2
+    received = b""
+    while len(received) < len(expected):
+        received += client.recv(100)
+    assert received == expected
+
+
+def test_a_packet_of_an_unknown_area_is_a_modbus_frame_of_another_protocol(
+    run: Run, dial: Any
+) -> None:
+    appliance = run(configuration())
+    client = dial(appliance)
+    client.sendall(b"RI\x01\x09\x00\x02\x01\x11" + wire.frame(READ, 1, 1))
+    assert client.recv(100) == wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 1)
+    assert counters(appliance)["frames"]["foreign"] == 1
+
+
+def test_a_sender_without_a_rule_is_refused_and_may_speak_modbus(run: Run, dial: Any) -> None:
+    text = configuration()
+    elsewhere = text.replace(
+        '"raw_ingest": {"rules": [{"sources": ["127.0.0.0/8"]',
+        '"raw_ingest": {"rules": [{"sources": ["10.0.0.0/8"]',
+    )
+    assert elsewhere != text
+    appliance = run(elsewhere)
+    sender, client = dial(appliance), dial(appliance)
+    sender.sendall(packet(0, 7))
+    assert sender.recv(1) == REFUSED
+    client.sendall(wire.frame(READ, 1, 1))
+    assert client.recv(100) == wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 1)
+    assert counters(appliance)["packets"]["refused"] == {"not_granted": 1}
+
+
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+def test_a_connection_can_carry_many_packets(run: Run, dial: Any, kind: str) -> None:
+    appliance = run(configuration({"packets": "many"}, kind=kind))
+    sender = dial(appliance)
+    sender.sendall(packet(0, 1))
+    assert sender.recv(1) == DONE
+    # Two and a half, then the rest.
+    third = packet(3, 4)
+    sender.sendall(packet(1, 2) + packet(2, 3) + third[:7])
+    assert sender.recv(1) + sender.recv(1) == DONE * 2
+    sender.sendall(third[7:])
+    assert sender.recv(1) == DONE
+    assert registers(appliance) == [1, 2, 3, 4]
+    sender.shutdown(socket.SHUT_WR)
+    assert sender.recv(1) == b""
+    assert counters(appliance)["packets"]["accepted"] == 4
+
+
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+def test_a_refused_packet_ends_a_connection_with_many(run: Run, dial: Any, kind: str) -> None:
+    appliance = run(configuration({"packets": "many"}, kind=kind))
+    sender = dial(appliance)
+    sender.sendall(packet(0, 1) + packet(99, 2, 3) + packet(1, 4))
+    assert sender.recv(1) + sender.recv(1) == DONE + REFUSED
+    assert registers(appliance) == [1, 0, 0, 0]
+    assert counters(appliance)["packets"]["refused"] == {"range": 1}
+
+
+def test_half_a_packet_is_refused(run: Run, dial: Any) -> None:
+    appliance = run(configuration({"packets": "many"}))
+    sender = dial(appliance)
+    sender.sendall(packet(0, 1) + packet(1, 2)[:-1])
+    assert sender.recv(1) == DONE
+    sender.shutdown(socket.SHUT_WR)
+    assert sender.recv(1) == REFUSED
+    assert counters(appliance)["packets"]["refused"] == {"short": 1}
+
+
+def test_packets_without_a_next_one_end_by_themselves(run: Run, dial: Any) -> None:
+    appliance = run(configuration({"packets": "many", "idle_timeout": 0.2}, kind="raw-ingest"))
+    sender = dial(appliance)
+    sender.sendall(packet(0, 1))
+    assert (sender.recv(1), sender.recv(1)) == (DONE, b"")
+    assert counters(appliance)["connections"]["idle"] == 1
+
+
+def test_other_listeners_take_no_packets() -> None:
+    memory = holdfast.Memory(holding_registers=1)
+    with holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write") as server:
+        sender = socket.create_connection(server.address, timeout=wire.DEADLINE)
+        with sender:
+            sender.sendall(packet(0, 7))
+            sender.shutdown(socket.SHUT_WR)
+            assert sender.recv(1) == b""
+    assert memory.read("holding_registers", 0, 1) == [0]
