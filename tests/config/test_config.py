@@ -636,6 +636,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "NatsPingConfig": None,
         "RawIngestListener": ["type", "bind", "rules"],
         "RangeConfig": ["area", "start"],
+        "RawIngestConfig": ["rules"],
         "RawRuleConfig": ["sources", "areas"],
         "ReadConfig": ["area", "address", "count"],
         "RestConfig": ["bind", "sources", "tokens"],

@@ -75,9 +75,8 @@ def grants(config: Config) -> Iterator[WriterGrant]:
             yield WriterGrant(("rest", "tokens", index), token.memories, token.areas, writes)
     if config.mqtt is not None:
         for index, topic in enumerate(config.mqtt.subscriptions):
-            yield WriterGrant(
-                ("mqtt", "subscriptions", index), topic.memories, topic.areas, writes=True
-            )
+            path = ("mqtt", "subscriptions", index)
+            yield WriterGrant(path, topic.memories, topic.areas, writes=True)
     for name, adapter in config.adapters.items():
         writes = adapter.access == "read-write"
         yield WriterGrant(("adapters", name), adapter.memories, adapter.areas, writes)

@@ -175,7 +175,7 @@ def _crc(data: dict[str, Any]) -> Literal["required"] | None:
 
 
 class RawIngestConfig(Model):
-    """Raw ingest packets on the port of a Modbus TCP server: the first bytes of a connection decide."""
+    """Raw ingest packets on the port of a Modbus TCP server: the first bytes decide."""
 
     format: Literal["v1", "crc"] = "v1"
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
