@@ -102,7 +102,7 @@ class ListenerChecks:
         self._raw(path, part)
         for rule_path, rule in self._rules(path, part):
             self._raw_rule(rule_path, rule, part.get("format", "v1"))
-        self._shadows(path, part)
+        doubt_order(self._rules(path, part), "raw-ingest", self.report)
 
     def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
         if "crc" in listener and listener.get("format", "v1") == "v1":
