@@ -227,7 +227,8 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
         ("    bind", "    crc: none\n    bind",
          "7: crc: found with format v1, allowed: only with format crc"),
         ("    bind", "    when_full: evict\n    bind", "7: when_full: unknown key, allowed: type, "
-         "format, crc, bind, max_connections, max_connections_per_source, request_timeout, rules"),
+         "format, crc, bind, max_connections, max_connections_per_source, request_timeout, "
+         "packets, idle_timeout, rules"),
         ("    bind", "    max_connections: 0\n    bind",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
         ("units: {1: plant}, ", "",
