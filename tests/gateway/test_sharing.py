@@ -192,6 +192,9 @@ def test_a_write_goes_before_reads_that_wait(run: Run, threads: ThreadPoolExecut
         body = {"address": 5, "value": 1}
         later.append(threads.submit(ask, appliance, "/write/register", device.port, **body))
         await_count(appliance, "waiting", 5)
+        # The link takes requests in order: once it has this one, it has them all.
+        later.append(threads.submit(read, appliance, device.port, 1))
+        await_count(appliance, "coalesced", 1)
         held.release()
         assert all(each.result().json["success"] for each in [first, *later])
     assert [asked.pdu[0] for asked in device.requests] == [3, 6, 3, 3, 3]
@@ -207,7 +210,8 @@ def test_equal_reads_that_wait_are_answered_by_one_request(
         equal = [threads.submit(read, appliance, device.port, 5) for _ in range(8)]
         front = connect(endpoint(appliance, "scada"))
         routed = threads.submit(front.ask, READ)
-        await_count(appliance, "waiting", 10)
+        # One of them waits; the others wait for its reply.
+        await_count(appliance, "coalesced", 8)
         held.release()
         assert first.result().json["values"] == [100]
         assert [each.result().json["values"] for each in equal] == [[5]] * 8
