@@ -25,7 +25,9 @@ __all__ = [
     "FAULTS",
     "FUNCTIONS",
     "MAX_PDU",
+    "OTHER_READS",
     "SUB_FUNCTIONS",
+    "WRITE_FILE_RECORD",
     "Attempt",
     "BatchRefused",
     "BlockingClient",
@@ -69,6 +71,12 @@ registers that it reads and writes."""
 
 SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
 """Each sub-function of function 8: code, name, and whether it changes the device."""
+
+OTHER_READS: Final[tuple[int, ...]]
+"""Functions of the standard that only read, and that memories do not know."""
+
+WRITE_FILE_RECORD: Final[int]
+"""The function that writes file records, which memories do not know."""
 
 EXCEPTIONS: Final[dict[int, str]]
 """The names of exceptions, by code."""

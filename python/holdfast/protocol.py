@@ -57,10 +57,10 @@ CODES = tuple(OF_CODE)
 MAX_CODE = 0x7F
 """The largest function code; greater ones are exceptions (V1.1b3, 4.1)."""
 
-OTHER_READS = (7, 12, 20, 24)
+OTHER_READS = _core.OTHER_READS
 """Functions that only devices have, and that change nothing."""
 
-WRITE_FILE_RECORD = 21
+WRITE_FILE_RECORD = _core.WRITE_FILE_RECORD
 WRITING_CODES = tuple(each.code for each in FUNCTIONS if each.writes)
 
 BROADCAST_CODES = tuple(each.code for each in FUNCTIONS if each.writes and not each.most_read)

@@ -2,6 +2,7 @@
 //! Python takes them from here and keeps no list of its own.
 
 use holdfast_engine::link::Fault;
+use holdfast_engine::server::functions::{OTHER_READS, WRITE_FILE_RECORD};
 use holdfast_memory::{Area, Span};
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
 use pyo3::prelude::*;
@@ -19,6 +20,8 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
         (code, name, function.is_write(), area, of.most_read, of.most_written)
     });
     module.add("FUNCTIONS", PyTuple::new(py, functions.collect::<Vec<_>>())?)?;
+    module.add("OTHER_READS", PyTuple::new(py, OTHER_READS)?)?;
+    module.add("WRITE_FILE_RECORD", WRITE_FILE_RECORD)?;
     let sub_functions = (0..=u16::MAX).filter_map(SubFunction::from_code);
     let sub_functions = sub_functions.map(|each| (each.code(), each.name(), each.changes_state()));
     module.add("SUB_FUNCTIONS", PyTuple::new(py, sub_functions.collect::<Vec<_>>())?)?;

@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_engine::server::policy::{
-    AccessMode, Elsewhere, Functions, Items, Narrowed, Ranges, Rule as CoreRule,
-};
+use holdfast_engine::items::Items;
+use holdfast_engine::server::functions::{AccessMode, Functions};
+use holdfast_engine::server::policy::{Elsewhere, Narrowed, Rule as CoreRule};
+use holdfast_engine::server::ranges::Ranges;
 use holdfast_engine::server::{
     ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, PacketsPerConnection,
     RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming, StreamSettings,

@@ -17,6 +17,7 @@
 
 pub mod client;
 mod counter;
+pub mod items;
 pub mod link;
 pub mod packet_area;
 pub mod poller;

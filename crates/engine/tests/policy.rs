@@ -3,7 +3,8 @@
 use std::net::IpAddr;
 use std::sync::Arc;
 
-use holdfast_engine::server::policy::{AccessMode, Functions, PeerRights, Policy, Rule};
+use holdfast_engine::server::functions::{AccessMode, Functions};
+use holdfast_engine::server::policy::{PeerRights, Policy, Rule};
 use holdfast_memory::{Layout, Memory};
 
 fn rule(sources: &[&str], unit: u8, rights: AccessMode, functions: Functions) -> Rule {

@@ -13,7 +13,8 @@ use holdfast_engine::client::Place;
 use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink};
 use holdfast_engine::poller::Poller;
 use holdfast_engine::server::event::Verbosity;
-use holdfast_engine::server::policy::{AccessMode, Elsewhere, Functions, Rule};
+use holdfast_engine::server::functions::{AccessMode, Functions};
+use holdfast_engine::server::policy::{Elsewhere, Rule};
 use holdfast_engine::server::{
     ConnectionLimits, Engine, ListenerKind, ListenerSettings, Settings, StreamFraming,
     StreamSettings, WhenFull,

@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
+use holdfast_engine::items::Items;
 use holdfast_engine::server::counters::Bus;
+use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::identity::Identity;
-use holdfast_engine::server::policy::{
-    AccessMode, Functions, Items, Narrowed, PeerRights, Ranges, Rule,
-};
+use holdfast_engine::server::policy::{Narrowed, PeerRights, Rule};
+use holdfast_engine::server::ranges::Ranges;
 use holdfast_engine::server::unit_server::UnitServer;
 use holdfast_memory::{Area, Gate, GateMode, Layout, Memory, Span};
 use holdfast_protocol::pdu;

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use holdfast_protocol::pdu::ExceptionCode;
+
 use crate::client::ClientError;
 
 /// Errors from this code on are not exceptions.
@@ -32,6 +34,16 @@ impl Fault {
         matches!(self, Fault::Exception(code) if !UNREACHED.contains(&code))
     }
 
+    /// The code of the exception that a client of a gateway gets for it (V1.1b3, 7): that of the device,
+    /// or whether its address or only the device could not be reached.
+    pub(crate) fn exception(self, is_unreachable: bool) -> u8 {
+        match self {
+            Fault::Exception(code) => code,
+            _ if is_unreachable => ExceptionCode::GatewayPathUnavailable.code(),
+            _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
+        }
+    }
+
     pub const fn code(self) -> u16 {
         match self {
             Fault::Exception(code) => code as u16,
@@ -44,6 +56,11 @@ impl Fault {
             Fault::Internal => NO_EXCEPTION + 7,
         }
     }
+}
+
+/// The PDU of an exception that answers a request.
+pub(crate) fn exception(request: &[u8], code: u8) -> Vec<u8> {
+    vec![request.first().copied().unwrap_or_default() | 0x80, code]
 }
 
 /// The PDU of a reply, empty after a broadcast; or the fault.

@@ -27,6 +27,7 @@ pub(crate) use access::Link;
 pub use caller::{Called, Caller, Wakes};
 pub(crate) use coming::{Coming, ReplyTo, coming};
 pub use fault::Fault;
+pub(crate) use fault::exception;
 pub use pace::InFlight;
 pub(crate) use queue::{Priority, source};
 pub(crate) use route::{Asker, Call};

@@ -145,12 +145,10 @@ impl SharedLink {
             _ => Priority::Usual,
         }
     }
-}
 
-impl SharedLink {
     /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. A
-    /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full. Event loops together may fill no more of
-    /// the queue than they leave to others.
+    /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full.
+    /// Event loops together may fill no more of the queue than they leave to others.
     pub fn call(
         self: &Arc<SharedLink>,
         caller: &Arc<Caller>,

@@ -5,12 +5,12 @@ use std::cell::RefCell;
 use std::rc::Rc;
 use std::sync::{Arc, Weak};
 
-use holdfast_protocol::pdu::{self, EncodedRequest, ExceptionCode, reply};
+use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use tokio::sync::mpsc;
 use tokio::task::spawn_local;
 
 use super::access::Link;
-use super::fault::{Exchanged, Fault, fault};
+use super::fault::{Exchanged, Fault, exception, fault};
 use super::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
 use super::shared_reads::{SharedReads, shareable};
 use super::silence::Silence;
@@ -79,21 +79,16 @@ impl Serving {
             }
             Err(error) => error,
         };
-        let pdu = match fault(&error) {
-            Fault::Exception(code) => {
+        let fault = fault(&error);
+        match fault {
+            Fault::Exception(_) => {
                 counters.replies.add();
                 counters.exceptions.add();
-                vec![request.pdu()[0] | 0x80, code]
             }
-            Fault::Timeout => {
-                counters.timeouts.add();
-                exception(&request, self.silence.exception())
-            }
-            _ => {
-                counters.failures.add();
-                exception(&request, self.silence.exception())
-            }
-        };
+            Fault::Timeout => counters.timeouts.add(),
+            _ => counters.failures.add(),
+        }
+        let pdu = exception(request.pdu(), fault.exception(self.silence.is_unreachable()));
         replies.into_iter().for_each(|reply| reply.send(Err((&error, &pdu))));
     }
 
@@ -107,7 +102,7 @@ impl Serving {
         counters: &LinkCounters,
     ) -> Vec<Reply> {
         let Err(code) = self.silence.refuse(unit_id) else { return replies };
-        let pdu = exception(request, code);
+        let pdu = exception(request.pdu(), code.code());
         let error = self.error.borrow();
         let error = error.as_ref().filter(|_| code == ExceptionCode::GatewayPathUnavailable);
         let mut admitted = Vec::new();
@@ -143,10 +138,4 @@ impl Serving {
             self.silence.learn(unit_id, outcome, is_unreachable);
         }
     }
-}
-
-fn exception(request: &EncodedRequest, code: ExceptionCode) -> Vec<u8> {
-    let mut pdu = [0; pdu::MAX_LEN];
-    let len = reply::exception(request.pdu()[0], code, &mut pdu);
-    pdu[..len].to_vec()
 }

@@ -74,12 +74,9 @@ impl Silence {
         }
     }
 
-    /// The exception for a request without an answer.
-    pub(super) fn exception(&self) -> ExceptionCode {
-        match self.address.get() {
-            Some(_) => ExceptionCode::GatewayPathUnavailable,
-            None => ExceptionCode::GatewayTargetFailedToRespond,
-        }
+    /// Whether the address could not be reached the last time.
+    pub(super) fn is_unreachable(&self) -> bool {
+        self.address.get().is_some()
     }
 }
 

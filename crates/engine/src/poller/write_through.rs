@@ -14,7 +14,8 @@ use holdfast_protocol::pdu::{
 };
 use tokio::sync::mpsc;
 
-use crate::link::{Coming, Fault, Link, Priority, ReplyTo, coming};
+use crate::items::{Items, touched};
+use crate::link::{Coming, Fault, Link, Priority, ReplyTo, coming, exception};
 
 /// The most writes into one memory that wait for devices.
 const MAX_WAITING: usize = 256;
@@ -40,14 +41,6 @@ pub struct Passage {
     ranges: Vec<PassedRange>,
     writes: mpsc::UnboundedSender<PassedWrite>,
     waiting: Arc<AtomicUsize>,
-}
-
-/// Items of a memory.
-#[derive(Debug, Clone, Copy)]
-struct Items {
-    area: Area,
-    address: u16,
-    count: u32,
 }
 
 /// A write on its way to a device.
@@ -80,44 +73,10 @@ impl Drop for Place {
     }
 }
 
-impl Items {
-    fn end(self) -> u32 {
-        u32::from(self.address) + self.count
+impl PassedRange {
+    fn items(&self) -> Items {
+        Items { area: self.area, address: self.address, count: self.count }
     }
-
-    fn overlaps(self, range: &PassedRange) -> bool {
-        let first = u32::from(range.address);
-        self.area == range.area
-            && u32::from(self.address) < first + range.count
-            && first < self.end()
-    }
-
-    fn is_in(self, range: &PassedRange) -> bool {
-        self.area == range.area
-            && range.address <= self.address
-            && self.end() <= u32::from(range.address) + range.count
-    }
-}
-
-/// What a request writes, and what it reads after that; `None` if it does not write items.
-fn touched(request: &Request<'_>) -> Option<(Items, Option<Items>)> {
-    let registers =
-        |address, count: u16| Items { area: Area::HoldingRegisters, address, count: count.into() };
-    let coils = |address, count: u16| Items { area: Area::Coils, address, count: count.into() };
-    Some(match *request {
-        Request::WriteSingleCoil { address, .. } => (coils(address, 1), None),
-        Request::WriteMultipleCoils { address, bits } => (coils(address, bits.quantity()), None),
-        Request::WriteSingleRegister { address, .. }
-        | Request::MaskWriteRegister { address, .. } => (registers(address, 1), None),
-        Request::WriteMultipleRegisters { address, registers: new } => {
-            (registers(address, new.quantity()), None)
-        }
-        Request::ReadWriteMultipleRegisters { read, write_address, registers: new } => {
-            let read = registers(read.address(), read.quantity());
-            (registers(write_address, new.quantity()), Some(read))
-        }
-        _ => return None,
-    })
 }
 
 impl Passage {
@@ -134,8 +93,9 @@ impl Passage {
         let function = pdu.first().copied().and_then(Function::from_code);
         function.is_some_and(Function::is_write)
             && Request::parse(pdu).is_ok_and(|request| {
-                touched(&request).is_some_and(|(written, _)| {
-                    self.ranges.iter().any(|range| written.overlaps(range))
+                let (_, written) = touched(&request);
+                written.is_some_and(|written| {
+                    self.ranges.iter().any(|range| written.overlaps(range.items()))
                 })
             })
     }
@@ -156,7 +116,7 @@ impl Passage {
     /// The device that a range of the memory is read from, if one write can change it.
     pub fn device_of(&self, area: Area, address: u16, count: u32) -> Option<&str> {
         let items = Items { area, address, count };
-        let range = self.ranges.iter().find(|range| items.is_in(range));
+        let range = self.ranges.iter().find(|range| items.is_in(range.items()));
         range.map(|range| &*range.device)
     }
 
@@ -176,8 +136,10 @@ impl Passage {
 
     fn pass(&self, pdu: &[u8]) -> Result<(Arc<str>, Coming), ExceptionCode> {
         let request = Request::parse(pdu)?;
-        let (written, read) = touched(&request).ok_or(ExceptionCode::IllegalFunction)?;
+        let (read, written) = touched(&request);
+        let written = written.ok_or(ExceptionCode::IllegalFunction)?;
         let is_whole = |range: &&PassedRange| {
+            let range = range.items();
             written.is_in(range) && read.is_none_or(|read| read.is_in(range))
         };
         let range = self.ranges.iter().find(is_whole).ok_or(ExceptionCode::IllegalDataAddress)?;
@@ -226,7 +188,7 @@ impl PassedWrite {
 
     /// Refuses it without a try.
     pub(super) fn refuse(self, code: ExceptionCode) {
-        let pdu = self.exception(code);
+        let pdu = exception(&self.pdu, code.code());
         self.reply.send(pdu);
     }
 
@@ -283,11 +245,7 @@ impl PassedWrite {
         };
         let pdu = match answered {
             Ok(answer) => return self.confirm(&answer, value),
-            Err(Fault::Exception(code)) => vec![self.pdu[0] | 0x80, code],
-            Err(_) if link.retry_at().is_some() => {
-                self.exception(ExceptionCode::GatewayPathUnavailable)
-            }
-            Err(_) => self.exception(ExceptionCode::GatewayTargetFailedToRespond),
+            Err(fault) => exception(&self.pdu, fault.exception(link.retry_at().is_some())),
         };
         self.reply.send(pdu);
         None
@@ -328,7 +286,7 @@ impl PassedWrite {
     /// What the device has taken over.
     fn change(&self, value: Option<u16>) -> Option<Change> {
         let request = self.request.request()?;
-        let (Items { area, address, count }, _) = touched(&request)?;
+        let Items { area, address, count } = touched(&request).1?;
         let bytes = match request {
             Request::WriteSingleCoil { value, .. } => vec![u8::from(value)],
             Request::WriteSingleRegister { value, .. } => value.to_be_bytes().to_vec(),
@@ -351,12 +309,6 @@ impl PassedWrite {
         let write = Write { area, address, count: count as usize, bytes };
         let stored = self.memory.write(Access::Mirror, write);
         debug_assert!(stored.is_ok(), "a mirrored range is inside its memory: {stored:?}");
-    }
-
-    fn exception(&self, code: ExceptionCode) -> Vec<u8> {
-        let mut buffer = [0; pdu::MAX_LEN];
-        let len = reply::exception(self.pdu[0], code, &mut buffer);
-        buffer[..len].to_vec()
     }
 }
 

@@ -7,10 +7,10 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use holdfast_protocol::pdu::{Function, Request};
+use holdfast_protocol::pdu::Function;
 use holdfast_protocol::raw_ingest;
 
-use super::policy::OTHER_READS;
+use super::functions::only_reads;
 
 /// The most bytes in the queue.
 const CAPACITY: usize = 32 << 20;
@@ -112,18 +112,6 @@ impl Auditor {
             self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
         }
-    }
-}
-
-/// Whether a request is known to change nothing in a device.
-fn only_reads(request: &[u8]) -> bool {
-    let code = request.first().copied().unwrap_or_default();
-    match Function::from_code(code) {
-        Some(Function::Diagnostics | Function::EncapsulatedInterface) => {
-            Request::parse(request).is_ok_and(|request| request.is_read())
-        }
-        Some(function) => !function.is_write(),
-        None => OTHER_READS.contains(&code),
     }
 }
 

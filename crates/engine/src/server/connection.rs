@@ -542,8 +542,9 @@ mod tests {
     use holdfast_protocol::frame::{ascii, mbap};
 
     use super::*;
+    use crate::server::functions::{AccessMode, Functions};
     use crate::server::identity::Identity;
-    use crate::server::policy::{AccessMode, Functions, Rule};
+    use crate::server::policy::Rule;
 
     fn answering<F: Framing>() -> Answering<F> {
         let span = Span::new(0, 2000).unwrap();

@@ -10,11 +10,11 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use holdfast_protocol::pdu::{self, ExceptionCode, reply};
+use holdfast_protocol::pdu::ExceptionCode;
 
 use super::policy::{Elsewhere, PeerRights};
 use super::unit_server::UnitServer;
-use crate::link::{Asker, Coming, source};
+use crate::link::{Asker, Coming, exception, source};
 
 /// The most requests of a connection that wait for replies.
 pub(super) const MAX_WAITING: usize = 16;
@@ -85,17 +85,16 @@ impl Deferred {
         peer: IpAddr,
         (tag, unit_id, request): (u16, u8, &[u8]),
     ) -> Deferral {
-        match place {
+        let place = match place {
             None if self.is_empty() => return Deferral::Now,
-            Some(Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => {}
-            Some(Elsewhere::Mirror(_)) if self.is_empty() => {}
+            Some(place @ Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => place,
+            Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
             _ => return Deferral::Wait,
-        }
-        let Some(place) = place else { return Deferral::Now };
+        };
         let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
         let (route, reply) = match unit_server.forward(rights, place, &asker, unit_id, request) {
             Ok((route, coming)) => (Some(route), Expected::Coming(coming)),
-            Err(code) => (None, Expected::Known(exception(request, code))),
+            Err(code) => (None, Expected::Known(exception(request, code.code()))),
         };
         let request = request.to_vec();
         self.waiting.push_back(Waiting { tag, unit_id, route, request, reply });
@@ -160,15 +159,8 @@ impl Waiting {
 
 /// The reply that came, and counts it. `None` means that the link has ended.
 pub(super) fn come(unit_server: &UnitServer, request: &[u8], reply: Option<Vec<u8>>) -> Vec<u8> {
-    let ended = || exception(request, ExceptionCode::GatewayPathUnavailable);
+    let ended = || exception(request, ExceptionCode::GatewayPathUnavailable.code());
     let reply = reply.unwrap_or_else(ended);
     unit_server.forwarded(request, &reply);
     reply
-}
-
-pub(super) fn exception(request: &[u8], code: ExceptionCode) -> Vec<u8> {
-    let mut buffer = [0; pdu::MAX_LEN];
-    let function_code = request.first().copied().unwrap_or_default();
-    let len = reply::exception(function_code, code, &mut buffer);
-    buffer[..len].to_vec()
 }

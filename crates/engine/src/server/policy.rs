@@ -4,34 +4,13 @@ use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use holdfast_memory::{Area, Memory};
-use holdfast_protocol::pdu::{Function, Request};
+use holdfast_memory::Memory;
 use ipnet::IpNet;
 
+use super::functions::{AccessMode, Codes, Functions, only_reads};
+use super::ranges::Ranges;
 use crate::link::Route;
 use crate::poller::Passage;
-
-/// Functions of the standard that only read, and that memories do not know (V1.1b3, 6): exception
-/// status, event log, file records, FIFO queue.
-pub(super) const OTHER_READS: [u8; 4] = [7, 12, 20, 24];
-
-/// The function of the standard that writes file records (V1.1b3, 6.15).
-const WRITE_FILE_RECORD: u8 = 21;
-
-/// What a rule allows its peers to do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AccessMode {
-    ReadOnly,
-    ReadWrite,
-}
-
-/// The function codes of a rule.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Functions {
-    All,
-    Only(Vec<u8>),
-    Except(Vec<u8>),
-}
 
 /// The rights of peers from some networks.
 #[derive(Debug, Clone)]
@@ -139,143 +118,6 @@ impl Policy {
     }
 }
 
-/// Ranges of areas, for reading and for writing; `None` is everything.
-#[derive(Debug, Clone, Default)]
-pub struct Ranges {
-    read: Option<Vec<Items>>,
-    write: Option<Vec<Items>>,
-}
-
-/// Items of an area.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Items {
-    pub area: Area,
-    pub address: u16,
-    pub count: u32,
-}
-
-impl Items {
-    fn end(self) -> u32 {
-        u32::from(self.address) + self.count
-    }
-
-    fn is_in(self, ranges: &Option<Vec<Items>>) -> bool {
-        ranges.as_ref().is_none_or(|ranges| {
-            ranges.iter().any(|range| {
-                range.area == self.area
-                    && range.address <= self.address
-                    && self.end() <= range.end()
-            })
-        })
-    }
-}
-
-impl Ranges {
-    pub fn new(read: Option<Vec<Items>>, write: Option<Vec<Items>>) -> Ranges {
-        Ranges { read: read.map(joined), write: write.map(joined) }
-    }
-
-    fn is_everything(&self) -> bool {
-        self.read.is_none() && self.write.is_none()
-    }
-
-    /// Whether a request reads and writes only inside the ranges.
-    pub(crate) fn allow(&self, request: &Request<'_>) -> bool {
-        let (read, written) = touched(request);
-        read.is_none_or(|items| items.is_in(&self.read))
-            && written.is_none_or(|items| items.is_in(&self.write))
-    }
-}
-
-/// Joins ranges that meet, so that a request may cross from one into the other.
-fn joined(mut ranges: Vec<Items>) -> Vec<Items> {
-    ranges.sort_by_key(|range| {
-        (Area::ALL.iter().position(|area| *area == range.area), range.address)
-    });
-    let mut all: Vec<Items> = Vec::new();
-    for range in ranges {
-        match all.last_mut() {
-            Some(last) if last.area == range.area && u32::from(range.address) <= last.end() => {
-                last.count = range.end().max(last.end()) - u32::from(last.address);
-            }
-            _ => all.push(range),
-        }
-    }
-    all
-}
-
-/// What a request reads, and what it writes.
-fn touched(request: &Request<'_>) -> (Option<Items>, Option<Items>) {
-    let items = |area, address, count: u16| Some(Items { area, address, count: count.into() });
-    let (coils, registers) = (Area::Coils, Area::HoldingRegisters);
-    match *request {
-        Request::ReadCoils(range) => (items(coils, range.address(), range.quantity()), None),
-        Request::ReadDiscreteInputs(range) => {
-            (items(Area::DiscreteInputs, range.address(), range.quantity()), None)
-        }
-        Request::ReadHoldingRegisters(range) => {
-            (items(registers, range.address(), range.quantity()), None)
-        }
-        Request::ReadInputRegisters(range) => {
-            (items(Area::InputRegisters, range.address(), range.quantity()), None)
-        }
-        Request::WriteSingleCoil { address, .. } => (None, items(coils, address, 1)),
-        Request::WriteSingleRegister { address, .. }
-        | Request::MaskWriteRegister { address, .. } => (None, items(registers, address, 1)),
-        Request::WriteMultipleCoils { address, bits } => {
-            (None, items(coils, address, bits.quantity()))
-        }
-        Request::WriteMultipleRegisters { address, registers: new } => {
-            (None, items(registers, address, new.quantity()))
-        }
-        Request::ReadWriteMultipleRegisters { read, write_address, registers: new } => (
-            items(registers, read.address(), read.quantity()),
-            items(registers, write_address, new.quantity()),
-        ),
-        _ => (None, None),
-    }
-}
-
-/// Function codes.
-#[derive(Debug, Clone, Copy, Default)]
-struct Codes([u64; 4]);
-
-impl Codes {
-    #[inline]
-    fn has(&self, code: u8) -> bool {
-        self.0[usize::from(code >> 6)] >> (code & 63) & 1 == 1
-    }
-
-    fn of(functions: &Functions, access: AccessMode, of_device: bool) -> Codes {
-        let mut codes = Codes::default();
-        for code in (0..=u8::MAX).filter(|code| is_allowed(*code, functions, access, of_device)) {
-            codes.0[usize::from(code >> 6)] |= 1 << (code & 63);
-        }
-        codes
-    }
-
-    fn with(self, other: Codes) -> Codes {
-        Codes(std::array::from_fn(|index| self.0[index] | other.0[index]))
-    }
-}
-
-fn is_allowed(code: u8, functions: &Functions, access: AccessMode, of_device: bool) -> bool {
-    let (named, listed) = match functions {
-        Functions::All => (true, false),
-        Functions::Only(codes) => (codes.contains(&code), true),
-        Functions::Except(codes) => (!codes.contains(&code), false),
-    };
-    let writes = access == AccessMode::ReadWrite;
-    named
-        && match Function::from_code(code) {
-            Some(function) => writes || !function.is_write(),
-            // Only devices know other functions.
-            None if !of_device || code & 0x80 != 0 => false,
-            None if OTHER_READS.contains(&code) => true,
-            None => writes && (listed || code == WRITE_FILE_RECORD),
-        }
-}
-
 /// The rights of a peer, compiled to a table by unit id.
 #[derive(Debug)]
 pub struct PeerRights {
@@ -366,14 +208,10 @@ impl PeerRights {
         self.unit(unit_id)?.ranges.as_ref()
     }
 
-    /// Whether a request to a device is denied for what follows its function code: a read-only peer may
-    /// send only sub-functions that are known to change nothing.
+    /// Whether a request to a device is denied although its function is allowed: a read-only peer may send
+    /// only what is known to change nothing, which a sub-function decides too.
     pub(crate) fn denies(&self, unit_id: u8, request: &[u8]) -> bool {
-        let with_sub_functions = [Function::Diagnostics, Function::EncapsulatedInterface];
-        let code = request.first().copied().unwrap_or_default();
-        self.is_read_only(unit_id)
-            && with_sub_functions.iter().any(|function| function.code() == code)
-            && !Request::parse(request).is_ok_and(|request| request.is_read())
+        self.is_read_only(unit_id) && !only_reads(request)
     }
 
     /// One unit id per memory, chosen among the `wanted` unit ids: the first one that may do what is

@@ -14,13 +14,13 @@ use serial2_tokio::SerialPort;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use super::deferred::{come, exception};
+use super::deferred::come;
 use super::event::Kind;
 use super::framing::{Framing, Rtu};
 use super::listener::ListenerContext;
 use super::policy::{PeerRights, Rule};
 use super::unit_server::UnitServer;
-use crate::link::{Asker, source};
+use crate::link::{Asker, exception, source};
 use crate::serial_line::{LineMode, SerialLine};
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
@@ -237,7 +237,7 @@ impl ModbusSerial {
                 Ok((route, coming)) => {
                     (Some(route), come(&self.unit_server, request, coming.await.ok()))
                 }
-                Err(code) => (None, exception(request, code)),
+                Err(code) => (None, exception(request, code.code())),
             };
             if let Some(auditor) = &context.auditor {
                 let passed = (route.as_ref(), request, &answered[..]);
