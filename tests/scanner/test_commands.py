@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import logs
 from holdfast.scanner import ScannerLimits
 from holdfast.scanner.commands import value
 from holdfast.scanner.errors import Refused
@@ -190,9 +189,7 @@ def test_a_message_that_is_refused_is_logged(
     caller: Caller,
     server: holdfast.Server,
     caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
     caller.request("modbus.subscribe", subscription(server, tag("a", 0, writable=False)))
     caller.publish("modbus.command.a", "7")
 

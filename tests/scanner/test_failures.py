@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import logs
 from holdfast.scanner import devices
 from support import wire
 from support.brokers import NatsServer
@@ -22,22 +21,10 @@ from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.nats_bus import Caller, leaving, subscription, tag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from support.nats_bus import Run
     from support.running import Process, Serve
-
-
-@pytest.fixture(autouse=True)
-def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
-@pytest.fixture
-def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
-    with Caller(own_nats.url) as caller:
-        yield caller
 
 
 def events(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -80,7 +67,7 @@ def test_nats_comes_back_and_everything_goes_on_with_the_newest_values(
         message = data.next()
         found[message["variableId"]].append(message["value"])
     assert {id: set(values) for id, values in found.items()} == {"a": {2}, "b": {3}}
-    wire.until(lambda: events(caplog).count("nats_connected") == 2, "it is told")
+    wire.until(lambda: events(caplog).count("nats_connected") == 2, "it is logged")
     assert "nats_connect_failed" in events(caplog)
     assert own_caller.request("modbus.unsubscribe", leaving("a", "b"))["success"]
 
@@ -118,7 +105,7 @@ def test_a_scanner_waits_for_nats(
     own_nats = NatsServer(tmp_path)
     own_nats.kill()
     scanner = run_scanner(own_nats, wait=False)
-    wire.until(lambda: "nats_connect_failed" in events(caplog), "it is told")
+    wire.until(lambda: "nats_connect_failed" in events(caplog), "it is logged")
     own_nats.start()
     try:
         wire.until(lambda: scanner.serves, "it is connected")
@@ -384,7 +371,7 @@ def test_without_jetstream_it_says_so_once_and_goes_on(
     bare = NatsServer(tmp_path, jetstream=False)
     try:
         scanner = run_scanner(bare)
-        wire.until(lambda: "no_heartbeat" in events(caplog), "it is told")
+        wire.until(lambda: "no_heartbeat" in events(caplog), "it is logged")
         with Caller(bare.url) as caller:
             data = caller.listen("modbus.data.plc1")
             caller.request("modbus.subscribe", subscription(server, tag("a", 0)))

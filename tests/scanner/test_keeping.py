@@ -10,39 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast import logs
 from holdfast.scanner import keeping, kept_entries
 from holdfast.scanner.keeping import BUCKET
 from support import wire
 from support.brokers import NatsServer
-from support.nats_bus import Caller, leaving, subscription, tag
+from support.nats_bus import Caller, leaving, logged, subscription, tag
 from support.tentacle import plc_subscribe, plc_tag, plc_unsubscribe
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     import holdfast
     from support.nats_bus import Run
-
-
-@pytest.fixture(autouse=True)
-def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
-@pytest.fixture
-def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
-    with Caller(own_nats.url) as caller:
-        yield caller
-
-
-def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
-    return [
-        record.fields  # type: ignore[attr-defined]
-        for record in caplog.records
-        if record.getMessage() == event
-    ]
 
 
 def device(caller: Caller, id: str) -> Any:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import pytest
 from nats.errors import NoRespondersError
 
-from holdfast import logs
 from holdfast.net.tls import Tls
 from holdfast.scanner import Scanner, Servers, Settings, broker
 from support import wire
@@ -48,11 +47,6 @@ def serve_nats(tmp_path: Path) -> Iterator[Serve]:
         server.kill()
 
 
-@pytest.fixture(autouse=True)
-def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
 def reasons(caplog: pytest.LogCaptureFixture, event: str) -> list[str]:
     """What an event was logged with, each time."""
     found = [record for record in caplog.records if record.getMessage() == event]
@@ -61,7 +55,7 @@ def reasons(caplog: pytest.LogCaptureFixture, event: str) -> list[str]:
 
 def failure(caplog: pytest.LogCaptureFixture) -> str:
     """Why it can't connect, when it says so."""
-    wire.until(lambda: reasons(caplog, "nats_connect_failed"), "it is told")
+    wire.until(lambda: reasons(caplog, "nats_connect_failed"), "it is logged")
     return reasons(caplog, "nats_connect_failed")[0]
 
 

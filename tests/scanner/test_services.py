@@ -16,32 +16,11 @@ from holdfast.scanner import Ping, heartbeat, service
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import FakeDevice, exception, registers
-from support.nats_bus import Caller, subscription, tag
+from support.nats_bus import Caller, logged, subscription, tag
 from support.tentacle import plc_subscribe, plc_tag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from support.nats_bus import Inbox, Run
-
-
-@pytest.fixture(autouse=True)
-def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
-@pytest.fixture
-def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
-    with Caller(own_nats.url) as caller:
-        yield caller
-
-
-def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
-    return [
-        record.fields  # type: ignore[attr-defined]
-        for record in caplog.records
-        if record.getMessage() == event
-    ]
 
 
 # Logs.
@@ -115,7 +94,7 @@ def test_a_log_that_may_not_be_published_causes_no_flood(
         url = server.url.replace("nats://", "nats://a:b@")
         scanner = run_scanner(servers=Servers((url,)))
         with Caller(url) as caller:
-            wire.until(lambda: logged(caplog, "nats_error"), "it is told")
+            wire.until(lambda: logged(caplog, "nats_error"), "it is logged")
             for _ in range(30):
                 assert not caller.request("modbus.subscribe", "nonsense")["success"]
         scanner.stop()
@@ -198,7 +177,7 @@ def test_a_frozen_server_is_found(
     own_nats.freeze()
     try:
         wire.until(lambda: not scanner.serves, "it is found")
-        wire.until(lambda: logged(caplog, "nats_disconnected"), "it is told")
+        wire.until(lambda: logged(caplog, "nats_disconnected"), "it is logged")
     finally:
         own_nats.thaw()
     wire.until(lambda: scanner.serves, "it is connected again")

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import logs
 from holdfast.scanner import Defaults
 from support import wire
-from support.nats_bus import leaving, subscription, tag
+from support.nats_bus import leaving, logged, subscription, tag
 from support.tentacle import (
     gateway_tag,
     plc_subscribe,
@@ -24,20 +23,6 @@ from support.tentacle import (
 if TYPE_CHECKING:
     from support.nats_bus import Caller, Inbox, Run
     from support.running import Serve
-
-
-@pytest.fixture(autouse=True)
-def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
-def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
-    """The fields of an event, for each time it was logged."""
-    return [
-        record.fields  # type: ignore[attr-defined]
-        for record in caplog.records
-        if record.getMessage() == event
-    ]
 
 
 def device(caller: Caller, id: str) -> Any:

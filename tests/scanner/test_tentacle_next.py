@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast import logs
 from holdfast.scanner import Defaults, tentacle_next, watching
 from holdfast.scanner import configured as configured_module
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.keeping import BUCKET as KEPT
 from support import wire
 from support.brokers import NatsServer
-from support.nats_bus import Caller, leaving, subscription, tag
+from support.nats_bus import Caller, leaving, logged, subscription, tag
 from support.tentacle_next import (
     BUCKET,
     ENABLED,
@@ -39,19 +38,8 @@ NEXT: dict[str, Any] = {"dialect": "tentacle-next", "defaults": Defaults(publish
 
 
 @pytest.fixture(autouse=True)
-def _fresh_throttle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
-
-
-@pytest.fixture(autouse=True)
 def _retried_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(configured_module, "RETRIED", 0.1)
-
-
-@pytest.fixture
-def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
-    with Caller(own_nats.url) as caller:
-        yield caller
 
 
 @pytest.fixture
@@ -62,15 +50,6 @@ def scanner(run_scanner: Run, caller: Caller) -> Iterator[Running]:
     running.stop()
     caller.forget(BUCKET)
     caller.forget(ENABLED)
-
-
-def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
-    """The fields of an event, for each time it was logged."""
-    return [
-        record.fields  # type: ignore[attr-defined]
-        for record in caplog.records
-        if record.getMessage() == event
-    ]
 
 
 def devices(caller: Caller) -> dict[str, Any]:

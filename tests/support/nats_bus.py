@@ -297,6 +297,12 @@ def caller(nats: NatsServer) -> Iterator[Caller]:
 
 
 @pytest.fixture
+def own_caller(own_nats: NatsServer) -> Iterator[Caller]:
+    with Caller(own_nats.url) as caller:
+        yield caller
+
+
+@pytest.fixture
 def run_scanner(nats: NatsServer) -> Iterator[Run]:
     with ExitStack() as running:
 
@@ -316,6 +322,15 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
 def scanner(run_scanner: Run) -> Running:
     """A scanner with default settings, connected to `nats`."""
     return run_scanner()
+
+
+def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:
+    """Returns the fields of an event, for each time it was logged."""
+    return [
+        record.fields  # type: ignore[attr-defined]
+        for record in caplog.records
+        if record.getMessage() == event
+    ]
 
 
 def tag(id: str, address: int, datatype: str = "uint16", **more: Any) -> dict[str, Any]:

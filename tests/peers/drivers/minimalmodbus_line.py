@@ -75,7 +75,7 @@ def call(device: Any, operation: dict[str, Any]) -> Any:
             return device.write_bits(at, values)
         case "write_registers":
             return device.write_registers(at, values)
-    raise NotImplementedError(operation["call"])
+    raise ValueError(f"there is no call named {operation['call']}")
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def call(client: Any, operation: dict[str, Any]) -> Any:
         case "identify":
             reply = client.read_device_identification(operation["code"], operation["object"])
             return reply and {key: text.decode() for key, text in reply.objects_by_id.items()}
-    raise NotImplementedError(operation["call"])
+    raise ValueError(f"there is no call named {operation['call']}")
 
 
 def run_server() -> None:

@@ -74,7 +74,7 @@ async def write(client: Any, operation: dict[str, Any]) -> None:
         case "mask_write":
             await client.mask_write_register(at, operation["and"], operation["or"])
         case name:
-            raise NotImplementedError(name)
+            raise ValueError(f"there is no call named {name}")
 
 
 def words(values: list[int]) -> bytes:
