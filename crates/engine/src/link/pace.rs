@@ -13,7 +13,7 @@ use super::queue::{Priority, Queue};
 const MAX_AUTO: usize = 16;
 
 /// Answers after which `auto` judges how many are in flight.
-const ANSWERS: u32 = 20;
+const ANSWERS: usize = 20;
 
 /// A round trip may take so much longer than that of a single request before the device is held to
 /// answer one request after the other.
@@ -53,9 +53,9 @@ pub(super) struct Free(Option<Rc<Places>>);
 
 struct Auto {
     limit: usize,
-    answers: u32,
-    sum: Duration,
-    /// The mean round trip of single requests.
+    /// The round trips since the last judgement.
+    answers: Vec<Duration>,
+    /// The median round trip of single requests.
     alone: Option<Duration>,
     /// No more places before.
     settled: Option<Instant>,
@@ -165,7 +165,7 @@ enum Change {
 
 impl Auto {
     fn new() -> Auto {
-        Auto { limit: 1, answers: 0, sum: Duration::ZERO, alone: None, settled: None }
+        Auto { limit: 1, answers: Vec::with_capacity(ANSWERS), alone: None, settled: None }
     }
 
     fn answered(&mut self, took: Duration, was_full: bool, now: Instant) -> Change {
@@ -173,18 +173,18 @@ impl Auto {
         if !was_full {
             return Change::None;
         }
-        self.answers += 1;
-        self.sum += took;
-        if self.answers < ANSWERS {
+        self.answers.push(took);
+        if self.answers.len() < ANSWERS {
             return Change::None;
         }
-        let mean = self.sum / self.answers;
-        (self.answers, self.sum) = (0, Duration::ZERO);
+        // A few answers that were held up do not matter.
+        let (_, &mut median, _) = self.answers.select_nth_unstable(ANSWERS / 2);
+        self.answers.clear();
         if self.limit == 1 {
-            self.alone = Some(mean);
+            self.alone = Some(median);
         }
-        let alone = self.alone.unwrap_or(mean);
-        if mean > alone.mul_f64(FLAT) {
+        let alone = self.alone.unwrap_or(median);
+        if median > alone.mul_f64(FLAT) {
             return Change::Fewer(self.back_to(self.limit - 1, now));
         }
         if self.limit == MAX_AUTO || self.settled.is_some_and(|until| now < until) {
@@ -234,6 +234,17 @@ mod tests {
         assert_eq!(answer(&mut auto, 20 * MS, now), Change::Fewer(1));
         assert_eq!(answer(&mut auto, 10 * MS, now), Change::None);
         assert_eq!(answer(&mut auto, 10 * MS, now + RETRY_AFTER), Change::More);
+    }
+
+    #[test]
+    fn an_answer_that_was_held_up_changes_nothing() {
+        let (mut auto, now) = (Auto::new(), Instant::now());
+        assert_eq!(auto.answered(1000 * MS, true, now), Change::None);
+        for _ in 2..ANSWERS {
+            assert_eq!(auto.answered(10 * MS, true, now), Change::None);
+        }
+        assert_eq!(auto.answered(10 * MS, true, now), Change::More);
+        assert_eq!(answer(&mut auto, 20 * MS, now), Change::Fewer(1));
     }
 
     #[test]
