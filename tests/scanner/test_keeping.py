@@ -6,9 +6,12 @@ import asyncio
 import json
 import logging
 import shutil
+import threading
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.js.kv import KeyValue
 
 from holdfast.scanner import keeping, kept_entries
 from holdfast.scanner.keeping import BUCKET
@@ -67,6 +70,37 @@ def test_a_restarted_scanner_goes_on_for_callers_that_never_repeat(
     second.stop()
     run_scanner()
     assert caller.request("modbus.browse", b"")["count"] == 0
+
+
+def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun, put = threading.Event(), KeyValue.put
+    sent: list[Future[int]] = []
+
+    async def late(key: str, value: bytes) -> int:
+        bucket = await caller.client.jetstream().key_value(BUCKET)
+        await asyncio.sleep(0.2)
+        return await put(bucket, key, value)
+
+    async def put_slowly(_: KeyValue, key: str, value: bytes) -> int:
+        if "status" in key:
+            begun.set()
+        # What is on its way arrives, also if nobody waits for it.
+        sent.append(asyncio.run_coroutine_threadsafe(late(key, value), caller.loop))
+        return await asyncio.shield(asyncio.wrap_future(sent[-1]))
+
+    monkeypatch.setattr(KeyValue, "put", put_slowly)
+    running = run_scanner()
+    caller.publish("modbus.subscribe", subscription(server, tag("a", 0)))
+    assert begun.wait(wire.DEADLINE)
+    running.stop()
+    for each in sent:
+        each.result(wire.DEADLINE)
+    assert not [key for key in caller.kept(BUCKET) if "status" in key]
 
 
 def test_everything_of_a_subscription_is_restored(

@@ -202,6 +202,11 @@ class Caller:
         with contextlib.suppress(NotFoundError):
             self._loop.do(self.client.jetstream().delete_key_value(bucket))
 
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The client's loop."""
+        return self._loop.loop
+
     def do(self, work: Coroutine[Any, Any, Result]) -> Result:
         """Runs a coroutine in the client's loop and returns its result."""
         return self._loop.do(work)

@@ -79,6 +79,8 @@ class Keeper:
         """The hashes of the stored entries, by key."""
         self._works: bool | None = None
         self._failures = 0
+        self._busy = asyncio.Lock()
+        """Held while entries are read or written."""
         self.tried = asyncio.Event()
         """Set after the first attempt to read the stored entries."""
 
@@ -117,9 +119,10 @@ class Keeper:
                 self._release()
                 continue
             try:
-                if bucket is None:
-                    bucket = await self._read(client)
-                await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT), bucket)
+                async with self._busy:
+                    if bucket is None:
+                        bucket = await self._read(client)
+                    await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT), bucket)
             except Exception as error:  # Keeping is optional, no error may stop the scanner.
                 bucket = None
                 if self._client is client:  # Else the connection has ended, and not JetStream.
@@ -209,7 +212,8 @@ class Keeper:
         self._news.set()
         if client is not None and self._works:
             jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT)
-            await jetstream.purge_stream(STREAM, subject=f"{PRE}{self._prefix}.status.*")
+            async with self._busy:  # What is on its way to the server comes before the removal.
+                await jetstream.purge_stream(STREAM, subject=f"{PRE}{self._prefix}.status.*")
 
     def _tell(self, works: bool, reason: str) -> None:
         if works is self._works:
