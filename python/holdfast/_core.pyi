@@ -343,10 +343,12 @@ class Engine:
     def counters(self) -> dict[str, ListenerCounters]:
         """The counters of each listener since the start, by name."""
 
-    def next_event(self, timeout: float) -> tuple[str, str, str | None, str | None] | None:
-        """Listener, kind, peer and reason of the next event; `None` after `timeout` seconds.
+    def next_event(
+        self, timeout: float
+    ) -> tuple[str, str, str | None, str | None, int | None] | None:
+        """Listener, kind, peer, reason and bytes of the next event; `None` after `timeout` seconds.
 
-        The reason of `refused_role` is the role.
+        The reason of `refused_role` is the role. Only `bytes_dropped` has a number of bytes.
         """
 
     @property

@@ -76,10 +76,14 @@ class FrameCounters(TypedDict):
 
 
 class PacketCounters(TypedDict):
-    """Raw Ingest packets: written packets, their values, and refused packets by reason."""
+    """Raw Ingest packets: written packets, their values, and refused packets by reason.
+
+    `dropped_bytes`: bytes behind accepted packets that were dropped.
+    """
 
     accepted: int
     values: int
+    dropped_bytes: int
     refused: dict[str, int]
 
 

@@ -460,7 +460,7 @@ def test_a_peer_that_sends_nothing_gets_nothing(start: Start, kind: str) -> None
     plant.connect().close()
     plant.connect().reset()
     wire.until(lambda: plant.counted("connections")["open"] == 0, "all connections have ended")
-    assert plant.counted() == {"accepted": 0, "values": 0, "refused": {}}
+    assert plant.counted() == {"accepted": 0, "values": 0, "dropped_bytes": 0, "refused": {}}
 
 
 def test_stopping_ends_what_has_begun(start: Start) -> None:
@@ -523,7 +523,7 @@ def test_a_source_that_no_rule_names_gets_no_byte(start: Start) -> None:
             client.send(good("v1", "coils", 0, [0]))
         assert client.rest() == b""
     assert plant.content() == before
-    assert plant.counted() == {"accepted": 0, "values": 0, "refused": {}}
+    assert plant.counted() == {"accepted": 0, "values": 0, "dropped_bytes": 0, "refused": {}}
     assert plant.counted("connections")["refused_source"] == 1
 
 

@@ -166,6 +166,33 @@ def test_half_a_packet_is_refused(run: Run, dial: Any) -> None:
     assert counters(appliance)["packets"]["refused"] == {"short": 1}
 
 
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+def test_packets_are_written_though_their_sender_has_left(run: Run, dial: Any, kind: str) -> None:
+    appliance = run(configuration({"packets": "many"}, kind=kind))
+    sender = dial(appliance)
+    sender.sendall(b"".join(packet(address, address + 1) for address in range(100)))
+    sender.close()
+    wire.until(lambda: counters(appliance)["packets"]["accepted"] == 100, "all are written")
+    assert registers(appliance, 100) == list(range(1, 101))
+
+
+def test_what_is_left_of_a_packet_is_counted_when_its_connection_breaks(
+    run: Run, dial: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    appliance = run(configuration({"packets": "many"}, kind="raw-ingest"))
+    sender = dial(appliance)
+    sender.sendall(packet(0, 1) + packet(1, 2)[:5])
+    assert sender.recv(1) == DONE
+    sender.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    peer = "{}:{}".format(*sender.getsockname())
+    sender.close()
+    wire.until(lambda: counters(appliance)["packets"]["dropped_bytes"] == 5, "they are counted")
+    appliance.log_events(wire.DEADLINE)
+    (record,) = [each for each in caplog.records if each.message == "bytes_dropped"]
+    fields = {"listener": "both", "peer": peer, "bytes": 5}
+    assert (record.levelname, record.__dict__["fields"]) == ("WARNING", fields)
+
+
 def test_packets_without_a_next_one_end_by_themselves(run: Run, dial: Any) -> None:
     appliance = run(configuration({"packets": "many", "idle_timeout": 0.2}, kind="raw-ingest"))
     sender = dial(appliance)

@@ -74,7 +74,8 @@ impl Engine {
         Ok(event.map(|event| {
             let reason = event.role.or_else(|| event.kind.reason().map(Box::from));
             let (kind, peer) = (event.kind.name(), event.peer.map(crate::peer::text));
-            (event.listener.to_string(), kind, peer, reason.map(String::from))
+            let (reason, bytes) = (reason.map(String::from), event.kind.bytes());
+            (event.listener.to_string(), kind, peer, reason, bytes)
         }))
     }
 
@@ -104,9 +105,9 @@ impl Engine {
     }
 }
 
-/// Listener, kind, peer and reason. For a peer that was refused for its role, the reason is the
-/// role.
-type Event = (String, &'static str, Option<String>, Option<String>);
+/// Listener, kind, peer, reason and number of bytes. For a peer that was refused for its role, the
+/// reason is the role.
+type Event = (String, &'static str, Option<String>, Option<String>, Option<u64>);
 
 fn counted_packets<'py>(
     py: Python<'py>,
@@ -119,6 +120,7 @@ fn counted_packets<'py>(
     let packets = PyDict::new(py);
     packets.set_item("accepted", counters.accepted.get())?;
     packets.set_item("values", counters.values.get())?;
+    packets.set_item("dropped_bytes", counters.dropped_bytes.get())?;
     packets.set_item("refused", refused)?;
     Ok(packets)
 }

@@ -246,10 +246,14 @@ class _Running:
             fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
         logs.write(logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields)
 
-    def _log_event(self, listener: str, event: str, peer: str | None, reason: str | None) -> None:
-        fields = {"listener": listener, "peer": peer or "-"}
+    def _log_event(
+        self, listener: str, event: str, peer: str | None, reason: str | None, count: int | None
+    ) -> None:
+        fields: dict[str, object] = {"listener": listener, "peer": peer or "-"}
         if reason is not None:
             fields["role" if event == "refused_role" else "reason"] = reason
+        if count is not None:
+            fields["bytes"] = count
         if event in LEVELS:
             logs.write(LEVELS[event], event, **fields)
         else:

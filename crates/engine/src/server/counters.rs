@@ -39,6 +39,8 @@ pub struct PacketCounters {
     pub accepted: Counter,
     /// Bits and registers written.
     pub values: Counter,
+    /// Bytes behind accepted packets that were dropped.
+    pub dropped_bytes: Counter,
     refused: [Counter; 13],
 }
 

@@ -39,6 +39,8 @@ pub enum Kind {
     AcceptError,
     /// A Raw Ingest packet was not written.
     PacketRefused(Refusal),
+    /// This many bytes behind an accepted Raw Ingest packet were dropped.
+    BytesDropped(u64),
     /// A serial device was lost. The listener tries to open it again.
     LineLost,
     /// A lost serial device was opened again.
@@ -66,6 +68,7 @@ impl Kind {
             Kind::TlsFailed(_) => "tls_failed",
             Kind::AcceptError => "accept_error",
             Kind::PacketRefused(_) => "packet_refused",
+            Kind::BytesDropped(_) => "bytes_dropped",
             Kind::LineLost => "line_lost",
             Kind::LineBack => "line_back",
         }
@@ -76,6 +79,14 @@ impl Kind {
         match self {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
             Kind::TlsFailed(reason) => Some(reason),
+            _ => None,
+        }
+    }
+
+    /// The number of bytes that the event is about.
+    pub const fn bytes(self) -> Option<u64> {
+        match self {
+            Kind::BytesDropped(count) => Some(count),
             _ => None,
         }
     }

@@ -27,12 +27,16 @@ use super::counters::PacketCounters;
 use super::event::Kind;
 use super::listener::{Admitted, ListenerContext, Service, drain};
 use super::policy::Grants;
+use super::stream::send_all;
 
 /// Bytes that tell a packet from a Modbus frame.
 pub(crate) const DECISIVE: usize = 4;
 
-/// Bytes per read of a new connection.
+/// Bytes per read of a new connection, and of what follows its packet.
 const CHUNK: usize = 16 * 1024;
+
+/// The most reads of what follows an accepted packet.
+const LAST_READS: usize = 4;
 
 /// What peers from some networks can write.
 #[derive(Debug, Clone)]
@@ -252,14 +256,16 @@ impl RawIngest {
         idle: Duration,
         mut stop: watch::Receiver<bool>,
     ) {
-        let (mut end, mut begun) = (Kind::Closed, Instant::now());
+        let (mut end, mut begun, mut accepted) = (Kind::Closed, Instant::now(), false);
         loop {
             let refusal = match self.first_of(&context, peer, &rights, &bytes) {
                 Ok(Some(len)) => {
                     bytes.drain(..len);
+                    accepted = true;
                     begun = Instant::now();
                     ticket.touch(begun.into_std());
-                    if (&*SockRef::from(&stream)).write(&[DONE]).is_err() {
+                    if let Err(slow) = self.reply(&stream, DONE).await {
+                        end = slow;
                         break;
                     }
                     continue;
@@ -293,12 +299,30 @@ impl RawIngest {
                 Err(refusal) => refusal,
             };
             self.refuse(&context, peer, &bytes, refusal);
-            let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
+            let _ = self.reply(&stream, REFUSED).await;
+            bytes.clear();
             drain(&stream, stop).await;
             break;
         }
+        if accepted {
+            self.drop_bytes(&context, peer, bytes.len());
+        }
         context.ended(end, peer);
         drop(ticket);
+    }
+
+    /// Replies to one of several packets. Packets of a peer that has left are still written: it may
+    /// not wait for replies.
+    async fn reply(&self, stream: &TcpStream, reply: u8) -> Result<(), Kind> {
+        match (&*SockRef::from(stream)).write(&[reply]) {
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                match send_all(stream, &[reply], self.request_timeout).await {
+                    Err(Kind::SlowReader) => Err(Kind::SlowReader),
+                    _ => Ok(()),
+                }
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Writes the packet that `bytes` begin with. Returns its length, `None` while more are needed.
@@ -317,6 +341,27 @@ impl RawIngest {
                 self.write(context, peer, (header, memory, payload))?;
                 Ok(len)
             }
+        }
+    }
+
+    /// Confirms the only packet of a connection. Bytes that have arrived behind it by then are read,
+    /// because closing a socket with unread bytes could lose the reply.
+    fn confirm(&self, context: &ListenerContext, peer: SocketAddr, stream: &TcpStream) {
+        let socket = SockRef::from(stream);
+        let _ = (&*socket).write(&[DONE]);
+        let (mut chunk, mut dropped) = ([0; CHUNK], 0);
+        for _ in 0..LAST_READS {
+            let Ok(len @ 1..) = (&*socket).read(&mut chunk) else { break };
+            dropped += len;
+        }
+        self.drop_bytes(context, peer, dropped);
+    }
+
+    /// Counts and reports bytes behind an accepted packet that are not part of another one.
+    fn drop_bytes(&self, context: &ListenerContext, peer: SocketAddr, count: usize) {
+        if count > 0 {
+            self.packets.dropped_bytes.add_many(count as u64);
+            context.report(Kind::BytesDropped(count as u64), Some(peer));
         }
     }
 
@@ -370,7 +415,7 @@ impl Service for RawIngest {
             && len < CHUNK
             && self.write(context, peer, (header, memory, payload)).is_ok()
         {
-            let _ = (&*socket).write(&[DONE]);
+            self.confirm(context, peer, &connection.stream);
             context.ended(Kind::Closed, peer);
             return None;
         }
@@ -401,12 +446,11 @@ impl Service for RawIngest {
         });
         if let Err(refusal) = written {
             self.refuse(&context, peer, &packet, refusal);
-        }
-        drop(packet);
-        let reply = if written.is_ok() { DONE } else { REFUSED };
-        let _ = (&*SockRef::from(&stream)).write(&[reply]);
-        if written.is_err() {
+            drop(packet);
+            let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
             drain(&stream, stop).await;
+        } else {
+            self.confirm(&context, peer, &stream);
         }
         context.ended(Kind::Closed, peer);
         drop(ticket);
@@ -416,4 +460,45 @@ impl Service for RawIngest {
 /// Whether bytes after the packet have arrived.
 fn more_is_there(stream: &TcpStream) -> bool {
     matches!((&*SockRef::from(stream)).read(&mut [0]), Ok(len) if len > 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+    use std::net::TcpListener;
+
+    use super::*;
+
+    fn listener() -> RawIngest {
+        RawIngest::new(&RawSettings {
+            bind: SocketAddr::from(([127, 0, 0, 1], 0)),
+            format: Format::V1,
+            rules: Vec::new(),
+            limits: ConnectionLimits::NONE,
+            request_timeout: Duration::from_secs(10),
+            packets: PacketsPerConnection::One,
+        })
+    }
+
+    #[test]
+    fn bytes_behind_a_confirmed_packet_are_read_and_counted() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
+        let _guard = runtime.enter();
+        let bound = TcpListener::bind("127.0.0.1:0").unwrap();
+        let mut client = std::net::TcpStream::connect(bound.local_addr().unwrap()).unwrap();
+        let (accepted, peer) = bound.accept().unwrap();
+        client.write_all(&[7; CHUNK + 3]).unwrap();
+        let mut all = vec![0; CHUNK + 3];
+        while accepted.peek(&mut all).unwrap() < all.len() {}
+        accepted.set_nonblocking(true).unwrap();
+        let stream = TcpStream::from_std(accepted).unwrap();
+
+        let raw = listener();
+        raw.confirm(&ListenerContext::for_tests(), peer, &stream);
+        assert_eq!(raw.packets.dropped_bytes.get(), CHUNK as u64 + 3);
+        drop(stream);
+        let mut reply = Vec::new();
+        client.read_to_end(&mut reply).unwrap();
+        assert_eq!(reply, [DONE]);
+    }
 }
