@@ -303,6 +303,7 @@ class Listener:
         *,
         format: Literal["v1", "crc"] = "v1",
         crc: Literal["required", "none"] = "required",
+        flags: Literal["strict", "ignore"] = "strict",
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
         request_timeout: float = 10.0,
@@ -311,7 +312,7 @@ class Listener:
     ) -> Listener:
         """A listener for Raw Ingest packets.
 
-        With `packets` many, a connection carries any number of them, until the sender closes, one
+        With `flags` ignore, flags and the reserved byte of a packet may have any value. With `packets` many, a connection carries any number of them, until the sender closes, one
         is refused, or none comes for `idle_timeout` seconds.
         """
 

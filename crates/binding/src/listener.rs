@@ -10,7 +10,7 @@ use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::policy::{Elsewhere, Narrowed, Rule as CoreRule};
 use holdfast_engine::server::ranges::Ranges;
 use holdfast_engine::server::{
-    ConnectionLimits, DatagramFraming, ListenerKind, ListenerSettings, PacketsPerConnection,
+    ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings, PacketsPerConnection,
     RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming, StreamSettings,
     UdpSettings, WhenFull,
 };
@@ -230,13 +230,14 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", max_connections=256, max_connections_per_source=None, request_timeout=10.0, packets="one", idle_timeout=300.0))]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, request_timeout=10.0, packets="one", idle_timeout=300.0))]
     fn raw_ingest(
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, RawRule>>,
         format: &str,
         crc: &str,
+        flags: &str,
         max_connections: i128,
         max_connections_per_source: Option<i128>,
         request_timeout: f64,
@@ -252,6 +253,7 @@ impl Listener {
         let kind = ListenerKind::RawIngest(RawSettings {
             bind: address(bind)?,
             format: word("format", format, &formats)?,
+            flags: word("flags", flags, &[("strict", Flags::Strict), ("ignore", Flags::Ignore)])?,
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
             limits: limits(max_connections, max_connections_per_source, "refuse")?,
             request_timeout: time_to_wait("request_timeout", request_timeout)?,

@@ -186,6 +186,18 @@ impl Format {
     /// [`Refusal::Magic`], [`Refusal::Version`], [`Refusal::Flags`], [`Refusal::Area`] or
     /// [`Refusal::Count`], as soon as the wrong byte has arrived.
     pub fn header(self, bytes: &[u8]) -> Result<Option<Header>, Refusal> {
+        self.checked_header(bytes, true)
+    }
+
+    /// As [`Format::header`], but flags and the reserved byte may have any value.
+    ///
+    /// # Errors
+    /// As [`Format::header`], without [`Refusal::Flags`].
+    pub fn header_with_any_flags(self, bytes: &[u8]) -> Result<Option<Header>, Refusal> {
+        self.checked_header(bytes, false)
+    }
+
+    fn checked_header(self, bytes: &[u8], strict: bool) -> Result<Option<Header>, Refusal> {
         let is = |at: usize, expected: u8| bytes.get(at).is_none_or(|byte| *byte == expected);
         if !is(0, MAGIC[0]) || !is(1, MAGIC[1]) {
             return Err(Refusal::Magic);
@@ -195,7 +207,9 @@ impl Format {
         }
         let rest = match self {
             Format::V1 => bytes.get(3..),
-            Format::Crc { .. } if !is(3, 0) || !is(5, 0) => return Err(Refusal::Flags),
+            Format::Crc { .. } if strict && !(is(3, 0) && is(5, 0)) => {
+                return Err(Refusal::Flags);
+            }
             Format::Crc { .. } => bytes.get(4..),
         };
         let Some(&[area, ref rest @ ..]) = rest else {

@@ -52,6 +52,27 @@ proptest! {
     }
 
     #[test]
+    fn flags_matter_only_where_they_are_checked(
+        (header, payload) in a_packet(),
+        flags: u8,
+        reserved: u8,
+        required: bool,
+    ) {
+        let format = Format::Crc { required };
+        let mut packet = encoded(format, &header, &payload);
+        (packet[3], packet[5]) = (flags, reserved);
+        let strict = if (flags, reserved) == (0, 0) { Ok(Some(header)) } else { Err(Refusal::Flags) };
+        prop_assert_eq!(format.header(&packet), strict);
+        for len in 0..packet.len() {
+            let known = (len >= format.header_len()).then_some(header);
+            prop_assert_eq!(format.header_with_any_flags(&packet[..len]), Ok(known));
+        }
+        // The version is never ignored: it is what tells a packet from a Modbus frame.
+        packet[2] = 0;
+        prop_assert_eq!(format.header_with_any_flags(&packet), Err(Refusal::Version));
+    }
+
+    #[test]
     fn any_bytes_are_a_header_incomplete_or_refused(
         bytes in prop::collection::vec(prop_oneof![Just(0), Just(1), any::<u8>()], 0..40),
         format in a_format(),

@@ -105,9 +105,10 @@ class ListenerChecks:
         doubt_order(self._rules(path, part), "raw-ingest", self.report)
 
     def _raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
-        if "crc" in listener and listener.get("format", "v1") == "v1":
-            message = "found with format v1, allowed: only with format crc"
-            self.report.add((*path, "crc"), message, of_key=True)
+        for key in ("crc", "flags"):
+            if key in listener and listener.get("format", "v1") == "v1":
+                message = "found with format v1, allowed: only with format crc"
+                self.report.add((*path, key), message, of_key=True)
 
     def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
         for unit, target in mapping(rule.get("units")).items():

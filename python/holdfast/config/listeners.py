@@ -174,6 +174,10 @@ def _crc(data: dict[str, Any]) -> Literal["required"] | None:
     return "required" if data["format"] == "crc" else None
 
 
+def _flags(data: dict[str, Any]) -> Literal["strict"] | None:
+    return "strict" if data["format"] == "crc" else None
+
+
 class RawIngestConfig(Model):
     """Raw ingest packets on the port of a Modbus TCP server: the first bytes decide."""
 
@@ -181,6 +185,9 @@ class RawIngestConfig(Model):
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
     crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
     """Format crc: whether packets end with a CRC. Default: required."""
+    flags: Annotated[Literal["strict", "ignore"] | None, NotNull()] = Field(default_factory=_flags)
+    """Format crc: strict, flags and the reserved byte must be 0; ignore: may be anything. Default:
+    strict."""
     packets: Literal["one", "many"] = "one"
     """Packets that a connection carries; many: until the sender closes, or one is refused."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
@@ -340,6 +347,9 @@ class RawIngestListener(Model):
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
     crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
     """Format crc: whether packets end with a CRC. Default: required."""
+    flags: Annotated[Literal["strict", "ignore"] | None, NotNull()] = Field(default_factory=_flags)
+    """Format crc: strict, flags and the reserved byte must be 0; ignore: may be anything. Default:
+    strict."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256

@@ -29,8 +29,12 @@ use super::listener::{Admitted, ListenerContext, Service, drain};
 use super::policy::Grants;
 use super::stream::send_all;
 
-/// Bytes that tell a packet from a Modbus frame.
+/// The most bytes that are needed to tell a packet from a Modbus frame.
 pub(crate) const DECISIVE: usize = 4;
+
+/// The bytes of a packet before its flags: magic and version. The third byte of a Modbus frame is that
+/// of its protocol id, 0.
+const BEFORE_FLAGS: usize = 3;
 
 /// Bytes per read of a new connection, and of what follows its packet.
 const CHUNK: usize = 16 * 1024;
@@ -53,11 +57,21 @@ pub struct RawSettings {
     /// With port 0, the system picks a port. `[::]` also accepts IPv4 connections.
     pub bind: SocketAddr,
     pub format: Format,
+    pub flags: Flags,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
     /// The longest time from the start of a connection to the last byte of its packet.
     pub request_timeout: Duration,
     pub packets: PacketsPerConnection,
+}
+
+/// What flags and the reserved byte of a packet of format crc may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Flags {
+    /// Only 0.
+    Strict,
+    /// Anything.
+    Ignore,
 }
 
 /// How many packets a connection carries.
@@ -90,6 +104,7 @@ pub(crate) struct RawIngest {
     pub(crate) packets: PacketCounters,
     policy: Grants<RawGrant>,
     format: Format,
+    flags: Flags,
     request_timeout: Duration,
     many: Option<Duration>,
 }
@@ -124,6 +139,7 @@ impl RawIngest {
             packets: PacketCounters::default(),
             policy: Grants::new(rules),
             format: settings.format,
+            flags: settings.flags,
             request_timeout: settings.request_timeout,
             many: match settings.packets {
                 PacketsPerConnection::One => None,
@@ -133,13 +149,24 @@ impl RawIngest {
     }
 
     /// Whether the first bytes of a connection are those of a packet. A Modbus frame never is: its
-    /// protocol id, bytes 3 and 4, is 0.
+    /// protocol id, bytes 3 and 4, is 0, and the third byte of a packet is its version, 1.
     pub(crate) fn beginning(&self, bytes: &[u8]) -> Beginning {
-        match self.format.header(bytes) {
+        let decisive = match (self.format, self.flags) {
+            (Format::Crc { .. }, Flags::Ignore) => BEFORE_FLAGS,
+            _ => DECISIVE,
+        };
+        match self.header(bytes) {
             Err(Refusal::Magic | Refusal::Version | Refusal::Flags) => Beginning::SomethingElse,
             Err(Refusal::Area) if bytes.len() <= DECISIVE => Beginning::SomethingElse,
-            _ if bytes.len() < DECISIVE => Beginning::Unknown,
+            _ if bytes.len() < decisive => Beginning::Unknown,
             _ => Beginning::Packet,
+        }
+    }
+
+    fn header(&self, bytes: &[u8]) -> Result<Option<Header>, Refusal> {
+        match self.flags {
+            Flags::Strict => self.format.header(bytes),
+            Flags::Ignore => self.format.header_with_any_flags(bytes),
         }
     }
 
@@ -159,7 +186,7 @@ impl RawIngest {
 
     /// Checks the bytes received so far.
     fn judge<'p>(&self, rights: &'p RawGrant, bytes: &'p [u8]) -> Result<Packet<'p>, Refusal> {
-        let Some(header) = self.format.header(bytes)? else {
+        let Some(header) = self.header(bytes)? else {
             let missing = self.format.header_len().saturating_sub(bytes.len()).max(1);
             return Ok(Packet::Incomplete { missing });
         };
@@ -333,7 +360,7 @@ impl RawIngest {
         rights: &RawGrant,
         bytes: &[u8],
     ) -> Result<Option<usize>, Refusal> {
-        let len = self.format.header(bytes)?.map(|header| self.format.packet_len(&header));
+        let len = self.header(bytes)?.map(|header| self.format.packet_len(&header));
         let packet = len.and_then(|len| bytes.get(..len)).unwrap_or(bytes);
         match self.judge(rights, packet)? {
             Packet::Incomplete { .. } => Ok(None),
@@ -368,7 +395,7 @@ impl RawIngest {
     fn refuse(&self, context: &ListenerContext, peer: SocketAddr, packet: &[u8], refusal: Refusal) {
         self.packets.refuse(refusal);
         context.report(Kind::PacketRefused(refusal), Some(peer));
-        let header = self.format.header(packet).ok().flatten();
+        let header = self.header(packet).ok().flatten();
         self.audit(context, peer, header, &[], Some(refusal));
     }
 
@@ -469,15 +496,51 @@ mod tests {
 
     use super::*;
 
-    fn listener() -> RawIngest {
+    fn listener(format: Format, flags: Flags) -> RawIngest {
         RawIngest::new(&RawSettings {
             bind: SocketAddr::from(([127, 0, 0, 1], 0)),
-            format: Format::V1,
+            format,
+            flags,
             rules: Vec::new(),
             limits: ConnectionLimits::NONE,
             request_timeout: Duration::from_secs(10),
             packets: PacketsPerConnection::One,
         })
+    }
+
+    /// Whether these bytes begin a packet; `None` if more are needed.
+    fn begins(raw: &RawIngest, bytes: &[u8]) -> Option<bool> {
+        match raw.beginning(bytes) {
+            Beginning::Packet => Some(true),
+            Beginning::SomethingElse => Some(false),
+            Beginning::Unknown => None,
+        }
+    }
+
+    #[test]
+    fn three_or_four_bytes_tell_packets_from_modbus_frames() {
+        let crc = Format::Crc { required: false };
+        for (format, flags) in
+            [(Format::V1, Flags::Strict), (crc, Flags::Strict), (crc, Flags::Ignore)]
+        {
+            let raw = listener(format, flags);
+            for transaction in [[0x52, 0x49], [0x52, 0x00], [0x00, 0x49], [0x00, 0x00]] {
+                let frame = [transaction[0], transaction[1], 0, 0];
+                let begins: Vec<_> = (0..=4).map(|len| begins(&raw, &frame[..len])).collect();
+                assert!(!begins.contains(&Some(true)), "{format:?}, {flags:?}, {frame:?}");
+                assert_eq!(begins[3], Some(false), "the protocol id has begun");
+            }
+            assert_eq!(begins(&raw, b"RI"), None);
+            let fourth = |byte| begins(&raw, &[b'R', b'I', 1, byte]);
+            let packets: Vec<u8> = (0..=255).filter(|byte| fourth(*byte) == Some(true)).collect();
+            match (format, flags) {
+                (Format::V1, _) => assert_eq!(packets, [1, 2, 3, 4]),
+                (_, Flags::Strict) => assert_eq!(packets, [0]),
+                (_, Flags::Ignore) => assert_eq!(packets.len(), 256),
+            }
+            let decided_by_three = (flags == Flags::Ignore).then_some(true);
+            assert_eq!(begins(&raw, b"RI\x01"), decided_by_three);
+        }
     }
 
     #[test]
@@ -493,7 +556,7 @@ mod tests {
         accepted.set_nonblocking(true).unwrap();
         let stream = TcpStream::from_std(accepted).unwrap();
 
-        let raw = listener();
+        let raw = listener(Format::V1, Flags::Strict);
         raw.confirm(&ListenerContext::for_tests(), peer, &stream);
         assert_eq!(raw.packets.dropped_bytes.get(), CHUNK as u64 + 3);
         drop(stream);
