@@ -302,7 +302,7 @@ class Listener:
         rules: Sequence[RawRule],
         *,
         format: Literal["v1", "crc"] = "v1",
-        crc: Literal["required", "none"] = "required",
+        crc: Literal["required", "none", "if-present"] = "required",
         flags: Literal["strict", "ignore"] = "strict",
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
@@ -312,7 +312,8 @@ class Listener:
     ) -> Listener:
         """A listener for Raw Ingest packets.
 
-        With `flags` ignore, flags and the reserved byte of a packet may have any value. With `packets` many, a connection carries any number of them, until the sender closes, one
+        With `crc` if-present, only with `packets` one, bytes that have arrived behind a packet are
+        its CRC. With `flags` ignore, flags and the reserved byte of a packet may have any value. With `packets` many, a connection carries any number of them, until the sender closes, one
         is refused, or none comes for `idle_timeout` seconds.
         """
 

@@ -109,6 +109,10 @@ class ListenerChecks:
             if key in listener and listener.get("format", "v1") == "v1":
                 message = "found with format v1, allowed: only with format crc"
                 self.report.add((*path, key), message, of_key=True)
+        if listener.get("crc") == "if-present" and listener.get("packets", "one") == "many":
+            message = "found if-present with packets: many, allowed: required or none; bytes behind"
+            told = f"{message} a packet could be its CRC or the next packet"
+            self.report.add((*path, "crc"), told)
 
     def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
         for unit, target in mapping(rule.get("units")).items():

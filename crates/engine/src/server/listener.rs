@@ -240,28 +240,34 @@ pub(crate) fn set_options(stream: &TcpStream) {
     let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
 }
 
-/// Shuts down the sending side, then reads until the peer closes. Closing a socket with unread
-/// bytes resets the connection, and the peer may lose the last reply.
-pub(crate) async fn drain(stream: &TcpStream, mut stop: watch::Receiver<bool>) {
+/// Shuts down the sending side, then reads until the peer closes, or about `most` bytes. Returns their
+/// number. Closing a socket with unread bytes resets the connection, and the peer may lose the last
+/// reply.
+pub(crate) async fn drain(
+    stream: &TcpStream,
+    most: usize,
+    mut stop: watch::Receiver<bool>,
+) -> usize {
+    let mut drained = 0;
     if SockRef::from(stream).shutdown(Shutdown::Write).is_err() {
-        return;
+        return drained;
     }
     let deadline = Instant::now() + DRAIN;
     let mut chunk = vec![0; DRAIN_CHUNK];
-    loop {
+    while drained < most && Instant::now() < deadline {
         let readable = tokio::select! {
             readable = timeout_at(deadline, stream.readable()) => readable,
-            _ = stop.wait_for(|stop| *stop) => return,
+            _ = stop.wait_for(|stop| *stop) => break,
         };
-        let Ok(Ok(())) = readable else { return };
+        let Ok(Ok(())) = readable else { break };
         match stream.try_read(&mut chunk) {
-            Ok(0) => return,
-            Ok(_) if Instant::now() >= deadline => return,
-            Ok(_) => {}
+            Ok(0) => break,
+            Ok(len) => drained += len,
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-            Err(_) => return,
+            Err(_) => break,
         }
     }
+    drained
 }
 
 /// Whether an error of `accept` concerns one peer, not the listener.

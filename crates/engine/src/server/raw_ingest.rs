@@ -42,6 +42,12 @@ const CHUNK: usize = 16 * 1024;
 /// The most reads of what follows an accepted packet.
 const LAST_READS: usize = 4;
 
+/// The most bytes that are read after a packet without its CRC.
+const LATE_BYTES: usize = 64 * 1024;
+
+/// Bytes that are read to see what has arrived behind a packet: more than a CRC.
+const BEHIND: usize = 5;
+
 /// What peers from some networks can write.
 #[derive(Debug, Clone)]
 pub struct RawRule {
@@ -58,6 +64,9 @@ pub struct RawSettings {
     pub bind: SocketAddr,
     pub format: Format,
     pub flags: Flags,
+    /// With a format without a CRC, and one packet for each connection: if bytes have arrived behind a
+    /// packet when it is complete, they are its CRC.
+    pub crc_if_present: bool,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
     /// The longest time from the start of a connection to the last byte of its packet.
@@ -105,6 +114,7 @@ pub(crate) struct RawIngest {
     policy: Grants<RawGrant>,
     format: Format,
     flags: Flags,
+    crc_if_present: bool,
     request_timeout: Duration,
     many: Option<Duration>,
 }
@@ -131,6 +141,7 @@ enum Gone {
 
 impl RawIngest {
     pub(crate) fn new(settings: &RawSettings) -> RawIngest {
+        debug_assert!(!settings.crc_if_present || settings.packets == PacketsPerConnection::One);
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
             (rule.sources.clone(), RawGrant { targets, areas: rule.areas.clone() })
@@ -140,6 +151,7 @@ impl RawIngest {
             policy: Grants::new(rules),
             format: settings.format,
             flags: settings.flags,
+            crc_if_present: settings.crc_if_present,
             request_timeout: settings.request_timeout,
             many: match settings.packets {
                 PacketsPerConnection::One => None,
@@ -180,7 +192,7 @@ impl RawIngest {
     ) {
         self.refuse(context, peer, packet, Refusal::NotGranted);
         let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
-        drain(&stream, stop).await;
+        drain(&stream, usize::MAX, stop).await;
         context.ended(Kind::Closed, peer);
     }
 
@@ -205,10 +217,15 @@ impl RawIngest {
         if address < start || address + u32::from(header.count.get()) > end {
             return Err(Refusal::Range);
         }
-        match self.format.packet_len(&header).checked_sub(bytes.len()) {
+        let format = if self.crc_if_present && bytes.len() > self.format.packet_len(&header) {
+            Format::Crc { required: true }
+        } else {
+            self.format
+        };
+        match format.packet_len(&header).checked_sub(bytes.len()) {
             Some(missing) if missing > 0 => Ok(Packet::Incomplete { missing }),
             _ => {
-                let payload = self.format.payload(&header, bytes)?;
+                let payload = format.payload(&header, bytes)?;
                 Ok(Packet::Whole { header, memory, payload })
             }
         }
@@ -247,12 +264,15 @@ impl RawIngest {
         loop {
             let missing = match self.judge(rights, packet) {
                 Ok(Packet::Incomplete { missing }) => missing,
-                Ok(Packet::Whole { .. }) if more_is_there(stream) => {
-                    return Ok(Err(Refusal::Extra));
-                }
-                Ok(Packet::Whole { .. }) => return Ok(Ok(())),
+                Ok(Packet::Whole { .. }) => 0,
                 Err(refusal) => return Ok(Err(refusal)),
             };
+            if missing == 0 {
+                if read_behind(stream, packet) {
+                    continue;
+                }
+                return Ok(Ok(()));
+            }
             let readable = tokio::select! {
                 readable = timeout_at(deadline, stream.readable()) => readable,
                 _ = stop.wait_for(|stop| *stop) => return Err(Gone::Stopped),
@@ -328,7 +348,7 @@ impl RawIngest {
             self.refuse(&context, peer, &bytes, refusal);
             let _ = self.reply(&stream, REFUSED).await;
             bytes.clear();
-            drain(&stream, stop).await;
+            drain(&stream, usize::MAX, stop).await;
             break;
         }
         if accepted {
@@ -372,8 +392,8 @@ impl RawIngest {
     }
 
     /// Confirms the only packet of a connection. Bytes that have arrived behind it by then are read,
-    /// because closing a socket with unread bytes could lose the reply.
-    fn confirm(&self, context: &ListenerContext, peer: SocketAddr, stream: &TcpStream) {
+    /// because closing a socket with unread bytes could lose the reply. Returns their number.
+    fn confirm(stream: &TcpStream) -> usize {
         let socket = SockRef::from(stream);
         let _ = (&*socket).write(&[DONE]);
         let (mut chunk, mut dropped) = ([0; CHUNK], 0);
@@ -381,7 +401,7 @@ impl RawIngest {
             let Ok(len @ 1..) = (&*socket).read(&mut chunk) else { break };
             dropped += len;
         }
-        self.drop_bytes(context, peer, dropped);
+        dropped
     }
 
     /// Counts and reports bytes behind an accepted packet that are not part of another one.
@@ -428,7 +448,7 @@ impl Service for RawIngest {
         context: &ListenerContext,
         mut connection: Admitted<RawGrant>,
     ) -> Option<Admitted<RawGrant>> {
-        if self.many.is_some() {
+        if self.many.is_some() || self.crc_if_present {
             return Some(connection);
         }
         let mut chunk = [0; CHUNK];
@@ -442,7 +462,8 @@ impl Service for RawIngest {
             && len < CHUNK
             && self.write(context, peer, (header, memory, payload)).is_ok()
         {
-            self.confirm(context, peer, &connection.stream);
+            let dropped = RawIngest::confirm(&connection.stream);
+            self.drop_bytes(context, peer, dropped);
             context.ended(Kind::Closed, peer);
             return None;
         }
@@ -475,18 +496,26 @@ impl Service for RawIngest {
             self.refuse(&context, peer, &packet, refusal);
             drop(packet);
             let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
-            drain(&stream, stop).await;
+            drain(&stream, usize::MAX, stop).await;
         } else {
-            self.confirm(&context, peer, &stream);
+            let mut dropped = RawIngest::confirm(&stream);
+            if self.crc_if_present {
+                // A CRC that comes too late must not reset the connection, reply and all.
+                dropped += drain(&stream, LATE_BYTES, stop).await;
+            }
+            self.drop_bytes(&context, peer, dropped);
         }
         context.ended(Kind::Closed, peer);
         drop(ticket);
     }
 }
 
-/// Whether bytes after the packet have arrived.
-fn more_is_there(stream: &TcpStream) -> bool {
-    matches!((&*SockRef::from(stream)).read(&mut [0]), Ok(len) if len > 0)
+/// Appends bytes that have arrived behind a packet, without waiting. Returns whether there are any.
+fn read_behind(stream: &TcpStream, packet: &mut Vec<u8>) -> bool {
+    let mut behind = [0; BEHIND];
+    let len = (&*SockRef::from(stream)).read(&mut behind).unwrap_or(0);
+    packet.extend_from_slice(&behind[..len]);
+    len > 0
 }
 
 #[cfg(test)]
@@ -501,6 +530,7 @@ mod tests {
             bind: SocketAddr::from(([127, 0, 0, 1], 0)),
             format,
             flags,
+            crc_if_present: false,
             rules: Vec::new(),
             limits: ConnectionLimits::NONE,
             request_timeout: Duration::from_secs(10),
@@ -557,7 +587,8 @@ mod tests {
         let stream = TcpStream::from_std(accepted).unwrap();
 
         let raw = listener(Format::V1, Flags::Strict);
-        raw.confirm(&ListenerContext::for_tests(), peer, &stream);
+        let dropped = RawIngest::confirm(&stream);
+        raw.drop_bytes(&ListenerContext::for_tests(), peer, dropped);
         assert_eq!(raw.packets.dropped_bytes.get(), CHUNK as u64 + 3);
         drop(stream);
         let mut reply = Vec::new();

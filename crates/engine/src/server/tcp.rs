@@ -137,7 +137,8 @@ impl ModbusStream {
             Ok(role) => role,
             Err(end) => {
                 context.ended(end, peer);
-                return drain(&stream.into_socket(), stop).await;
+                drain(&stream.into_socket(), usize::MAX, stop).await;
+                return;
             }
         };
         let rights = self.policy.rights_of_role(peer.ip(), &role).unwrap_or_else(|| {
