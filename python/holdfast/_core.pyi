@@ -306,6 +306,7 @@ class Listener:
         flags: Literal["strict", "ignore"] = "strict",
         max_connections: int = 256,
         max_connections_per_source: int | None = None,
+        when_full: WhenFull = "refuse",
         request_timeout: float = 10.0,
         packets: Literal["one", "many"] = "one",
         idle_timeout: float = 300.0,

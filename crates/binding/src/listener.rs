@@ -230,7 +230,7 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, request_timeout=10.0, packets="one", idle_timeout=300.0))]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0))]
     fn raw_ingest(
         name: String,
         bind: &str,
@@ -240,6 +240,7 @@ impl Listener {
         flags: &str,
         max_connections: i128,
         max_connections_per_source: Option<i128>,
+        when_full: &str,
         request_timeout: f64,
         packets: &str,
         idle_timeout: f64,
@@ -261,7 +262,7 @@ impl Listener {
             crc_if_present,
             flags: word("flags", flags, &[("strict", Flags::Strict), ("ignore", Flags::Ignore)])?,
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
-            limits: limits(max_connections, max_connections_per_source, "refuse")?,
+            limits: limits(max_connections, max_connections_per_source, when_full)?,
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             packets,
         });

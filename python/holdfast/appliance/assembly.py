@@ -215,6 +215,7 @@ def listener(
                 flags=settings.flags or "strict",
                 max_connections=settings.max_connections,
                 max_connections_per_source=settings.max_connections_per_source,
+                when_full=settings.when_full,
                 request_timeout=settings.request_timeout,
                 packets=settings.packets,
                 idle_timeout=settings.idle_timeout,

@@ -362,6 +362,8 @@ class RawIngestListener(Model):
     """Maximum number of open connections."""
     max_connections_per_source: Connections | None = None
     """Maximum number of open connections from one address; null: unlimited."""
+    when_full: Literal["refuse", "evict"] = "refuse"
+    """At the limit: refuse closes the new connection, evict the connection idle longest."""
     request_timeout: Duration = 10.0
     """Seconds from the start of a connection to the last byte of its packet."""
     packets: Literal["one", "many"] = "one"

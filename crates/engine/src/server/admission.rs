@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
@@ -13,7 +13,8 @@ use tokio::task::AbortHandle;
 pub enum WhenFull {
     /// The new connection is closed.
     Refuse,
-    /// The connection that has been idle longest is closed.
+    /// The connection that has been idle longest is closed. A connection in the middle of a Raw
+    /// Ingest packet is closed only if all are.
     Evict,
 }
 
@@ -53,9 +54,17 @@ struct Table {
 #[derive(Debug)]
 struct Held {
     peer: SocketAddr,
-    last_request: Arc<AtomicU64>,
+    activity: Arc<Activity>,
     /// Set once the task of the connection runs.
     task: Option<AbortHandle>,
+}
+
+/// What decides which connection is evicted.
+#[derive(Debug)]
+struct Activity {
+    /// In microseconds since the epoch of the admission.
+    last_request: AtomicU64,
+    is_amid_packet: AtomicBool,
 }
 
 /// The limit is reached, and no connection can be evicted.
@@ -66,7 +75,7 @@ pub(crate) struct Full;
 #[derive(Debug)]
 pub(crate) struct Ticket {
     id: u64,
-    last_request: Arc<AtomicU64>,
+    activity: Arc<Activity>,
     admission: Arc<Admission>,
 }
 
@@ -99,14 +108,16 @@ impl Admission {
         };
         let id = table.next_id;
         table.next_id += 1;
-        let last_request = Arc::new(AtomicU64::new(self.now()));
-        let held = Held { peer, last_request: Arc::clone(&last_request), task: None };
+        let last_request = AtomicU64::new(self.now());
+        let activity = Arc::new(Activity { last_request, is_amid_packet: AtomicBool::new(false) });
+        let held = Held { peer, activity: Arc::clone(&activity), task: None };
         table.held.insert(id, held);
         *table.per_source.entry(source).or_default() += 1;
-        Ok((Ticket { id, last_request, admission: Arc::clone(self) }, evicted))
+        Ok((Ticket { id, activity, admission: Arc::clone(self) }, evicted))
     }
 
-    /// Closes the connection that has been idle longest, of one source or of all.
+    /// Closes the connection that has been idle longest, of one source or of all; first those that are
+    /// not in the middle of a packet.
     fn evict(&self, table: &mut Table, source: Option<IpAddr>) -> Result<SocketAddr, Full> {
         if self.when_full == WhenFull::Refuse {
             return Err(Full);
@@ -115,7 +126,11 @@ impl Admission {
         let candidates =
             table.held.iter().filter(|(_, held)| held.task.is_some() && of_source(held));
         let id = candidates
-            .min_by_key(|(id, held)| (held.last_request.load(Ordering::Relaxed), **id))
+            .min_by_key(|(id, held)| {
+                let Activity { last_request, is_amid_packet } = &*held.activity;
+                let is_amid_packet = is_amid_packet.load(Ordering::Relaxed);
+                (is_amid_packet, last_request.load(Ordering::Relaxed), **id)
+            })
             .map(|(id, _)| *id)
             .ok_or(Full)?;
         let held = table.remove(id).ok_or(Full)?;
@@ -161,7 +176,12 @@ impl Ticket {
     #[inline]
     pub(crate) fn touch(&self, now: Instant) {
         let since = now.saturating_duration_since(self.admission.epoch);
-        self.last_request.store(since.as_micros() as u64, Ordering::Relaxed);
+        self.activity.last_request.store(since.as_micros() as u64, Ordering::Relaxed);
+    }
+
+    /// Records whether part of a packet has arrived.
+    pub(crate) fn set_amid_packet(&self, is_amid_packet: bool) {
+        self.activity.is_amid_packet.store(is_amid_packet, Ordering::Relaxed);
     }
 }
 
@@ -241,6 +261,30 @@ mod tests {
         let (_fourth, evicted) = admission.admit(peer(1, 4)).unwrap();
         assert_eq!(evicted, Some(peer(1, 2)));
         assert_eq!(admission.open(), 3);
+    }
+
+    #[test]
+    fn a_connection_in_the_middle_of_a_packet_is_evicted_last() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(3, None, WhenFull::Evict);
+        let admit = |port| {
+            let (ticket, evicted) = admission.admit(peer(1, port)).unwrap();
+            attach(&admission, ticket.id(), task(&runtime));
+            (ticket, evicted)
+        };
+        let tickets = [1, 2, 3].map(|port| admit(port).0);
+        tickets[0].set_amid_packet(true);
+        tickets[2].set_amid_packet(true);
+        let (_fourth, evicted) = admit(4);
+        assert_eq!(evicted, Some(peer(1, 2)));
+        let (fifth, evicted) = admit(5);
+        assert_eq!(evicted, Some(peer(1, 4)), "the silent one, although it is the newest");
+        fifth.set_amid_packet(true);
+        let (sixth, evicted) = admit(6);
+        assert_eq!(evicted, Some(peer(1, 1)), "all are in the middle of a packet");
+        sixth.set_amid_packet(true);
+        fifth.set_amid_packet(false);
+        assert_eq!(admit(7).1, Some(peer(1, 5)), "its packet is complete");
     }
 
     #[test]

@@ -21,7 +21,7 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::packet_area::of_packet;
 
-use super::admission::ConnectionLimits;
+use super::admission::{ConnectionLimits, Ticket};
 use super::audit::{Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
@@ -258,10 +258,12 @@ impl RawIngest {
         stream: &TcpStream,
         rights: &RawGrant,
         packet: &mut Vec<u8>,
+        ticket: &Ticket,
         mut stop: watch::Receiver<bool>,
     ) -> Result<Result<(), Refusal>, Gone> {
         let deadline = Instant::now() + self.request_timeout;
         loop {
+            ticket.set_amid_packet(!packet.is_empty());
             let missing = match self.judge(rights, packet) {
                 Ok(Packet::Incomplete { missing }) => missing,
                 Ok(Packet::Whole { .. }) => 0,
@@ -318,6 +320,7 @@ impl RawIngest {
                     continue;
                 }
                 Ok(None) => {
+                    ticket.set_amid_packet(!bytes.is_empty());
                     let patience = if bytes.is_empty() { idle } else { self.request_timeout };
                     let was_empty = bytes.is_empty();
                     let readable = tokio::select! {
@@ -345,6 +348,7 @@ impl RawIngest {
                 }
                 Err(refusal) => refusal,
             };
+            ticket.set_amid_packet(false);
             self.refuse(&context, peer, &bytes, refusal);
             let _ = self.reply(&stream, REFUSED).await;
             bytes.clear();
@@ -468,6 +472,7 @@ impl Service for RawIngest {
             return None;
         }
         connection.received = bytes.to_vec();
+        connection.ticket.set_amid_packet(len > 0);
         Some(connection)
     }
 
@@ -481,7 +486,8 @@ impl Service for RawIngest {
             return self.serve_many(context, connection, idle, stop).await;
         }
         let Admitted { stream, peer, rights, received: mut packet, ticket } = connection;
-        let judged = match self.receive(&stream, &rights, &mut packet, stop.clone()).await {
+        let judged = self.receive(&stream, &rights, &mut packet, &ticket, stop.clone()).await;
+        let judged = match judged {
             Err(Gone::Timeout) => return context.ended(Kind::RequestTimeout, peer),
             Err(Gone::Closed | Gone::Stopped) => return context.ended(Kind::Closed, peer),
             Ok(judged) => judged,
@@ -492,6 +498,7 @@ impl Service for RawIngest {
             }
             Packet::Incomplete { .. } => Err(Refusal::Short),
         });
+        ticket.set_amid_packet(false);
         if let Err(refusal) = written {
             self.refuse(&context, peer, &packet, refusal);
             drop(packet);

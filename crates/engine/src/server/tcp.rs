@@ -178,6 +178,7 @@ impl ModbusStream {
             match raw.beginning(&admitted.received) {
                 Beginning::Unknown => {}
                 Beginning::SomethingElse => {
+                    admitted.ticket.set_amid_packet(false);
                     return self.connection::<Mbap>(context, admitted, stop).await;
                 }
                 Beginning::Packet => {
@@ -205,7 +206,10 @@ impl ModbusStream {
                 Ok(Err(_)) => return context.ended(Kind::Closed, peer),
                 Ok(Ok(())) => match admitted.stream.try_read(&mut chunk[..missing]) {
                     Ok(0) => return context.ended(Kind::Closed, peer),
-                    Ok(len) => admitted.received.extend_from_slice(&chunk[..len]),
+                    Ok(len) => {
+                        admitted.received.extend_from_slice(&chunk[..len]);
+                        admitted.ticket.set_amid_packet(true);
+                    }
                     Err(error) if error.kind() == ErrorKind::WouldBlock => {}
                     Err(_) => return context.ended(Kind::Closed, peer),
                 },
