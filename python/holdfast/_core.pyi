@@ -310,12 +310,15 @@ class Listener:
         request_timeout: float = 10.0,
         packets: Literal["one", "many"] = "one",
         idle_timeout: float = 300.0,
+        after_refusal: Literal["close", "continue"] = "close",
     ) -> Listener:
         """A listener for Raw Ingest packets.
 
         With `crc` if-present, only with `packets` one, bytes that have arrived behind a packet are
-        its CRC. With `flags` ignore, flags and the reserved byte of a packet may have any value. With `packets` many, a connection carries any number of them, until the sender closes, one
-        is refused, or none comes for `idle_timeout` seconds.
+        its CRC. With `flags` ignore, flags and the reserved byte may have any value. With `packets`
+        many, a connection carries any number of them, until the sender closes, one is refused, or
+        none comes for `idle_timeout` seconds. With `after_refusal` continue, only an invalid header
+        or CRC ends the connection.
         """
 
 @final

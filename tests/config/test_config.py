@@ -245,6 +245,7 @@ def test_raw_ingest_speaks_v1_unless_it_says_otherwise(loaded: Callable[..., Con
     listener = listener_of(loaded, text, RawIngestListener)
     assert (listener.format, listener.crc) == ("v1", None)
     assert (listener.max_connections, listener.max_connections_per_source) == (256, None)
+    assert (listener.flags, listener.when_full, listener.after_refusal) == (None, "refuse", "close")
     assert (listener.rules[0].units, listener.rules[0].memories) == ({65535: "plant"}, ())
 
 
@@ -255,7 +256,7 @@ def test_raw_ingest_of_format_crc_needs_the_crc_unless_it_says_otherwise(
     rule = f"{{sources: [10.0.0.7], {GRANT}}}"
     text = f"type: raw-ingest, format: crc, {written}bind: '127.0.0.1:1', rules: [{rule}]"
     listener = listener_of(loaded, text, RawIngestListener)
-    assert listener.crc == crc
+    assert (listener.crc, listener.flags) == (crc, "strict")
     assert (listener.rules[0].units, listener.rules[0].memories) == ({}, ("plant",))
 
 

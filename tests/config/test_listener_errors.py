@@ -226,9 +226,15 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
         ("    bind", "    format: v2\n    bind", "7: format: found 'v2', allowed: v1 or crc"),
         ("    bind", "    crc: none\n    bind",
          "7: crc: found with format v1, allowed: only with format crc"),
-        ("    bind", "    when_full: evict\n    bind", "7: when_full: unknown key, allowed: type, "
-         "format, crc, bind, max_connections, max_connections_per_source, request_timeout, "
-         "packets, idle_timeout, rules"),
+        ("    bind", "    flags: ignore\n    bind",
+         "7: flags: found with format v1, allowed: only with format crc"),
+        ("    bind", "    after_refusal: continue\n    bind",
+         "7: after_refusal: found continue with packets: one, allowed: close, or packets: many"),
+        ("    bind", "    when_full: wait\n    bind",
+         "7: when_full: found 'wait', allowed: refuse or evict"),
+        ("    bind", "    tls: 1\n    bind", "7: tls: unknown key, allowed: "
+         "type, format, crc, flags, bind, max_connections, max_connections_per_source, when_full, "
+         "request_timeout, packets, after_refusal, idle_timeout, rules"),
         ("    bind", "    max_connections: 0\n    bind",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
         ("units: {1: plant}, ", "",
@@ -263,8 +269,14 @@ def test_raw_ingest_of_format_v1_is_checked(
     ("old", "new", "problem"),
     [
         ("    bind", "    crc: maybe\n    bind",
-         "8: crc: found 'maybe', allowed: required or none"),
-        ("    bind", "    crc: \n    bind", "8: crc: found nothing, allowed: required or none"),
+         "8: crc: found 'maybe', allowed: required, none or if-present"),
+        ("    bind", "    crc: \n    bind",
+         "8: crc: found nothing, allowed: required, none or if-present"),
+        ("    bind", "    crc: if-present\n    packets: many\n    bind",
+         "8: crc: found if-present with packets: many, allowed: required or none; bytes behind a "
+         "packet could be its CRC or the next packet"),
+        ("    bind", "    flags: any\n    bind",
+         "8: flags: found 'any', allowed: strict or ignore"),
         ("memories: [plant], ", "",
          f"10: rules[0].memories: missing with format crc, allowed: {SOME}"),
         ("[plant]", "[]", f"10: rules[0].memories: found an empty list, allowed: {SOME}"),
@@ -286,6 +298,38 @@ def test_raw_ingest_of_format_crc_is_checked(
     line, _, rest = problem.partition(" ")
     text = changed(CRC, old, new)
     assert folder.problems(text) == [f"p.yaml:{line} listeners.raw.{rest}"]
+
+
+def test_packets_on_a_modbus_port_are_checked_as_those_of_a_listener(folder: Folder) -> None:
+    text = """\
+  both:
+    type: modbus-tcp
+    bind: 127.0.0.1:5020
+    rules:
+      - {sources: [10.0.0.0/8], units: {1: plant}, access: read-only}
+    raw_ingest:
+      crc: if-present
+      flags: ignore
+      after_refusal: continue
+      rules:
+        - {sources: [10.0.0.0/8], units: {1: plant}, areas: [coils]}
+"""
+    only = "found with format v1, allowed: only with format crc"
+    at = "listeners.both.raw_ingest"
+    assert folder.problems(MEMORIES + text) == [
+        f"p.yaml:11: {at}.crc: {only}",
+        f"p.yaml:12: {at}.flags: {only}",
+        f"p.yaml:13: {at}.after_refusal: found continue with packets: one, allowed: close, or "
+        "packets: many",
+    ]
+    crc = text.replace("flags: ignore", "format: crc").replace(
+        "units: {1: plant}, areas", "memories: [plant], areas"
+    )
+    crc = crc.replace("after_refusal: continue", "packets: many")
+    assert folder.problems(MEMORIES + crc) == [
+        f"p.yaml:11: {at}.crc: found if-present with packets: many, allowed: required or none; "
+        "bytes behind a packet could be its CRC or the next packet"
+    ]
 
 
 def test_all_problems_of_a_raw_ingest_rule_are_told_at_once(folder: Folder) -> None:

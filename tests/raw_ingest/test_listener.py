@@ -92,19 +92,7 @@ class Plant:
 
     def until_taken(self, client: wire.Connection) -> None:
         """Waits until the listener has read all that was sent, where the system tells."""
-        table = Path("/proc/net/tcp")
-        if not table.exists():
-            return
-        ends = f"{self.address[1]:04X}", f"{client.socket.getsockname()[1]:04X}"
-
-        def taken() -> bool:
-            for line in table.read_text().splitlines()[1:]:
-                fields = line.split()
-                if (fields[1][-4:], fields[2][-4:]) == ends:
-                    return fields[4].endswith(":00000000")
-            return True
-
-        wire.until(taken, "the listener has read what was sent")
+        wire.until_taken(client.socket)
 
     def content(self) -> dict[Area, list[int]]:
         ranges = [(area, where.start, len(where)) for area, where in self.memory.areas.items()]
@@ -258,7 +246,12 @@ def test_accepted_vectors_reach_memory(plant: Plant, kind: str) -> None:
             assert plant.answer(packet, finish=finish) == DONE, case["name"]
             assert plant.content() == after(case), case["name"]
     values = sum(5 if "stray" in case["name"] else len(case["values"]) for case in ACCEPTED)
-    assert plant.counted() == {"accepted": 2 * len(ACCEPTED), "values": 2 * values, "dropped_bytes": 0, "refused": {}}
+    assert plant.counted() == {
+        "accepted": 2 * len(ACCEPTED),
+        "values": 2 * values,
+        "dropped_bytes": 0,
+        "refused": {},
+    }
 
 
 def test_refused_vectors_leave_memory_as_it_was(plant: Plant, kind: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import socket
 import struct
+import zlib
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import pytest
 import holdfast
 from support import wire
 from support.config_folder import written
+from support.machine import needs_127_0_0_2
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -34,7 +36,9 @@ def packet(address: int, *values: int, area: int = 3, unit: int = 1) -> bytes:
 def configuration(
     part: dict[str, Any] | None = None, *, kind: str = "modbus-tcp", **more: Any
 ) -> str:
-    raw = {"sources": SOURCES, "units": {1: "plant"}, "areas": ["holding_registers"]}
+    by_id = (part or {}).get("format") == "crc"
+    target: dict[str, Any] = {"memories": ["plant"]} if by_id else {"units": {1: "plant"}}
+    raw = {"sources": SOURCES, **target, "areas": ["holding_registers"]}
     rule: dict[str, Any] = {"sources": SOURCES, "units": {1: "plant"}, "access": "read-write"}
     listener: dict[str, Any] = {"type": kind, "bind": "127.0.0.1:0", **more}
     if kind == "modbus-tcp":
@@ -42,7 +46,10 @@ def configuration(
     else:
         listener |= {"rules": [raw], **(part or {})}
     return written(
-        {"memories": {"plant": {"holding_registers": 100}}, "listeners": {"both": listener}}
+        {
+            "memories": {"plant": {"id": 7, "holding_registers": 100}},
+            "listeners": {"both": listener},
+        }
     )
 
 
@@ -155,6 +162,162 @@ def test_a_refused_packet_ends_a_connection_with_many(run: Run, dial: Any, kind:
     assert sender.recv(1) + sender.recv(1) == DONE + REFUSED
     assert registers(appliance) == [1, 0, 0, 0]
     assert counters(appliance)["packets"]["refused"] == {"range": 1}
+
+
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+def test_a_connection_can_go_on_after_a_refused_packet(run: Run, dial: Any, kind: str) -> None:
+    appliance = run(configuration({"packets": "many", "after_refusal": "continue"}, kind=kind))
+    sender = dial(appliance)
+    refused = [packet(99, 2, 3), packet(0, 4, unit=2), packet(0, 5, area=4)]
+    pieces = [packet(0, 1), *refused, packet(1, 2)]
+    for byte in b"".join(pieces):
+        sender.sendall(bytes([byte]))
+    replies = b"".join(sender.recv(1) for _ in pieces)
+    assert replies == DONE + REFUSED * 3 + DONE
+    assert registers(appliance) == [1, 2, 0, 0]
+    assert counters(appliance)["packets"]["refused"] == {"range": 1, "unit": 1, "not_granted": 1}
+    # After an invalid header, the next packet can't be found.
+    sender.sendall(packet(0, 6, area=5) + packet(2, 3))
+    assert (sender.recv(2), sender.recv(1)) == (REFUSED, b"")
+    assert registers(appliance) == [1, 2, 0, 0]
+
+
+def with_memory_id(address: int, *values: int, flags: int = 0, reserved: int = 0) -> bytes:
+    """A packet of format crc, without its CRC."""
+    head = struct.pack(">2sBBBBHHH", b"RI", 1, flags, 3, reserved, 7, address, len(values))
+    return head + struct.pack(f">{len(values)}H", *values)
+
+
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+@pytest.mark.parametrize(("flags", "reserved"), [(1, 0), (0, 1), (255, 255)])
+def test_flags_can_be_ignored(run: Run, dial: Any, kind: str, flags: int, reserved: int) -> None:
+    lenient = run(configuration({"format": "crc", "crc": "none", "flags": "ignore"}, kind=kind))
+    strict = run(configuration({"format": "crc", "crc": "none"}, kind=kind))
+    sent = with_memory_id(0, 7, 8, flags=flags, reserved=reserved)
+    sender = dial(lenient)
+    for byte in sent:
+        sender.sendall(bytes([byte]))
+    assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
+    assert registers(lenient) == [7, 8, 0, 0]
+    sender = dial(strict)
+    sender.sendall(sent)
+    sender.shutdown(socket.SHUT_WR)
+    # With flags, it is no packet, so a Modbus listener does not reply.
+    assert sender.recv(1) == (b"" if kind == "modbus-tcp" and flags else REFUSED)
+    assert registers(strict) == [0, 0, 0, 0]
+
+
+def test_modbus_needs_no_more_bytes_where_flags_are_ignored(run: Run, dial: Any) -> None:
+    appliance = run(
+        configuration({"format": "crc", "crc": "none", "flags": "ignore"}, kind="modbus-tcp")
+    )
+    client = dial(appliance)
+    for byte in wire.frame(READ, 1, 0x5249):
+        client.sendall(bytes([byte]))
+    assert client.recv(100) == wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 0x5249)
+    assert counters(appliance)["packets"]["refused"] == {}
+
+
+@pytest.fixture(params=["modbus-tcp", "raw-ingest"])
+def lenient(run: Run, request: pytest.FixtureRequest) -> Appliance:
+    return run(configuration({"format": "crc", "crc": "if-present"}, kind=request.param))
+
+
+def crc_of(body: bytes) -> bytes:
+    return zlib.crc32(body).to_bytes(4, "big")
+
+
+def test_a_crc_that_has_arrived_is_checked(lenient: Appliance, dial: Any) -> None:
+    body = with_memory_id(0, 7, 8)
+    wrong = bytes([crc_of(body)[0] ^ 1]) + crc_of(body)[1:]
+    for sent, reply in [
+        (body + wrong, REFUSED),
+        (body + crc_of(body) + b"\0", REFUSED),
+        (body + body, REFUSED),
+        (body + crc_of(body), DONE),
+    ]:
+        assert registers(lenient) == [0, 0, 0, 0]
+        sender = dial(lenient)
+        sender.sendall(sent)
+        assert (sender.recv(2), sender.recv(1)) == (reply, b"")
+    assert registers(lenient) == [7, 8, 0, 0]
+    assert counters(lenient)["packets"]["refused"] == {"crc": 1, "extra": 2}
+
+
+def test_a_crc_that_has_begun_is_awaited(lenient: Appliance, dial: Any) -> None:
+    body = with_memory_id(0, 7)
+    sender = dial(lenient)
+    sender.sendall(body + crc_of(body)[:1])
+    wire.until_taken(sender)
+    for byte in crc_of(body)[1:]:
+        sender.sendall(bytes([byte]))
+    assert sender.recv(1) == DONE
+    cut = dial(lenient)
+    cut.sendall(body + crc_of(body)[:3])
+    cut.shutdown(socket.SHUT_WR)
+    assert cut.recv(1) == REFUSED
+    assert counters(lenient)["packets"]["refused"] == {"short": 1}
+
+
+def test_a_packet_without_a_crc_is_written_at_once(lenient: Appliance, dial: Any) -> None:
+    sender = dial(lenient)
+    sender.sendall(with_memory_id(0, 7, 8))
+    assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
+    assert registers(lenient) == [7, 8, 0, 0]
+
+
+def test_a_crc_that_comes_too_late_is_counted_and_resets_nothing(
+    lenient: Appliance, dial: Any
+) -> None:
+    body = with_memory_id(0, 7, 8)
+    sender = dial(lenient)
+    sender.sendall(body)
+    wire.until(lambda: registers(lenient)[0] == 7, "it is written")
+    sender.sendall(crc_of(body))
+    assert (sender.recv(2), sender.recv(1)) == (DONE, b"")
+    sender.close()
+    wire.until(lambda: counters(lenient)["packets"]["dropped_bytes"] == 4, "it is counted")
+    assert counters(lenient)["packets"]["accepted"] == 1
+
+
+@pytest.mark.parametrize("kind", ["modbus-tcp", "raw-ingest"])
+@pytest.mark.parametrize("packets", ["one", "many"])
+def test_silent_connections_are_evicted_before_those_amid_a_packet(
+    run: Run, dial: Any, kind: str, packets: str
+) -> None:
+    limits: dict[str, Any] = {"max_connections": 3, "when_full": "evict"}
+    appliance = run(configuration({"packets": packets}, kind=kind, **limits))
+    begun = dial(appliance)
+    begun.sendall(packet(0, 1)[:-1])
+    wire.until_taken(begun)
+    silent = [dial(appliance) for _ in range(5)]
+    assert [each.recv(1) for each in silent[:3]] == [b""] * 3
+    assert counters(appliance)["connections"]["evicted"] == 3
+    begun.sendall(packet(0, 1)[-1:])
+    assert begun.recv(1) == DONE
+    late = dial(appliance)
+    late.sendall(packet(1, 2))
+    assert late.recv(1) == DONE
+    assert registers(appliance) == [1, 2, 0, 0]
+
+
+@needs_127_0_0_2
+def test_silent_connections_of_one_source_evict_each_other(run: Run, dial: Any) -> None:
+    limits: dict[str, Any] = {
+        "max_connections": 2,
+        "max_connections_per_source": 1,
+        "when_full": "evict",
+    }
+    appliance = run(configuration(kind="raw-ingest", **limits))
+    other = socket.create_connection(
+        endpoint(appliance, "both"), timeout=wire.DEADLINE, source_address=("127.0.0.2", 0)
+    )
+    with other:
+        silent = [dial(appliance) for _ in range(3)]
+        assert [each.recv(1) for each in silent[:2]] == [b""] * 2
+        other.sendall(packet(0, 1))
+        assert other.recv(1) == DONE
+    assert counters(appliance)["connections"]["evicted"] == 2
 
 
 def test_half_a_packet_is_refused(run: Run, dial: Any) -> None:

@@ -142,13 +142,18 @@ def raw_ingest(draw: st.DrawFn, memories: list[str], port: int) -> dict[str, Any
     names = st.lists(name, min_size=1, unique=True)
     form = draw(st.sampled_from(["v1", "crc"]))
     named = {"units": units} if form == "v1" else {"memories": names}
-    crc = {"crc": st.sampled_from(["required", "none"])} if form == "crc" else {}
+    own: dict[str, st.SearchStrategy[str]] = {"when_full": st.sampled_from(["refuse", "evict"])}
+    if form == "crc":
+        own |= {
+            "crc": st.sampled_from(["required", "none", "if-present"]),
+            "flags": st.sampled_from(["strict", "ignore"]),
+        }
     return {
         "type": "raw-ingest",
         "format": form,
         "bind": f"127.0.0.1:{port}",
         "rules": draw(with_sources(st.fixed_dictionaries({**named, "areas": AREAS}))),
-        **draw(st.fixed_dictionaries({}, optional={**crc, "max_connections": CONNECTIONS})),
+        **draw(st.fixed_dictionaries({}, optional={**own, "max_connections": CONNECTIONS})),
     }
 
 

@@ -14,6 +14,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -76,6 +77,23 @@ def until(condition: Callable[[], object], what: str, seconds: float = DEADLINE)
         if time.monotonic() > deadline:
             raise AssertionError(f"not within {seconds} s: {what}")
         between_looks.wait(0.002)
+
+
+def until_taken(client: socket.socket) -> None:
+    """Waits until the peer on this machine has read all that was sent, where the system tells."""
+    table = Path("/proc/net/tcp")
+    if not table.exists():
+        return
+    ends = f"{client.getpeername()[1]:04X}", f"{client.getsockname()[1]:04X}"
+
+    def taken() -> bool:
+        for line in table.read_text().splitlines()[1:]:
+            fields = line.split()
+            if (fields[1][-4:], fields[2][-4:]) == ends:
+                return fields[4].endswith(":00000000")
+        return True
+
+    until(taken, "the peer has read what was sent")
 
 
 class Connection:

@@ -10,9 +10,9 @@ use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::policy::{Elsewhere, Narrowed, Rule as CoreRule};
 use holdfast_engine::server::ranges::Ranges;
 use holdfast_engine::server::{
-    ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings, PacketsPerConnection,
-    RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming, StreamSettings,
-    UdpSettings, WhenFull,
+    AfterRefusal, ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings,
+    PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
+    StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
@@ -230,7 +230,7 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0))]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0, after_refusal="close"))]
     fn raw_ingest(
         name: String,
         bind: &str,
@@ -244,9 +244,12 @@ impl Listener {
         request_timeout: f64,
         packets: &str,
         idle_timeout: f64,
+        after_refusal: &str,
     ) -> PyResult<Listener> {
         let idle = time_to_wait("idle_timeout", idle_timeout)?;
-        let many = PacketsPerConnection::Many { idle };
+        let refusals = [("close", AfterRefusal::Close), ("continue", AfterRefusal::Continue)];
+        let after_refusal = word("after_refusal", after_refusal, &refusals)?;
+        let many = PacketsPerConnection::Many { idle, after_refusal };
         let packets =
             word("packets", packets, &[("one", PacketsPerConnection::One), ("many", many)])?;
         let crcs =

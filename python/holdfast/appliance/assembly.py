@@ -219,6 +219,7 @@ def listener(
                 request_timeout=settings.request_timeout,
                 packets=settings.packets,
                 idle_timeout=settings.idle_timeout,
+                after_refusal=settings.after_refusal,
             )
         case _:
             assert_never(settings)
@@ -241,6 +242,7 @@ def _shared_port(
         request_timeout=settings.request_timeout,
         packets=part.packets,
         idle_timeout=settings.idle_timeout or MAX_TIME,
+        after_refusal=part.after_refusal,
     )
 
 

@@ -113,6 +113,9 @@ class ListenerChecks:
             message = "found if-present with packets: many, allowed: required or none; bytes behind"
             told = f"{message} a packet could be its CRC or the next packet"
             self.report.add((*path, "crc"), told)
+        if listener.get("after_refusal") == "continue" and listener.get("packets", "one") == "one":
+            message = "found continue with packets: one, allowed: close, or packets: many"
+            self.report.add((*path, "after_refusal"), message)
 
     def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
         for unit, target in mapping(rule.get("units")).items():

@@ -193,6 +193,9 @@ class RawIngestConfig(Model):
     strict."""
     packets: Literal["one", "many"] = "one"
     """Packets that a connection carries; many: until the sender closes, or one is refused."""
+    after_refusal: Literal["close", "continue"] = "close"
+    """With packets: many, after a refused packet whose header and CRC are valid: close ends the
+    connection; continue reads the next packet."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
     """The first rule whose sources contain the sender applies."""
 
@@ -368,6 +371,9 @@ class RawIngestListener(Model):
     """Seconds from the start of a connection to the last byte of its packet."""
     packets: Literal["one", "many"] = "one"
     """Packets that a connection carries; many: until the sender closes, or one is refused."""
+    after_refusal: Literal["close", "continue"] = "close"
+    """With packets: many, after a refused packet whose header and CRC are valid: close ends the
+    connection; continue reads the next packet."""
     idle_timeout: Duration = 300.0
     """With packets: many, seconds without a packet after which a connection is closed."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]

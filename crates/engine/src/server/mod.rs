@@ -26,7 +26,7 @@ pub use engine::{
     Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
     StartError,
 };
-pub use raw_ingest::{Flags, PacketsPerConnection, RawRule, RawSettings};
+pub use raw_ingest::{AfterRefusal, Flags, PacketsPerConnection, RawRule, RawSettings};
 pub use serial::SerialSettings;
 pub use tcp::{StreamFraming, StreamSettings};
 pub use udp::{DatagramFraming, UdpSettings};

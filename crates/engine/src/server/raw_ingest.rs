@@ -87,11 +87,20 @@ pub enum Flags {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PacketsPerConnection {
     One,
-    /// Any number, until the peer closes or one is refused. A connection ends after this time without
-    /// a packet.
+    /// Any number, until the peer closes. A connection ends after this time without a packet.
     Many {
         idle: Duration,
+        after_refusal: AfterRefusal,
     },
+}
+
+/// What follows a packet whose header is valid, but that may not be written as it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AfterRefusal {
+    /// The connection ends.
+    Close,
+    /// The next packet.
+    Continue,
 }
 
 /// Whether a connection begins with a packet.
@@ -117,6 +126,7 @@ pub(crate) struct RawIngest {
     crc_if_present: bool,
     request_timeout: Duration,
     many: Option<Duration>,
+    after_refusal: AfterRefusal,
 }
 
 /// The state of a packet that is being received.
@@ -146,6 +156,10 @@ impl RawIngest {
             let targets = rule.targets.iter().cloned().collect();
             (rule.sources.clone(), RawGrant { targets, areas: rule.areas.clone() })
         });
+        let (many, after_refusal) = match settings.packets {
+            PacketsPerConnection::One => (None, AfterRefusal::Close),
+            PacketsPerConnection::Many { idle, after_refusal } => (Some(idle), after_refusal),
+        };
         RawIngest {
             packets: PacketCounters::default(),
             policy: Grants::new(rules),
@@ -153,10 +167,8 @@ impl RawIngest {
             flags: settings.flags,
             crc_if_present: settings.crc_if_present,
             request_timeout: settings.request_timeout,
-            many: match settings.packets {
-                PacketsPerConnection::One => None,
-                PacketsPerConnection::Many { idle } => Some(idle),
-            },
+            many,
+            after_refusal,
         }
     }
 
@@ -308,12 +320,12 @@ impl RawIngest {
         let (mut end, mut begun, mut accepted) = (Kind::Closed, Instant::now(), false);
         loop {
             let refusal = match self.first_of(&context, peer, &rights, &bytes) {
-                Ok(Some(len)) => {
+                Ok(Some((len, reply))) => {
                     bytes.drain(..len);
-                    accepted = true;
+                    accepted |= reply == DONE;
                     begun = Instant::now();
                     ticket.touch(begun.into_std());
-                    if let Err(slow) = self.reply(&stream, DONE).await {
+                    if let Err(slow) = self.reply(&stream, reply).await {
                         end = slow;
                         break;
                     }
@@ -376,22 +388,41 @@ impl RawIngest {
         }
     }
 
-    /// Writes the packet that `bytes` begin with. Returns its length, `None` while more are needed.
+    /// Writes the packet that `bytes` begin with. Returns its length and the reply, `None` while more
+    /// bytes are needed, and the refusal that ends the connection.
     fn first_of(
         &self,
         context: &ListenerContext,
         peer: SocketAddr,
         rights: &RawGrant,
         bytes: &[u8],
-    ) -> Result<Option<usize>, Refusal> {
-        let len = self.header(bytes)?.map(|header| self.format.packet_len(&header));
-        let packet = len.and_then(|len| bytes.get(..len)).unwrap_or(bytes);
-        match self.judge(rights, packet)? {
-            Packet::Incomplete { .. } => Ok(None),
-            Packet::Whole { header, memory, payload } => {
-                self.write(context, peer, (header, memory, payload))?;
-                Ok(len)
+    ) -> Result<Option<(usize, u8)>, Refusal> {
+        let Some(header) = self.header(bytes)? else {
+            return Ok(None);
+        };
+        let len = self.format.packet_len(&header);
+        let packet = bytes.get(..len).unwrap_or(bytes);
+        let continues = self.after_refusal == AfterRefusal::Continue;
+        if continues && packet.len() < len {
+            return Ok(None);
+        }
+        let written = match self.judge(rights, packet) {
+            Ok(Packet::Incomplete { .. }) => return Ok(None),
+            Ok(Packet::Whole { header, memory, payload }) => {
+                self.write(context, peer, (header, memory, payload))
             }
+            Err(refusal) => Err(refusal),
+        };
+        match written {
+            Ok(()) => Ok(Some((len, DONE))),
+            // The packet ends where its header says, so the next one can be found.
+            Err(
+                refusal @ (Refusal::Unit | Refusal::Memory | Refusal::NotGranted | Refusal::Range),
+            ) if continues => {
+                self.refuse(context, peer, packet, refusal);
+                Ok(Some((len, REFUSED)))
+            }
+            Err(refusal) => Err(refusal),
         }
     }
 
