@@ -164,7 +164,7 @@ def test_the_example_of_the_page_is_what_the_command_makes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = (DOCS / "moving-from-mma.md").read_text()
-    old, new = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    old, new, _ = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     Path("config.yaml").write_text(old)
     assert read_mma("config.yaml").to_yaml() == new
@@ -418,6 +418,12 @@ def test_other_answers_to_what_is_not_allowed_are_noted(imported: Import) -> Non
 # The second generation.
 
 
+def raw_ingest(units: dict[int, str], areas: list[str]) -> dict[str, Any]:
+    """What everybody may write by Raw Ingest."""
+    rule = {"sources": ["0.0.0.0/0", "::/0"], "units": units, "areas": areas}
+    return {"packets": "many", "after_refusal": "continue", "rules": [rule]}
+
+
 def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> None:
     found = imported(SECOND % (RULE, ""))
     assert found.data["memories"] == {"main-1": {"coils": 8, "holding_registers": 4}}
@@ -426,6 +432,7 @@ def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> Non
         "bind": "127.0.0.1:502",
         "when_full": "evict",
         "rules": [{"sources": ["10.0.0.0/8"], "units": {1: "main-1"}, "access": "read-write"}],
+        "raw_ingest": raw_ingest({1: "main-1"}, ["coils", "holding_registers"]),
     }
 
 
@@ -455,7 +462,7 @@ def test_a_sealing_coil_is_followed(imported: Import) -> None:
     expected = {"area": "coils", "address": 7, "mode": "level"}
     assert found.data["memories"]["main-1"]["seal"] == expected
     assert noted(found, "state_sealing.exception: left out", "0x06")
-    assert noted(found, "nothing can open main-1")
+    assert not noted(found, "nothing can open main-1")
 
 
 def test_a_seal_that_is_off_is_left_out(imported: Import) -> None:
@@ -532,12 +539,35 @@ def test_what_has_no_counterpart_is_noted_with_the_reason(imported: Import, key:
     assert not noted(found, "unknown key")
 
 
-def test_raw_ingest_on_the_same_port_is_noted(imported: Import) -> None:
+def test_everybody_may_write_by_raw_ingest_whatever_the_policies_say(imported: Import) -> None:
+    nobody = "      - {unit_id: 2, name: silent, input_registers: {start: 0, count: 1}}\n"
+    found = imported(SECOND % (RULE.replace("rw", "ro"), "") + nobody)
+    areas = ["coils", "holding_registers", "input_registers"]
+    assert port(found, "main")["raw_ingest"] == raw_ingest({1: "main-1", 2: "silent"}, areas)
+    assert rule(found, "main")["units"] == {1: "main-1"}
     assert noted(
-        imported(SECOND % (RULE, "")),
-        "listeners: check: these ports also received Raw Ingest",
-        "format: v1",
+        found,
+        "2: listeners[0]: check: every address may write all areas of all its units by Raw Ingest",
+        "as it ran",
+        "or remove raw_ingest",
     )
+
+
+def test_the_filter_of_the_whole_file_can_limit_raw_ingest(imported: Import) -> None:
+    text = SECOND % (RULE, "") + "ip_filter: {allow: [10.0.0.0/9]}\n"
+    (limited,) = port(imported(text, as_meant=True), "main")["raw_ingest"]["rules"]
+    assert limited["sources"] == ["10.0.0.0/9"]
+
+
+def test_a_listener_without_policies_takes_only_raw_ingest(imported: Import) -> None:
+    found = imported(SECOND % (RULE.replace("allow: rw", "allow_fc: []"), ""))
+    assert port(found, "main") == {
+        "type": "raw-ingest",
+        "bind": "127.0.0.1:502",
+        "when_full": "evict",
+        **raw_ingest({1: "main-1"}, ["coils", "holding_registers"]),
+    }
+    assert noted(found, "listeners[0]: changed: no policy allows a function for its areas")
 
 
 # REST, MQTT and Raw Ingest.
@@ -684,7 +714,11 @@ def test_raw_ingest_becomes_a_listener_without_crc(imported: Import) -> None:
         "bind": "[::]:9000",
         "format": "crc",
         "crc": "none",
+        "flags": "ignore",
+        "packets": "many",
+        "when_full": "evict",
         "request_timeout": 1.5,
+        "idle_timeout": 1.5,
         "rules": [{"sources": ["10.0.0.0/8"], "memories": ["5"], "areas": ["coils"]}],
     }
     assert noted(found, "raw_ingest.max_packet_bytes: left out")

@@ -46,6 +46,14 @@ class Draft:
         areas = [area for area in grant["areas"] if area in _INGEST]
         return {**grant, "areas": areas} if areas else {}
 
+    def raw_ingest_may_open(self, memory: str) -> bool:
+        """Whether a listener takes Raw Ingest packets for a memory: they may write all areas."""
+        rules: list[dict[str, Any]] = []
+        for listener in self.listeners.values():
+            part = listener if listener["type"] == "raw-ingest" else listener.get("raw_ingest", {})
+            rules += part.get("rules", [])
+        return any(memory in (rule.get("memories") or rule["units"].values()) for rule in rules)
+
     def written_by_raw_ingest(self) -> list[str]:
         """The memories with an id, which Raw Ingest packets with memory ids can write."""
         return [name for name, memory in self.memories.items() if "id" in memory]

@@ -78,8 +78,7 @@ class Adapters:
         return None
 
     def _tell_who_opens(self, name: str, path: KeyPath) -> None:
-        by_raw = "raw-ingest" in (one["type"] for one in self.draft.listeners.values())
-        if self.draft.rest or self.draft.mqtt or (by_raw and "id" in self.draft.memories[name]):
+        if self.draft.rest or self.draft.mqtt or self.draft.raw_ingest_may_open(name):
             return
         message = f"nothing can open {name}: REST, MQTT and Raw Ingest write gate bits"
         self.desk.note("check", path, f"{message}, and none of them can access it")
@@ -288,8 +287,10 @@ class Adapters:
         if bind is None or not sources:
             return
         listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind)}
-        listener |= {"format": "crc", "crc": "none"}
+        listener |= {"format": "crc", "crc": "none", "flags": "ignore", "packets": "many"}
+        listener["when_full"] = "evict"
         if timeout is not None:
-            listener["request_timeout"] = timeout / 1000 if timeout % 1000 else timeout // 1000
+            seconds = timeout / 1000 if timeout % 1000 else timeout // 1000
+            listener |= {"request_timeout": seconds, "idle_timeout": seconds}
         listener["rules"] = [{"sources": sources, **self.draft.grant(memories)}]
         self.draft.listeners[free_name("raw-ingest", set(self.draft.listeners))] = listener

@@ -79,10 +79,8 @@ class SecondGeneration:
             self._tell_all(root.at("listeners"))
 
     def _tell_all(self, path: KeyPath) -> None:
-        message = "these ports also received Raw Ingest; for it, add a listener with type:"
-        self.desk.note("check", path, f"{message} raw-ingest, format: v1 and a separate port")
         message = "a function that is not allowed returns 0x01, an unmapped unit id 0x0B"
-        closed = "a peer that no rule matches is disconnected at once"
+        closed = "a peer that neither rules nor raw_ingest name is disconnected at once"
         self.desk.note("check", path, f"{message}; {closed}")
         if self.rules_have_ids:
             self.desk.note("left out", path, "the ids of policy rules: rules have no names")
@@ -123,16 +121,41 @@ class SecondGeneration:
         listener.close()
         policies = [self._memory(memory) for memory in memories]
         known = [policy for policy in policies if policy is not None]
-        rules = merged(known, ALL if self.admitted is None else self.admitted)
-        if not rules:
-            message = "the listener is left out: no policy allows a function for its areas"
+        admitted = ALL if self.admitted is None else self.admitted
+        rules = merged(known, admitted)
+        raw = self._raw_ingest(listener, memories, admitted)
+        common = {"bind": str(bind), "when_full": "evict"}
+        if not raw:
+            message = "the listener is left out: nobody may read or write its memories"
             self.desk.note("left out", listener.path, message)
+            return
+        if not rules:
+            message = "no policy allows a function for its areas, so only Raw Ingest is served"
+            self.desk.note("changed", listener.path, message)
+            self.draft.listeners[name] = {"type": "raw-ingest", **common, **raw}
             return
         for policy in unserved(known, rules):
             message = f"no rule serves unit {policy.unit}: it allows no function for its areas"
             self.desk.note("check", listener.path, message)
-        listen = {"type": "modbus-tcp", "bind": str(bind), "when_full": "evict"}
-        self.draft.listeners[name] = {**listen, "rules": rules}
+        listen = {"type": "modbus-tcp", **common}
+        self.draft.listeners[name] = {**listen, "rules": rules, "raw_ingest": raw}
+
+    def _raw_ingest(
+        self, listener: Section, memories: list[_Memory], admitted: Peers
+    ) -> dict[str, Any]:
+        """What Raw Ingest packets to the port of a listener may write; empty if nobody may.
+
+        The source applied no policy to packets, and answered each packet of a connection.
+        """
+        units = {one.unit: one.name for one in memories if one.unit is not None}
+        areas = self.draft.grant(list(units.values()))["areas"]
+        if not units or not admitted or not areas:
+            return {}
+        message = "every address may write all areas of all its units by Raw Ingest, as it ran:"
+        told = f"{message} policies are for Modbus only. List only the senders in the sources of"
+        self.desk.note("check", listener.path, f"{told} raw_ingest, or remove raw_ingest")
+        rule = {"sources": admitted.written(), "units": units, "areas": areas}
+        return {"packets": "many", "after_refusal": "continue", "rules": [rule]}
 
     def _memory(self, memory: _Memory) -> Policy | None:
         one = memory.section
