@@ -102,6 +102,26 @@ def test_a_peer_that_no_rule_names_is_told_so(file: Path) -> None:
     assert lines.count("  no rule names 192.0.2.1: it gets no reply") == 1
 
 
+def test_packets_on_a_modbus_port_are_rights_too(file: Path) -> None:
+    part = """    raw_ingest:
+      rules: [{sources: [10.0.0.0/24, 192.0.2.1], areas: [coils], units: {300: plant}}]
+"""
+    file.write_text(TEXT.replace("  meters:", f"{part}  meters:"))
+    both = check(file, "--as", "10.0.0.7").stdout.splitlines()
+    at = both.index("  Raw Ingest packets:")
+    assert both[at - 1].split()[:3] == ["9", "route", "bus"]
+    assert both[at + 2].split() == ["300", "memory", "plant", "coils"]
+    only = check(file, "--as", "192.0.2.1").stdout.splitlines()
+    assert only[1:3] == [
+        "  no rule names 192.0.2.1: every request gets exception 01",
+        "  Raw Ingest packets:",
+    ]
+    found = peer(file, "--as", "192.0.2.1")["listeners"]
+    assert (found["scada"]["outcome"], found["scada"]["units"]) == ("only_packets", [])
+    assert found["scada"]["packets"] == [{"unit": 300, "memory": "plant", "areas": ["coils"]}]
+    assert "packets" not in peer(file, "--as", "10.1.0.7")["listeners"]["scada"]
+
+
 def test_programs_get_the_rights(file: Path) -> None:
     found = peer(file, "--as", "::ffff:10.1.0.7")
     listeners = found["listeners"]

@@ -7,8 +7,13 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from holdfast.cli.showing import ranges_shown, styled, table, words
-from holdfast.config import ModbusAsciiListener, ModbusRtuListener, RawIngestListener
-from holdfast.config.listeners import DATAGRAM_TYPES
+from holdfast.config import (
+    ModbusAsciiListener,
+    ModbusRtuListener,
+    ModbusTcpListener,
+    RawIngestListener,
+)
+from holdfast.config.listeners import DATAGRAM_TYPES, RawIngestConfig
 from holdfast.config.rights import matching, together
 
 if TYPE_CHECKING:
@@ -60,21 +65,30 @@ def _rights(listener: Listener, peer: Peer) -> tuple[str, dict[int, UnitRights]]
     if isinstance(listener, ModbusRtuListener | ModbusAsciiListener):
         return "no_addresses", {}
     if not matching(listener.rules, peer.address):
+        if _packet_rule(listener, peer) is not None:
+            return "only_packets", {}
         return "unanswered" if listener.type in DATAGRAM_TYPES else "disconnected", {}
     role = peer.role if listener.type == "modbus-tls" else None
     rules = matching(listener.rules, peer.address, role)
     return ("served", together(rules)) if rules else ("no_rights", {})
 
 
+def _packet_rule(listener: Listener, peer: Peer) -> RawRuleConfig | None:
+    """The rule for Raw Ingest packets of the peer."""
+    taker = listener.raw_ingest if isinstance(listener, ModbusTcpListener) else listener
+    if not isinstance(taker, RawIngestListener | RawIngestConfig):
+        return None
+    return next(iter(matching(taker.rules, peer.address)), None)
+
+
 def _told(listener: Listener, peer: Peer) -> list[str]:
+    packets = _packet_rule(listener, peer)
     if isinstance(listener, RawIngestListener):
-        rules = matching(listener.rules, peer.address)
-        return _raw_told(rules[0]) if rules else [_outcomes(peer)["disconnected"]]
+        return [_outcomes(peer)["disconnected"]] if packets is None else _raw_told(packets)
     outcome, rights = _rights(listener, peer)
-    if outcome != "served":
-        return [_outcomes(peer)[outcome]]
-    rows = (_row(units, each) for units, each in _joined(rights))
-    return table(HEAD, rows)
+    told = [_outcomes(peer)[outcome]] if outcome != "served" else []
+    told += table(HEAD, [_row(units, each) for units, each in _joined(rights)]) if rights else []
+    return told if packets is None else [*told, "Raw Ingest packets:", *_raw_told(packets)]
 
 
 def _outcomes(peer: Peer) -> dict[str, str]:
@@ -83,6 +97,7 @@ def _outcomes(peer: Peer) -> dict[str, str]:
         "no_addresses": "a serial line has no addresses",
         "disconnected": f"no rule names {peer.address}: it is disconnected at once",
         "unanswered": f"no rule names {peer.address}: it gets no reply",
+        "only_packets": f"no rule names {peer.address}: every request gets exception 01",
         "no_rights": f"no rule names {peer.address} with {role}: every request gets exception 01",
     }
 
@@ -126,24 +141,21 @@ def runs(numbers: Iterable[int]) -> str:
 
 def _data(listener: Listener, peer: Peer) -> dict[str, Any]:
     where = {"type": listener.type, "at": _place(listener)}
+    rule = _packet_rule(listener, peer)
+    packets = [] if rule is None else _packets_data(rule)
     if isinstance(listener, RawIngestListener):
-        rules = matching(listener.rules, peer.address)
-        if not rules:
-            return {**where, "outcome": "disconnected", "units": []}
-        rule = rules[0]
-        targets: list[dict[str, Any]] = [
-            {"unit": unit, "memory": name} for unit, name in rule.units.items()
-        ]
-        targets += [{"memory": name} for name in rule.memories]
-        areas = list(rule.areas)
-        return {
-            **where,
-            "outcome": "served",
-            "units": [{**each, "areas": areas} for each in targets],
-        }
+        outcome = "disconnected" if rule is None else "served"
+        return {**where, "outcome": outcome, "units": packets}
     outcome, rights = _rights(listener, peer)
     units = [_unit_data(unit, each) for unit, each in sorted(rights.items())]
-    return {**where, "outcome": outcome, "units": units}
+    found = {**where, "outcome": outcome, "units": units}
+    return {**found, "packets": packets} if packets else found
+
+
+def _packets_data(rule: RawRuleConfig) -> list[dict[str, Any]]:
+    areas = list(rule.areas)
+    units = [{"unit": unit, "memory": name, "areas": areas} for unit, name in rule.units.items()]
+    return [*units, *({"memory": name, "areas": areas} for name in rule.memories)]
 
 
 def _unit_data(unit: int, rights: UnitRights) -> dict[str, Any]:
