@@ -10,6 +10,7 @@ use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
 use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
+use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
 use super::admission::{Admission, ConnectionLimits, Full, Ticket, attach};
@@ -262,7 +263,11 @@ pub(crate) async fn drain(
         let Ok(Ok(())) = readable else { break };
         match stream.try_read(&mut chunk) {
             Ok(0) => break,
-            Ok(len) => drained += len,
+            Ok(len) => {
+                drained += len;
+                // A peer that never pauses leaves time for other connections.
+                yield_now().await;
+            }
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
             Err(_) => break,
         }

@@ -17,6 +17,7 @@ use ipnet::IpNet;
 use socket2::SockRef;
 use tokio::net::TcpStream;
 use tokio::sync::watch;
+use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
 use crate::packet_area::of_packet;
@@ -318,10 +319,12 @@ impl RawIngest {
         mut stop: watch::Receiver<bool>,
     ) {
         let (mut end, mut begun, mut accepted) = (Kind::Closed, Instant::now(), false);
+        // The packets that were answered end here.
+        let mut answered = 0;
         loop {
-            let refusal = match self.first_of(&context, peer, &rights, &bytes) {
+            let refusal = match self.first_of(&context, peer, &rights, &bytes[answered..]) {
                 Ok(Some((len, reply))) => {
-                    bytes.drain(..len);
+                    answered += len;
                     accepted |= reply == DONE;
                     begun = Instant::now();
                     ticket.touch(begun.into_std());
@@ -332,6 +335,8 @@ impl RawIngest {
                     continue;
                 }
                 Ok(None) => {
+                    bytes.drain(..answered);
+                    answered = 0;
                     ticket.set_amid_packet(!bytes.is_empty());
                     let patience = if bytes.is_empty() { idle } else { self.request_timeout };
                     let was_empty = bytes.is_empty();
@@ -347,6 +352,9 @@ impl RawIngest {
                             if was_empty {
                                 begun = Instant::now();
                             }
+                            ticket.set_amid_packet(true);
+                            // A sender that never pauses leaves time for other connections.
+                            yield_now().await;
                             continue;
                         }
                         Ok(Err(error)) if error.kind() == ErrorKind::WouldBlock => continue,
@@ -361,14 +369,14 @@ impl RawIngest {
                 Err(refusal) => refusal,
             };
             ticket.set_amid_packet(false);
-            self.refuse(&context, peer, &bytes, refusal);
+            self.refuse(&context, peer, &bytes[answered..], refusal);
             let _ = self.reply(&stream, REFUSED).await;
-            bytes.clear();
+            answered = bytes.len();
             drain(&stream, usize::MAX, stop).await;
             break;
         }
         if accepted {
-            self.drop_bytes(&context, peer, bytes.len());
+            self.drop_bytes(&context, peer, bytes.len() - answered);
         }
         context.ended(end, peer);
         drop(ticket);
@@ -576,6 +584,32 @@ mod tests {
         })
     }
 
+    /// Both ends of a connection.
+    fn connected() -> (std::net::TcpStream, std::net::TcpStream, SocketAddr) {
+        let bound = TcpListener::bind("127.0.0.1:0").unwrap();
+        let client = std::net::TcpStream::connect(bound.local_addr().unwrap()).unwrap();
+        let (accepted, peer) = bound.accept().unwrap();
+        (client, accepted, peer)
+    }
+
+    #[test]
+    fn a_sender_that_does_not_read_its_replies_is_given_up_on() {
+        let mut runtime = tokio::runtime::Builder::new_current_thread();
+        let runtime = runtime.enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let (client, accepted, _) = connected();
+        accepted.set_nonblocking(true).unwrap();
+        let stream = TcpStream::from_std(accepted).unwrap();
+        let mut raw = listener(Format::V1, Flags::Strict);
+        raw.request_timeout = Duration::from_millis(50);
+        while (&*SockRef::from(&stream)).write(&[DONE; CHUNK]).is_ok() {}
+        assert_eq!(runtime.block_on(raw.reply(&stream, DONE)), Err(Kind::SlowReader));
+        // Nobody can get a reply from a connection that is gone, but that is no reason to stop.
+        drop(client);
+        while (&*SockRef::from(&stream)).write(&[DONE]).is_ok() {}
+        assert_eq!(runtime.block_on(raw.reply(&stream, DONE)), Ok(()));
+    }
+
     /// Whether these bytes begin a packet; `None` if more are needed.
     fn begins(raw: &RawIngest, bytes: &[u8]) -> Option<bool> {
         match raw.beginning(bytes) {
@@ -615,9 +649,7 @@ mod tests {
     fn bytes_behind_a_confirmed_packet_are_read_and_counted() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
         let _guard = runtime.enter();
-        let bound = TcpListener::bind("127.0.0.1:0").unwrap();
-        let mut client = std::net::TcpStream::connect(bound.local_addr().unwrap()).unwrap();
-        let (accepted, peer) = bound.accept().unwrap();
+        let (mut client, accepted, peer) = connected();
         client.write_all(&[7; CHUNK + 3]).unwrap();
         let mut all = vec![0; CHUNK + 3];
         while accepted.peek(&mut all).unwrap() < all.len() {}
