@@ -17,7 +17,8 @@ from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
 from holdfast.adapters.rest import openapi
 from holdfast.ingest.audit import Audit
-from holdfast.web.host import Host, listen
+from holdfast.web.host import Host
+from holdfast.web.port import listen
 from support import web, wire
 
 if TYPE_CHECKING:

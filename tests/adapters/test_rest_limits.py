@@ -20,6 +20,7 @@ import holdfast
 from holdfast.adapters import Stop
 from holdfast.web import host as http_host
 from holdfast.web import requests
+from holdfast.web.port import listen
 from support import web, wire
 from support.machine import missing
 
@@ -591,7 +592,7 @@ needs_127_0_0_2 = pytest.mark.skipif(
 
 def has_ipv6() -> bool:
     try:
-        http_host.listen("::1", 0).close()
+        listen("::1", 0).close()
     except OSError:
         return False
     return True
@@ -715,4 +716,4 @@ def test_a_socket_that_is_gone_is_an_error_for_the_supervisor() -> None:
 
 def test_listening_takes_no_names() -> None:
     with pytest.raises(socket.gaierror):
-        http_host.listen("localhost", 0)
+        listen("localhost", 0)

@@ -11,8 +11,6 @@ import asyncio
 import contextlib
 import logging
 import math
-import socket
-import sys
 import time
 from dataclasses import asdict, dataclass
 from email.utils import formatdate
@@ -27,8 +25,10 @@ from uvicorn.server import ServerState
 
 from holdfast import logs
 from holdfast.net.addresses import holds, joined, parse_address
+from holdfast.web.port import BACKLOG
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 
     from holdfast.net.addresses import Network
@@ -40,9 +40,6 @@ if TYPE_CHECKING:
     App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
     Headers: TypeAlias = list[tuple[bytes, bytes]]
     Rejection: TypeAlias = Callable[[str, str], tuple[Headers, bytes]]
-
-BACKLOG = 512
-"""Connections that the system queues before they are accepted."""
 
 MAX_HEADER = 65536
 """The largest request header in bytes; also the limit for chunk extensions and trailers."""
@@ -65,29 +62,6 @@ SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"
 # uvicorn's own log is discarded. This module logs events in the project's format.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 logging.getLogger("uvicorn").propagate = False
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Returns a socket that listens on an IP address; `::` includes IPv4. Raises `OSError`."""
-    flags = socket.AI_NUMERICHOST | socket.AI_PASSIVE
-    [(family, kind, number, _, address)] = socket.getaddrinfo(
-        host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP, flags=flags
-    )
-    listener = socket.socket(family, kind, number)
-    try:
-        if sys.platform == "win32":
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
-        else:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            any_address = parse_address(host).is_unspecified
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, not any_address)
-        listener.bind(address)
-        listener.listen(BACKLOG)
-    except OSError:
-        listener.close()
-        raise
-    return listener
 
 
 def address_of(host: str, port: int) -> str:
