@@ -10,8 +10,10 @@ NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
 PEERS := tests/peers/drivers
 
-.PHONY: run test lint no-std format bench docs lock clean
+.PHONY: build run test lint no-std format bench docs lock clean
 .DELETE_ON_ERROR:
+
+build: .venv/core.stamp
 
 run: .venv/core.stamp
 	@exec $(BIN)/holdfast run examples/plant.yaml

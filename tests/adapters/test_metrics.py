@@ -16,7 +16,7 @@ from holdfast.adapters import Grant, MemoryAccess, Refused
 from holdfast.adapters.metrics import Metrics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import MetricsConfig
-from holdfast.web.host import listen
+from holdfast.web.port import listen
 from support import web, wire
 
 if TYPE_CHECKING:

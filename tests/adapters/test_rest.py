@@ -17,7 +17,9 @@ from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
 from holdfast.adapters.rest import openapi
 from holdfast.ingest.audit import Audit
-from holdfast.web.host import Host, listen
+from holdfast.web.admission import ConnectionLimits
+from holdfast.web.host import Host
+from holdfast.web.port import listen
 from support import web, wire
 
 if TYPE_CHECKING:
@@ -506,7 +508,7 @@ def test_a_fault_is_answered_without_a_detail_and_logged(log: web.Records) -> No
 
     listener = listen("127.0.0.1", 0)
     loopback = [ip_network("127.0.0.0/8")]
-    host = Host("x", app, listener, sources=loopback, max_connections=1, request_timeout=9)
+    host = Host("x", app, listener, sources=loopback, limits=ConnectionLimits(1), request_timeout=9)
     with (
         contextlib.closing(listener),
         web.in_a_thread(host),

@@ -20,6 +20,7 @@ import holdfast
 from holdfast.adapters import Stop
 from holdfast.web import host as http_host
 from holdfast.web import requests
+from holdfast.web.port import listen
 from support import web, wire
 from support.machine import missing
 
@@ -591,7 +592,7 @@ needs_127_0_0_2 = pytest.mark.skipif(
 
 def has_ipv6() -> bool:
     try:
-        http_host.listen("::1", 0).close()
+        listen("::1", 0).close()
     except OSError:
         return False
     return True
@@ -667,7 +668,7 @@ def test_how_a_peer_is_shown(host: str, shown: str) -> None:
 
 
 def test_there_are_only_so_many_connections(start: Start, connect: Connect) -> None:
-    service = start(max_connections=2)
+    service = start(max_connections=2, when_full="refuse")
     first, second = connect(service, HEALTH), connect(service)
     service.until_counted("accepted", 2)
     third = connect(service)
@@ -680,6 +681,96 @@ def test_there_are_only_so_many_connections(start: Start, connect: Connect) -> N
     fourth = connect(service, web.head("GET", "/api/v1/health", CLOSE))
     assert web.answers(fourth.rest())[0].status == 200
     first.close()
+
+
+def refused(connection: wire.Connection) -> bool:
+    """Whether the connection was closed without a byte."""
+    with suppress(ConnectionError):
+        connection.send(HEALTH)
+    return connection.rest() == b""
+
+
+def answered(connection: wire.Connection, sends: bytes = b"") -> int:
+    """Sends the rest of a request that closes the connection. Returns the status."""
+    connection.send(sends)
+    [answer] = web.answers(connection.rest())
+    return answer.status
+
+
+LAST = web.head("GET", "/api/v1/health", CLOSE)
+
+
+def test_the_connection_that_is_idle_longest_gives_way(start: Start, connect: Connect) -> None:
+    service = start(max_connections=3)
+    idle = [connect(service) for _ in range(3)]
+    for connection in (idle[1], idle[2], idle[0]):
+        connection.send(HEALTH)
+        assert connection.socket.recv(65536)
+    before = service.connections()
+    assert answered(connect(service), LAST) == 200
+    assert service.connections()["evicted"] == before["evicted"] + 1
+    assert service.connections()["refused_full"] == 0
+    assert idle[1].rest() == b""
+    assert [answered(connection, LAST) for connection in (idle[0], idle[2])] == [200, 200]
+
+
+def test_an_idle_connection_gives_way_before_one_in_a_request(
+    start: Start, connect: Connect
+) -> None:
+    service = start(max_connections=2)
+    begun = connect(service, LAST[:-4])
+    idle = connect(service, HEALTH)
+    assert idle.socket.recv(65536)
+    service.until_counted("accepted", 2)
+    assert answered(connect(service), LAST) == 200
+    assert idle.rest() == b""
+    assert answered(begun, LAST[-4:]) == 200
+
+
+@pytest.mark.parametrize("sent", [b"", LAST[:9], web.post(GOOD)[:-1]], ids=["no", "head", "body"])
+def test_silent_peers_do_not_lock_the_port(start: Start, connect: Connect, sent: bytes) -> None:
+    service = start(max_connections=4)
+    silent = [connect(service, sent) for _ in range(4)]
+    service.until_counted("accepted", 4)
+    assert refused(connect(service)), "each has a second for its request"
+    wire.until(lambda: is_well(service), "a silent peer is evicted")
+    assert service.connections()["evicted"] >= 1
+    assert silent[0].rest() == b"", "the first one goes first"
+    assert coil(service) == 0
+
+
+def test_a_peer_that_takes_no_reply_gives_way(start: Start, connect: Connect) -> None:
+    service = start(max_connections=1)
+    everything = f"{web.READ}?memory=plant_a&area=holding_registers&address=0&count=65536"
+    slow = connect(service, receive_buffer=4096)
+    slow.send(web.head("GET", everything) * 50)
+    service.until_counted("accepted")
+    wire.until(lambda: is_well(service), "the slow peer is evicted")
+    assert service.connections()["slow_reader"] == 0
+
+
+def test_a_source_at_its_limit_gives_way_itself(start: Start, connect: Connect) -> None:
+    service = start(max_connections=9, max_connections_per_source=2)
+    other = connect(service, HEALTH, source="127.0.0.2")
+    assert other.socket.recv(65536)
+    first, second = connect(service, HEALTH), connect(service, HEALTH)
+    assert second.socket.recv(65536)
+    assert first.socket.recv(65536)
+    assert answered(connect(service), LAST) == 200
+    wire.until(lambda: service.connections()["open"] == 2, "one of three is closed")
+    assert service.connections()["evicted"] == 1
+    assert answered(other, LAST) == 200
+
+
+def test_a_source_at_its_limit_is_refused(start: Start, connect: Connect) -> None:
+    service = start(max_connections_per_source=1, when_full="refuse")
+    first = connect(service, HEALTH)
+    assert first.socket.recv(65536)
+    assert refused(connect(service))
+    assert answered(connect(service, source="127.0.0.2"), LAST) == 200
+    first.close()
+    wire.until(lambda: is_well(service), "the place is free")
+    assert service.connections()["evicted"] == 0
 
 
 def test_many_come_and_go(service: web.Service, connect: Connect) -> None:
@@ -715,4 +806,4 @@ def test_a_socket_that_is_gone_is_an_error_for_the_supervisor() -> None:
 
 def test_listening_takes_no_names() -> None:
     with pytest.raises(socket.gaierror):
-        http_host.listen("localhost", 0)
+        listen("localhost", 0)

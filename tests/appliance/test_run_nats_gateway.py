@@ -329,18 +329,17 @@ def test_it_says_what_is_served_and_a_signal_ends_it(
     assert "adapter_" not in log
 
 
-def test_a_port_that_is_taken_is_told_before_anything_is_served(
-    start: Start, nats: NatsServer, caller: Caller
+def test_a_gateway_without_a_port_does_not_keep_the_scanner_from_serving(
+    start: Start, nats: NatsServer, caller: Caller, server: holdfast.Server
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        process = start(nats_section(nats.url, "taken") + gateway_section(port)).process
-        out, log = process.communicate(timeout=wire.DEADLINE)
-    assert (process.returncode, out) == (1, "")
-    said = f"holdfast: gateway: can't listen on 127.0.0.1:{port}: Address already in use"
-    assert log.splitlines() == [said]
-    with pytest.raises(NoRespondersError):
-        caller.request("taken.browse", b"")
+        command = start(nats_section(nats.url, "taken") + gateway_section(port))
+        assert "not served yet, retried: Address already in use\n" in command.wait_for_greeting()
+        assert subscribed(caller, server, "taken")["success"] is True
+        code, log = command.end(signal.SIGTERM)
+    assert code == 0
+    assert f"adapter_not_listening adapter=gateway bind=127.0.0.1:{port} " in log
 
 
 PARTS = """

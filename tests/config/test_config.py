@@ -271,6 +271,7 @@ def rest_of(loaded: Callable[..., Config], tokens: str) -> RestConfig:
 def test_rest_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
     rest = rest_of(loaded, "none")
     assert (rest.max_body, rest.max_connections, rest.request_timeout) == (8388608, 64, 10)
+    assert (rest.max_connections_per_source, rest.when_full) == (None, "evict")
     assert rest.tokens == "none"
 
 
@@ -601,6 +602,7 @@ def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:
         "ModbusTcpListener.max_connections_per_source",
         "ModbusTlsListener.max_connections_per_source",
         "RawIngestListener.max_connections_per_source",
+        "RestConfig.max_connections_per_source",
     ]
 
 

@@ -319,6 +319,15 @@ def test_a_limit_of_a_source_beyond_that_of_all_is_a_warning(folder: Folder) -> 
     ]
 
 
+def test_a_limit_of_a_source_beyond_that_of_rest_is_a_warning(folder: Folder) -> None:
+    rest = "rest: {bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none, "
+    text = f"{GOOD}{rest}max_connections_per_source: 65}}\n"
+    [warning] = folder.warnings(text)
+    assert warning.endswith(
+        "rest.max_connections_per_source: 65 has no effect: max_connections is 64"
+    )
+
+
 @pytest.mark.parametrize(
     ("one", "other"),
     [

@@ -90,11 +90,15 @@ def test_listeners_are_not_empty_text(folder: Folder) -> None:
          "7: max_body: found 1023, allowed: an integer from 1024 to 1073741824"),
         ("  tokens:", "  max_connections: 0\n  tokens:",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
+        ("  tokens:", "  max_connections_per_source: 0\n  tokens:",
+         "7: max_connections_per_source: found 0, allowed: an integer from 1 to 65535 or null"),
+        ("  tokens:", "  when_full: wait\n  tokens:",
+         "7: when_full: found 'wait', allowed: refuse or evict"),
         ("  tokens:", "  request_timeout: 0\n  tokens:",
          "7: request_timeout: found 0, allowed: a number from 0.001 to 31622400"),
         ("  tokens:", "  token: []\n  tokens:",
          "7: token: unknown key, allowed: bind, sources, tokens, max_body, max_connections, "
-         "request_timeout; did you mean 'tokens'?"),
+         "max_connections_per_source, when_full, request_timeout; did you mean 'tokens'?"),
         ("name: edge", "name: ''", f"8: tokens[0].name: found '', allowed: {NAME}"),
         ("[plant]", "[]", f"10: tokens[0].memories: found an empty list, allowed: {SOME}"),
         ("[plant]", "[plan]", "10: tokens[0].memories[0]: found 'plan', allowed: plant, other; "

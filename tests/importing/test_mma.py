@@ -306,6 +306,7 @@ def test_ipv4_addresses_are_ipv4_only_if_that_was_meant(imported: Import) -> Non
 
 def test_a_full_port_closes_the_connection_that_is_idle_longest(imported: Import) -> None:
     assert port(imported(FIRST))["when_full"] == "evict"
+    assert port(imported(FIRST))["idle_timeout"] == 0
     assert port(imported(SECOND % (RULE, "")), "main")["when_full"] == "evict"
 
 

@@ -175,7 +175,12 @@ def rest(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
     listed = tokens(**grants(memories), access=ACCESS)
     return st.fixed_dictionaries(
         {"bind": st.just("127.0.0.1:80"), "sources": SOURCES, "tokens": listed | st.just("none")},
-        optional={"max_body": st.integers(1024, 2**30), "request_timeout": SECONDS},
+        optional={
+            "max_body": st.integers(1024, 2**30),
+            "request_timeout": SECONDS,
+            "max_connections_per_source": st.none() | CONNECTIONS,
+            "when_full": st.sampled_from(["refuse", "evict"]),
+        },
     )
 
 

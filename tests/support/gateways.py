@@ -13,7 +13,7 @@ from holdfast.config.egress import parse_allowed
 from holdfast.gateway import Gateway, GatewayLimits, Settings
 from holdfast.gateway.pool import dial
 from holdfast.net.resolver import NoSuchName
-from holdfast.web.host import listen
+from holdfast.web.port import listen
 from support import web, wire
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from holdfast.adapters.rest import Rest
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import RestConfig
-from holdfast.web.host import listen
+from holdfast.web.port import listen
 from support import wire
 
 if TYPE_CHECKING:

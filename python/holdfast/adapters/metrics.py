@@ -13,6 +13,7 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from holdfast import __version__
+from holdfast.web.admission import ConnectionLimits
 from holdfast.web.host import SAFE, Host, rejection, respond
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from holdfast.stop import Stop
     from holdfast.web.host import Receive, Scope, Send
 
-MAX_CONNECTIONS = 32
+LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
 PATH = "/metrics"
 STATES = ("running", "failed", "stopped")
@@ -62,7 +63,7 @@ class Metrics:
             self._serve,
             listener,
             sources=settings.sources,
-            max_connections=MAX_CONNECTIONS,
+            limits=LIMITS,
             request_timeout=REQUEST_TIMEOUT,
         )
 

@@ -24,15 +24,14 @@ from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
 from holdfast.ingest.audit import Audit
 from holdfast.net.addresses import joined
+from holdfast.web.port import Port
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Mapping
 
     from holdfast.adapters import Adapter
     from holdfast.client.url import Tls
     from holdfast.config import (
-        Bind,
         Config,
         GatewayConfig,
         Listener,
@@ -68,13 +67,17 @@ class ListenAddress:
     port: int | None
     """`None` on a serial line, whose device is `host`."""
     settings: Listener | RestConfig | GatewayConfig | MetricsConfig
+    error: str | None = None
+    """Why the port of an HTTP service is not bound yet."""
 
 
 class Appliance:
     """Runs one configuration, from `start` (or `with`) to `stop`.
 
-    `start` raises `OSError` if an address can't be bound or a file can't be opened, and
-    `UnknownAdapter` if an adapter is not installed. Nothing is left running then.
+    `start` raises `OSError` if the address of a listener can't be bound or a file can't be opened,
+    and `UnknownAdapter` if an adapter is not installed. Nothing is left running then. The ports of
+    REST, gateway and metrics are tried again until they can be bound, because these services must
+    not keep Modbus from starting.
     """
 
     def __init__(self, config: Config) -> None:
@@ -85,11 +88,13 @@ class Appliance:
         self._running: _Running | None = None
 
     def start(self) -> Self:
-        """Binds all addresses and serves. Raises `RuntimeError` if already running."""
+        """Binds the listeners and serves. Raises `RuntimeError` if already running."""
         if self._running is not None:
             raise RuntimeError("the appliance is already running")
         self._running = _Running(self.config, self.memories)
         for endpoint in self.endpoints():
+            if endpoint.error is not None:
+                continue
             host, port = endpoint.host, endpoint.port
             address = host if port is None else joined(host, port)
             logs.write(logging.INFO, "listening", listener=endpoint.name, address=address)
@@ -109,7 +114,7 @@ class Appliance:
 
     def endpoints(self) -> list[ListenAddress]:
         """Returns the addresses of all listeners and services, in configuration order."""
-        return self._parts().endpoints
+        return self._parts().endpoints()
 
     def log_events(self, timeout: float) -> None:
         """Waits up to `timeout` seconds for a listener event and logs it.
@@ -157,7 +162,7 @@ class _Running:
         disabled = self._tell_disabled()
         with ExitStack() as undo:
             self._audit = self._opened_audit(undo)
-            self._sockets = sockets = self._bound_sockets(undo)
+            self._ports = self._bound_ports(undo)
             # The links of listeners come first: the first use of an address decides its settings.
             self._poller: _core.Poller | None = None
             links = assembly.Links()
@@ -171,13 +176,12 @@ class _Running:
             if self._poller is not None:
                 for device in devices:
                     self._poller.add(device)
-            self.endpoints = self._listed(sockets)
             self.diagnostics = Diagnostics(memories, self._engine)
             self.diagnostics.audit = self._audit
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
-            self._add_adapters(sockets)
+            self._add_adapters(self._ports)
             undo.pop_all()
         self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
         self._stopped = threading.Event()
@@ -200,8 +204,8 @@ class _Running:
             supervisor.join()
         if self._poller is not None:
             self._poller.stop()
-        for bound in self._sockets.values():
-            bound.close()
+        for port in self._ports.values():
+            port.close()
         if self._audit is not None:
             self._auditing.join()
             self._audit.close()
@@ -267,16 +271,17 @@ class _Running:
         undo.callback(audit.close)
         return audit
 
-    def _bound_sockets(self, undo: ExitStack) -> dict[str, socket.socket]:
-        """Binds the sockets of the HTTP services."""
-        sockets: dict[str, socket.socket] = {}
+    def _bound_ports(self, undo: ExitStack) -> dict[str, Port]:
+        """Tries to bind the ports of the HTTP services. The others are tried again later."""
+        ports: dict[str, Port] = {}
         config = self._config
         services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
         for name, settings in services.items():
             if settings is not None:
-                sockets[name] = _listening(name, settings.bind)
-                undo.callback(sockets[name].close)
-        return sockets
+                ports[name] = Port(name, settings.bind.host, settings.bind.port)
+                undo.callback(ports[name].close)
+                ports[name].bind()
+        return ports
 
     def _started_engine(self, links: assembly.Links) -> _core.Engine:
         config = self._config
@@ -301,7 +306,8 @@ class _Running:
                 self._memories[status.memory].write(status.area, status.addresses.start, told)
         return disabled
 
-    def _listed(self, sockets: dict[str, socket.socket]) -> list[ListenAddress]:
+    def endpoints(self) -> list[ListenAddress]:
+        """Returns where listeners and HTTP services listen."""
         listeners = self._config.listeners.items()
         endpoints: list[ListenAddress] = []
         for (name, settings), address in zip(listeners, self._engine.addresses, strict=True):
@@ -310,21 +316,23 @@ class _Running:
                 endpoints.append(ListenAddress(name, settings.type, device, None, settings))
             elif address is not None:
                 endpoints.append(ListenAddress(name, settings.type, *address, settings))
-        for name, bound in sockets.items():
-            host, port = bound.getsockname()[:2]
+        for name, port in self._ports.items():
             service = getattr(self._config, name)
-            endpoints.append(ListenAddress(name, "http", host, port, service))
+            endpoints.append(ListenAddress(name, "http", *port.address, service, port.error))
         return endpoints
 
-    def _add_adapters(self, sockets: dict[str, socket.socket]) -> None:
+    def _add_adapters(self, ports: Mapping[str, Port]) -> None:
         config = self._config
         if config.rest is not None:
             from holdfast.adapters.rest import Rest
 
             rest, memory_access = config.rest, self._memory_access("rest")
-            at = sockets["rest"]
+            at = ports["rest"]
             self._add(
-                "rest", memory_access, lambda: Rest(rest, memory_access, self.diagnostics, at)
+                "rest",
+                memory_access,
+                lambda: Rest(rest, memory_access, self.diagnostics, at.listener),
+                port=at,
             )
         if config.mqtt is not None:
             from holdfast.adapters.mqtt import Mqtt
@@ -339,13 +347,23 @@ class _Running:
         if config.gateway is not None:
             from holdfast.gateway import Gateway
 
-            gateway, gateway_at = assembly.gateway(config.gateway), sockets["gateway"]
-            self._add("gateway", None, lambda: Gateway(gateway, gateway_at, poller=self._poller))
+            gateway, gateway_at = assembly.gateway(config.gateway), ports["gateway"]
+            self._add(
+                "gateway",
+                None,
+                lambda: Gateway(gateway, gateway_at.listener, poller=self._poller),
+                port=gateway_at,
+            )
         if config.metrics is not None:
             from holdfast.adapters.metrics import Metrics
 
-            metrics, metrics_at = config.metrics, sockets["metrics"]
-            self._add("metrics", None, lambda: Metrics(metrics, self.diagnostics, metrics_at))
+            metrics, metrics_at = config.metrics, ports["metrics"]
+            self._add(
+                "metrics",
+                None,
+                lambda: Metrics(metrics, self.diagnostics, metrics_at.listener),
+                port=metrics_at,
+            )
         for name, settings in config.adapters.items():
             own_door = self._memory_access(name)
             self._add(name, own_door, foreign.factory(name, settings, own_door))
@@ -360,8 +378,9 @@ class _Running:
         factory: Callable[[], Adapter],
         *,
         may_end: bool = False,
+        port: Port | None = None,
     ) -> None:
-        supervisor = Supervisor(name, factory, may_end=may_end)
+        supervisor = Supervisor(name, factory, may_end=may_end, port=port)
         self._supervisors.append(supervisor)
         self.diagnostics.adapters[name] = (supervisor, memory_access)
 
@@ -381,17 +400,6 @@ class _Running:
                 lost = missed
             if ended and not writes:
                 return
-
-
-def _listening(name: str, bind: Bind) -> socket.socket:
-    """Returns a listening socket. Raises `OSError` with the service and the address."""
-    from holdfast.web import host
-
-    try:
-        return host.listen(bind.host, bind.port)
-    except OSError as error:
-        message = f"{name}: can't listen on {bind}: {error.strerror or error}"
-        raise OSError(error.errno, message) from error
 
 
 def _check_files(name: str, tls: Tls) -> None:

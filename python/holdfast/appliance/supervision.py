@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast.adapters import Adapter
+    from holdfast.web.port import Port
 
 FIRST_PAUSE = 1.0
 MAX_PAUSE = 60.0
@@ -49,13 +50,22 @@ def give_way() -> None:
 class Supervisor:
     """Supervises one adapter from `start` to `stop`.
 
-    With `may_end`, an adapter that returns is not restarted.
+    With `may_end`, an adapter that returns is not restarted. With `port`, the adapter is created
+    once that port is bound.
     """
 
-    def __init__(self, name: str, factory: Callable[[], Adapter], *, may_end: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        factory: Callable[[], Adapter],
+        *,
+        may_end: bool = False,
+        port: Port | None = None,
+    ) -> None:
         self.name = name
         self._factory = factory
         self._may_end = may_end
+        self._port = port
         self._stop = Stop()
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
         self._adapter: Adapter | None = None
@@ -87,6 +97,8 @@ class Supervisor:
         except Exception:  # A faulty adapter must not break diagnostics.
             logs.problem("adapter_status_failed", adapter=self.name)
             own = {}
+        if self._port is not None:
+            own |= self._port.status()
         return {
             **own,
             "state": self._state,
@@ -97,6 +109,10 @@ class Supervisor:
     def _run(self) -> None:
         _step_back()
         pause = FIRST_PAUSE
+        if self._port is not None:
+            if self._port.error is not None:
+                self._state = "failed"
+            self._port.wait(self._stop)
         while not self._stop.is_set():
             began = time.monotonic()
             ended = self._once()

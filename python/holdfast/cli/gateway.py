@@ -24,7 +24,7 @@ from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
 from holdfast.net.tls import NO_FILES
 from holdfast.protocol import PORT
 from holdfast.stop import Stop
-from holdfast.web.host import listen
+from holdfast.web.port import explained, listen
 
 if TYPE_CHECKING:
     import socket
@@ -122,7 +122,7 @@ def gateway(
     try:
         listener = listen(bind.host, bind.port)
     except OSError as error:
-        click.echo(f"holdfast: can't listen on {bind}: {error.strerror or error}", err=True)
+        click.echo(f"holdfast: can't listen on {bind}: {explained(error)}", err=True)
         sys.exit(FAILED)
     with listener:
         _serve(settings, listener, signals)

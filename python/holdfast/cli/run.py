@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shlex
 import shutil
@@ -27,6 +26,7 @@ from holdfast.config.scanning import written_pollable
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
+from holdfast.web.port import explained
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -65,7 +65,8 @@ def run(file: Path) -> None:
     """Run the appliance with the configuration FILE.
 
     Prints listeners and polled devices, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped
-    by a signal, 1 can't bind a listener, 2 the configuration has errors.
+    by a signal, 1 can't bind a listener, 2 the configuration has errors. The ports of REST, gateway
+    and metrics are retried until they are free.
     """
     config = load_or_exit(file)
     serve(config, lambda appliance: _greeting(appliance, file), named=str(file))
@@ -81,7 +82,7 @@ def serve(config: Config, greeting: Callable[[Appliance], str], *, named: str) -
     try:
         appliance.start()
     except OSError as error:
-        click.echo(f"holdfast: {_explained(error)}", err=True)
+        click.echo(f"holdfast: {explained(error)}", err=True)
         sys.exit(1)
     except UnknownAdapter as error:
         click.echo(f"{named}: {error}", err=True)
@@ -120,13 +121,6 @@ class Signals:
         signal.signal(number, signal.SIG_DFL)
 
 
-def _explained(error: OSError) -> str:
-    text = error.strerror or str(error)
-    if error.errno == errno.EACCES:
-        text += " (ports below 1024 require a privilege, on Linux CAP_NET_BIND_SERVICE)"
-    return text
-
-
 def _greeting(appliance: Appliance, file: Path) -> str:
     endpoints, config = appliance.endpoints(), appliance.config
     devices, nats = list(config.devices.items()), config.nats
@@ -137,6 +131,8 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
         lines.append(f"  {endpoint.name:{width}}  {_address(endpoint)}")
+        if endpoint.error is not None:
+            lines.append(f"  {'':{width}}    not served yet, retried: {endpoint.error}")
         rules = getattr(endpoint.settings, "rules", ())
         lines += [f"  {'':{width}}    {_granted(rule)}" for rule in rules]
         if isinstance(endpoint.settings, GatewayConfig):

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.allowed import allowed
-from holdfast.config.lenient import entries, integer, mapping
+from holdfast.config.connection_checks import doubt_source_limit
+from holdfast.config.lenient import entries, mapping
 from holdfast.config.listeners import SERIAL_TYPES, ModbusTcpListener
 from holdfast.config.route_checks import has_route
 from holdfast.config.rule_order_checks import doubt_order
-from holdfast.config.scalars import MAX_CONNECTIONS
 from holdfast.config.tls_checks import check_server_tls
 from holdfast.config.unique import refuse_repeats
 from holdfast.config.unit_checks import RightsCheck, UnitCheck
@@ -75,11 +75,7 @@ class ListenerChecks:
         ]
 
     def _limits(self, path: KeyPath, listener: dict[Any, Any]) -> None:
-        most = integer(listener.get("max_connections", _DEFAULT_CONNECTIONS), 1, MAX_CONNECTIONS)
-        of_source = integer(listener.get("max_connections_per_source"), 1, MAX_CONNECTIONS)
-        if most is not None and of_source is not None and of_source > most:
-            message = f"{of_source} has no effect: max_connections is {most}"
-            self.report.doubt((*path, "max_connections_per_source"), message)
+        doubt_source_limit(path, listener, _DEFAULT_CONNECTIONS, self.report)
 
     def _rule(self, path: KeyPath, rule: dict[Any, Any]) -> None:
         units = rule.get("units")

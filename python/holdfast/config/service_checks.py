@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.broker import parse_broker, parse_topic_filter
+from holdfast.config.connection_checks import doubt_source_limit
 from holdfast.config.files import check_readable
 from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.scanning import check_dialect, parse_server
+from holdfast.config.services import RestConfig
 from holdfast.config.tls_checks import check_client_tls
 from holdfast.config.unique import Owners
 from holdfast.config.words import choice, listing, show
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 _USERS_OF_MEMORIES = ("rest", "mqtt", "adapters")
 _USERS_OF_NONE = {"nats", "gateway", "links", "devices"}
 _INSTEAD_OF_LISTENERS = ("rest", "mqtt", "nats", "gateway", "devices")
+_REST_CONNECTIONS = RestConfig.model_fields["max_connections"].default
 _IDENTITIES = ("username", "token_file", "credentials_file")
 """Keys that authenticate the scanner at the NATS server; only one of them is allowed."""
 
@@ -62,6 +65,7 @@ class ServiceChecks:
 
     def _rest(self, rest: dict[Any, Any]) -> None:
         self._tokens("rest", rest)
+        doubt_source_limit(("rest",), rest, _REST_CONNECTIONS, self.report)
         for index, token in enumerate(entries(rest.get("tokens"))):
             self.grants.grant(("rest", "tokens", index), mapping(token))
 

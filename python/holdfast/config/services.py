@@ -101,6 +101,10 @@ class RestConfig(Model):
     """Maximum number of bytes in the body of a request."""
     max_connections: Connections = 64
     """Maximum number of open connections."""
+    max_connections_per_source: Connections | None = None
+    """Maximum number of open connections from one address; null: unlimited."""
+    when_full: Literal["refuse", "evict"] = "evict"
+    """At the limit: refuse closes the new connection, evict the connection idle longest."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last."""
 

@@ -8,6 +8,7 @@ from holdfast.gateway.app import App, rejection
 from holdfast.gateway.pool import dial
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
+from holdfast.web.admission import ConnectionLimits
 from holdfast.web.host import Host, address_of
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Gateway:
             self._app,
             listener,
             sources=settings.sources,
-            max_connections=settings.limits.connections,
+            limits=ConnectionLimits(settings.limits.connections, when_full="evict"),
             request_timeout=settings.limits.request_timeout,
             leaving=True,
             rejection=rejection,

@@ -148,7 +148,7 @@ class Adapters:
         else:
             message = "no memory has discrete inputs or input registers, so each token only reads"
             self.desk.note("check", auth.path, message)
-        ran = "these tokens had no effect: everybody could read, and one published token wrote"
+        ran = "these tokens had no effect: one published token wrote, and reads failed"
         self.desk.note("check", auth.path, f"as it ran: {ran}; as it was meant: each has access")
         return tokens
 

@@ -173,7 +173,7 @@ class FirstGeneration:
         if sources is None or not units or rights is None:
             return None
         rule = {"sources": sources, "units": units, **rights}
-        limits = {"max_connections": most, "when_full": "evict"}
+        limits = {"max_connections": most, "when_full": "evict", "idle_timeout": 0}
         return {"type": "modbus-tcp", "bind": bind, **limits, "rules": [rule]}
 
     def _sources(self, policy: Section) -> list[str] | None:

@@ -11,8 +11,6 @@ import asyncio
 import contextlib
 import logging
 import math
-import socket
-import sys
 import time
 from dataclasses import asdict, dataclass
 from email.utils import formatdate
@@ -27,12 +25,16 @@ from uvicorn.server import ServerState
 
 from holdfast import logs
 from holdfast.net.addresses import holds, joined, parse_address
+from holdfast.web.admission import Admission, Full, Waiting
+from holdfast.web.port import BACKLOG
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 
     from holdfast.net.addresses import Network
     from holdfast.stop import Stop
+    from holdfast.web.admission import ConnectionLimits
 
     Scope: TypeAlias = MutableMapping[str, Any]
     Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -40,9 +42,6 @@ if TYPE_CHECKING:
     App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
     Headers: TypeAlias = list[tuple[bytes, bytes]]
     Rejection: TypeAlias = Callable[[str, str], tuple[Headers, bytes]]
-
-BACKLOG = 512
-"""Connections that the system queues before they are accepted."""
 
 MAX_HEADER = 65536
 """The largest request header in bytes; also the limit for chunk extensions and trailers."""
@@ -65,29 +64,6 @@ SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"
 # uvicorn's own log is discarded. This module logs events in the project's format.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 logging.getLogger("uvicorn").propagate = False
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Returns a socket that listens on an IP address; `::` includes IPv4. Raises `OSError`."""
-    flags = socket.AI_NUMERICHOST | socket.AI_PASSIVE
-    [(family, kind, number, _, address)] = socket.getaddrinfo(
-        host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP, flags=flags
-    )
-    listener = socket.socket(family, kind, number)
-    try:
-        if sys.platform == "win32":
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
-        else:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            any_address = parse_address(host).is_unspecified
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, not any_address)
-        listener.bind(address)
-        listener.listen(BACKLOG)
-    except OSError:
-        listener.close()
-        raise
-    return listener
 
 
 def address_of(host: str, port: int) -> str:
@@ -113,6 +89,7 @@ class Counts:
     accepted: int = 0
     refused_source: int = 0
     refused_full: int = 0
+    evicted: int = 0
     idle: int = 0
     request_timeout: int = 0
     slow_reader: int = 0
@@ -140,7 +117,7 @@ class Host:
         listener: socket.socket,
         *,
         sources: Iterable[Network],
-        max_connections: int,
+        limits: ConnectionLimits,
         request_timeout: float,
         leaving: bool = False,
         rejection: Rejection = rejection,
@@ -148,12 +125,13 @@ class Host:
         self.name = name
         self.rejection = rejection
         self.leaving = leaving
-        self.max_connections = max_connections
         self.request_timeout = request_timeout
         self.sources = tuple(sources)
         self.counted = Counts()
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
+        self._limits = limits
+        self._admission: Admission[_Connection] = Admission(limits)
         self._app = app
         self._listener = listener
 
@@ -168,6 +146,21 @@ class Host:
     def admits(self, host: str) -> bool:
         """Returns whether a peer with this address may connect."""
         return holds(self.sources, parse_address(host))
+
+    def has_room(self, connection: _Connection, host: str) -> bool:
+        """Returns whether a connection has a place. Another one may have been evicted for it."""
+        try:
+            now = connection.loop.time()
+            evicted = self._admission.admit(connection, parse_address(host), now)
+        except Full:
+            return False
+        if evicted is not None:
+            evicted.give_way()
+        return True
+
+    def release(self, connection: _Connection) -> None:
+        """Frees the place of a connection that was closed."""
+        self._admission.release(connection)
 
     def note(self, event: str, peer: str) -> None:
         """Counts and logs an event of a connection. Called in the thread of `run`."""
@@ -196,6 +189,7 @@ class Host:
         config.load()
         state = ServerState()
         self.counted.open = 0
+        self._admission = Admission(self._limits)
         with self._listener.dup() as listener:
             server = await loop.create_server(
                 lambda: _Connection(config, state, {}, loop, host=self),
@@ -318,6 +312,8 @@ class _Connection(HttpToolsProtocol):
         self._messages = 0
         self._unparsed = 0
         self._overhead = 0
+        self._since = 0.0
+        self._used = False
         self._step = min(host.request_timeout, KEEP_ALIVE)
         self._request_due = self._reply_due = self._idle_due = math.inf
         self._alarm: asyncio.TimerHandle | None = None
@@ -335,7 +331,7 @@ class _Connection(HttpToolsProtocol):
             "refused_source"
             if not self.host.admits(host)
             else "refused_full"
-            if len(self.connections) >= self.host.max_connections
+            if not self.host.has_room(self, host)
             else None
         )
         if refusal is not None:
@@ -349,7 +345,8 @@ class _Connection(HttpToolsProtocol):
         self.app_state = {"peer": peer}
         transport.set_write_buffer_limits(high=0)  # At most one reply is buffered, with a timeout.
         self.flow = _Flow(self)
-        self._request_due = self.loop.time() + self.host.request_timeout
+        self._since = self.loop.time()
+        self._request_due = self._since + self.host.request_timeout
         self._set_alarm()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -357,6 +354,7 @@ class _Connection(HttpToolsProtocol):
         if not self._admitted:
             return
         self.host.counted.open -= 1
+        self.host.release(self)
         if self._alarm is not None:
             self._alarm.cancel()
         self.held = b""
@@ -364,6 +362,7 @@ class _Connection(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Buffers and parses received bytes."""
+        self._used = True
         if not self._broken and not self.transport.is_closing():
             self.held += data
             self._parse()
@@ -379,10 +378,12 @@ class _Connection(HttpToolsProtocol):
     def pause_writing(self) -> None:
         """Called when the peer reads more slowly than replies are written."""
         super().pause_writing()
-        self._reply_due = self.loop.time() + self.host.request_timeout
+        self._since = self.loop.time()
+        self._reply_due = self._since + self.host.request_timeout
 
     def resume_writing(self) -> None:
         """Called when all written bytes were sent."""
+        self._since = self.loop.time()
         self._reply_due = math.inf
         super().resume_writing()
 
@@ -455,7 +456,8 @@ class _Connection(HttpToolsProtocol):
         if self._ended:
             self.transport.close()
         else:
-            self._idle_due = self.loop.time() + KEEP_ALIVE
+            self._since = self.loop.time()
+            self._idle_due = self._since + KEEP_ALIVE
 
     def _busy(self) -> bool:
         """Returns whether a request waits for its response."""
@@ -466,7 +468,8 @@ class _Connection(HttpToolsProtocol):
         whole, at, messages = memoryview(self.held), 0, self._messages
         self._idle_due = math.inf
         if self._request_due == math.inf:
-            self._request_due = self.loop.time() + self.host.request_timeout
+            self._since = self.loop.time()
+            self._request_due = self._since + self.host.request_timeout
         while at < len(whole) and not self.pipeline and not self._broken:
             at += self._take(whole[at : at + SLICE])
         self.held = b"" if self._broken else bytes(whole[at:])
@@ -474,7 +477,8 @@ class _Connection(HttpToolsProtocol):
             self.flow.pause_reading()
         if self._broken or self._messages != messages:
             more = self._in_message and not self._broken
-            self._request_due = self.loop.time() + self.host.request_timeout if more else math.inf
+            self._since = self.loop.time()
+            self._request_due = self._since + self.host.request_timeout if more else math.inf
         self._settle()
 
     def _take(self, piece: memoryview) -> int:
@@ -511,6 +515,24 @@ class _Connection(HttpToolsProtocol):
             lines = [b"%b: %b\r\n" % header for header in [*headers, (b"connection", b"close")]]
             self.transport.write(b"".join([STATUS_LINE[status], *lines, b"\r\n", body]))
             self.transport.close()
+
+    # A limit is reached.
+
+    def waiting(self) -> Waiting | None:
+        """Returns what it waits for; `None` while its request is answered, and the peer reads."""
+        taken = self._reply_due == math.inf
+        if self._busy() and taken and (self.cycle.response_started or not self.cycle.more_body):
+            return None
+        between_requests = taken and self._idle_due != math.inf
+        return Waiting(self._used and not between_requests, self._since, self._used)
+
+    def give_way(self) -> None:
+        """Closes the connection for a new one."""
+        self.host.note("evicted", self.app_state["peer"])
+        if self._reply_due == math.inf and not self._in_message:
+            self.transport.close()
+        else:
+            self.transport.abort()
 
     # Deadlines.
 

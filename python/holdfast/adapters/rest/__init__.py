@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.rest.app import App
+from holdfast.web.admission import ConnectionLimits
 from holdfast.web.host import Host
 
 if TYPE_CHECKING:
@@ -33,7 +34,11 @@ class Rest:
             App(settings, memory_access, diagnostics, listener),
             listener,
             sources=settings.sources,
-            max_connections=settings.max_connections,
+            limits=ConnectionLimits(
+                settings.max_connections,
+                settings.max_connections_per_source,
+                settings.when_full,
+            ),
             request_timeout=settings.request_timeout,
         )
 

@@ -1,0 +1,159 @@
+"""The TCP port of an HTTP service, which is bound at the start or as soon as it is free.
+
+A port that can't be bound must not affect other services, so it is tried again until the service is
+stopped.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import socket
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from holdfast import logs
+from holdfast.net.addresses import joined, parse_address
+
+if TYPE_CHECKING:
+    from holdfast.stop import Stop
+
+BACKLOG = 512
+"""Connections that the system queues before they are accepted."""
+
+FIRST_PAUSE = 1.0
+MAX_PAUSE = 10.0
+"""Seconds before a port is tried again. Each failure doubles the pause, up to the maximum."""
+
+LOG_INTERVAL = 60.0
+"""Seconds after which a failure is logged again, if its reason is still the same."""
+
+PRIVILEGE = "ports below 1024 require a privilege, on Linux CAP_NET_BIND_SERVICE"
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Returns a socket that listens on an IP address; `::` includes IPv4. Raises `OSError`."""
+    flags = socket.AI_NUMERICHOST | socket.AI_PASSIVE
+    [(family, kind, number, _, address)] = socket.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, proto=socket.IPPROTO_TCP, flags=flags
+    )
+    listener = socket.socket(family, kind, number)
+    try:
+        if sys.platform == "win32":
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        else:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            any_address = parse_address(host).is_unspecified
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, not any_address)
+        listener.bind(address)
+        listener.listen(BACKLOG)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def explained(error: OSError) -> str:
+    """Returns why a port can't be bound, with a hint about privileges."""
+    text = error.strerror or str(error)
+    return f"{text} ({PRIVILEGE})" if error.errno == errno.EACCES else text
+
+
+class Port:
+    """The port of one service. Bound by `bind` or `wait`, and then until `close`."""
+
+    def __init__(self, name: str, host: str, port: int) -> None:
+        self.name = name
+        self.failures = 0
+        """Attempts that failed."""
+        self.error: str | None = None
+        """Why the port is not bound; `None` once it is."""
+        self._host = host
+        self._port = port
+        self._listener: socket.socket | None = None
+        self._pause = FIRST_PAUSE
+        self._logged: tuple[str, float] | None = None
+
+    @property
+    def bind_address(self) -> str:
+        """The address of the configuration."""
+        return joined(self._host, self._port)
+
+    @property
+    def listener(self) -> socket.socket:
+        """The listening socket. Raises `RuntimeError` if the port is not bound."""
+        if self._listener is None:
+            raise RuntimeError(f"{self.name}: {self.bind_address} is not bound")
+        return self._listener
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port: of the listening socket, else those of the configuration."""
+        if self._listener is None:
+            return self._host, self._port
+        host, port = self._listener.getsockname()[:2]
+        return host, port
+
+    def status(self) -> dict[str, object]:
+        """Returns the address, whether it is bound, and how many attempts failed. Thread-safe."""
+        error = self.error
+        told = (
+            {} if error is None else {"last_error": f"can't listen on {self.bind_address}: {error}"}
+        )
+        return {
+            "address": joined(*self.address),
+            "listening": self._listener is not None,
+            "failed_binds": self.failures,
+            **told,
+        }
+
+    def bind(self) -> bool:
+        """Tries once to bind the port. A failure is logged. Returns whether the port is bound."""
+        if self._listener is None:
+            try:
+                self._listener = listen(self._host, self._port)
+            except OSError as error:
+                self._note(explained(error))
+                return False
+            self.error = None
+        return True
+
+    def wait(self, stop: Stop) -> bool:
+        """Tries to bind the port until it succeeds. Returns `False` if `stop` was set."""
+        while not stop.is_set():
+            late = self.error is not None
+            if late:
+                if stop.wait(self._pause):
+                    break
+                self._pause = min(2 * self._pause, MAX_PAUSE)
+            if self.bind():
+                if late:
+                    address = joined(*self.address)
+                    logs.write(logging.INFO, "listening", listener=self.name, address=address)
+                return True
+        return False
+
+    def close(self) -> None:
+        """Frees the port."""
+        if self._listener is not None:
+            self._listener.close()
+
+    def _note(self, reason: str) -> None:
+        """Logs a failure: the first one, another reason, and otherwise once in a while."""
+        self.error = reason
+        self.failures += 1
+        now = time.monotonic()
+        if self._logged and self._logged[0] == reason and now - self._logged[1] < LOG_INTERVAL:
+            return
+        self._logged = reason, now
+        logs.write(
+            logging.ERROR,
+            "adapter_not_listening",
+            adapter=self.name,
+            bind=self.bind_address,
+            reason=reason,
+            attempts=self.failures,
+            retry_in=self._pause,
+        )
