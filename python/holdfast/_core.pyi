@@ -11,10 +11,12 @@ from holdfast.types import (
     Access,
     Area,
     Extent,
+    Forward,
     ListenerCounters,
     NarrowedRights,
     PolledBlock,
     Seal,
+    StatusBlock,
     WhenFull,
 )
 
@@ -51,6 +53,7 @@ __all__ = [
     "encode_raw_ingest",
     "pack_raw_ingest",
     "plan_blocks",
+    "tell_disabled",
     "write_across",
 ]
 
@@ -575,12 +578,12 @@ class PolledDevice:
 
     `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
     `max_gap` (default: 0) or `cost` (of a request, of a register or 16 bits) selects the gaps that
-    are read; `readable` and `forbidden` are areas with start and end, exclusive. `forward` are
-    hosts, ports, formats (`v1`, `crc`), crc (`required`, `none`), unit or memory ids, and timeouts.
-    `status` is the memory, area and slot of the status block. `start_within` is the maximum delay
-    of the first poll (default: the interval). `report` queues polls for `Poller.results`. `release`
-    closes the connection after each poll. With `measured`, measurements replace `cost` after a
-    while. Times are in seconds; interval 0 polls without a pause.
+    are read; `readable` and `forbidden` are areas with start and end, exclusive. `status` is the
+    memory of the status block, and the block. `start_within` is the maximum delay of the first poll
+    (default: the interval). `report` queues polls for `Poller.results`. `release` closes the
+    connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
+    are the first and the longest pause after failures (default: 1 and 60). Times are in seconds;
+    interval 0 polls without a pause.
     """
 
     def __new__(
@@ -598,13 +601,14 @@ class PolledDevice:
         max_bits: int = 2000,
         readable: Sequence[tuple[Area, int, int]] | None = None,
         forbidden: Sequence[tuple[Area, int, int]] | None = None,
-        forward: Sequence[tuple[str, int, str, str, int, float]] | None = None,
-        status: tuple[Memory, Area, int] | None = None,
+        forward: Sequence[Forward] | None = None,
+        status: tuple[Memory, StatusBlock] | None = None,
         start_within: float | None = None,
         in_flight: int | None = 1,
         report: bool = False,
         release: bool = False,
         measured: bool = False,
+        retry: tuple[float, float] | None = None,
     ) -> PolledDevice: ...
 
 @final
@@ -724,13 +728,15 @@ class Poller:
         coalesce: bool = True,
         cache: float = 0.0,
         preferred: Sequence[str] | None = None,
+        retry: tuple[float, float] | None = None,
     ) -> Link:
         """The connection or serial line to an address, for the requests of listeners.
 
         Devices at the same address share it. The first call for an address decides its settings:
         `queue` is the most requests of listeners that wait, with `coalesce` one request answers
-        equal reads that wait at the same time, for `cache` seconds a reply answers equal reads, and
-        reads of the addresses in `preferred` go before those of others. Raises `ValueError`, and
+        equal reads that wait at the same time, for `cache` seconds a reply answers equal reads,
+        reads of the addresses in `preferred` go before those of others, and `retry` are the first
+        and the longest pause after failures (default: 1 and 60). Raises `ValueError`, and
         `RuntimeError` after `stop`.
         """
 
@@ -815,6 +821,12 @@ def encode_raw_ingest(
 
     Raises `ValueError` for a payload that does not match `count`, `OverflowError` for a number
     above 65535.
+    """
+
+def tell_disabled(memory: Memory, block: StatusBlock) -> None:
+    """Writes the status block of a device that is not polled.
+
+    Raises `ValueError` if it does not fit.
     """
 
 def plan_blocks(

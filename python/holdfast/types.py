@@ -41,6 +41,23 @@ Extent: TypeAlias = int | tuple[int, int]
 Seal: TypeAlias = tuple[Area, int] | tuple[Area, int, Literal["once", "level"]]
 """The gate bit of a memory: area of bits, address, and mode."""
 
+StatusBlock: TypeAlias = tuple[Area, int, str, bool]
+"""A status block of a device: area, slot, name, and whether it keeps the last error."""
+
+Forward: TypeAlias = tuple[
+    str,
+    int,
+    Literal["v1", "crc"],
+    Literal["required", "none"],
+    int,
+    float,
+    list[tuple[Area, int]],
+    tuple[int, StatusBlock] | None,
+]
+"""A raw ingest receiver of a polled device: host, port, format, crc, unit id or memory id, timeout
+in seconds, what is added to the addresses of areas, and the status block with its own unit id or
+memory id."""
+
 PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
 """One block of a poll: area, address, count, the bytes or `None`, the fault, and the time of the
 result in seconds since 1970."""

@@ -183,7 +183,8 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("slot: 4", "slot: 2184",
          "13: status.slot: found 2184, allowed: an integer from 0 to 2183"),
         ("area: input_registers, slot", "area: coils, slot",
-         "13: status.area: found 'coils', allowed: holding_registers or input_registers"),
+         "13: status.area: found 'coils', "
+         "allowed: holding_registers or input_registers"),
         ("    status: {memory: plant", "    status: {memory: other",
          "13: status.memory: found 'other', allowed: plant"),
         ("    status", "    forward: [{url: 'raw://a', unit: 1}]\n    status",
@@ -202,6 +203,34 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          f"13: forward[0].memory_id: missing with format crc, allowed: {WORD}"),
         ("    status", "    forward: [{url: 'raw://a:1', unit: 1, memory_id: 1}]\n    status",
          "13: forward[0].memory_id: found with format v1, allowed: unit"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, status: {area: coils, slot: 0, "
+         "unit: 2}}]\n    status",
+         "13: forward[0].status.area: found 'coils', allowed: holding_registers or "
+         "input_registers"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, status: {area: input_registers, "
+         "slot: 0}}]\n    status",
+         f"13: forward[0].status.unit: missing with format v1, allowed: {WORD}"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, status: {area: input_registers, "
+         "slot: 0, unit: 1, memory_id: 2}}]\n    status",
+         "13: forward[0].status.memory_id: found with format v1, allowed: unit"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, status: {area: input_registers, "
+         "slot: 2184, unit: 1}}]\n    status",
+         "13: forward[0].status.slot: found 2184, allowed: an integer from 0 to 2183"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, offsets: "
+         "{input_registers: 65417}}]\n    status",
+         "13: forward[0].offsets.input_registers: found 65417, which moves 100 to 119 "
+         "beyond 65535, allowed: 0 to 65416"),
+        ("    status", "    forward: [{url: 'raw://a:1', unit: 1, offsets: "
+         "{relays: 1}}]\n    status",
+         "13: forward[0].offsets.relays: unknown key, allowed: coils, discrete_inputs, "
+         "holding_registers, input_registers"),
+        ("    status", "    retry: {first: 0}\n    status",
+         "13: retry.first: found 0, allowed: a number from 0.001 to 31622400"),
+        ("    status", "    retry: {most: 0.5}\n    status",
+         "13: retry.first: found 1, allowed: up to most, which is 0.5"),
+        ("slot: 4}", "slot: 4, name: 'a name of 17 chars'}",
+         "13: status.name: found 'a name of 17 chars', "
+         "allowed: up to 16 printable ASCII characters"),
         ("    status", "    forward: [{url: 'raw://a:1', unit: 1, crc: none}]\n    status",
          "13: forward[0].crc: found with format v1, allowed: only with format crc"),
     ],
@@ -224,11 +253,15 @@ SHARED = HEAD + METER + ANOTHER
          "17: devices.other.tolerance: found another tolerance"),
         ({"    unit: 1": "    unit: 1\n    tolerance: {pad: true}"},
          "16: devices.other.url: found another tolerance"),
+        ({"    unit: 2": "    unit: 2\n    retry: {first: 2}"},
+         "17: devices.other.retry: found another retry"),
+        ({"    unit: 1": "    unit: 1\n    retry: {first: 2}"},
+         "16: devices.other.url: found another retry"),
         ({"tcp://10.0.0.9\n    unit: 2": "tcp://10.0.0.9?retries=1\n    unit: 2"},
          "15: devices.other.url: found another tolerance"),
     ],
 )  # fmt: skip
-def test_devices_at_one_address_have_the_same_tolerance_and_requests_in_flight(
+def test_devices_at_one_address_have_the_same_settings_of_their_connection(
     folder: Folder, changes: dict[str, str], differs: str
 ) -> None:
     text = SHARED

@@ -172,8 +172,8 @@ def test_a_serial_listener_has_routes_too(folder: Folder) -> None:
         ('"rtu:///dev/none?baud=9600"', '"tls://plc?ca=none.pem"',
          "5: links.bus.url: found ca='none.pem', which can't be read: No such file or directory"),
         ('"rtu:///dev/none?baud=9600"', '"tcp://a", units: 1',
-         "5: links.bus.units: unknown key, allowed: url, timeout, in_flight, tolerance, queue, "
-         "priority, coalesce, cache"),
+         "5: links.bus.units: unknown key, allowed: url, timeout, in_flight, tolerance, retry, "
+         "queue, priority, coalesce, cache"),
     ],
 )  # fmt: skip
 def test_a_wrong_route_or_link_is_named(
@@ -234,6 +234,8 @@ def test_a_serial_line_of_a_link_can_t_be_polled_for_nats(folder: Folder) -> Non
     [
         ("url: 'tcp://a', in_flight: 8, tolerance: {pad: true}", "url: 'tcp://a'"),
         ("url: 'tcp://a', in_flight: 8", "url: 'tcp://a', in_flight: 8"),
+        ("url: 'tcp://a', retry: {most: 5}", "url: 'tcp://a'"),
+        ("url: 'rtu:///dev/x', retry: {most: 5}", "url: 'rtu:///dev/x'"),
         ("url: 'tcp://a?retries=1'", "url: 'tcp://a', tolerance: {retries: 1}"),
         ("url: 'rtu:///dev/x?pad=1'", "url: 'rtu:///dev/x'"),
     ],
@@ -257,6 +259,12 @@ def test_a_link_decides_for_the_devices_at_its_address(
         ("url: 'tcp://a'", "url: 'tcp://a', tolerance: {pad: true}",
          "3: devices.drive.tolerance: found another tolerance than links.bus in line 5 has at "
          "this address, allowed: the same"),
+        ("url: 'tcp://a', retry: {most: 5}", "url: 'tcp://a', retry: {most: 6}",
+         "3: devices.drive.retry: found another retry than links.bus in line 5 has at this "
+         "address, allowed: the same"),
+        ("url: 'rtu:///dev/x'", "url: 'rtu:///dev/x', retry: {most: 6}",
+         "3: devices.drive.retry: found another retry than links.bus in line 5 has at this "
+         "address, allowed: the same"),
         ("url: 'rtu:///dev/x?baud=9600'", "url: 'rtu:///dev/x'",
          "3: devices.drive.url: found line settings that differ from those of links.bus in line "
          "5, allowed: the same settings"),

@@ -16,6 +16,8 @@ from support.polled import Fake, asked, data, exception, reply
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from holdfast.types import Forward
+
 
 def writable(request: wire.Frame) -> bytes:
     return data(request) if request.pdu[0] <= 4 else reply(request, request.pdu)
@@ -155,7 +157,7 @@ def test_a_poller_that_has_been_stopped_refuses_orders(poller: Poller) -> None:
 
 def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: Poller) -> None:
     fake = Fake(data)
-    receiver = ("127.0.0.1", 9, "v1", "required", 1, 1.0)
+    receiver: Forward = ("127.0.0.1", 9, "v1", "required", 1, 1.0, [], None)
     for count, forward in ((65535, [receiver]), (65536, None)):
         poller.add(device(fake, str(count), reads=[("coils", 0, count, None)], forward=forward))
     reads = [("coils", 0, 1, None), ("coils", 0, 65536, None)]
@@ -186,8 +188,8 @@ def test_a_unit_that_is_given_a_rest_keeps_it_when_its_device_is_replaced(
     poller: Poller,
 ) -> None:
     with Fake(lambda _: None) as fake:
-        poller.add(device(fake, interval=0.05, timeout=0.05))
-        taken(poller, lambda polls, _: len(polls) == 4)
+        poller.add(device(fake, interval=0.05, timeout=0.05, retry=(60, 60)))
+        taken(poller, lambda polls, _: len(polls) == 3)
         reads = len(fake.requests)
         fake.answer = writable
         poller.replace("a", device(fake, interval=0.05, timeout=0.05))

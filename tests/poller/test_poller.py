@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from holdfast.appliance import Appliance
     from holdfast.types import Area
+    from support.polled import Status
     from support.running import Run, Serve
 
 TIMEOUT, REFUSED, RESET, INVALID = 0x8001, 0x8002, 0x8003, 0x8004
@@ -243,7 +244,7 @@ def test_a_source_that_is_killed_and_comes_back(run: Run, serve: Serve) -> None:
     before = until_told(appliance, health=OK)
     assert (before.name, before.reserved) == (b"the-name-is-long", (0,) * 9)
     assert (before.last_error, before.seconds_in_error, before.failures) == (0, 0, 0)
-    assert before.requests == before.valid > 0
+    assert before.polls == before.good_polls > 0
     assert (before.timeouts, before.transport_errors, before.most_failures) == (0, 0, 0)
 
     server.stop()
@@ -252,7 +253,7 @@ def test_a_source_that_is_killed_and_comes_back(run: Run, serve: Serve) -> None:
     )
     assert dead.failures == dead.most_failures > 0
     assert dead.transport_errors > 0
-    assert dead.requests == dead.valid + dead.transport_errors
+    assert dead.polls == dead.good_polls + dead.transport_errors
     source.write("holding_registers", 0, [8] * 300)
     told = counters(appliance, name)
     assert (told["health"], told["last_error"], told["age"] > 1) == ("error", REFUSED, True)
@@ -260,9 +261,9 @@ def test_a_source_that_is_killed_and_comes_back(run: Run, serve: Serve) -> None:
 
     with holdfast.Server({1: source}, bind=f"{host}:{port}", access="read-only"):
         back = until_told(appliance, health=OK)
-        assert (back.last_error, back.seconds_in_error, back.failures) == (REFUSED, 0, 0)
+        assert (back.last_error, back.seconds_in_error, back.failures) == (0, 0, 0)
         assert back.most_failures >= dead.most_failures
-        assert back.valid > dead.valid
+        assert back.good_polls > dead.good_polls
         wire.until(
             lambda: mirror.read("holding_registers", 0, 300) == [8] * 300, "the newest is there"
         )
@@ -315,7 +316,7 @@ def test_every_fault_has_its_code_and_writes_nothing(
     reads = [read("holding_registers", 5, 3, ("input_registers", 5))]
     with Fake(lambda request: data(request, 9) if good.is_set() else answer(request)) as fake:
         timeout = 0.1 if code == TIMEOUT else wire.DEADLINE
-        meter = device(fake.url, *reads, timeout=timeout, status=block(0))
+        meter = device(fake.url, *reads, timeout=timeout, status=block(0, keep_last_error=True))
         appliance = run(configuration({"meter": meter}))
         until_told(appliance, health=OK)
         good.clear()
@@ -360,8 +361,8 @@ def test_nobody_there_from_the_start_is_refused(run: Run) -> None:
     meter = device(f"tcp://127.0.0.1:{free_port()}", *reads, status=block(0))
     appliance = run(configuration({"meter": meter}))
     told = until_told(appliance, health=ERROR, last_error=REFUSED)
-    assert told.valid == 0
-    assert told.requests == told.transport_errors
+    assert told.good_polls == 0
+    assert told.polls == told.transport_errors
     assert counters(appliance, "meter")["age"] is None
 
 
@@ -524,7 +525,7 @@ def test_a_unit_that_was_dead_is_read_when_it_answers(run: Run) -> None:
         alive.set()
         told = until_told(appliance, health=OK)
         assert told.timeouts >= 4
-        assert (told.last_error, told.failures) == (TIMEOUT, 0)
+        assert (told.last_error, told.failures) == (0, 0)
 
 
 def test_a_connection_that_has_gone_silent_is_made_anew(run: Run) -> None:
@@ -770,6 +771,60 @@ def test_a_receiver_that_is_killed_and_comes_back_gets_the_newest(
     wire.until(lambda: arrived(5), "the newest arrives")
     write(7)
     wire.until(lambda: arrived(7), "it goes on")
+
+
+def test_a_receiver_gets_offsets_of_its_own_and_the_status_block(run: Run, serve: Serve) -> None:
+    """Two receivers of one device, with blocks of different content."""
+    port = free_port()
+    target = run(receiving(port, "v1"))
+    source, memory = holdfast.Memory(holding_registers=8), target.memories["mirror"]
+    source.write("holding_registers", 0, [7] * 4)
+    registers = {"area": "holding_registers", "unit": 4}
+    forward = [
+        {
+            "url": f"raw://127.0.0.1:{port}",
+            "unit": 4,
+            "offsets": {"holding_registers": offset, "coils": 9},
+            "status": {**registers, "slot": slot, **more},
+        }
+        for offset, slot, more in (
+            (1000, 100, {"name": "Pump 1", "keep_last_error": True}),
+            (2000, 101, {}),
+        )
+    ]
+    server = serve({1: source})
+    meter = device(url(server), read("holding_registers", 0, 4), forward=forward)
+    run(configuration({"meter": meter}))
+
+    def told() -> list[Status]:
+        return [polled.status(memory, slot, "holding_registers") for slot in (100, 101)]
+
+    def arrived() -> bool:
+        found = (memory.read("holding_registers", address, 4) for address in (1000, 2000))
+        return all(registers == [7] * 4 for registers in found)
+
+    wire.until(arrived, "it is passed on")
+    wire.until(lambda: all(each.good_polls > 2 for each in told()), "it is told")
+    assert [(each.health, each.last_error) for each in told()] == [(OK, 0)] * 2
+    assert [each.name.rstrip(b"\0") for each in told()] == [b"Pump 1", b"meter"]
+
+    host, port = server.address
+    server.stop()
+    wire.until(lambda: all(each.last_error == REFUSED for each in told()), "the failure is told")
+    wire.until(lambda: all(each.seconds_in_error for each in told()), "so are the seconds")
+    with holdfast.Server({1: source}, bind=f"{host}:{port}", access="read-only"):
+        wire.until(lambda: all(each.health == OK for each in told()), "the recovery is told")
+        assert [each.last_error for each in told()] == [REFUSED, 0]
+
+
+def test_a_device_is_retried_as_soon_as_it_is_asked_for(run: Run) -> None:
+    port, polls = free_port(), 12
+    reads = [read("coils", 0, 8, ("coils", 0))]
+    soon = {"first": 0.01, "most": 0.02}
+    meter = device(f"tcp://127.0.0.1:{port}", *reads, interval=0.01, retry=soon)
+    # Pauses of 1, 2, 4 ... s would last for more than an hour.
+    appliance = run(configuration({"meter": meter}))
+    wire.until(lambda: counters(appliance, "meter")["failures"] >= polls, "it is retried")
 
 
 def test_every_read_is_passed_on_however_slow_the_receiver(run: Run) -> None:

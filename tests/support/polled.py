@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     import holdfast
     from holdfast.appliance import Appliance
+    from holdfast.types import Area
     from support.fake_device import Asked
 
     Answer = Callable[[wire.Frame], bytes | None]
@@ -171,24 +172,24 @@ class Status(NamedTuple):
     seconds_in_error: int
     name: bytes
     reserved: tuple[int, ...]
-    requests: int
-    valid: int
+    polls: int
+    good_polls: int
     timeouts: int
     transport_errors: int
     failures: int
     most_failures: int
 
 
-def status(memory: holdfast.Memory, slot: int = 0) -> Status:
-    """Parses a status block in the input registers of a memory."""
-    told = memory.read("input_registers", slot * 30, 30)
+def status(memory: holdfast.Memory, slot: int = 0, area: Area = "input_registers") -> Status:
+    """Parses a status block in a memory."""
+    told = memory.read(area, slot * 30, 30)
     health, last_error, seconds = told[:3]
     name = struct.pack(">8H", *told[3:11])
     pairs = zip(told[20:28:2], told[21:28:2], strict=True)
-    requests, valid, timeouts, transport = (low + (high << 16) for low, high in pairs)
+    polls, good_polls, timeouts, transport = (low + (high << 16) for low, high in pairs)
     return Status(
         health, last_error, seconds, name, tuple(told[11:20]),
-        requests, valid, timeouts, transport, told[28], told[29],
+        polls, good_polls, timeouts, transport, told[28], told[29],
     )  # fmt: skip
 
 
@@ -208,9 +209,9 @@ def device(url: str, *reads: dict[str, Any], unit: int = 1, **more: Any) -> dict
     return {"url": url, "unit": unit, **often, "reads": list(reads), **more}
 
 
-def block(slot: int) -> dict[str, Any]:
-    """Builds the place of a status block."""
-    return {"memory": "status", "area": "input_registers", "slot": slot}
+def block(slot: int, **more: Any) -> dict[str, Any]:
+    """Builds the settings of a status block."""
+    return {"memory": "status", "area": "input_registers", "slot": slot, **more}
 
 
 def configuration(devices: dict[str, Any], **more: Any) -> str:

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use holdfast_engine::client::ClientError;
 use holdfast_engine::link::{
-    Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink, Wakes,
+    Caller as CoreCaller, InFlight, LinkSettings, Retry, Route as CoreRoute, SharedLink, Wakes,
 };
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
@@ -33,11 +33,17 @@ pub(crate) fn in_flight(number: Option<i128>) -> PyResult<InFlight> {
     })
 }
 
+/// The first and the longest pause before another try, in seconds; `None` for the defaults.
+pub(crate) fn retry(pauses: Option<(f64, f64)>) -> PyResult<Retry> {
+    let Some((first, most)) = pauses else { return Ok(Retry::default()) };
+    Ok(Retry { first: seconds("first", first)?, most: seconds("most", most)? })
+}
+
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 pub(crate) fn settings(
     name: String,
     endpoint: &Endpoint,
-    number: Option<i128>,
+    (number, pauses): (Option<i128>, Option<(f64, f64)>),
     queue: i128,
     coalesce: bool,
     cache: f64,
@@ -51,6 +57,7 @@ pub(crate) fn settings(
         name,
         endpoint: endpoint.core.clone(),
         in_flight: in_flight(number)?,
+        retry: retry(pauses)?,
         queue: within("queue", queue, 1..=MAX_QUEUE)?,
         coalesce,
         cache: seconds("cache", cache)?,

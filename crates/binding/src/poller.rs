@@ -6,8 +6,8 @@ use std::time::SystemTime;
 use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    Batch, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll, Poller as Core,
-    PollerError, ReadSettings, StatusSettings,
+    Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
+    Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
@@ -28,8 +28,13 @@ type Place<'py> = (PyRef<'py, Memory>, String, u16);
 /// An area, an address, a count, and the destination of the bytes.
 type Read<'py> = (String, i128, i128, Option<Place<'py>>);
 
-/// Host, port, format, crc, unit or memory id, timeout.
-type Forward = (String, u16, String, String, u16, f64);
+/// Area and slot of a status block, its name, and whether it keeps the last error.
+type StatusBlock = (String, u16, String, bool);
+
+/// Host, port, format, crc, unit or memory id, timeout, offsets by area, and the unit or memory id of
+/// the status block with the block.
+type Forward =
+    (String, u16, String, String, u16, f64, Vec<(String, u16)>, Option<(u16, StatusBlock)>);
 
 /// Area, address, count, indexes of fields, number of items that no field covers.
 type PlannedBlock = (&'static str, u16, u16, Vec<usize>, u32);
@@ -43,7 +48,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=false, release=false, measured=false))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=false, release=false, measured=false, retry=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -58,12 +63,13 @@ impl PolledDevice {
         readable: Option<Vec<Range>>,
         forbidden: Option<Vec<Range>>,
         forward: Option<Vec<Forward>>,
-        status: Option<Place<'_>>,
+        status: Option<(PyRef<'_, Memory>, StatusBlock)>,
         start_within: Option<f64>,
         in_flight: Option<i128>,
         report: bool,
         release: bool,
         measured: bool,
+        retry: Option<(f64, f64)>,
     ) -> PyResult<PolledDevice> {
         let reads = reads.into_iter().map(|(area, address, count, into)| {
             Ok(ReadSettings {
@@ -74,14 +80,12 @@ impl PolledDevice {
             })
         });
         let forward = forward.unwrap_or_default().into_iter().map(target);
-        let status = status.map(|(memory, area, slot)| {
-            let memory = Arc::clone(&memory.core);
-            Ok::<_, PyErr>(StatusSettings { memory, area: named(&area)?, slot })
-        });
+        let status = status.map(|(memory, of)| self::status(&memory, of));
         let core = DeviceSettings {
             name,
             endpoint: endpoint.core.clone(),
             in_flight: link::in_flight(in_flight)?,
+            retry: link::retry(retry)?,
             unit_id: byte("unit", unit)?,
             interval: seconds("interval", interval)?,
             timeout: seconds("timeout", timeout)?,
@@ -127,7 +131,7 @@ impl Poller {
         self.core.write(name, Box::new(request.encoded.clone())).map_err(raised)
     }
 
-    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=None))]
+    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=None, retry=None))]
     #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
     fn link(
         &self,
@@ -138,15 +142,17 @@ impl Poller {
         coalesce: bool,
         cache: f64,
         preferred: Option<Vec<String>>,
+        retry: Option<(f64, f64)>,
     ) -> PyResult<Link> {
         let preferred = preferred.unwrap_or_default();
         let settings =
-            link::settings(name, &endpoint, in_flight, queue, coalesce, cache, preferred)?;
+            link::settings(name, &endpoint, (in_flight, retry), queue, coalesce, cache, preferred)?;
         Ok(Link { core: self.core.link(settings).map_err(raised)? })
     }
 
     fn known_link(&self, name: String, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
-        let settings = link::settings(name, &endpoint, Some(1), 256, true, 0.0, Vec::new())?;
+        let settings =
+            link::settings(name, &endpoint, (Some(1), None), 256, true, 0.0, Vec::new())?;
         let known = self.core.known_link(settings).map_err(raised)?;
         Ok(known.map(|core| Link { core }))
     }
@@ -252,12 +258,31 @@ fn destination((memory, area, address): Place<'_>) -> PyResult<Destination> {
     Ok(Destination { memory: Arc::clone(&memory.core), area: named(&area)?, address })
 }
 
+/// Writes the status block of a device that is not polled.
+#[pyfunction]
+pub fn tell_disabled(memory: PyRef<'_, Memory>, block: StatusBlock) -> PyResult<()> {
+    let refused = |_| PyValueError::new_err("the status block does not fit into its memory");
+    status(&memory, block)?.tell_disabled().map_err(refused)
+}
+
+fn status(memory: &Memory, of: StatusBlock) -> PyResult<StatusSettings> {
+    Ok(StatusSettings { memory: Arc::clone(&memory.core), block: block(of)? })
+}
+
+fn block((area, slot, name, keep_last_error): StatusBlock) -> PyResult<BlockSettings> {
+    Ok(BlockSettings { area: named(&area)?, slot, name, keep_last_error })
+}
+
 fn target(forward: Forward) -> PyResult<ForwardSettings> {
-    let (host, port, format, crc, target, timeout) = forward;
+    let (host, port, format, crc, target, timeout, offsets, status) = forward;
     let required = word("crc", &crc, &[("required", true), ("none", false)])?;
     let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
     let format = word("format", &format, &formats)?;
-    Ok(ForwardSettings { host, port, format, target, timeout: seconds("timeout", timeout)? })
+    let timeout = seconds("timeout", timeout)?;
+    let offsets = offsets.into_iter().map(|(area, offset)| Ok((named(&area)?, offset)));
+    let offsets = offsets.collect::<PyResult<_>>()?;
+    let status = status.map(|(target, of)| Ok::<_, PyErr>((target, block(of)?))).transpose()?;
+    Ok(ForwardSettings { host, port, format, target, timeout, offsets, status })
 }
 
 fn strategy(max_gap: Option<i128>, cost: Option<(f64, f64)>) -> PyResult<Strategy> {

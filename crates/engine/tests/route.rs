@@ -10,7 +10,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_engine::client::Place;
-use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink};
+use holdfast_engine::link::{InFlight, LinkSettings, Retry, Route, SharedLink};
 use holdfast_engine::poller::Poller;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::functions::{AccessMode, Functions};
@@ -97,6 +97,7 @@ impl Front {
             name: "device".into(),
             endpoint: place.into(),
             in_flight: InFlight::Fixed(1),
+            retry: Retry::default(),
             queue: 1000,
             coalesce: false,
             cache: Duration::ZERO,

@@ -6,7 +6,6 @@ here. Gateway and scanner are imported only if they are configured.
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, assert_never
 
@@ -23,13 +22,13 @@ from holdfast.config import (
     ModbusUdpListener,
     RawIngestListener,
 )
-from holdfast.config.devices import STATUS_BLOCK
 from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
 from holdfast.config.scalars import MAX_TIME
 from holdfast.net.tls import NO_FILES
 from holdfast.server import Identity
 from holdfast.tools import planning
+from holdfast.types import AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -49,11 +48,12 @@ if TYPE_CHECKING:
         SerialRuleConfig,
         ServerTlsConfig,
     )
+    from holdfast.config.devices import BlockConfig, ForwardConfig, StatusConfig
     from holdfast.config.rights import UnitRights
     from holdfast.gateway import Settings as GatewaySettings
     from holdfast.net.tls import Tls
     from holdfast.scanner import Settings as ScannerSettings
-    from holdfast.types import Area, NarrowedRights
+    from holdfast.types import Area, Forward, NarrowedRights, StatusBlock
 
 _FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
     "modbus-tcp": "mbap",
@@ -65,12 +65,6 @@ _FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
 
 SPREAD = 10.0
 """Seconds over which the first polls of devices are spread; at most the polling interval."""
-
-DISABLED = 4
-"""The health code of a device that is not polled, in its status block."""
-
-STATUS_NAME = 16
-"""The size of the name in a status block, in bytes."""
 
 
 def memory(settings: MemoryConfig) -> Memory:
@@ -129,6 +123,7 @@ def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) 
             coalesce=settings.coalesce,
             cache=settings.cache,
             preferred=list(settings.priority),
+            retry=settings.retry.pauses,
         )
         made.links[name] = link
         made.routes[name] = link.route(name, timeout=settings.timeout)
@@ -140,6 +135,7 @@ def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) 
             name,
             _endpoint(f"devices.{name}.url", device.target),
             in_flight=None if device.in_flight == "auto" else device.in_flight,
+            retry=device.retry.pauses,
         )
         made.links.setdefault(link.name, link)
         made.routes[name] = link.route(name, unit=device.unit, timeout=device.timeout)
@@ -271,13 +267,11 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
             (read.area, read.address, read.count, _place(read.into, memories))
             for read in settings.reads
         ],
-        forward=[
-            (*each.receiver, each.format, each.crc or "required", each.target, each.timeout)
-            for each in settings.forward
-        ],
-        status=None if status is None else (memories[status.memory], status.area, status.slot),
+        forward=[_forward(name, each) for each in settings.forward],
+        status=None if status is None else (memories[status.memory], _block(name, status)),
         start_within=min(settings.interval, SPREAD),
         in_flight=None if settings.in_flight == "auto" else settings.in_flight,
+        retry=settings.retry.pauses,
         measured=settings.cost is not None and settings.cost.measured,
         **planning.rules(settings),
     )
@@ -297,11 +291,29 @@ def mirror(config: Config, memories: Mapping[str, Memory]) -> None:
         memories[memory].mirror(ranges)
 
 
-def disabled_status(name: str) -> list[int]:
-    """Returns the registers of the status block of a device that is not polled."""
-    text = name.encode("ascii", "replace")[:STATUS_NAME].ljust(STATUS_NAME, b"\0")
-    told = [DISABLED, 0, 0, *struct.unpack(f">{STATUS_NAME // 2}H", text)]
-    return told + [0] * (STATUS_BLOCK - len(told))
+def _forward(device: str, settings: ForwardConfig) -> Forward:
+    """A receiver, as the native poller has it."""
+    status = settings.status
+    return (
+        *settings.receiver,
+        settings.format,
+        settings.crc or "required",
+        settings.target,
+        settings.timeout,
+        [(area, getattr(settings.offsets, area)) for area in AREAS],
+        None if status is None else (settings.status_target, _block(device, status)),
+    )
+
+
+def _block(device: str, settings: BlockConfig) -> StatusBlock:
+    """The status block of a device, as the native poller has it."""
+    name = device if settings.name is None else settings.name
+    return settings.area, settings.slot, name, settings.keep_last_error
+
+
+def tell_disabled(name: str, status: StatusConfig, memories: Mapping[str, Memory]) -> None:
+    """Writes the status block of a device that is not polled."""
+    _core.tell_disabled(memories[status.memory], _block(name, status))
 
 
 def gateway(settings: GatewayConfig) -> GatewaySettings:

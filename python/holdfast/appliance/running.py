@@ -302,8 +302,7 @@ class _Running:
         for name in disabled:
             status = devices[name].status
             if status is not None:
-                told = assembly.disabled_status(name)
-                self._memories[status.memory].write(status.area, status.addresses.start, told)
+                assembly.tell_disabled(name, status, self._memories)
         return disabled
 
     def endpoints(self) -> list[ListenAddress]:

@@ -75,7 +75,9 @@ class DeviceChecks:
         check_ranges((*path, "readable"), device.get("readable"), self.report)
         forbidden = check_ranges((*path, "forbidden"), device.get("forbidden"), self.report)
         for index, forward in enumerate(entries(device.get("forward"))):
-            self._forward((*path, "forward", index), mapping(forward))
+            where = (*path, "forward", index)
+            self._forward(where, mapping(forward))
+            self._offsets((*where, "offsets"), mapping(forward), entries(device.get("reads")))
         for index, read in enumerate(entries(device.get("reads"))):
             if isinstance(read, dict):
                 forwarded = bool(device.get("forward"))
@@ -114,13 +116,38 @@ class DeviceChecks:
             self.report.add((*path, "crc"), message, of_key=True)
         if form not in ("v1", "crc") or not forward:
             return
+        self._target(path, forward, form)
+        if isinstance(forward.get("status"), dict):
+            self._target((*path, "status"), forward["status"], form)
+
+    def _target(self, path: KeyPath, of: dict[Any, Any], form: str) -> None:
+        """Packets of a format name their memory in one way."""
         needed, other = _NAMING[form], _NAMING["v1" if form == "crc" else "crc"]
-        if needed not in forward:
+        if needed not in of:
             message = f"missing with format {form}, allowed: an integer from 0 to {MAX_WORD}"
             self.report.add((*path, needed), message, of_key=True)
-        if other in forward:
+        if other in of:
             message = f"found with format {form}, allowed: {needed}"
             self.report.add((*path, other), message, of_key=True)
+
+    def _offsets(self, path: KeyPath, forward: dict[Any, Any], reads: list[Any]) -> None:
+        """With its offset, every read is within the area of the receiver."""
+        for area, added in mapping(forward.get("offsets")).items():
+            offset = integer(added, 0, LAST_ADDRESS)
+            for read in map(mapping, reads):
+                of = mapping(read.get("into")) or read
+                address = integer(of.get("address"), 0, LAST_ADDRESS)
+                count = integer(read.get("count"), 1, ADDRESSES)
+                if of.get("area") != area or offset is None or address is None or count is None:
+                    continue
+                if offset + address + count > ADDRESSES:
+                    most = ADDRESSES - address - count
+                    message = (
+                        f"found {offset}, which moves {extent(range(address, address + count))}"
+                    )
+                    allowed = f"beyond {LAST_ADDRESS}, allowed: 0 to {most}"
+                    self.report.add((*path, area), f"{message} {allowed}")
+                    break
 
     def _read(
         self,

@@ -20,6 +20,7 @@ from holdfast.config.scalars import (
     Name,
     NotNull,
     ReceiverUrl,
+    StatusName,
     UnitId,
     whole_number,
 )
@@ -94,6 +95,53 @@ def _crc(data: dict[str, Any]) -> Literal["required"] | None:
     return "required" if data["format"] == "crc" else None
 
 
+class BlockConfig(Model):
+    """Place and content of a block of 30 registers with the status of a device."""
+
+    area: RegisterArea
+    """The area, of registers."""
+    slot: Annotated[int, Field(ge=0, le=LAST_SLOT)]
+    """The slot; the block begins at address 30 × slot."""
+    name: Annotated[StatusName | None, NotNull()] = None
+    """The name in the block, up to 16 characters. Default: the start of the name of the device."""
+    keep_last_error: bool = False
+    """Whether register 1 keeps the last error after a recovery; otherwise it is 0 then."""
+
+    @property
+    def addresses(self) -> range:
+        """The addresses, as a range."""
+        return range(self.slot * STATUS_BLOCK, (self.slot + 1) * STATUS_BLOCK)
+
+
+class StatusConfig(BlockConfig):
+    """A block of 30 registers with the status of a device."""
+
+    memory: Name
+    """The memory."""
+
+
+class ForwardedStatusConfig(BlockConfig):
+    """A block of 30 registers with the status of a device, in a memory of a receiver."""
+
+    unit: Annotated[Register | None, NotNull()] = None
+    """Format v1: the unit id of the packets."""
+    memory_id: Annotated[Register | None, NotNull()] = None
+    """Format crc: the memory id of the packets."""
+
+
+class OffsetsConfig(Model):
+    """What is added to the addresses of each area."""
+
+    coils: Register = 0
+    """For coils."""
+    discrete_inputs: Register = 0
+    """For discrete inputs."""
+    holding_registers: Register = 0
+    """For holding registers."""
+    input_registers: Register = 0
+    """For input registers."""
+
+
 class ForwardConfig(Model):
     """A raw ingest receiver to which every read is forwarded."""
 
@@ -109,6 +157,10 @@ class ForwardConfig(Model):
     """Format crc: the memory id of the packets."""
     timeout: Duration = 5.0
     """Seconds for connection, packet and reply together."""
+    offsets: OffsetsConfig = OffsetsConfig()
+    """What is added to the addresses in packets, for each area."""
+    status: Annotated[ForwardedStatusConfig | None, NotNull()] = None
+    """The status block of the device, which is forwarded too."""
 
     @property
     def receiver(self) -> Receiver:
@@ -118,23 +170,15 @@ class ForwardConfig(Model):
     @property
     def target(self) -> int:
         """The unit id or the memory id of the packets, depending on the format."""
-        return (self.unit if self.format == "v1" else self.memory_id) or 0
-
-
-class StatusConfig(Model):
-    """A block of 30 registers with the status of a device."""
-
-    memory: Name
-    """The memory."""
-    area: RegisterArea
-    """The area, of registers."""
-    slot: Annotated[int, Field(ge=0, le=LAST_SLOT)]
-    """The slot; the block begins at address 30 × slot."""
+        return self._target(self)
 
     @property
-    def addresses(self) -> range:
-        """The addresses, as a range."""
-        return range(self.slot * STATUS_BLOCK, (self.slot + 1) * STATUS_BLOCK)
+    def status_target(self) -> int:
+        """The unit id or the memory id of the packets with the status block."""
+        return 0 if self.status is None else self._target(self.status)
+
+    def _target(self, of: ForwardConfig | ForwardedStatusConfig) -> int:
+        return (of.unit if self.format == "v1" else of.memory_id) or 0
 
 
 InFlight = Annotated[int, Field(ge=1, le=MAX_IN_FLIGHT)] | Literal["auto"]
@@ -168,6 +212,20 @@ class ToleranceConfig(Model):
     """Requests after which the connection is closed, 0 for never; one is in flight then."""
     reconnect: Pause = 0.0
     """Seconds between the end of a connection and the next attempt to connect."""
+
+
+class RetryConfig(Model):
+    """When an address that can't be reached, or a unit that does not answer, is tried again."""
+
+    first: Duration = 1.0
+    """Seconds after the first failure; doubled with each further one."""
+    most: Duration = 60.0
+    """The longest pause, in seconds."""
+
+    @property
+    def pauses(self) -> tuple[float, float]:
+        """The first and the longest pause."""
+        return self.first, self.most
 
 
 def tolerating(target: Target, tolerance: ToleranceConfig | None) -> Target:
@@ -209,6 +267,8 @@ class DeviceConfig(Model):
     """The most requests in flight at its address, over TCP; auto: more while replies stay fast."""
     tolerance: Annotated[ToleranceConfig | None, NotNull()] = None
     """How to treat it if it deviates from the standard; in place of these options of the URL."""
+    retry: RetryConfig = RetryConfig()
+    """When it is tried again if it can't be reached or does not answer."""
     reads: Annotated[tuple[ReadConfig, ...], Strict(False)] = Field(
         default=(), min_length=1, exclude_if=lambda v: not v
     )

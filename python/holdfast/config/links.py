@@ -8,7 +8,7 @@ from pydantic import Field
 
 from holdfast.client.url import Target, parse
 from holdfast.config.base import Model
-from holdfast.config.devices import InFlight, ToleranceConfig, tolerating
+from holdfast.config.devices import InFlight, RetryConfig, ToleranceConfig, tolerating
 from holdfast.config.scalars import (
     PEER_KEYS,
     DeviceUrl,
@@ -32,6 +32,8 @@ class LinkConfig(Model):
     """The most requests in flight, over TCP; auto: more while replies stay fast."""
     tolerance: Annotated[ToleranceConfig | None, NotNull()] = None
     """How to treat devices that deviate from the standard; in place of these options of the URL."""
+    retry: RetryConfig = RetryConfig()
+    """When devices that can't be reached or do not answer are tried again."""
     queue: Annotated[int, Field(ge=1, le=MAX_QUEUE)] = 256
     """The most requests that wait; more are answered with exception 06."""
     priority: dict[PeerAddress, Literal["high"]] = Field(default={}, json_schema_extra=PEER_KEYS)

@@ -57,6 +57,7 @@ MIN_TIME = 0.001
 NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
+_STATUS_NAME = "[ -~]{0,16}"
 _BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
 _HIGH_BYTE = r"(12[89]|1[3-9][0-9]|2[0-4][0-9]|25[0-5])"
 _SERIAL = r"([1-9]|[1-9][0-9]|1[0-9][0-9]|2[0-3][0-9]|24[0-7])"
@@ -196,6 +197,12 @@ def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
     return text
 
 
+def _status_name(value: object) -> str:
+    if isinstance(value, str) and re.fullmatch(_STATUS_NAME, value):
+        return value
+    raise ValueError(f"found {show(value)}, allowed: up to 16 printable ASCII characters")
+
+
 def _no_instant(value: float) -> float:
     if 0 < value < MIN_TIME:
         raise ValueError(f"found {value}, allowed: 0, or {MIN_TIME} to {MAX_TIME} seconds")
@@ -279,6 +286,11 @@ DeviceName = Annotated[
     str,
     PlainValidator(_text_of(MAX_DEVICE)),
     WithJsonSchema({"type": "string", "minLength": 1, "examples": ["/dev/ttyUSB0", "COM3"]}),
+]
+StatusName = Annotated[
+    str,
+    PlainValidator(_status_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_STATUS_NAME}$"}),
 ]
 MqttText = Annotated[
     str,

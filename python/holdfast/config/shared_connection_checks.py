@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from holdfast.client.tolerance import STRICT, Tolerance
 from holdfast.client.url import SerialTarget, parse
-from holdfast.config.devices import ToleranceConfig
+from holdfast.config.devices import RetryConfig, ToleranceConfig
 from holdfast.config.files import check_readable
 from holdfast.config.lenient import entries, fitting, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES
@@ -38,6 +38,7 @@ class _Shared:
 
     tolerance: Tolerance
     in_flight: object
+    retry: RetryConfig
 
 
 @dataclass
@@ -51,7 +52,7 @@ class AddressChecks:
     report: Report
 
     def __post_init__(self) -> None:
-        self._lines: dict[str, tuple[KeyPath, SerialTarget]] = {}
+        self._lines: dict[str, tuple[KeyPath, SerialTarget, RetryConfig]] = {}
         self._addresses: dict[tuple[str, str, int], tuple[KeyPath, _Shared]] = {}
 
     def check(self, data: dict[Any, Any]) -> None:
@@ -69,10 +70,11 @@ class AddressChecks:
         if target is None:
             return
         target = self._tolerance(path, target, user)
+        retry = self._retry(path, user)
         if isinstance(target, SerialTarget):
-            self._line(path, target, user, taken)
+            self._line(path, target, retry, user, taken)
             return
-        self._shared(path, target, user)
+        self._shared(path, target, retry, user)
         for key, file in target.tls.files():
             where, shown = (*path, "url"), f"{key}={show(file)}"
             check_readable(where, file, self.folder, self.report, shown=shown)
@@ -93,10 +95,20 @@ class AddressChecks:
         tolerance = STRICT if found is None else Tolerance(**found.model_dump())
         return replace(target, tolerance=tolerance)
 
-    def _shared(self, path: KeyPath, target: NetworkTarget, user: dict[Any, Any]) -> None:
+    def _retry(self, path: KeyPath, user: dict[Any, Any]) -> RetryConfig:
+        """The pauses of a device or link; the default if they are invalid."""
+        found = fitting(TypeAdapter(RetryConfig), user.get("retry", {})) or RetryConfig()
+        if found.first > found.most:
+            message = f"found {found.first:g}, allowed: up to most, which is {found.most:g}"
+            self.report.add((*path, "retry", "first"), message)
+        return found
+
+    def _shared(
+        self, path: KeyPath, target: NetworkTarget, retry: RetryConfig, user: dict[Any, Any]
+    ) -> None:
         """What all at one network address share."""
         key = (target.transport, target.host, target.port)
-        settings = _Shared(target.tolerance, user.get("in_flight", 1))
+        settings = _Shared(target.tolerance, user.get("in_flight", 1), retry)
         first, other = self._addresses.setdefault(key, (path, settings))
         if first == path:
             return
@@ -105,18 +117,25 @@ class AddressChecks:
             return
         if first[0] == "links":
             settings = _Shared(
-                _tolerated(target, user, other.tolerance), user.get("in_flight", other.in_flight)
+                _tolerated(target, user, other.tolerance),
+                user.get("in_flight", other.in_flight),
+                retry if "retry" in user else other.retry,
             )
-        if settings != other:
-            differs = "in_flight" if settings.in_flight != other.in_flight else "tolerance"
-            where = (*path, differs if differs in user else "url")
-            message = f"found another {differs} than {self._named(first)} has at this address"
-            self.report.add(where, f"{message}, allowed: the same")
+        for differs in ("in_flight", "tolerance", "retry"):
+            if getattr(settings, differs) != getattr(other, differs):
+                self._different(path, differs, user, first)
+                return
+
+    def _different(self, path: KeyPath, differs: str, user: dict[Any, Any], first: KeyPath) -> None:
+        where = (*path, differs if differs in user else "url")
+        message = f"found another {differs} than {self._named(first)} has at this address"
+        self.report.add(where, f"{message}, allowed: the same")
 
     def _line(
         self,
         path: KeyPath,
         target: SerialTarget,
+        retry: RetryConfig,
         user: dict[Any, Any],
         taken: dict[str, KeyPath],
     ) -> None:
@@ -130,7 +149,7 @@ class AddressChecks:
         port = os.path.realpath(target.device)
         if port in taken:
             self._taken((*path, "url"), target.device, taken[port])
-        first, other = self._lines.setdefault(port, (path, target))
+        first, other, pauses = self._lines.setdefault(port, (path, target, retry))
         if path[0] == "links" and first != path:
             self._second_link(path, first)
             return
@@ -139,6 +158,8 @@ class AddressChecks:
         if replace(target, device=other.device) != other:
             message = f"found line settings that differ from those of {self._named(first)}"
             self.report.add((*path, "url"), f"{message}, allowed: the same settings")
+        elif retry != pauses and not (first[0] == "links" and "retry" not in user):
+            self._different(path, "retry", user, first)
 
     def _second_link(self, path: KeyPath, first: KeyPath) -> None:
         message = f"found the address of {self._named(first)}, allowed: one link for each address"
@@ -146,7 +167,7 @@ class AddressChecks:
 
     def _subscribed(self, devices: list[Any], taken: dict[str, KeyPath]) -> None:
         """Reports serial lines of the scanner that a device, a link or a listener uses."""
-        lines = {port: path for port, (path, _) in self._lines.items()} | taken
+        lines = {port: path for port, (path, *_) in self._lines.items()} | taken
         for index, device in enumerate(devices):
             entry = parsed(parse_pollable, device)
             port = os.path.realpath(entry.path) if isinstance(entry, AllowedDevice) else None

@@ -7,6 +7,7 @@ use std::time::Duration;
 use holdfast_protocol::pdu::EncodedRequest;
 use tokio::time::Instant;
 
+use super::backoff::Retry;
 use super::blocking::BlockingLink;
 use super::fault::{Answer, Exchanged, fault};
 use super::pace::{InFlight, Pace, Place as Turn};
@@ -20,6 +21,8 @@ const POLLER: u64 = 0;
 pub(crate) struct Link {
     pub(super) pace: Pace,
     pub(super) wire: Wire,
+    /// When an address that cannot be reached, or a unit that does not answer, is tried again.
+    pub(crate) retry: Retry,
     /// Grows whenever a device may have changed by a request.
     pub(super) changes: Cell<u64>,
 }
@@ -31,18 +34,18 @@ pub(super) enum Wire {
 
 impl Link {
     /// Must be called in the context of a `LocalSet`.
-    pub(crate) fn new(endpoint: Endpoint, in_flight: InFlight) -> Rc<Link> {
+    pub(crate) fn new(endpoint: Endpoint, in_flight: InFlight, retry: Retry) -> Rc<Link> {
         let one = InFlight::Fixed(1);
         let url = endpoint.to_string();
         let (wire, in_flight) = match endpoint.place {
             Place::Tcp { host, port, tls } => {
                 let is_one = endpoint.tolerance.is_one_at_a_time();
-                let link = TcpLink::new((host, port), tls, endpoint.tolerance, url);
+                let link = TcpLink::new((host, port), tls, (endpoint.tolerance, retry), url);
                 (Wire::Tcp(Box::new(link)), if is_one { one } else { in_flight })
             }
-            _ => (Wire::Blocking(BlockingLink::new(endpoint)), one),
+            _ => (Wire::Blocking(BlockingLink::new(endpoint, retry)), one),
         };
-        Rc::new(Link { pace: Pace::new(in_flight), wire, changes: Cell::default() })
+        Rc::new(Link { pace: Pace::new(in_flight), wire, retry, changes: Cell::default() })
     }
 
     /// Sends a request of the poller when it is its turn, and waits for the answer. `timeout` does not

@@ -1,32 +1,57 @@
-//! Pauses after failures: 1 s, doubled with each failure up to a limit, and randomized.
+//! Pauses after failures: doubled with each failure up to a limit, and randomized.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
 
-const FIRST: Duration = Duration::from_secs(1);
+/// When a device that does not answer is tried again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Retry {
+    /// The pause after the first failure.
+    pub first: Duration,
+    /// The longest pause.
+    pub most: Duration,
+}
 
-/// The longest pause before a device is asked again.
-pub(crate) const MAX_PAUSE: Duration = Duration::from_secs(60);
+impl Default for Retry {
+    fn default() -> Retry {
+        Retry { first: Duration::from_secs(1), most: Duration::from_secs(60) }
+    }
+}
 
-/// The pause after `failures` consecutive failures, at least one. It is up to a quarter shorter at
-/// random, so that devices that failed together are not retried together.
-pub(crate) fn pause(failures: u32, longest: Duration) -> Duration {
-    let doubled = FIRST.saturating_mul(1u32 << failures.saturating_sub(1).min(6)).min(longest);
-    // The keys of a hasher are random, which suffices here.
-    let chance = RandomState::new().hash_one(failures) as u32;
-    doubled.mul_f64(1.0 - 0.25 * f64::from(chance) / f64::from(u32::MAX))
+impl Retry {
+    /// With no pause longer than this.
+    pub(crate) fn up_to(self, most: Duration) -> Retry {
+        Retry { most: self.most.min(most), ..self }
+    }
+
+    /// The pause after `failures` consecutive failures, at least one. It is up to a quarter shorter
+    /// at random, so that devices that failed together are not retried together.
+    pub(crate) fn pause(self, failures: u32) -> Duration {
+        let doubled = self.first.saturating_mul(1 << failures.saturating_sub(1).min(31));
+        // The keys of a hasher are random, which suffices here.
+        let chance = RandomState::new().hash_one(failures) as u32;
+        doubled.min(self.most).mul_f64(1.0 - 0.25 * f64::from(chance) / f64::from(u32::MAX))
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn check(retry: Retry, failures: u32, most: Duration) {
+        let found = retry.pause(failures);
+        assert!(found <= most && found >= most.mul_f64(0.75), "{failures}: {found:?}");
+    }
+
     #[test]
     fn pauses_double_up_to_a_limit() {
         for (failures, most) in [(1, 1), (2, 2), (3, 4), (6, 32), (7, 60), (8, 60), (4000, 60)] {
-            let most = Duration::from_secs(most);
-            let found = pause(failures, MAX_PAUSE);
-            assert!(found <= most && found >= most.mul_f64(0.75), "{failures}: {found:?}");
+            check(Retry::default(), failures, Duration::from_secs(most));
+        }
+        let soon = Retry { first: Duration::from_millis(50), most: Duration::from_secs(3600) };
+        for (failures, most) in [(1, 50), (5, 800), (13, 204_800), (32, 3_600_000)] {
+            check(soon, failures, Duration::from_millis(most));
+            check(soon.up_to(soon.first), failures, soon.first);
         }
     }
 }

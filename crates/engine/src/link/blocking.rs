@@ -9,7 +9,7 @@ use holdfast_protocol::pdu::EncodedRequest;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 
-use super::backoff;
+use super::backoff::Retry;
 use super::fault::{Exchanged, Fault, fault};
 use crate::client::{BlockingClient, ClientError, Endpoint, Lost};
 
@@ -40,7 +40,7 @@ struct Call {
 }
 
 impl BlockingLink {
-    pub(super) fn new(endpoint: Endpoint) -> BlockingLink {
+    pub(super) fn new(endpoint: Endpoint, retry: Retry) -> BlockingLink {
         let (jobs, queue) = mpsc::channel::<Job>();
         let client = BlockingClient::new(endpoint);
         let work = move || {
@@ -50,7 +50,7 @@ impl BlockingLink {
                     // A stopped device no longer waits for its read.
                     Job::Call(call) if call.answer.is_closed() => {}
                     Job::Call(call) => {
-                        let answer = carried_out(&client, &call, &mut failed);
+                        let answer = carried_out(&client, retry, &call, &mut failed);
                         let retry_at = failed.as_ref().map(|failed| failed.until);
                         let _ = call.answer.send((answer, retry_at));
                     }
@@ -91,7 +91,12 @@ impl BlockingLink {
     }
 }
 
-fn carried_out(client: &BlockingClient, call: &Call, failed: &mut Option<Failed>) -> Exchanged {
+fn carried_out(
+    client: &BlockingClient,
+    retry: Retry,
+    call: &Call,
+    failed: &mut Option<Failed>,
+) -> Exchanged {
     if let Some(Failed { until, error, .. }) = failed
         && !call.eager
         && Instant::now() < *until
@@ -103,7 +108,7 @@ fn carried_out(client: &BlockingClient, call: &Call, failed: &mut Option<Failed>
     *failed = match &answer {
         Err(error) if fault(error) == Fault::Refused => {
             let attempts = failed.take().map_or(0, |failed| failed.attempts).saturating_add(1);
-            let until = Instant::now() + backoff::pause(attempts, backoff::MAX_PAUSE);
+            let until = Instant::now() + retry.pause(attempts);
             Some(Failed { attempts, until, error: Arc::clone(error) })
         }
         _ => None,

@@ -9,7 +9,7 @@
 //! `holdfast_protocol`, decides when a connection ends. The next request opens a new one.
 
 mod access;
-pub(crate) mod backoff;
+mod backoff;
 mod blocking;
 mod caller;
 mod coming;
@@ -24,6 +24,7 @@ mod silence;
 mod tcp;
 
 pub(crate) use access::Link;
+pub use backoff::Retry;
 pub use caller::{Called, Caller, Wakes};
 pub(crate) use coming::{Coming, ReplyTo, coming};
 pub use fault::Fault;

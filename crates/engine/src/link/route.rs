@@ -8,6 +8,7 @@ use std::time::Duration;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use tokio::sync::mpsc;
 
+use super::backoff::Retry;
 use super::caller::{Caller, Waiting};
 use super::coming::{Coming, ReplyTo, coming};
 use super::pace::InFlight;
@@ -22,6 +23,7 @@ pub struct LinkSettings {
     pub endpoint: Endpoint,
     /// Requests in flight, over TCP.
     pub in_flight: InFlight,
+    pub retry: Retry,
     /// The most requests that wait or are in flight, without those of the poller.
     pub queue: usize,
     /// Whether equal reads that wait at the same time are answered by one request.

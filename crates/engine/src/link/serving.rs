@@ -24,8 +24,8 @@ pub(crate) async fn serve(
     mut calls: mpsc::UnboundedReceiver<Call>,
 ) {
     let reads = SharedReads::new(settings.coalesce, settings.cache);
-    let serving =
-        Rc::new(Serving { link, reads, silence: Silence::default(), error: RefCell::default() });
+    let silence = Silence::new(link.retry);
+    let serving = Rc::new(Serving { link, reads, silence, error: RefCell::default() });
     while let Some(call) = calls.recv().await {
         let Some(shared) = shared.upgrade() else { return };
         spawn_local(Rc::clone(&serving).carry_out(call, shared));

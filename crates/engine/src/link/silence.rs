@@ -8,7 +8,7 @@ use std::time::Duration;
 use holdfast_protocol::pdu::ExceptionCode;
 use tokio::time::Instant;
 
-use super::backoff;
+use super::backoff::Retry;
 use super::fault::Fault;
 
 /// Timeouts in a row after which requests to a unit are refused for a while.
@@ -17,8 +17,8 @@ const SILENT_AFTER: u32 = 3;
 /// The longest time for which requests are refused without a try: somebody waits for them.
 const MAX_PAUSE: Duration = Duration::from_secs(5);
 
-#[derive(Default)]
 pub(super) struct Silence {
+    retry: Retry,
     units: RefCell<HashMap<u8, Pause>>,
     address: Cell<Option<Pause>>,
 }
@@ -32,11 +32,11 @@ struct Pause {
 
 impl Pause {
     /// After one more failure. The first `free` failures cause no pause.
-    fn longer(before: Option<Pause>, free: u32) -> Pause {
+    fn longer(before: Option<Pause>, free: u32, retry: Retry) -> Pause {
         let failures = before.map_or(1, |pause| pause.failures.saturating_add(1));
         let pause = match failures.checked_sub(free) {
             None | Some(0) => Duration::ZERO,
-            Some(counted) => backoff::pause(counted, MAX_PAUSE),
+            Some(counted) => retry.pause(counted),
         };
         Pause { failures, until: Instant::now() + pause }
     }
@@ -47,6 +47,11 @@ impl Pause {
 }
 
 impl Silence {
+    pub(super) fn new(retry: Retry) -> Silence {
+        let (units, address) = Default::default();
+        Silence { retry: retry.up_to(MAX_PAUSE), units, address }
+    }
+
     /// Whether a request is refused without a try.
     pub(super) fn refuse(&self, unit_id: u8) -> Result<(), ExceptionCode> {
         if self.address.get().is_some_and(|pause| pause.lasts()) {
@@ -62,12 +67,12 @@ impl Silence {
     /// reached.
     pub(super) fn learn(&self, unit_id: u8, answered: Result<(), Fault>, is_unreachable: bool) {
         if answered.is_err() && is_unreachable {
-            return self.address.set(Some(Pause::longer(self.address.get(), 0)));
+            return self.address.set(Some(Pause::longer(self.address.get(), 0, self.retry)));
         }
         self.address.set(None);
         let mut units = self.units.borrow_mut();
         if answered == Err(Fault::Timeout) {
-            let pause = Pause::longer(units.get(&unit_id).copied(), SILENT_AFTER - 1);
+            let pause = Pause::longer(units.get(&unit_id).copied(), SILENT_AFTER - 1, self.retry);
             units.insert(unit_id, pause);
         } else {
             units.remove(&unit_id);
@@ -88,7 +93,7 @@ mod tests {
 
     #[test]
     fn a_unit_is_left_alone_after_some_timeouts_and_others_are_not() {
-        let silence = Silence::default();
+        let silence = Silence::new(Retry::default());
         for _ in 1..SILENT_AFTER {
             silence.learn(7, SILENT, false);
             assert_eq!(silence.refuse(7), Ok(()));
@@ -104,7 +109,7 @@ mod tests {
 
     #[test]
     fn an_address_that_can_not_be_reached_is_left_alone_at_once() {
-        let silence = Silence::default();
+        let silence = Silence::new(Retry::default());
         silence.learn(7, Err(Fault::Refused), true);
         assert_eq!(silence.refuse(8), Err(ExceptionCode::GatewayPathUnavailable));
         silence.learn(8, Ok(()), false);

@@ -18,7 +18,7 @@ use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
-use super::backoff;
+use super::backoff::Retry;
 use super::fault::Exchanged;
 use super::handshake;
 use super::pace::Pace;
@@ -37,6 +37,7 @@ pub(super) struct TcpLink {
     port: u16,
     tls: Option<Arc<ClientTls>>,
     tolerance: Tolerance,
+    retry: Retry,
     /// For errors.
     url: String,
     connecting: Mutex<()>,
@@ -69,7 +70,7 @@ impl TcpLink {
     pub(super) fn new(
         (host, port): (String, u16),
         tls: Option<Arc<ClientTls>>,
-        tolerance: Tolerance,
+        (tolerance, retry): (Tolerance, Retry),
         url: String,
     ) -> TcpLink {
         TcpLink {
@@ -77,6 +78,7 @@ impl TcpLink {
             port,
             tls,
             tolerance,
+            retry,
             url,
             connecting: Mutex::default(),
             failures: Cell::default(),
@@ -179,7 +181,7 @@ impl TcpLink {
         };
         let error = Arc::new(error);
         self.failures.set(self.failures.get().saturating_add(1));
-        let pause = backoff::pause(self.failures.get(), backoff::MAX_PAUSE);
+        let pause = self.retry.pause(self.failures.get());
         self.failed.replace(Some((Instant::now() + pause, Arc::clone(&error))));
         Err(error)
     }
@@ -410,7 +412,8 @@ mod tests {
             let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
             let tolerance = Tolerance { close_after: 100, ..Tolerance::default() };
             let place = Place::Tcp { host, port, tls: None };
-            let link = Link::new(Endpoint { place, tolerance }, InFlight::Fixed(1));
+            let link =
+                Link::new(Endpoint { place, tolerance }, InFlight::Fixed(1), Retry::default());
             let range = Range::new(0, 1).unwrap();
             let read = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
 

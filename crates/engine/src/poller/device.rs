@@ -37,8 +37,7 @@ use super::turn::Turn;
 use crate::client::Endpoint;
 use crate::link::Fault;
 use crate::link::Link;
-use crate::link::backoff;
-use crate::link::{InFlight, Priority};
+use crate::link::{InFlight, Priority, Retry};
 
 /// The longest interval between writes of the status block.
 const TELLING: Duration = Duration::from_secs(1);
@@ -56,8 +55,10 @@ pub struct DeviceSettings {
     pub name: String,
     pub endpoint: Endpoint,
     /// Requests in flight at its address, over TCP. Of devices that share an address, the first one
-    /// decides this and [`Endpoint::tolerance`].
+    /// decides this, `retry` and [`Endpoint::tolerance`].
     pub in_flight: InFlight,
+    /// When it is tried again if it cannot be reached or does not answer.
+    pub retry: Retry,
     pub unit_id: u8,
     /// The time between polls; 0 polls without a pause.
     pub interval: Duration,
@@ -354,7 +355,7 @@ impl Device {
     }
 
     async fn tell_for_ever(&self) -> Infallible {
-        if self.settings.status.is_none() {
+        if self.settings.status.is_none() && !self.forwards.iter().any(|forward| forward.tells()) {
             pending::<()>().await;
         }
         loop {
@@ -367,9 +368,8 @@ impl Device {
     fn rest(&self) -> Option<Instant> {
         let silent = self.silent.get();
         self.link.retry_at().or_else(|| {
-            (silent >= DEAD_AFTER).then(|| {
-                Instant::now() + backoff::pause(silent - DEAD_AFTER + 1, backoff::MAX_PAUSE)
-            })
+            (silent >= DEAD_AFTER)
+                .then(|| Instant::now() + self.link.retry.pause(silent - DEAD_AFTER + 1))
         })
     }
 
@@ -612,10 +612,14 @@ impl Device {
     }
 
     fn tell(&self) {
+        let status = self.state.status();
         if let Some(to) = &self.settings.status
-            && self.state.status().write(&self.settings.name, to).is_err()
+            && status.write(to).is_err()
         {
             self.count_unstored();
+        }
+        for forward in &self.forwards {
+            forward.tell(&status);
         }
     }
 

@@ -11,6 +11,8 @@ pub enum Health {
     Error,
     /// The device answers, but its polls are late.
     Stale,
+    /// The device is switched off in the configuration.
+    Disabled,
 }
 
 impl Health {
@@ -37,6 +39,7 @@ impl Health {
             1 => Health::Ok,
             2 => Health::Error,
             3 => Health::Stale,
+            4 => Health::Disabled,
             _ => unreachable!("no health has the code {code}"),
         }
     }
@@ -47,6 +50,7 @@ impl Health {
             Health::Ok => 1,
             Health::Error => 2,
             Health::Stale => 3,
+            Health::Disabled => 4,
         }
     }
 
@@ -56,6 +60,7 @@ impl Health {
             Health::Ok => "ok",
             Health::Error => "error",
             Health::Stale => "stale",
+            Health::Disabled => "disabled",
         }
     }
 }

@@ -27,6 +27,6 @@ pub use raw_ingest::{ForwardCounters, ForwardSettings};
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};
-pub use status::StatusSettings;
+pub use status::{BlockSettings, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};
 pub use write_through::{Passage, PassedRange};

@@ -16,8 +16,9 @@ use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
 
+use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
-use crate::link::backoff;
+use crate::link::Retry;
 use crate::packet_area::in_packet;
 
 /// The longest pause before a target that is down is tried again.
@@ -32,6 +33,25 @@ pub struct ForwardSettings {
     /// The unit id (v1) or memory id (crc) in packets.
     pub target: u16,
     pub timeout: Duration,
+    /// Added to the addresses of reads, for each area; 0 for other areas.
+    pub offsets: Vec<(Area, u16)>,
+    /// The status block of the device, with the unit id or memory id in its packets.
+    pub status: Option<(u16, BlockSettings)>,
+}
+
+impl ForwardSettings {
+    /// The address in packets; `None` beyond 65535.
+    pub(super) fn address(&self, area: Area, address: u16) -> Option<u16> {
+        let offset = self.offsets.iter().find(|(of, _)| *of == area);
+        address.checked_add(offset.map_or(0, |(_, offset)| *offset))
+    }
+}
+
+/// What a packet has: a read, by its index, or the status block.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Content {
+    Read(usize),
+    Status,
 }
 
 /// Counters of forwarded packets.
@@ -53,40 +73,42 @@ pub(super) struct Forward {
     waiting: RefCell<Waiting>,
     news: Notify,
     failures: Cell<u32>,
+    /// The status block that was offered last.
+    told: RefCell<Vec<u8>>,
 }
 
-/// The newest unsent packet of each read, in the order of arrival.
+/// The newest unsent packet of each content, in the order of arrival.
 #[derive(Default)]
 struct Waiting {
-    order: VecDeque<usize>,
-    newest: HashMap<usize, Vec<u8>>,
+    order: VecDeque<Content>,
+    newest: HashMap<Content, Vec<u8>>,
 }
 
 impl Waiting {
     /// Queues a packet. Returns whether it replaced an older one.
-    fn put(&mut self, read: usize, packet: Vec<u8>) -> bool {
-        let replaced = self.newest.insert(read, packet).is_some();
+    fn put(&mut self, of: Content, packet: Vec<u8>) -> bool {
+        let replaced = self.newest.insert(of, packet).is_some();
         if !replaced {
-            self.order.push_back(read);
+            self.order.push_back(of);
         }
         replaced
     }
 
     /// Puts back a packet that was not sent. Returns whether there is already a newer one.
-    fn put_back(&mut self, read: usize, packet: Vec<u8>) -> bool {
-        let outdated = self.newest.contains_key(&read);
+    fn put_back(&mut self, of: Content, packet: Vec<u8>) -> bool {
+        let outdated = self.newest.contains_key(&of);
         if !outdated {
-            self.newest.insert(read, packet);
-            self.order.push_front(read);
+            self.newest.insert(of, packet);
+            self.order.push_front(of);
         }
         outdated
     }
 
-    fn take(&mut self) -> Option<(usize, Vec<u8>)> {
+    fn take(&mut self) -> Option<(Content, Vec<u8>)> {
         debug_assert_eq!(self.order.len(), self.newest.len());
-        let read = self.order.pop_front()?;
-        let packet = self.newest.remove(&read).expect("a read in the order has a packet");
-        Some((read, packet))
+        let of = self.order.pop_front()?;
+        let packet = self.newest.remove(&of).expect("what is in the order has a packet");
+        Some((of, packet))
     }
 }
 
@@ -98,6 +120,7 @@ impl Forward {
             waiting: RefCell::default(),
             news: Notify::new(),
             failures: Cell::new(0),
+            told: RefCell::default(),
         })
     }
 
@@ -110,12 +133,40 @@ impl Forward {
         count: NonZeroU16,
         bytes: &[u8],
     ) {
+        let address = self.settings.address(area, address);
+        let address = address.expect("offsets are checked when the device is made");
         let area = in_packet(area);
         let header = Header { area, target: self.settings.target, address, count };
-        let mut packet = Vec::with_capacity(self.settings.format.packet_len(&header));
-        let encoded = self.settings.format.encode(&header, bytes, &mut packet);
-        encoded.expect("the length of a read matches its count");
-        if self.waiting.borrow_mut().put(read, packet) {
+        self.queue(Content::Read(read), &header, bytes);
+    }
+
+    /// Whether the receiver gets the status block.
+    pub(super) fn tells(&self) -> bool {
+        self.settings.status.is_some()
+    }
+
+    /// Queues the status block, if the receiver gets it and it has changed. Never waits.
+    pub(super) fn tell(&self, status: &Status) {
+        let Some((target, block)) = &self.settings.status else { return };
+        let bytes = status.bytes(block);
+        if *self.told.borrow() == bytes {
+            return;
+        }
+        let header = Header {
+            area: in_packet(block.area),
+            target: *target,
+            address: block.address().expect("the block is checked when the device is made"),
+            count: const { NonZeroU16::new(STATUS_BLOCK_LEN).unwrap() },
+        };
+        self.queue(Content::Status, &header, &bytes);
+        self.told.replace(bytes);
+    }
+
+    fn queue(&self, of: Content, header: &Header, bytes: &[u8]) {
+        let mut packet = Vec::with_capacity(self.settings.format.packet_len(header));
+        let encoded = self.settings.format.encode(header, bytes, &mut packet);
+        encoded.expect("the length of the bytes matches their count");
+        if self.waiting.borrow_mut().put(of, packet) {
             self.counters.replaced.add();
         }
         self.news.notify_one();
@@ -125,7 +176,7 @@ impl Forward {
     pub(super) async fn run(self: Rc<Forward>) {
         loop {
             let next = self.waiting.borrow_mut().take();
-            let Some((read, packet)) = next else {
+            let Some((of, packet)) = next else {
                 self.news.notified().await;
                 continue;
             };
@@ -137,11 +188,11 @@ impl Forward {
                 }
                 Ok(Err(_)) | Err(_) => {
                     self.counters.failed.add();
-                    if self.waiting.borrow_mut().put_back(read, packet) {
+                    if self.waiting.borrow_mut().put_back(of, packet) {
                         self.counters.replaced.add();
                     }
                     self.failures.set(self.failures.get().saturating_add(1));
-                    sleep(backoff::pause(self.failures.get(), MAX_PAUSE)).await;
+                    sleep(Retry::default().up_to(MAX_PAUSE).pause(self.failures.get())).await;
                 }
             }
         }
@@ -162,16 +213,17 @@ mod tests {
     #[test]
     fn reads_take_turns_and_newer_bytes_replace_older_ones() {
         let mut waiting = Waiting::default();
-        assert!(!waiting.put(0, vec![1]) && !waiting.put(1, vec![2]));
-        let (read, packet) = waiting.take().unwrap();
-        assert_eq!((read, &packet[..]), (0, &[1][..]));
-        assert!(!waiting.put(0, vec![3]) && waiting.put(0, vec![4]));
-        assert!(waiting.put_back(read, packet));
-        let (read, packet) = waiting.take().unwrap();
-        assert_eq!((read, &packet[..]), (1, &[2][..]));
-        assert!(!waiting.put_back(read, packet));
-        assert_eq!(waiting.take(), Some((1, vec![2])));
-        assert_eq!(waiting.take(), Some((0, vec![4])));
+        let (first, second) = (Content::Read(0), Content::Status);
+        assert!(!waiting.put(first, vec![1]) && !waiting.put(second, vec![2]));
+        let (of, packet) = waiting.take().unwrap();
+        assert_eq!((of, &packet[..]), (first, &[1][..]));
+        assert!(!waiting.put(first, vec![3]) && waiting.put(first, vec![4]));
+        assert!(waiting.put_back(of, packet));
+        let (of, packet) = waiting.take().unwrap();
+        assert_eq!((of, &packet[..]), (second, &[2][..]));
+        assert!(!waiting.put_back(of, packet));
+        assert_eq!(waiting.take(), Some((second, vec![2])));
+        assert_eq!(waiting.take(), Some((first, vec![4])));
         assert_eq!(waiting.take(), None);
     }
 }

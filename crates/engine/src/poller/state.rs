@@ -41,8 +41,9 @@ pub struct DeviceCounters {
     pub exceptions: Counter,
     pub timeouts: Counter,
     pub transport_errors: Counter,
-    /// Polls carried out.
+    /// Polls carried out, and those of them that read everything.
     pub polls: Counter,
+    pub good_polls: Counter,
     /// Polls that could not begin in time.
     pub missed: Counter,
     /// Polls not carried out because the device has no plan.
@@ -136,6 +137,7 @@ impl DeviceState {
 
     /// Records a complete poll.
     pub(super) fn good(&self) {
+        self.counters.good_polls.add();
         self.times().error_since = None;
         self.failures.store(0, Ordering::Relaxed);
         self.health.store(Health::Ok.code(), Ordering::Relaxed);
@@ -155,8 +157,8 @@ impl DeviceState {
             health: self.health(),
             last_error: self.last_error(),
             seconds_in_error: saturated(self.in_error().as_secs()),
-            requests: counters.requests.get() as u32,
-            valid: counters.valid.get() as u32,
+            polls: counters.polls.get() as u32,
+            good_polls: counters.good_polls.get() as u32,
             timeouts: counters.timeouts.get() as u32,
             transport_errors: counters.transport_errors.get() as u32,
             failures: saturated(self.failures().into()),

@@ -12,25 +12,51 @@ pub const STATUS_BLOCK_LEN: u16 = 30;
 /// The size of the device name, in bytes.
 const NAME: usize = 16;
 
-/// The place of the block of a device: at `slot` × 30 of an area of registers.
+/// Place and content of the block of a device: at `slot` × 30 of an area of registers.
+#[derive(Debug, Clone)]
+pub struct BlockSettings {
+    pub area: Area,
+    pub slot: u16,
+    /// The name in the block.
+    pub name: String,
+    /// Whether the last error stays after a recovery.
+    pub keep_last_error: bool,
+}
+
+impl BlockSettings {
+    /// The first register of the block; `None` if an address of the block is beyond 65535.
+    pub(super) fn address(&self) -> Option<u16> {
+        let address = self.slot.checked_mul(STATUS_BLOCK_LEN)?;
+        address.checked_add(STATUS_BLOCK_LEN - 1).map(|_| address)
+    }
+
+    /// Whether the area has registers at these addresses.
+    pub(super) fn is_possible(&self) -> bool {
+        !self.area.is_bits() && self.address().is_some()
+    }
+}
+
+/// The memory that has the block of a device.
 #[derive(Debug, Clone)]
 pub struct StatusSettings {
     pub memory: Arc<Memory>,
-    pub area: Area,
-    pub slot: u16,
+    pub block: BlockSettings,
 }
 
 impl StatusSettings {
-    /// The first register of the block; `None` beyond address 65535.
-    fn address(&self) -> Option<u16> {
-        self.slot.checked_mul(STATUS_BLOCK_LEN)
+    /// Writes the block of a device that is not polled.
+    ///
+    /// # Errors
+    /// As [`Status::write`].
+    pub fn tell_disabled(&self) -> Result<(), Refusal> {
+        Status { health: Health::Disabled, ..Status::default() }.write(self)
     }
 
     /// Whether the memory has the registers of the block.
     pub(super) fn fits(&self) -> bool {
-        let span = self.memory.span(self.area);
+        let span = self.memory.span(self.block.area);
         let inside = |address| span.holds(address, usize::from(STATUS_BLOCK_LEN));
-        !self.area.is_bits() && self.address().is_some_and(inside)
+        self.block.is_possible() && self.block.address().is_some_and(inside)
     }
 }
 
@@ -40,8 +66,8 @@ pub struct Status {
     pub health: Health,
     pub last_error: u16,
     pub seconds_in_error: u16,
-    pub requests: u32,
-    pub valid: u32,
+    pub polls: u32,
+    pub good_polls: u32,
     pub timeouts: u32,
     pub transport_errors: u32,
     pub failures: u16,
@@ -49,19 +75,22 @@ pub struct Status {
 }
 
 impl Status {
-    fn registers(&self, name: &str) -> [u16; STATUS_BLOCK_LEN as usize] {
+    fn registers(&self, settings: &BlockSettings) -> [u16; STATUS_BLOCK_LEN as usize] {
         let mut block = [0; STATUS_BLOCK_LEN as usize];
         block[0] = self.health.code();
-        block[1] = self.last_error;
+        if self.failures > 0 || settings.keep_last_error {
+            block[1] = self.last_error;
+        }
         block[2] = self.seconds_in_error;
         let mut text = [0; NAME];
-        for (byte, character) in text.iter_mut().zip(name.bytes()) {
-            *byte = if character.is_ascii_graphic() { character } else { b'?' };
+        for (byte, character) in text.iter_mut().zip(settings.name.bytes()) {
+            let is_shown = character.is_ascii_graphic() || character == b' ';
+            *byte = if is_shown { character } else { b'?' };
         }
         for (register, pair) in block[3..11].iter_mut().zip(text.as_chunks::<2>().0) {
             *register = u16::from_be_bytes(*pair);
         }
-        let counters = [self.requests, self.valid, self.timeouts, self.transport_errors];
+        let counters = [self.polls, self.good_polls, self.timeouts, self.transport_errors];
         for (pair, counter) in block[20..28].as_chunks_mut::<2>().0.iter_mut().zip(counters) {
             *pair = [counter as u16, (counter >> 16) as u16];
         }
@@ -70,16 +99,20 @@ impl Status {
         block
     }
 
+    /// The bytes of the registers of the block.
+    pub fn bytes(&self, settings: &BlockSettings) -> Vec<u8> {
+        self.registers(settings).iter().flat_map(|register| register.to_be_bytes()).collect()
+    }
+
     /// Writes the block, atomically.
     ///
     /// # Errors
     /// [`Refusal::OutOfRange`] when the block does not fit. Nothing has changed then.
-    pub fn write(&self, name: &str, to: &StatusSettings) -> Result<(), Refusal> {
-        let bytes: Vec<u8> =
-            self.registers(name).iter().flat_map(|register| register.to_be_bytes()).collect();
+    pub fn write(&self, to: &StatusSettings) -> Result<(), Refusal> {
+        let bytes = self.bytes(&to.block);
         let write = Write {
-            area: to.area,
-            address: to.address().ok_or(Refusal::OutOfRange)?,
+            area: to.block.area,
+            address: to.block.address().ok_or(Refusal::OutOfRange)?,
             count: usize::from(STATUS_BLOCK_LEN),
             bytes: &bytes,
         };
@@ -98,17 +131,29 @@ mod tests {
             health: Health::Error,
             last_error: Fault::Timeout.code(),
             seconds_in_error: 7,
-            requests: 0x0001_0002,
-            valid: 3,
+            polls: 0x0001_0002,
+            good_polls: 3,
             timeouts: 4,
             transport_errors: 5,
             failures: 6,
             most_failures: 8,
         };
-        let block = status.registers("meter_1 and more than sixteen");
+        let mut settings = BlockSettings {
+            area: Area::InputRegisters,
+            slot: 0,
+            name: "meter_1 and more than sixteen".into(),
+            keep_last_error: false,
+        };
+        let block = status.registers(&settings);
         assert_eq!(block[..3], [2, 0x8001, 7]);
-        assert_eq!(block[3..11], [0x6D65, 0x7465, 0x725F, 0x313F, 0x616E, 0x643F, 0x6D6F, 0x7265]);
+        assert_eq!(block[3..11], [0x6D65, 0x7465, 0x725F, 0x3120, 0x616E, 0x6420, 0x6D6F, 0x7265]);
         assert_eq!(block[11..20], [0; 9]);
         assert_eq!(block[20..], [2, 1, 3, 0, 4, 0, 5, 0, 6, 8]);
+        let recovered = Status { failures: 0, ..status };
+        assert_eq!(recovered.registers(&settings)[1], 0);
+        settings.keep_last_error = true;
+        assert_eq!(recovered.registers(&settings)[1], 0x8001);
+        settings.name = "a\tb\u{e9}".into();
+        assert_eq!(recovered.registers(&settings)[3..6], [0x613F, 0x623F, 0x3F00]);
     }
 }

@@ -19,13 +19,13 @@ use tokio::task::{AbortHandle, LocalSet, spawn_local};
 use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned};
 use super::plan::{PlanError, PlanLimits};
-use super::raw_ingest::{Forward, ForwardCounters};
+use super::raw_ingest::{Forward, ForwardCounters, ForwardSettings};
 use super::results::{Results, Written};
 use super::state::DeviceState;
 use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
-use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, SharedLink, serve};
+use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, serve};
 use crate::tls::client::Identity;
 
 #[derive(Debug, Error)]
@@ -40,6 +40,10 @@ pub enum PollerError {
     Beyond { device: String, read: usize },
     #[error("device {device}: read {read} has 65536 items, a forwarded packet has at most 65535")]
     Forward { device: String, read: usize },
+    #[error("device {device}: forward {forward} moves read {read} beyond address 65535")]
+    Offset { device: String, forward: usize, read: usize },
+    #[error("device {device}: the status block of forward {forward} ends beyond address 65535")]
+    ForwardedStatus { device: String, forward: usize },
     #[error("device {device}: max_{items} is {found}, allowed are 1 to {most}")]
     Limit { device: String, items: &'static str, found: u16, most: u16 },
     #[error("device {device}: the name is already in use")]
@@ -367,7 +371,8 @@ async fn obey(
         match order {
             Order::Stop => return,
             Order::Serve(settings, shared, calls) => {
-                let link = link_to(&settings.endpoint, settings.in_flight, &mut links);
+                let link =
+                    link_to(&settings.endpoint, (settings.in_flight, settings.retry), &mut links);
                 spawn_local(serve(link, *settings, shared, calls));
             }
             Order::Remove(name) => {
@@ -380,15 +385,15 @@ async fn obey(
                 let phase = spread(planned.settings.start_within, started);
                 started += 1;
                 let name = planned.settings.name.clone();
-                let DeviceSettings { endpoint, in_flight, .. } = &planned.settings;
-                let link = link_to(endpoint, *in_flight, &mut links);
+                let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
+                let link = link_to(endpoint, (*in_flight, *retry), &mut links);
                 let device = Running::start(*planned, polled, link, phase, &results);
                 let before = running.insert(name, device);
                 debug_assert!(before.is_none(), "{IN_ORDER}");
             }
             Order::Replace { name, device: planned, polled, at_once } => {
-                let DeviceSettings { endpoint, in_flight, .. } = &planned.settings;
-                let link = link_to(endpoint, *in_flight, &mut links);
+                let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
+                let link = link_to(endpoint, (*in_flight, *retry), &mut links);
                 let before = running.remove(&name);
                 debug_assert!(before.is_some(), "{IN_ORDER}");
                 let name = planned.settings.name.clone();
@@ -529,12 +534,12 @@ fn made(
 /// The link to an address, shared by all that ask for it.
 fn link_to(
     endpoint: &Endpoint,
-    in_flight: InFlight,
+    (in_flight, retry): (InFlight, Retry),
     links: &mut HashMap<Address, rc::Weak<Link>>,
 ) -> Rc<Link> {
     let known = links.entry(address(endpoint)).or_default();
     known.upgrade().unwrap_or_else(|| {
-        let link = Link::new(endpoint.clone(), in_flight);
+        let link = Link::new(endpoint.clone(), in_flight, retry);
         *known = Rc::downgrade(&link);
         link
     })
@@ -593,6 +598,23 @@ fn checked(device: DeviceSettings) -> Result<Planned, PollerError> {
         if !device.forward.is_empty() && settings.count > u32::from(u16::MAX) {
             return Err(PollerError::Forward { device: name(), read });
         }
+        let (area, address) = match &settings.into {
+            Some(into) => (into.area, into.address),
+            None => (settings.area, settings.address),
+        };
+        let last = u32::from(address) + settings.count - 1;
+        let fits = |forward: &ForwardSettings| {
+            u16::try_from(last).is_ok_and(|last| forward.address(area, last).is_some())
+        };
+        if let Some(forward) = device.forward.iter().position(|forward| !fits(forward)) {
+            return Err(PollerError::Offset { device: name(), forward, read });
+        }
+    }
+    let is_wrong = |forward: &ForwardSettings| {
+        forward.status.as_ref().is_some_and(|(_, block)| !block.is_possible())
+    };
+    if let Some(forward) = device.forward.iter().position(is_wrong) {
+        return Err(PollerError::ForwardedStatus { device: name(), forward });
     }
     if !device.status.as_ref().is_none_or(super::StatusSettings::fits) {
         return Err(PollerError::Status { device: name() });
@@ -607,10 +629,11 @@ mod tests {
 
     use holdfast_memory::{Area, Layout, Memory, Span};
     use holdfast_protocol::pdu::{Range, Request};
+    use holdfast_protocol::raw_ingest::Format;
 
     use super::*;
     use crate::poller::plan::Strategy;
-    use crate::poller::{Destination, ReadSettings, StatusSettings};
+    use crate::poller::{BlockSettings, Destination, ReadSettings, StatusSettings};
 
     const AREA: Area = Area::HoldingRegisters;
 
@@ -619,11 +642,16 @@ mod tests {
         Arc::new(Memory::new(layout, None).unwrap())
     }
 
+    fn block(area: Area, slot: u16) -> BlockSettings {
+        BlockSettings { area, slot, name: "meter".into(), keep_last_error: false }
+    }
+
     fn settings() -> DeviceSettings {
         DeviceSettings {
             name: "meter".into(),
             endpoint: Place::Tcp { host: "127.0.0.1".into(), port: 502, tls: None }.into(),
             in_flight: InFlight::Fixed(1),
+            retry: Retry::default(),
             unit_id: 1,
             interval: Duration::from_secs(1),
             timeout: Duration::from_secs(1),
@@ -688,13 +716,33 @@ mod tests {
             assert_eq!(refused(|device| device.reads[0].into = into), expected);
         }
         for (area, slot) in [(AREA, 0), (AREA, 2), (AREA, u16::MAX), (Area::Coils, 1)] {
-            let status = Some(StatusSettings { memory: memory(), area, slot });
+            let status = Some(StatusSettings { memory: memory(), block: block(area, slot) });
             let expected = "device meter: the status block does not fit into its memory";
             assert_eq!(refused(|device| device.status = status), expected);
         }
+        let forward = |offset, status: Option<BlockSettings>| ForwardSettings {
+            host: "127.0.0.1".into(),
+            port: 1,
+            format: Format::V1,
+            target: 1,
+            timeout: Duration::from_secs(1),
+            offsets: vec![(AREA, offset)],
+            status: status.map(|block| (2, block)),
+        };
+        let (near, far) = (forward(65_532, None), forward(65_533, None));
+        let expected = "device meter: forward 1 moves read 0 beyond address 65535";
+        assert_eq!(refused(|device| device.forward = vec![near.clone(), far]), expected);
+        for (area, slot) in [(Area::Coils, 0), (AREA, 2184)] {
+            let beyond = forward(0, Some(block(area, slot)));
+            let expected = "device meter: the status block of forward 0 ends beyond address 65535";
+            assert_eq!(refused(|device| device.forward = vec![beyond]), expected);
+        }
+        let mut fits = settings();
+        fits.forward = vec![near, forward(0, Some(block(AREA, 2183)))];
+        assert!(checked(fits).is_ok());
         let mut fits = settings();
         fits.reads[0].into = Some(Destination { memory: memory(), area: AREA, address: 76 });
-        fits.status = Some(StatusSettings { memory: memory(), area: AREA, slot: 1 });
+        fits.status = Some(StatusSettings { memory: memory(), block: block(AREA, 1) });
         assert!(checked(fits).is_ok());
     }
 

@@ -10,6 +10,7 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::client::Place;
+use crate::poller::BlockSettings;
 use crate::poller::caught::spawn_watched;
 use crate::poller::health::Health;
 
@@ -97,6 +98,7 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
         name: "meter".into(),
         endpoint,
         in_flight: InFlight::Fixed(1),
+        retry: Retry::default(),
         unit_id: 1,
         interval: Duration::from_millis(1),
         timeout: TIMEOUT,
@@ -112,8 +114,12 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
     }
 }
 
+fn block(area: Area, slot: u16) -> BlockSettings {
+    BlockSettings { area, slot, name: "meter".into(), keep_last_error: false }
+}
+
 fn made(settings: DeviceSettings, state: &Arc<DeviceState>, results: &Arc<Results>) -> Device {
-    let link = Link::new(settings.endpoint.clone(), settings.in_flight);
+    let link = Link::new(settings.endpoint.clone(), settings.in_flight, settings.retry);
     let planned = Planned::new(settings).unwrap();
     let to = (link, Rc::default());
     Device::new(planned, Arc::clone(state), to, Vec::new(), Some(Arc::clone(results)))
@@ -150,7 +156,7 @@ fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
     with_device(async |endpoint| {
         let memory = memory();
         for (slot, area) in [(1, AREA), (u16::MAX, AREA), (0, Area::InputRegisters)] {
-            let status = StatusSettings { memory: Arc::clone(&memory), area, slot };
+            let status = StatusSettings { memory: Arc::clone(&memory), block: block(area, slot) };
             let settings =
                 DeviceSettings { status: Some(status), ..settings(endpoint.clone(), &memory, 0) };
             let (device, state, _) = device(settings);
@@ -202,7 +208,7 @@ fn a_device_without_a_plan_sends_nothing_and_is_in_error() {
 fn a_device_that_panics_writes_nothing_and_is_in_error_until_it_is_replaced() {
     with_device(async |endpoint| {
         let memory = memory();
-        let status = StatusSettings { memory: self::memory(), area: AREA, slot: 0 };
+        let status = StatusSettings { memory: self::memory(), block: block(AREA, 0) };
         let blocks = Arc::clone(&status.memory);
         let settings = DeviceSettings { status: Some(status), ..settings(endpoint, &memory, 0) };
         let (device, state, results) = device(settings.clone());
