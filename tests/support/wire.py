@@ -234,7 +234,7 @@ class Connection:
 
 def rounds(enough: threading.Event, least: int = 1) -> Iterator[int]:
     """Counts rounds until there are enough, because threads of a slow machine meet later."""
-    deadline = time.monotonic() + 3 * DEADLINE
+    deadline = time.monotonic() + 12 * DEADLINE
     for number in itertools.count():
         if number >= least and enough.is_set():
             return
