@@ -201,6 +201,13 @@ def test_where_nothing_needs_memories_there_may_be_none(
 
 REST = "rest: {bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none}\n"
 READS = "reads: [{area: coils, address: 0, count: 1}]"
+FORWARDED = (
+    f"{{url: 'tcp://plc', unit: 1, interval: 1, {READS}, forward: [{{url: 'raw://a:1', unit: 1}}]"
+)
+
+
+def test_devices_that_are_only_forwarded_need_no_memories(folder: Folder) -> None:
+    assert folder.warnings(f"devices: {{a: {FORWARDED}}}}}\n") == []
 
 
 @pytest.mark.parametrize(
@@ -212,6 +219,8 @@ READS = "reads: [{area: coils, address: 0, count: 1}]"
         NATS + REST,
         LISTENER.replace("1: plant", "1: a"),
         f"devices: {{a: {{url: 'tcp://plc', unit: 1, interval: 1, {READS}}}}}\n" + GATEWAY,
+        f"devices: {{a: {FORWARDED}, status: {{memory: a, area: input_registers, slot: 0}}}}}}\n",
+        f"devices: {{a: {FORWARDED.replace('1}]', '1, into: {memory: a, area: coils}}]')}}}}}\n",
         "adapters: {a: {type: b, memories: [c], areas: [coils], access: read-only}}\n" + NATS,
     ],
 )
@@ -223,7 +232,7 @@ def test_everything_else_needs_memories(
 ) -> None:
     assert folder.problems(memories + (more or "workers: 1\n"))[0] == (
         f"p.yaml:1: memories: {found}, allowed: a mapping with at least one entry "
-        "(optional when only nats, gateway and routes are configured)"
+        "(optional when only nats, gateway, routes and devices that are forwarded are configured)"
     )
 
 

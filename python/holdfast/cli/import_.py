@@ -12,15 +12,28 @@ import click
 
 from holdfast.cli.configuration import WRONG, show_problems
 from holdfast.config import ConfigError
-from holdfast.importing import ORDINALS, NotImportable, read_mma
+from holdfast.importing import ORDINALS, NotImportable, read_mma, read_replicator
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from holdfast.config import Problem
     from holdfast.importing import Imported, Note
 
 FAILED = 1
+
+
+def _common(command: Callable[..., None]) -> Callable[..., None]:
+    """Adds the argument and the options of all imports."""
+    out = click.Path(path_type=Path)
+    for each in (
+        click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs."),
+        click.option("--force", is_flag=True, help="Overwrite OUT if it exists."),
+        click.option("--output", metavar="OUT", type=out, help="Write the YAML to this file."),
+        click.argument("file", type=click.Path(path_type=Path)),
+    ):
+        command = each(command)
+    return command
 
 
 @click.group("import", epilog="Example: holdfast import mma config.yaml --output plant.yaml")
@@ -29,12 +42,7 @@ def import_() -> None:
 
 
 @import_.command(epilog="Example: holdfast import mma config.yaml --output plant.yaml")
-@click.argument("file", type=click.Path(path_type=Path))
-@click.option(
-    "--output", metavar="OUT", type=click.Path(path_type=Path), help="Write the YAML to this file."
-)
-@click.option("--force", is_flag=True, help="Overwrite OUT if it exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
+@_common
 @click.option(
     "--as-it-was-meant/--as-it-ran",
     "as_meant",
@@ -59,10 +67,32 @@ def mma(
     what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
     OUT, 2 can't import FILE.
     """
+
+    def read() -> Imported:
+        return read_mma(file, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
+
+    _convert(read, file, output, force, as_json)
+
+
+@import_.command(epilog="Example: holdfast import replicator replicator.yaml --output mirror.yaml")
+@_common
+def replicator(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+    """Convert FILE, a configuration of the Modbus Replicator, to a Holdfast configuration.
+
+    Prints the new configuration. Notes on standard error, and comments in the configuration, say
+    what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
+    OUT, 2 can't import FILE.
+    """
+    _convert(lambda: read_replicator(file), file, output, force, as_json)
+
+
+def _convert(
+    read: Callable[[], Imported], file: Path, output: Path | None, force: bool, as_json: bool
+) -> None:
     if output is not None and _same(file, output):
         raise click.UsageError("OUT and FILE are the same file.")
     try:
-        imported = read_mma(file, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
+        imported = read()
     except ConfigError as error:
         _refuse(error, as_json)
     if output is not None:
@@ -110,21 +140,20 @@ def _same(file: Path, output: Path) -> bool:
 
 
 def _summary(imported: Imported, output: Path | None) -> str:
-    generation = ORDINALS[imported.generation]
+    of = ""
+    if imported.generation is not None:
+        of = f" is of the {ORDINALS[imported.generation]} generation"
     count = len(imported.notes)
     notes = "1 note" if count == 1 else f"{count} notes"
     check = f"; next: holdfast check {output}" if output is not None else ""
-    return f"{imported.file} is of the {generation} generation: {notes}{check}"
+    return f"{imported.file}{of}: {notes}{check}"
 
 
 def _answer(imported: Imported) -> dict[str, object]:
-    return {
-        "ok": True,
-        "problems": [],
-        "generation": imported.generation,
-        "notes": _plain(imported.notes),
-        "config": imported.data,
-    }
+    answer: dict[str, object] = {"ok": True, "problems": []}
+    if imported.generation is not None:
+        answer["generation"] = imported.generation
+    return {**answer, "notes": _plain(imported.notes), "config": imported.data}
 
 
 def _plain(entries: Iterable[Note | Problem]) -> list[dict[str, object]]:

@@ -90,7 +90,8 @@ class Config(Model):
     """The configuration of a Holdfast appliance."""
 
     memories: dict[Name, MemoryConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
-    """The memories, by name; optional when only nats, gateway and routes are configured."""
+    """The memories, by name; optional when only nats, gateway, routes and
+    devices that are forwarded are configured."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
     """The identification of the appliance."""
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(

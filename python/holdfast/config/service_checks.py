@@ -54,7 +54,8 @@ class ServiceChecks:
         """Reports a missing server, and missing memories if a section uses them."""
         used = any(data.get(key, {}) != {} for key in _USERS_OF_MEMORIES) or _uses_memories(data)
         if data.get("memories", {}) == {} and (used or not data.keys() & _USERS_OF_NONE):
-            self._empty("memories", data, "when only nats, gateway and routes are configured")
+            none = "nats, gateway, routes and devices that are forwarded"
+            self._empty("memories", data, f"when only {none} are configured")
         if data.get("listeners", {}) == {} and not data.keys() & {*_INSTEAD_OF_LISTENERS}:
             self._empty("listeners", data, f"with {choice(_INSTEAD_OF_LISTENERS)}")
 
@@ -160,7 +161,7 @@ class ServiceChecks:
 
 
 def _uses_memories(data: dict[Any, Any]) -> bool:
-    """Whether a listener or a device needs a memory: all do that are not only for routes."""
+    """Whether a listener or a device needs a memory: all do that only route or forward."""
     devices, listeners = data.get("devices", {}), data.get("listeners", {})
     if devices != {} and not isinstance(devices, dict):
         return True
@@ -172,5 +173,13 @@ def _uses_memories(data: dict[Any, Any]) -> bool:
         for rule in rules
         for target in mapping(mapping(rule).get("units")).values() or [None]
     )
-    polled = any("reads" in device for device in devices.values() if isinstance(device, dict))
-    return (bool(listeners) and not (rules and only_routes)) or polled
+    return (bool(listeners) and not (rules and only_routes)) or any(
+        _is_stored(device) for device in devices.values() if isinstance(device, dict)
+    )
+
+
+def _is_stored(device: dict[Any, Any]) -> bool:
+    """Whether a memory has values or the status of a device."""
+    reads = [mapping(read) for read in entries(device.get("reads"))]
+    stored = "status" in device or any("into" in read for read in reads)
+    return stored or ("reads" in device and not device.get("forward"))

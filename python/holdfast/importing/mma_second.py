@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Network
 
 TOP_REASONS = {
+    "replicator": "for the units in this file, use: holdfast import replicator",
     "debug": "log.level sets what is logged",
     "device_identity": "set the values under identity",
     "notify": "no notifications; programs read with Modbus or REST",

@@ -1,0 +1,99 @@
+"""The result of an import, and the reading of its source file."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from holdfast.config import source
+from holdfast.config.dump import to_yaml
+from holdfast.config.problems import ConfigError
+from holdfast.config.words import show
+from holdfast.importing.notes import Desk, Note
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.config.problems import Problem
+
+Generation: TypeAlias = Literal[1, 2]
+ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}
+
+_SECRET = re.compile(r"(token|password|broker)[\"']?\s*:")
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A Holdfast configuration, with notes on the conversion."""
+
+    file: str
+    command: str
+    """The command that imports it."""
+    program: str
+    """The program that it is for."""
+    data: dict[str, Any]
+    notes: tuple[Note, ...]
+    generation: Generation | None = None
+    """The generation of its format, if there are several."""
+
+    def to_yaml(self) -> str:
+        """The configuration as YAML, with the notes as comments above it."""
+        of = f"{ORDINALS[self.generation]} generation: " if self.generation else ""
+        made = f"Made by `holdfast import {self.command}` from a configuration of {self.program},"
+        lines = [made, f"{of}{self.file}"]
+        if self.notes:
+            lines += ["Left out, changed or to be checked:", *map(str, self.notes)]
+        comments = "".join(f"# {' '.join(line.splitlines())}\n" for line in lines)
+        body = "".join(f"{line.rstrip()}\n" for line in to_yaml(self.data).splitlines())
+        return f"{comments}\n{body}"
+
+
+class NotImportable(ConfigError):
+    """The source can't be imported; `notes` has the notes until then."""
+
+    def __init__(self, file: str, problems: Iterable[Problem], notes: tuple[Note, ...]) -> None:
+        super().__init__(file, problems)
+        self.notes = notes
+
+
+class Source:
+    """A source file while it is read: its `desk` has its data, and takes notes and problems."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Raises `ConfigError` for a file that can't be read."""
+        self.file = str(path)
+        text = source.read_text(Path(path), self.file)
+        try:
+            document, found = source.parse(text, self.file)
+        except ConfigError as error:
+            raise ConfigError(self.file, _without_secrets(text, error.problems)) from None
+        self._problems = _without_secrets(text, found)
+        self.desk = Desk(document)
+
+    def is_mapping(self) -> bool:
+        """Whether the file contains a mapping; adds a problem otherwise."""
+        data = self.desk.document.data
+        if not isinstance(data, dict):
+            found = "an empty file" if data is None else show(data)
+            self.desk.problem((), f"found {found}, allowed: a mapping")
+        return isinstance(data, dict)
+
+    def finish(self) -> None:
+        """Raises `NotImportable` if there was any problem."""
+        problems = self._problems + self.desk.report.problems
+        if problems:
+            raise NotImportable(self.file, problems, self.desk.notes)
+
+
+def _without_secrets(text: str, problems: Iterable[Problem]) -> list[Problem]:
+    """Hides what a YAML error quotes from a line that may contain a secret."""
+    lines = text.splitlines()
+    hidden = "not YAML (line hidden, as it may contain a secret), allowed: text in quotes"
+    return [
+        replace(problem, message=hidden)
+        if problem.line and _SECRET.search(" ".join(lines[problem.line - 1 : problem.line]))
+        else problem
+        for problem in problems
+    ]

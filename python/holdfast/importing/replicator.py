@@ -1,0 +1,299 @@
+"""Imports configurations of the Modbus Replicator: units become devices that are forwarded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from holdfast.config.devices import LAST_SLOT, MIN_INTERVAL
+from holdfast.config.words import show
+from holdfast.importing.imported import Imported, Source
+from holdfast.importing.names import unique_names
+from holdfast.importing.sections import Section, section
+from holdfast.net.addresses import joined
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
+from holdfast.types import AREAS, Area
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from holdfast.config.source import KeyPath
+    from holdfast.importing.notes import Desk
+
+MAX_MS = 86_400_000
+
+DEVICE_TIMEOUT = 5
+"""Seconds for a device without a timeout. The source waited for it without an end."""
+
+TARGET_TIMEOUT = 2
+"""Seconds for a target of a device without a timeout, as in the source."""
+
+_AREAS: dict[int, Area] = dict(enumerate(AREAS, 1))
+"""The areas by the functions that read them."""
+
+_TOP_REASONS = {
+    "listeners": "for the memories in this file, use: holdfast import mma",
+    "Status_Memory": "the source ignores it; each target has a status_unit_id",
+}
+
+
+@dataclass
+class _Read:
+    area: Area
+    address: int
+    count: int
+
+    def plain(self) -> dict[str, Any]:
+        return {"area": self.area, "address": self.address, "count": self.count}
+
+
+@dataclass
+class _Unit:
+    """One unit of the source, as far as it is valid."""
+
+    section: Section
+    endpoint: str | None = None
+    device: dict[str, Any] = field(default_factory=dict)
+
+
+def read_replicator(path: Path | str) -> Imported:
+    """Converts a configuration of the Modbus Replicator.
+
+    Raises `ConfigError` with every problem that prevents the import.
+    """
+    source = Source(path)
+    devices: dict[str, Any] = {}
+    if source.is_mapping():
+        root = Section(source.desk, (), source.desk.document.data)
+        devices = _Units(source.desk).read(root)
+    source.finish()
+    program = "the Modbus Replicator"
+    return Imported(source.file, "replicator", program, {"devices": devices}, source.desk.notes)
+
+
+@dataclass
+class _Units:
+    """Reads `replicator.units` into devices."""
+
+    desk: Desk
+
+    def read(self, root: Section) -> dict[str, Any]:
+        """The devices by name."""
+        replicator = root.mapping("replicator", required=True)
+        root.close(_TOP_REASONS)
+        if replicator is None:
+            return {}
+        entries = replicator.entries("units", required=True)
+        replicator.close(_TOP_REASONS)
+        if entries == []:
+            self.desk.problem(replicator.at("units"), "no unit, allowed: at least one")
+        found = [section(self.desk, path, value) for path, value in entries or ()]
+        sections = [each for each in found if each is not None]
+        wanted = [(each.at("id"), self._id(each)) for each in sections]
+        units = [self._unit(each) for each in sections]
+        self._retry(units)
+        names = unique_names(self.desk, wanted)
+        kept = [(name, unit) for name, unit in zip(names, units, strict=True) if unit.device]
+        if sections and not kept and not self.desk.report.problems:
+            self.desk.problem(replicator.at("units"), "no unit has a target that is written")
+        if kept:
+            self._tell_all(replicator.at("units"))
+        return {name: unit.device for name, unit in kept}
+
+    def _id(self, unit: Section) -> str:
+        name = unit.name("id", required=True)
+        if name is None and unit.get("id") is not None:
+            self.desk.problem(unit.at("id"), "found an empty text, allowed: text")
+        return name or "unit"
+
+    def _tell_all(self, path: KeyPath) -> None:
+        partly = "if a read of a device fails, the others are written; the source wrote none"
+        self.desk.note("check", path, partly)
+
+    def _unit(self, one: Section) -> _Unit:
+        unit = _Unit(one)
+        source = one.mapping("source", required=True)
+        poll = one.mapping("poll", required=True)
+        reads = list(self._reads(one))
+        targets = one.entries("targets") or []
+        interval = None if poll is None else self._interval(poll)
+        one.close()
+        if source is None:
+            return unit
+        unit.endpoint = self._endpoint(source)
+        timeout = self._timeout(source)
+        block = self._block(source, has_targets=bool(targets))
+        number = source.integer("unit_id", 0, MAX_UNIT, what="a unit id")
+        source.close()
+        found = [section(self.desk, path, value) for path, value in targets]
+        forward = [
+            each
+            for target in found
+            if target is not None
+            for each in self._forwards(target, reads, block, timeout)
+        ]
+        if not forward:
+            self.desk.note("left out", one.path, "no target is written, so it is not polled")
+        elif unit.endpoint is not None and interval is not None:
+            unit.device = {
+                "url": f"tcp://{unit.endpoint}",
+                "unit": number or 0,
+                "interval": interval,
+                "timeout": timeout or DEVICE_TIMEOUT,
+                "reads": [read.plain() for read in reads],
+                "forward": forward,
+            }
+        return unit
+
+    def _interval(self, poll: Section) -> float | None:
+        """Seconds between polls."""
+        given = poll.integer("interval_ms", 1, MAX_MS, required=True, what="milliseconds")
+        poll.close()
+        if given is not None and given < MIN_INTERVAL * 1000:
+            message = f"raised to {MIN_INTERVAL * 1000:g} ms, the shortest interval"
+            self.desk.note("changed", poll.at("interval_ms"), message)
+            return MIN_INTERVAL
+        return None if given is None else _seconds(given)
+
+    def _timeout(self, source: Section) -> float | None:
+        """Seconds for a request; `None` if the source waits without an end."""
+        given = source.integer("timeout_ms", -MAX_MS, MAX_MS, what="milliseconds")
+        if given is not None and given > 0:
+            return _seconds(given)
+        message = f"no timeout_ms: {DEVICE_TIMEOUT} s; the source waited without an end"
+        self.desk.note("check", source.path, message)
+        return None
+
+    def _endpoint(self, one: Section) -> str | None:
+        """Host and port of an address to connect to."""
+        text = one.text("endpoint", required=True)
+        if text is None:
+            return None
+        try:
+            parts = urlsplit(f"//{text}")
+            host, port = parts.hostname or "127.0.0.1", parts.port
+        except ValueError:
+            port = None
+        if not port or parts.netloc != text or "@" in text:
+            message = f"found {show(text)}, allowed: host:port, as in 10.5.1.29:502"
+            self.desk.problem(one.at("endpoint"), message)
+            return None
+        return joined(host, port)
+
+    def _block(self, source: Section, *, has_targets: bool) -> dict[str, Any] | None:
+        """The status block, without its unit id; `None` if there is none."""
+        slot = source.integer("status_slot", 0, LAST_SLOT)
+        name = source.name("device_name") or ""
+        if not name.isascii():
+            message = f"found {show(name)}, allowed: ASCII characters"
+            self.desk.problem(source.at("device_name"), message)
+        if slot is None:
+            return None
+        if not has_targets:
+            message = "found without targets, allowed: only with targets"
+            self.desk.problem(source.at("status_slot"), message, of_key=True)
+        shown = "".join(each if " " <= each <= "~" else "?" for each in name[:16])
+        return {"area": "holding_registers", "slot": slot, "name": shown}
+
+    def _reads(self, one: Section) -> Iterator[_Read]:
+        entries = one.entries("reads", required=True)
+        if entries == []:
+            self.desk.problem(one.at("reads"), "no read, allowed: at least one")
+        for path, value in entries or ():
+            read = section(self.desk, path, value)
+            if read is None:
+                continue
+            function = read.integer("fc", 1, 4, required=True, what="a function")
+            address = read.integer("address", 0, LAST_ADDRESS) or 0
+            count = read.integer("quantity", 1, LAST_ADDRESS, required=True)
+            read.close()
+            if function is None or count is None:
+                continue
+            if address + count > ADDRESSES:
+                allowed = f"allowed: up to {ADDRESSES - address} from address {address}"
+                self.desk.problem(read.at("quantity"), f"found {count}, {allowed}")
+                continue
+            yield _Read(_AREAS[function], address, count)
+
+    def _forwards(
+        self,
+        target: Section,
+        reads: list[_Read],
+        block: dict[str, Any] | None,
+        timeout: float | None,
+    ) -> Iterator[dict[str, Any]]:
+        """What one target receives: the reads for each of its memories, and one status block."""
+        number = target.integer("id", 0, 2**32 - 1, required=True)
+        endpoint = self._endpoint(target)
+        unit = target.integer("unit_id", 0, MAX_UNIT, what="a unit id")
+        status_unit = target.integer("status_unit_id", 0, MAX_UNIT, what="a unit id")
+        memories = target.entries("memories") or []
+        offsets = [self._offsets(path, value, reads) for path, value in memories]
+        target.close()
+        if block is not None and status_unit is None:
+            message = f"missing with status_slot, allowed: a unit id from 0 to {MAX_UNIT}"
+            self.desk.problem(target.at("status_unit_id"), message, of_key=True)
+        if number is None or endpoint is None:
+            return
+        if number > MAX_UNIT:
+            message = f"the source never wrote to it: its id is {number}, more than {MAX_UNIT}"
+            self.desk.note("left out", target.path, message)
+            return
+        if not offsets:
+            self.desk.note("left out", target.path, "no memories: it received no values")
+            return
+        if unit is not None and unit != number:
+            message = f"packets go to unit {number}, the id of the target, as before"
+            self.desk.note("left out", target.at("unit_id"), message)
+        wait = TARGET_TIMEOUT if timeout is None else timeout
+        for index, added in enumerate(offsets):
+            forward: dict[str, Any] = {"url": f"raw://{endpoint}", "unit": number, "timeout": wait}
+            if added:
+                forward["offsets"] = added
+            if index == 0 and block is not None and status_unit is not None:
+                forward["status"] = {"unit": status_unit, **block}
+            yield forward
+
+    def _offsets(self, path: KeyPath, value: object, reads: list[_Read]) -> dict[Area, int]:
+        """What is added to addresses, by area; the source has it by function."""
+        memory = section(self.desk, path, value)
+        if memory is None:
+            return {}
+        memory.get("memory_id")  # The source only compared it with others.
+        given = memory.mapping("offsets")
+        memory.close()
+        found: dict[Area, int] = {}
+        if given is None:
+            return found
+        for function in list(given.data):
+            if function not in _AREAS:
+                message = "no read has this function, allowed: 1 to 4"
+                self.desk.note("left out", given.at(function), message)
+                continue
+            area = _AREAS[function]
+            most = ADDRESSES - max(
+                (read.address + read.count for read in reads if read.area == area), default=1
+            )
+            offset = given.integer(function, 0, most, what="an offset")
+            if offset:
+                found[area] = offset
+        return found
+
+    def _retry(self, units: list[_Unit]) -> None:
+        """Retries each address at the shortest interval of its units, as the source does."""
+        soonest: dict[str, float] = {}
+        for unit in units:
+            if unit.device and unit.endpoint is not None:
+                interval = unit.device["interval"]
+                soonest[unit.endpoint] = min(interval, soonest.get(unit.endpoint, interval))
+        for unit in units:
+            if unit.device and unit.endpoint is not None:
+                pause = soonest[unit.endpoint]
+                unit.device["retry"] = {"first": pause, "most": pause}
+
+
+def _seconds(milliseconds: int) -> float:
+    seconds = milliseconds / 1000
+    return int(seconds) if seconds.is_integer() else seconds
