@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import errno
-import io
 import json
+import os
 import socket
+import stat
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -207,23 +208,52 @@ def test_an_old_file_is_put_aside_and_none_is_lost(tmp_path: Path) -> None:
     assert all(file.stat().st_size <= 65536 for file in files)
 
 
-class Full(io.StringIO):
-    """A file on a disk that has no room."""
-
-    def write(self, _: str) -> int:
-        raise OSError(errno.ENOSPC, "no space left on device")
-
-
-def test_a_file_that_takes_no_line_is_counted_and_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_lines_that_could_not_be_written_are_counted_and_leave_a_mark(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
-    handler: Any = audit._file
-    stream, handler.stream = handler.stream, Full()
     audit.write(number=1)
-    handler.stream = stream
+    write, room = os.write, 10
+
+    def written(descriptor: int, data: bytes) -> int:
+        nonlocal room
+        if room == 0:
+            raise OSError(errno.ENOSPC, "no space left on device")
+        data, room = data[:room], 0
+        return write(descriptor, data)
+
+    with monkeypatch.context() as full:
+        full.setattr(os, "write", written)
+        audit.write_all([{"number": 2}, {"number": 3}])
+        audit.write(number=4)
+        assert [line["number"] for line in lines(tmp_path)] == [1]
+    audit.write(number=5)
+    audit.write(number=6)
+    audit.close()
+    assert audit.counts() == {"lines": 3, "failed": 3}
+    assert "audit_failed" in caplog.messages
+    found = [{**line, "time": ""} for line in lines(tmp_path)]
+    kept: list[dict[str, Any]] = [{"number": 1}, {"lost": 3}, {"number": 5}, {"number": 6}]
+    assert found == [{"time": "", **each} for each in kept]
+
+
+def test_a_file_that_can_not_be_renamed_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "audit.log.1" / "in the way").mkdir(parents=True)
+    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
+    audit.write_all([{"number": number} for number in range(3000)])
+    audit.close()
+    assert audit.counts() == {"lines": 3000, "failed": 0}
+    assert "audit_not_rotated" in caplog.messages
+    assert [line["number"] for line in lines(tmp_path)] == list(range(3000))
+
+
+def test_a_file_that_was_renamed_by_others_is_created_anew(tmp_path: Path) -> None:
+    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
+    audit.write(number=1)
+    (tmp_path / "audit.log").rename(tmp_path / "audit-2026-11-22.log")
     audit.write(number=2)
     audit.close()
-    assert audit.counts() == {"lines": 1, "failed": 1}
-    assert "audit_failed" in caplog.messages
     assert [line["number"] for line in lines(tmp_path)] == [2]
+    assert stat.S_IMODE((tmp_path / "audit.log").stat().st_mode) & ~0o640 == 0

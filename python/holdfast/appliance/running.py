@@ -390,8 +390,7 @@ class _Running:
         while True:
             ended = self._stopped.is_set()
             writes = self._engine.next_writes(0 if ended else WAIT_TIMEOUT, AUDIT_BATCH)
-            for write in writes:
-                audit.write(**write)
+            audit.write_all(writes)
             missed = self._engine.lost_writes
             if missed > lost:
                 audit.write(lost=missed - lost)
