@@ -149,7 +149,7 @@ def test_it_serves_the_initial_values(
         assert client.ask(READ_TWO) == bytes.fromhex("030400000007")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_ends_it_with_exit_code_0(
     configure: Callable[..., Path], run: Callable[[Path], RunCommand], number: signal.Signals
 ) -> None:
@@ -160,6 +160,19 @@ def test_a_signal_ends_it_with_exit_code_0(
     assert code == 0
     assert "stopped" in log
     assert "Traceback" not in log
+
+
+def test_a_closed_terminal_loses_no_line_of_the_audit_log(
+    configure: Callable[..., Path], run: Callable[[Path], RunCommand]
+) -> None:
+    file = configure()
+    file.write_text(f"{file.read_text()}audit: {{file: audit.log}}\n")
+    running = run(file)
+    with wire.Connection(running.wait_until_it_serves()) as client:
+        client.ask_many([bytes.fromhex("06000101f4")] * 20_000)
+        code, _ = running.end(signal.SIGHUP)
+    assert code == 0
+    assert (file.parent / "audit.log").read_text().count("\n") == 20_000
 
 
 def test_a_port_that_is_taken_is_one_line_that_names_listener_and_port(

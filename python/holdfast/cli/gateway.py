@@ -14,7 +14,8 @@ import click
 
 from holdfast import logs
 from holdfast.cli.parsing import by
-from holdfast.cli.run import JOIN_TIMEOUT, Signals
+from holdfast.cli.run import JOIN_TIMEOUT
+from holdfast.cli.signals import Signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.client.endpoint import check_files
 from holdfast.config.egress import parse_allowed

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +19,7 @@ from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
 from holdfast.cli.showing import ranges_shown
+from holdfast.cli.signals import Signals
 from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from holdfast.config.rights import unit_rights
 from holdfast.config.scanning import written_pollable
@@ -30,7 +30,6 @@ from holdfast.web.port import explained
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from types import FrameType
 
     from holdfast.appliance.running import ListenAddress
     from holdfast.config import (
@@ -106,19 +105,6 @@ def _connections(config: Config) -> int:
     if config.gateway is not None:
         most += assembly.gateway(config.gateway).limits.open_connections
     return most
-
-
-class Signals:
-    """Records SIGINT and SIGTERM. The second signal ends the process at once."""
-
-    def __init__(self) -> None:
-        self.received = False
-        signal.signal(signal.SIGINT, self._note)
-        signal.signal(signal.SIGTERM, self._note)
-
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        self.received = True
-        signal.signal(number, signal.SIG_DFL)
 
 
 def _greeting(appliance: Appliance, file: Path) -> str:

@@ -17,6 +17,7 @@ import click
 
 from holdfast import logs
 from holdfast.cli.open_files import allow_open_files
+from holdfast.cli.signals import ending_signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
 from holdfast.config.scanning import (
     MAX_DEADBAND,
@@ -360,7 +361,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
         signal.signal(number, signal.SIG_DFL)  # The second signal ends the process at once.
         loop.call_soon_threadsafe(scanner.end)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending_signals():
         signal.signal(number, end)
     running = asyncio.create_task(scanner.run())
     while not running.done():
