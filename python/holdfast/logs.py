@@ -12,16 +12,23 @@ import threading
 import time
 from typing import Literal
 
+from holdfast.log_output import QueuedHandler
+
 LOGGER = logging.getLogger("holdfast")
 
 
 def configure(level: str, form: Literal["text", "json"]) -> None:
     """Sends the log to standard error; `level` is debug, info, warning or error."""
-    handler = logging.StreamHandler(sys.stderr)
+    handler = QueuedHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(level.upper())
     LOGGER.propagate = False
+
+
+def dropped() -> int:
+    """Returns the number of lines that were dropped because nobody read the log."""
+    return sum(getattr(handler, "dropped", 0) for handler in LOGGER.handlers)
 
 
 def write(level: int, event: str, **fields: object) -> None:

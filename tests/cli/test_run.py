@@ -162,6 +162,21 @@ def test_a_signal_ends_it_with_exit_code_0(
     assert "Traceback" not in log
 
 
+def test_a_reader_of_the_log_that_stops_reading_holds_up_nobody(
+    configure: Callable[..., Path], run: Callable[[Path], RunCommand]
+) -> None:
+    """Its pipe is full after a few hundred lines."""
+    file = configure()
+    file.write_text(f"{file.read_text()}log: {{level: debug}}\n")
+    running = run(file)
+    port = running.wait_until_it_serves()
+    for _ in range(3000):
+        with wire.Connection(port) as client:
+            assert client.ask(READ_TWO) == bytes.fromhex("030400000007")
+    running.process.send_signal(signal.SIGTERM)
+    assert running.process.wait(wire.DEADLINE) == 0
+
+
 def test_a_closed_terminal_loses_no_line_of_the_audit_log(
     configure: Callable[..., Path], run: Callable[[Path], RunCommand]
 ) -> None:

@@ -123,6 +123,11 @@ class Figures(Collector):
             "Listener events that were not logged.",
             stats["events_lost"],
         )
+        yield CounterMetricFamily(
+            "holdfast_log_dropped",
+            "Log lines that were dropped because nobody read them.",
+            stats["log_dropped"],
+        )
         if stats["audit"] is not None:
             yield CounterMetricFamily(
                 "holdfast_audit_lines", "Lines written to the audit log.", stats["audit"]["lines"]

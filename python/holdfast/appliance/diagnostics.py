@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+from holdfast import logs
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -53,6 +55,7 @@ class Diagnostics:
             "links": {name: link.counters() for name, link in self.links.items()},
             "adapters": {name: self.adapter(name) for name in self.adapters},
             "events_lost": self._engine.lost_events,
+            "log_dropped": logs.dropped(),
             "audit": None if self.audit is None else self.audit.counts(),
         }
 

@@ -206,6 +206,7 @@ ROUTES = (
                     }
                 },
                 "events_lost": 0,
+                "log_dropped": 0,
                 "audit": None,
             },
         ),

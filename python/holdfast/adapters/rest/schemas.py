@@ -131,6 +131,7 @@ DIAGNOSTICS: dict[str, Schema] = {
                 },
             },
             "events_lost": COUNTER,
+            "log_dropped": COUNTER,
             "audit": {
                 "type": ["object", "null"],
                 "description": "Lines written, and lines that failed",
