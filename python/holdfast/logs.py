@@ -52,6 +52,15 @@ def problem(event: str, **fields: object) -> None:
         LOGGER.error(event, extra={"fields": fields | more}, exc_info=True)
 
 
+def tell_held_back() -> None:
+    """Logs how many events were held back, for kinds of which none came since. Call it often."""
+    for kind, count in _REFUSALS.over(time.monotonic()):
+        event, of = kind if isinstance(kind, tuple) else (kind, "")
+        parts = of if isinstance(of, tuple) else (of,)
+        shown = " ".join(str(part) for part in parts if part is not None)
+        write(logging.WARNING, "held_back", of=event, kind=shown, count=count)
+
+
 class TextFormatter(logging.Formatter):
     """`2026-01-31T12:00:00.000Z warning refused_source listener=scada peer=10.0.0.9:51200`."""
 
@@ -102,7 +111,8 @@ class Throttle:
     """Admits the first `burst` events of a kind in each `window` of seconds.
 
     `admit` returns whether to log an event, and how many events of its kind the window before held
-    back. The log includes that number, so no event is lost without a trace.
+    back; `over` returns the same for kinds without further events. The log includes that number, so
+    no event is lost without a trace.
     """
 
     def __init__(self, burst: int = 20, window: float = 10.0) -> None:
@@ -121,6 +131,13 @@ class Throttle:
                 began, count = now, 0
             self._seen[kind] = (began, count + 1)
             return count < self._burst, held_back
+
+    def over(self, now: float) -> list[tuple[object, int]]:
+        """Forgets kinds whose window is over. Returns those with the events that were held back."""
+        with self._lock:
+            over = [kind for kind, (began, _) in self._seen.items() if now - began >= self._window]
+            counts = [(kind, self._seen.pop(kind)[1] - self._burst) for kind in over]
+        return [(kind, count) for kind, count in counts if count > 0]
 
 
 _REFUSALS = Throttle()

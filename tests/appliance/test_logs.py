@@ -39,6 +39,30 @@ def test_json_has_the_same_fields() -> None:
     }
 
 
+def test_what_was_held_back_is_told_even_if_nothing_follows(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    throttle = logs.Throttle(burst=2, window=10)
+    for now in (0.0, 1.0, 2.0, 3.0):
+        throttle.admit("a", now)
+    throttle.admit("b", 0.0)
+    assert throttle.over(9.9) == []
+    assert throttle.over(10.0) == [("a", 2)]
+    # It begins anew.
+    assert throttle.over(30.0) == []
+    assert throttle.admit("a", 11.0) == (True, 0)
+
+    throttle = logs.Throttle(burst=1, window=3600)
+    monkeypatch.setattr(logs, "_REFUSALS", throttle)
+    for _ in range(4):
+        logs.refused("refused_source", kind=("scada", None))
+    logs.tell_held_back()
+    throttle._window = 0
+    logs.tell_held_back()
+    [told] = [vars(each)["fields"] for each in caplog.records if each.message == "held_back"]
+    assert told == {"of": "refused_source", "kind": "scada", "count": 3}
+
+
 def test_a_flood_is_held_back_and_its_number_told() -> None:
     throttle = logs.Throttle(burst=2, window=10.0)
     assert [throttle.admit("kind", now) for now in (0.0, 1.0, 2.0, 3.0)] == [

@@ -214,6 +214,7 @@ class _Running:
         event = self._engine.next_event(timeout)
         if event is not None:
             self._log_event(*event)
+        logs.tell_held_back()
         lost = self._engine.lost_events
         if lost > self._lost_events:
             logs.write(logging.WARNING, "events_lost", count=lost - self._lost_events)

@@ -138,6 +138,7 @@ def _serve(settings: Settings, listener: socket.socket, signals: Signals) -> Non
         click.echo(_greeting(served.address, settings))
         while not signals.received and not running.done():
             wait_for([running], JOIN_TIMEOUT)
+            logs.tell_held_back()
         stop.set()
         running.result()
 

@@ -366,6 +366,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
     running = asyncio.create_task(scanner.run())
     while not running.done():
         await asyncio.wait([running], timeout=WATCHED)
+        logs.tell_held_back()
         if check is not None and not running.done():
             try:
                 check()
