@@ -6,11 +6,12 @@ file, so an error in one does not hide an error in the other.
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from holdfast.config import source
-from holdfast.config.allowed import allowed
+from holdfast.config.allowed import allowed, known_keys
 from holdfast.config.device_checks import DeviceChecks
 from holdfast.config.grant_checks import GrantChecks, doubt_grants
 from holdfast.config.lenient import mapping
@@ -24,7 +25,7 @@ from holdfast.config.service_checks import ServiceChecks
 from holdfast.config.shared_connection_checks import AddressChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
-from holdfast.config.words import show
+from holdfast.config.words import shape, show
 
 
 def load(path: Path | str) -> Config:
@@ -34,10 +35,11 @@ def load(path: Path | str) -> Config:
     """
     file = str(path)
     document, problems = source.parse(source.read_text(Path(path), file), file)
-    if not isinstance(document.data, dict):
-        found = "an empty file" if document.data is None else show(document.data)
+    found = _foreign(document.data)
+    if found is not None:
         message = f"found {found}, allowed: {allowed((), None)}"
         raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
+    assert isinstance(document.data, dict), "anything else is foreign"
     report, data = Report(document), document.data
     folder = Path(path).absolute().parent
     memories = MemoryChecks(folder, report)
@@ -51,6 +53,20 @@ def load(path: Path | str) -> Config:
     doubt_grants(config, report)
     doubt_routes(config, report)
     return config.with_warnings(sorted(report.doubts, key=lambda doubt: doubt.line or 0))
+
+
+def _foreign(data: object) -> str | None:
+    """What a file is that is no configuration. Its content is not shown: it could be a secret."""
+    if data is None:
+        return "an empty file"
+    if not isinstance(data, dict):
+        return shape(data) if data else show(data)
+    known = known_keys((), None)
+    if not data or any(get_close_matches(str(key), known, cutoff=0.8) for key in data):
+        return None
+    return (
+        f"a mapping with {len(data)} other keys" if len(data) > 1 else "a mapping with another key"
+    )
 
 
 def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
