@@ -286,6 +286,16 @@ def test_a_port_that_was_never_bound_has_no_socket() -> None:
     port.close()
 
 
+def test_a_closed_port_still_has_a_status() -> None:
+    """Programs may ask the diagnostics while the appliance stops, and after that."""
+    port = Port("rest", "127.0.0.1", 0)
+    assert port.bind()
+    bound = port.status()
+    assert (bound["listening"], bound["address"]) == (True, f"127.0.0.1:{port.address[1]}")
+    port.close()
+    assert port.status() == {"address": "127.0.0.1:0", "listening": False, "failed_binds": 0}
+
+
 def test_a_wait_in_another_thread_ends_when_the_port_is_free(taken: Taken) -> None:
     port = Port("rest", *taken.addresses["rest"])
     assert not port.bind()

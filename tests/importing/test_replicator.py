@@ -216,11 +216,14 @@ def test_a_target_that_got_nothing_gets_nothing(imported: Callable[[str], Import
     )
     found = imported(text)
     assert [each["unit"] for each in found.data["devices"]["pump_1"]["forward"]] == [2, 2]
-    assert notes(found)[2:] == [
-        "16: replicator.units[0].targets[1]: left out: the source never wrote to it: its id is "
-        "300, more than 255",
+    lost = ". It received the status block, which requires values here"
+    reasons = [
+        "16: replicator.units[0].targets[1]: left out: its id is 300, more than 255: the source "
+        "wrote no values to it",
         "17: replicator.units[0].targets[2]: left out: no memories: it received no values",
     ]
+    assert notes(found)[2:] == [f"{reason}{lost}" for reason in reasons]
+    assert notes(imported(changed(", status_slot: 4", "", text)))[2:] == reasons
 
 
 def test_the_command_writes_a_file_and_tells_programs(tmp_path: Path) -> None:

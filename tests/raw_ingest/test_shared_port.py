@@ -6,7 +6,7 @@ import logging
 import socket
 import struct
 import zlib
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -110,14 +110,23 @@ def test_a_modbus_request_whose_transaction_id_is_that_of_a_packet_is_modbus(
     assert received == expected
 
 
-def test_a_packet_of_an_unknown_area_is_a_modbus_frame_of_another_protocol(
-    run: Run, dial: Any
+@pytest.mark.parametrize(("begun", "area"), [(True, 3), (True, 9), (False, 9)])
+def test_a_packet_among_modbus_frames_ends_the_connection(
+    run: Run, dial: Any, begun: bool, area: int
 ) -> None:
+    """The unit id of the packet is the length of a frame, behind which the payload is a request."""
     appliance = run(configuration())
     client = dial(appliance)
-    client.sendall(b"RI\x01\x09\x00\x02\x01\x11" + wire.frame(READ, 1, 1))
-    assert client.recv(100) == wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 1)
-    assert counters(appliance)["frames"]["foreign"] == 1
+    if begun:
+        client.sendall(wire.frame(READ, 1, 1))
+        assert client.recv(100) == wire.frame(b"\x03\x04\x00\x00\x00\x00", 1, 1)
+    client.sendall(packet(0, 0, area=area, unit=2)[:8] + wire.frame(b"\x06\x00\x00\x00\x07", 1, 1))
+    with suppress(ConnectionResetError):
+        assert client.recv(100) == b""
+    counted = counters(appliance)
+    assert counted["frames"]["broken"] == 1
+    assert counted["packets"] == {**counted["packets"], "accepted": 0, "refused": {}}
+    assert registers(appliance) == [0, 0, 0, 0]
 
 
 def test_a_sender_without_a_rule_is_refused_and_may_speak_modbus(run: Run, dial: Any) -> None:

@@ -238,11 +238,11 @@ class _Units:
         if number is None or endpoint is None:
             return
         if number > MAX_UNIT:
-            message = f"the source never wrote to it: its id is {number}, more than {MAX_UNIT}"
-            self.desk.note("left out", target.path, message)
+            message = f"its id is {number}, more than {MAX_UNIT}: the source wrote no values to it"
+            self._leave_out(target, message, block)
             return
         if not offsets:
-            self.desk.note("left out", target.path, "no memories: it received no values")
+            self._leave_out(target, "no memories: it received no values", block)
             return
         if unit is not None and unit != number:
             message = f"packets go to unit {number}, the id of the target, as before"
@@ -255,6 +255,11 @@ class _Units:
             if index == 0 and block is not None and status_unit is not None:
                 forward["status"] = {"unit": status_unit, **block}
             yield forward
+
+    def _leave_out(self, target: Section, reason: str, block: dict[str, Any] | None) -> None:
+        """Notes that a target receives nothing, also not the status block that it received."""
+        lost = "" if block is None else ". It received the status block, which requires values here"
+        self.desk.note("left out", target.path, f"{reason}{lost}")
 
     def _offsets(self, path: KeyPath, value: object, reads: list[_Read]) -> dict[Area, int]:
         """What is added to addresses, by area; the source has it by function."""

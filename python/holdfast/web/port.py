@@ -73,6 +73,7 @@ class Port:
         self._host = host
         self._port = port
         self._listener: socket.socket | None = None
+        self._bound: tuple[str, int] | None = None
         self._pause = FIRST_PAUSE
         self._logged: tuple[str, float] | None = None
 
@@ -90,11 +91,8 @@ class Port:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port: of the listening socket, else those of the configuration."""
-        if self._listener is None:
-            return self._host, self._port
-        host, port = self._listener.getsockname()[:2]
-        return host, port
+        """Host and port: of the listening socket, otherwise those of the configuration."""
+        return (self._host, self._port) if self._bound is None else self._bound
 
     def status(self) -> dict[str, object]:
         """Returns the address, whether it is bound, and how many attempts failed. Thread-safe."""
@@ -104,7 +102,7 @@ class Port:
         )
         return {
             "address": joined(*self.address),
-            "listening": self._listener is not None,
+            "listening": self._bound is not None,
             "failed_binds": self.failures,
             **told,
         }
@@ -113,10 +111,12 @@ class Port:
         """Tries once to bind the port. A failure is logged. Returns whether the port is bound."""
         if self._listener is None:
             try:
-                self._listener = listen(self._host, self._port)
+                listener = listen(self._host, self._port)
             except OSError as error:
                 self._note(explained(error))
                 return False
+            host, port = listener.getsockname()[:2]
+            self._listener, self._bound = listener, (host, port)
             self.error = None
         return True
 
@@ -137,6 +137,7 @@ class Port:
 
     def close(self) -> None:
         """Frees the port."""
+        self._bound = None
         if self._listener is not None:
             self._listener.close()
 

@@ -542,6 +542,7 @@ mod tests {
     use holdfast_protocol::frame::{ascii, mbap};
 
     use super::*;
+    use crate::server::framing::MbapBesidePackets;
     use crate::server::functions::{AccessMode, Functions};
     use crate::server::identity::Identity;
     use crate::server::policy::Rule;
@@ -691,5 +692,41 @@ mod tests {
         let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
         let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
         assert_eq!((answered.requests, answered.broken), (1, true));
+    }
+
+    #[test]
+    fn a_packet_among_frames_breaks_a_connection_that_also_accepts_packets() {
+        // Unit id 2 is the length of a frame that ends in the middle of the packet.
+        let write = frame(1, &[6, 0, 0, 0, 7]);
+        let packet = [b"RI\x01\x03\x00\x02\x00\x00\x00\x06", &write[..]].concat();
+        let input = [frame(1, &[17]), packet].concat();
+        for cut in 0..=input.len() {
+            let mut shared = answering::<MbapBesidePackets>();
+            let (mut buffer, mut output) = (vec![0; INPUT], vec![0; OUTPUT]);
+            let (mut requests, mut broken) = (0, false);
+            for part in [&input[..cut], &input[cut..]] {
+                let kept = shared.restore(&mut buffer);
+                buffer[kept..kept + part.len()].copy_from_slice(part);
+                let answered = shared.answer(&buffer[..kept + part.len()], &mut output);
+                requests += answered.requests;
+                broken |= answered.broken;
+                if answered.broken {
+                    break;
+                }
+            }
+            assert_eq!((requests, broken), (1, true), "cut at {cut}");
+            let frames = &shared.unit_server.counters.frames;
+            assert_eq!((frames.broken.get(), frames.foreign.get()), (1, 0));
+        }
+        // Frames of other protocols, and transaction ids like the start of a packet, are as before.
+        let foreign = [0x52, 0x49, 2, 1, 0, 2, 1, 17];
+        let mut harmless = frame(1, &[17]);
+        harmless[..2].copy_from_slice(b"RI");
+        let input = [&foreign[..], &harmless].concat();
+        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!((answered.requests, answered.broken), (1, false));
+        let input = [b"RI\x01\x09\x00\x02\x01\x11", &frame(1, &[17])[..]].concat();
+        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT]);
+        assert_eq!((answered.requests, answered.broken), (1, false), "no packets at this port");
     }
 }

@@ -25,7 +25,8 @@ pub struct Counters {
 pub struct FrameCounters {
     /// Wrong protocol id: discarded.
     pub foreign: Counter,
-    /// Invalid length: the connection is closed, or the datagram is discarded.
+    /// Invalid length, or the start of a Raw Ingest packet: the connection is closed, or the datagram
+    /// is discarded.
     pub broken: Counter,
     /// Wrong CRC or LRC, incomplete, too long, or invalid characters: discarded.
     pub damaged: Counter,

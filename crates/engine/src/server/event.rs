@@ -26,7 +26,7 @@ pub enum Kind {
     RequestTimeout,
     /// The peer did not read its replies.
     SlowReader,
-    /// A frame had an invalid length.
+    /// A frame had an invalid length, or began like a Raw Ingest packet.
     BrokenFrame,
     /// Closed in favour of a new connection.
     Evicted,

@@ -1,7 +1,7 @@
 //! The framings of streams and datagrams: an MBAP header, RTU frames, or ASCII frames.
 
 use holdfast_protocol::frame::{ascii, mbap, rtu};
-use holdfast_protocol::pdu;
+use holdfast_protocol::{pdu, raw_ingest};
 
 /// What is at the start of received bytes.
 pub(crate) enum Next<'a> {
@@ -110,6 +110,38 @@ fn mbap_next(bytes: &[u8]) -> Next<'_> {
         }
         mbap::Next::Foreign { len, .. } => Next::Foreign { len },
         mbap::Next::Broken { .. } => Next::Broken,
+    }
+}
+
+/// Frames with an MBAP header on a port that also accepts Raw Ingest packets. A packet among frames is
+/// broken: read as a frame of another protocol, it would end too early, and its payload would follow
+/// as Modbus requests.
+pub(crate) struct MbapBesidePackets;
+
+impl Framing for MbapBesidePackets {
+    const HEADER_LEN: usize = Mbap::HEADER_LEN;
+    const SHORTEST: usize = Mbap::SHORTEST;
+    const MAX_LEN: usize = Mbap::MAX_LEN;
+
+    type Partial = <Mbap as Framing>::Partial;
+    const NO_PARTIAL: Self::Partial = Mbap::NO_PARTIAL;
+
+    type Decoded = ();
+    const NOT_DECODED: () = ();
+
+    #[inline]
+    fn next<'a>(
+        bytes: &'a [u8],
+        _delimiter: impl FnOnce() -> u8,
+        _decoded: &'a mut (),
+    ) -> Next<'a> {
+        // No Modbus request starts like this: byte 3 is that of a protocol id other than 0.
+        if raw_ingest::is_start(bytes) { Next::Broken } else { mbap_next(bytes) }
+    }
+
+    #[inline]
+    fn complete(frame: &mut [u8], tag: u16, unit_id: u8, pdu_len: usize) -> usize {
+        Mbap::complete(frame, tag, unit_id, pdu_len)
     }
 }
 

@@ -43,6 +43,9 @@ const CHUNK: usize = 16 * 1024;
 /// The most reads of what follows an accepted packet.
 const LAST_READS: usize = 4;
 
+/// The most packets of one connection that are answered before other tasks run.
+const TURN: usize = 64;
+
 /// The most bytes that are read after a packet without its CRC.
 const LATE_BYTES: usize = 64 * 1024;
 
@@ -321,6 +324,7 @@ impl RawIngest {
         let (mut end, mut begun, mut accepted) = (Kind::Closed, Instant::now(), false);
         // The packets that were answered end here.
         let mut answered = 0;
+        let mut packets: usize = 0;
         loop {
             let refusal = match self.first_of(&context, peer, &rights, &bytes[answered..]) {
                 Ok(Some((len, reply))) => {
@@ -331,6 +335,10 @@ impl RawIngest {
                     if let Err(slow) = self.reply(&stream, reply).await {
                         end = slow;
                         break;
+                    }
+                    packets += 1;
+                    if packets.is_multiple_of(TURN) {
+                        yield_now().await;
                     }
                     continue;
                 }
@@ -569,6 +577,9 @@ mod tests {
     use std::io::Write as _;
     use std::net::TcpListener;
 
+    use holdfast_memory::{Layout, Span};
+
+    use super::super::admission::Admission;
     use super::*;
 
     fn listener(format: Format, flags: Flags) -> RawIngest {
@@ -608,6 +619,46 @@ mod tests {
         drop(client);
         while (&*SockRef::from(&stream)).write(&[DONE]).is_ok() {}
         assert_eq!(runtime.block_on(raw.reply(&stream, DONE)), Ok(()));
+    }
+
+    #[test]
+    fn other_tasks_run_between_many_packets_that_arrive_together() {
+        const PACKETS: usize = 20 * TURN;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let (client, accepted, peer) = connected();
+        client.shutdown(std::net::Shutdown::Write).unwrap();
+        accepted.set_nonblocking(true).unwrap();
+        let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 1).unwrap());
+        let memory = Arc::new(Memory::new(layout, None).unwrap());
+        let rights = RawGrant {
+            targets: HashMap::from([(1, Arc::clone(&memory))]),
+            areas: vec![Area::HoldingRegisters],
+        };
+        let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07";
+        let context = Arc::new(ListenerContext::for_tests());
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
+        let admitted = Admitted {
+            stream: TcpStream::from_std(accepted).unwrap(),
+            peer,
+            rights: Arc::new(rights),
+            received: packet.repeat(PACKETS),
+            ticket,
+        };
+        let raw = listener(Format::V1, Flags::Strict);
+        let (_engine, stop) = watch::channel(false);
+        let mut turns = 0;
+        runtime.block_on(async {
+            let serving = raw.serve_many(context, admitted, Duration::from_secs(10), stop);
+            tokio::select! {
+                biased;
+                () = serving => {}
+                () = async { loop { turns += 1; yield_now().await } } => unreachable!(),
+            }
+        });
+        assert_eq!(raw.packets.accepted.get(), PACKETS as u64);
+        assert!(turns >= PACKETS / TURN, "{turns} turns");
     }
 
     /// Whether these bytes begin a packet; `None` if more are needed.

@@ -12,7 +12,7 @@ use super::admission::ConnectionLimits;
 use super::admission::Ticket;
 use super::connection::{Connection, Timeouts};
 use super::event::Kind;
-use super::framing::{Ascii, Framing, Mbap, Rtu};
+use super::framing::{Ascii, Framing, Mbap, MbapBesidePackets, Rtu};
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::policy::{PeerRights, Policy, Rule};
 use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
@@ -179,7 +179,7 @@ impl ModbusStream {
                 Beginning::Unknown => {}
                 Beginning::SomethingElse => {
                     admitted.ticket.set_amid_packet(false);
-                    return self.connection::<Mbap>(context, admitted, stop).await;
+                    return self.connection::<MbapBesidePackets>(context, admitted, stop).await;
                 }
                 Beginning::Packet => {
                     let Admitted { stream, peer, received, ticket, .. } = admitted;
