@@ -406,3 +406,17 @@ def test_readable_ranges_without_holes_are_a_warning(
         "p.yaml:14: devices.meter.readable: has no effect: gaps are read only with max_gap or cost"
     )
     assert folder.warnings(text) == ([message] if warned else [])
+
+
+def test_a_block_of_a_receiver_has_one_device(folder: Folder) -> None:
+    block = (
+        "forward: [{url: 'raw://A:1', unit: 1, status: {unit: 2, area: input_registers, slot: 3}}]"
+    )
+    read = "reads: [{area: coils, address: 0, count: 1}]"
+    each = f"{{url: tcp://a, unit: 1, interval: 1, {read}, {block}}}"
+    text = f"devices:\n  a: {each}\n  b: {each.replace('A:1', 'a:1')}\n"
+    assert folder.problems(text) == [
+        "p.yaml:3: devices.b.forward[0].status: found input_registers 90 to 119 of unit 2 of a:1, "
+        "which overlaps 90 to 119 of devices.a.forward[0].status in line 2, " + OWN
+    ]
+    assert folder.warnings(text.replace("slot: 3", "slot: 4", 1)) == []

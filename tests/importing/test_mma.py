@@ -432,6 +432,7 @@ def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> Non
         "type": "modbus-tcp",
         "bind": "127.0.0.1:502",
         "when_full": "evict",
+        "idle_timeout": 0,
         "rules": [{"sources": ["10.0.0.0/8"], "units": {1: "main-1"}, "access": "read-write"}],
         "raw_ingest": raw_ingest({1: "main-1"}, ["coils", "holding_registers"]),
     }
@@ -566,6 +567,7 @@ def test_a_listener_without_policies_takes_only_raw_ingest(imported: Import) -> 
         "type": "raw-ingest",
         "bind": "127.0.0.1:502",
         "when_full": "evict",
+        "idle_timeout": 0,
         **raw_ingest({1: "main-1"}, ["coils", "holding_registers"]),
     }
     assert noted(found, "listeners[0]: changed: no policy allows a function for its areas")

@@ -195,6 +195,7 @@ def test_units_at_one_address_share_its_settings(
 ) -> None:
     """They have one connection here, so that their retries are those of the fastest."""
     second = changed("interval_ms: 250", "interval_ms: 4000").partition("units:\n")[2]
+    second = second.replace("status_slot: 4", "status_slot: 5")
     found = imported(UNIT + second)
     assert [note for note in notes(found) if "renamed" in note] == [
         "3: replicator.units[0].id: changed: renamed to pump_1: a name has "
@@ -224,6 +225,16 @@ def test_a_target_that_got_nothing_gets_nothing(imported: Callable[[str], Import
     ]
     assert notes(found)[2:] == [f"{reason}{lost}" for reason in reasons]
     assert notes(imported(changed(", status_slot: 4", "", text)))[2:] == reasons
+
+
+def test_the_other_import_names_this_one(tmp_path: Path) -> None:
+    source = tmp_path / "replicator.yaml"
+    source.write_text(UNIT)
+    result = CliRunner().invoke(main, ["import", "mma", str(source)])
+    assert result.exit_code == 2
+    assert "1: replicator: for the units in this file, use: holdfast import replicator" in (
+        result.stderr
+    )
 
 
 def test_the_command_writes_a_file_and_tells_programs(tmp_path: Path) -> None:

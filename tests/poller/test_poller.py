@@ -817,6 +817,33 @@ def test_a_receiver_gets_offsets_of_its_own_and_the_status_block(run: Run, serve
         assert [each.last_error for each in told()] == [REFUSED, 0]
 
 
+def test_what_happens_at_receivers_is_logged(
+    run: Run, serve: Serve, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = free_port()
+    target = run(receiving(port, "v1"))
+    source = holdfast.Memory(coils=8)
+    receiver = f"raw://127.0.0.1:{port}"
+    forward = [{"url": receiver, "unit": unit} for unit in (4, 5)]
+    meter = device(url(serve({1: source})), read("coils", 0, 8), forward=forward)
+    appliance = run(configuration({"meter": meter}))
+
+    def is_logged(event: str) -> bool:
+        appliance.log_events(0.01)
+        return event in caplog.messages
+
+    with caplog.at_level("INFO"):
+        wire.until(lambda: is_logged("forward_refused"), "nobody has unit 5")
+        target.stop()
+        wire.until(lambda: is_logged("forward_failed"), "it is gone")
+        target.start()
+        wire.until(lambda: is_logged("forward_back"), "it is back")
+    first = {record.message: vars(record)["fields"] for record in reversed(caplog.records)}
+    assert first["forward_refused"].pop("count") > 0
+    for event in ("forward_refused", "forward_failed", "forward_back"):
+        assert first[event] == {"device": "meter", "receiver": receiver}
+
+
 def test_a_device_is_retried_as_soon_as_it_is_asked_for(run: Run) -> None:
     port, polls = free_port(), 12
     reads = [read("coils", 0, 8, ("coils", 0))]

@@ -37,10 +37,6 @@ def idle(since: float) -> Peer:
     return Peer(Waiting(in_request=False, since=since))
 
 
-def silent(since: float) -> Peer:
-    return Peer(Waiting(in_request=False, since=since, used=False))
-
-
 def in_request(since: float) -> Peer:
     return Peer(Waiting(in_request=True, since=since))
 
@@ -63,8 +59,6 @@ def full(*peers: Peer, when_full: WhenFull = "evict") -> Admission[Peer]:
         ([idle(99.9), in_request(1)], 0),
         ([in_request(1), idle(99.9)], 1),
         ([in_request(9), in_request(8), in_request(99.9)], 1),
-        ([silent(LONG_AGO), idle(LONG_AGO + 0.1)], 0),
-        ([silent(LONG_AGO + 0.1), idle(99.9)], 1),
         ([answered(), in_request(LONG_AGO)], 1),
     ],
 )
@@ -77,7 +71,6 @@ def test_who_is_evicted(peers: list[Peer], evicted: int) -> None:
     "peers",
     [
         [answered(), answered()],
-        [silent(LONG_AGO + 0.1)],
         [in_request(LONG_AGO + 0.1)],
         [answered(), in_request(NOW)],
     ],

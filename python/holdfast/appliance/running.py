@@ -27,7 +27,7 @@ from holdfast.net.addresses import joined
 from holdfast.web.port import Port
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from holdfast.adapters import Adapter
     from holdfast.client.url import Tls
@@ -147,6 +147,8 @@ class _Running:
         self._health = dict.fromkeys(config.devices, "unknown")
         self._plan_errors: dict[str, str | None] = {}
         self._unstored: dict[str, int] = {}
+        self._forwarded: dict[tuple[str, int], Mapping[str, int]] = {}
+        self._unreachable: set[tuple[str, int]] = set()
         self._looked = time.monotonic()
         # Missing adapters and unusable TLS files are reported before any socket is opened.
         for name, settings in config.adapters.items():
@@ -243,6 +245,7 @@ class _Running:
         if refused:
             logs.write(logging.ERROR, "device_unstored", device=name, count=refused)
         self._unstored[name] = unstored
+        self._log_forwards(name, told.get("forward", ()))
         if health == self._health[name]:
             return
         self._health[name] = health
@@ -250,6 +253,26 @@ class _Running:
         if health == "error":
             fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
         logs.write(logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields)
+
+    def _log_forwards(self, name: str, counted: Sequence[Mapping[str, int]]) -> None:
+        """Logs what happened at the receivers of a device since the last check."""
+        receivers = self._config.devices[name].forward
+        for index, (receiver, now) in enumerate(zip(receivers, counted, strict=True)):
+            key = (name, index)
+            before = self._forwarded.get(key, {})
+            self._forwarded[key] = now
+            refused = now["refused"] - before.get("refused", 0)
+            replied = refused + now["sent"] - before.get("sent", 0)
+            failed = now["failed"] - before.get("failed", 0)
+            fields = {"device": name, "receiver": receiver.url}
+            if refused:
+                logs.refused("forward_refused", kind=key, **fields, count=refused)
+            if replied and key in self._unreachable:
+                self._unreachable.discard(key)
+                logs.write(logging.INFO, "forward_back", **fields)
+            elif failed and not replied and key not in self._unreachable:
+                self._unreachable.add(key)
+                logs.write(logging.WARNING, "forward_failed", **fields)
 
     def _log_event(
         self, listener: str, event: str, peer: str | None, reason: str | None, count: int | None

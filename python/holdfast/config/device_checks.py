@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.allowed import allowed
 from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, takes_writes
 from holdfast.config.initial import extent
-from holdfast.config.lenient import entries, integer, mapping
+from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.memory_checks import area_of
 from holdfast.config.range_checks import check_ranges, counted
+from holdfast.config.receiver import parse_receiver
 from holdfast.config.words import choice, show
+from holdfast.net.addresses import joined
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS, Area
 
@@ -119,6 +121,7 @@ class DeviceChecks:
         self._target(path, forward, form)
         if isinstance(forward.get("status"), dict):
             self._target((*path, "status"), forward["status"], form)
+            self._forwarded_status((*path, "status"), forward, forward["status"], form)
 
     def _target(self, path: KeyPath, of: dict[Any, Any], form: str) -> None:
         """Packets of a format name their memory in one way."""
@@ -129,6 +132,19 @@ class DeviceChecks:
         if other in of:
             message = f"found with format {form}, allowed: {needed}"
             self.report.add((*path, other), message, of_key=True)
+
+    def _forwarded_status(
+        self, path: KeyPath, forward: dict[Any, Any], status: dict[Any, Any], form: str
+    ) -> None:
+        """Each block of a receiver has one device."""
+        receiver = parsed(parse_receiver, forward.get("url"))
+        area, slot = status.get("area"), integer(status.get("slot"), 0, LAST_SLOT)
+        target = integer(status.get(_NAMING[form]), 0, MAX_WORD)
+        if receiver is None or area not in REGISTER_AREAS or slot is None or target is None:
+            return
+        of = f"{_NAMING[form]} {target} of {joined(*receiver)}"
+        block = range(slot * STATUS_BLOCK, (slot + 1) * STATUS_BLOCK)
+        self._claims.append(Claim(path, of, area, block))
 
     def _offsets(self, path: KeyPath, forward: dict[Any, Any], reads: list[Any]) -> None:
         """With its offset, every read is within the area of the receiver."""

@@ -55,6 +55,9 @@ def _generation(desk: Desk) -> Generation | None:
         return 2
     if any(key in data for key in _FIRST):
         return 1
+    if "replicator" in data:
+        desk.problem(("replicator",), "for the units in this file, use: holdfast import replicator")
+        return None
     allowed = "memory, routing and ports (first generation) or listeners (second)"
     desk.problem((), f"found none of the keys of a generation, allowed: {allowed}")
     return None

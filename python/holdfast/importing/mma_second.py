@@ -29,7 +29,7 @@ TOP_REASONS = {
     "rbe": "no report by exception; programs read with Modbus or REST",
     "access_events": "the log has refused peers",
     "persistence": "memory is not kept; initial values come from a file, see initial",
-    "memory": "in this generation, each listener has its own memories",
+    "memory": "each listener has its own memories in this generation: listeners[].memory",
 }
 _MEMORY_REASONS = {
     "fc43": "set the values under identity, which applies to the whole appliance",
@@ -125,7 +125,7 @@ class SecondGeneration:
         admitted = ALL if self.admitted is None else self.admitted
         rules = merged(known, admitted)
         raw = self._raw_ingest(listener, memories, admitted)
-        common = {"bind": str(bind), "when_full": "evict"}
+        common = {"bind": str(bind), "when_full": "evict", "idle_timeout": 0}
         if not raw:
             message = "the listener is left out: nobody may read or write its memories"
             self.desk.note("left out", listener.path, message)

@@ -37,8 +37,6 @@ class Waiting(NamedTuple):
     in_request: bool
     """Whether it waits for the rest of a request, or for the peer to take a response."""
     since: float
-    used: bool = True
-    """Whether the peer has sent anything yet."""
 
 
 class Held(Protocol):
@@ -102,5 +100,4 @@ class Admission(Generic[Connection]):
 
 
 def _may_go(waiting: Waiting, now: float) -> bool:
-    between_requests = waiting.used and not waiting.in_request
-    return between_requests or now - waiting.since >= PATIENCE
+    return not waiting.in_request or now - waiting.since >= PATIENCE

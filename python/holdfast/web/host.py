@@ -524,7 +524,7 @@ class _Connection(HttpToolsProtocol):
         if self._busy() and taken and (self.cycle.response_started or not self.cycle.more_body):
             return None
         between_requests = taken and self._idle_due != math.inf
-        return Waiting(self._used and not between_requests, self._since, self._used)
+        return Waiting(self._used and not between_requests, self._since)
 
     def give_way(self) -> None:
         """Closes the connection for a new one."""
