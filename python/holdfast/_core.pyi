@@ -248,7 +248,8 @@ class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
     `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
-    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. `raw_ingest`, only with `mbap`
+    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. With `listen_only`, function 8
+    may set a unit to listen only mode, for all peers. `raw_ingest`, only with `mbap`
     and without TLS, is a listener for packets whose connections come to the same port: its own bind
     and limits are ignored. Raises `ValueError` for an invalid address, limit or time.
     """
@@ -266,12 +267,18 @@ class Listener:
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
         frame_timeout: float | None = None,
+        listen_only: bool = False,
         tls: ServerTls | None = None,
         raw_ingest: Listener | None = None,
     ) -> Listener: ...
     @staticmethod
     def udp(
-        name: str, bind: str, rules: Sequence[Rule], *, framing: Literal["mbap", "rtu"] = "mbap"
+        name: str,
+        bind: str,
+        rules: Sequence[Rule],
+        *,
+        framing: Literal["mbap", "rtu"] = "mbap",
+        listen_only: bool = False,
     ) -> Listener:
         """A listener for Modbus over UDP.
 

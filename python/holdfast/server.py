@@ -70,7 +70,8 @@ class Server:
 
     Times are in seconds. `idle_timeout` is the time without a request; 0 is unlimited.
     `request_timeout` is the time from the first byte of a request to its last, and the time for a
-    peer to read its replies. `workers` is the number of native threads.
+    peer to read its replies. With `listen_only`, a peer that may write can set a unit to listen
+    only mode for all peers (function 8, sub-function 4). `workers` is the number of native threads.
 
     Raises `ValueError` or `TypeError` at once for invalid arguments.
 
@@ -94,6 +95,7 @@ class Server:
         when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
+        listen_only: bool = False,
         identity: Identity | None = None,
         workers: int = 1,
     ) -> None:
@@ -121,6 +123,7 @@ class Server:
             when_full=when_full,
             idle_timeout=idle_timeout,
             request_timeout=request_timeout,
+            listen_only=listen_only,
         )
         self._identity = identity or Identity()
         self._workers = workers

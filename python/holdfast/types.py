@@ -71,6 +71,7 @@ class ConnectionCounters(TypedDict):
     refused_role: int
     tls_failed: int
     refused_full: int
+    refused_listen_only: int
     evicted: int
     idle: int
     request_timeout: int

@@ -74,7 +74,7 @@ def test_a_restart_with_other_data_is_an_illegal_value(data: str, client: wire.C
     assert client.ask(bytes.fromhex("080001" + data)) == b"\x88\x03"
 
 
-@pytest.mark.parametrize("sub_function", [2, 4, *range(0x0A, 0x13), 0x14])
+@pytest.mark.parametrize("sub_function", [2, *range(0x0A, 0x13), 0x14])
 @pytest.mark.parametrize("data", ["0001", "ff00", "", "00", "000000", "00000000"])
 def test_other_sub_functions_take_0000_only(
     sub_function: int, data: str, client: wire.Connection
@@ -130,7 +130,7 @@ def test_a_busy_reply_is_counted(serve: Serve, connect: Connect) -> None:
 def test_requests_without_a_reply_are_counted(
     memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
-    client = connect(serve({1: memory, 2: memory}))
+    client = connect(serve({1: memory, 2: memory}, listen_only=True))
     client.send(listen_only(1) + framed(READ, 1) * 3)
 
     # Three reads, and the request that silenced the unit.
@@ -198,7 +198,27 @@ def test_a_read_only_peer_is_denied_before_the_form_is_judged(
 
 @pytest.fixture
 def two_units(memory: holdfast.Memory, serve: Serve) -> holdfast.Server:
-    return serve({1: memory, 2: memory})
+    return serve({1: memory, 2: memory}, listen_only=True)
+
+
+@pytest.mark.parametrize("data", ["0000", "0001", "", "000000"])
+@pytest.mark.parametrize("unit", [1, 9])
+def test_listen_only_mode_is_an_illegal_function_by_default(
+    data: str, unit: int, server: holdfast.Server, client: wire.Connection
+) -> None:
+    assert client.ask(bytes.fromhex("080004" + data), unit) == b"\x88\x01"
+
+    assert client.ask(READ) == bytes.fromhex("03020000")
+    assert client.ask(RESTART) == RESTART
+    assert server.counters()["connections"]["refused_listen_only"] == 1
+    assert server.counters()["exceptions"] == {1: 1}
+
+
+@pytest.mark.parametrize("data", ["0001", "ff00", "", "00", "000000", "00000000"])
+def test_listen_only_mode_takes_0000_only(
+    data: str, two_units: holdfast.Server, connect: Connect
+) -> None:
+    assert connect(two_units).ask(bytes.fromhex("080004" + data)) == b"\x88\x03"
 
 
 def test_listen_only_mode_is_entered_without_a_reply(
@@ -274,7 +294,7 @@ def test_a_restart_of_another_unit_does_not_end_listen_only_mode(
 def test_listen_only_mode_ends_with_its_listener(
     memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
-    silenced, other = serve({1: memory}), serve({1: memory})
+    silenced, other = (serve({1: memory}, listen_only=True) for _ in range(2))
     connect(silenced).send(listen_only(1))
 
     assert connect(other).ask(READ) == bytes.fromhex("03020000")
@@ -518,7 +538,7 @@ def test_frames_that_are_no_requests_are_counted(
 def test_requests_without_a_reply_are_counted_in_python_too(
     memory: holdfast.Memory, serve: Serve, connect: Connect
 ) -> None:
-    server = serve({1: memory, 2: memory})
+    server = serve({1: memory, 2: memory}, listen_only=True)
     client = connect(server)
     client.send(listen_only(1) + framed(READ, 1))
     client.ask(READ, unit=2)

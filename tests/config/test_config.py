@@ -513,6 +513,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "    when_full: refuse\n"
         "    idle_timeout: 300\n"
         "    request_timeout: 10\n"
+        "    listen_only: false\n"
         "    rules:\n"
         "      - sources: [10.0.0.7/32, fd00::/64]\n"
         "        units: {1: plant, 16: plant}\n"

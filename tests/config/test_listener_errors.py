@@ -106,7 +106,7 @@ def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) 
         (
             "    rules:",
             "    idle_timeout: 5\n    rules:",
-            "8: idle_timeout: unknown key, allowed: type, bind, rules",
+            "8: idle_timeout: unknown key, allowed: type, bind, listen_only, rules",
         ),
         ("{1: plant}", "{256: plant}", "9: rules[0].units.256: found 256, allowed: a unit id from "
          "0 to 255, or a range, as in 20-40"),

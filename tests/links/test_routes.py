@@ -106,6 +106,29 @@ def test_request_and_reply_pass_unchanged(
     assert [(asked.unit, asked.pdu.hex()) for asked in unmodelled.requests] == [(9, request_)]
 
 
+@pytest.mark.parametrize("data", ["0000", "0001", ""])
+def test_listen_only_mode_does_not_reach_the_device(
+    device: Stream, meter: Appliance, connect: Connect, data: str
+) -> None:
+    front = connect(scada(meter))
+
+    assert front.ask(bytes.fromhex("080004" + data)) == b"\x88\x01"
+    assert front.ask(READ) == FIVE
+    assert [asked.pdu for asked in device.requests] == [READ]
+    connections = meter.diagnostics.stats()["listeners"]["scada"]["connections"]
+    assert connections["refused_listen_only"] == 1
+
+
+def test_listen_only_mode_reaches_the_device_if_the_listener_allows_it(
+    unmodelled: FakeDevice, run: Run, connect: Connect
+) -> None:
+    unmodelled.answer = lambda _: bytes.fromhex("0800040000")
+    front = connect(scada(run(configuration(unmodelled.url, listener={"listen_only": True}))))
+
+    assert front.ask(bytes.fromhex("0800040000")).hex() == "0800040000"
+    assert [asked.pdu.hex() for asked in unmodelled.requests] == ["0800040000"]
+
+
 @pytest.mark.parametrize("code", [name for name in EXCHANGES if "," not in name])
 def test_functions_of_the_standard_need_no_list(
     unmodelled: FakeDevice, run: Run, connect: Connect, code: str

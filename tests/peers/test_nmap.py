@@ -41,7 +41,8 @@ def appliance(run: Run) -> Appliance:
     sealed = {"coils": 8, "seal": {"area": "coils", "address": 0}}
     rules = [{"sources": ["127.0.0.1"], "units": UNITS, "access": "read-write"}]
     memories = {"plant": ALL, "sealed": sealed}
-    return run(configuration("tcp", rules=rules, memories=memories, more={"identity": IDENTITY}))
+    more = {"identity": IDENTITY}
+    return run(configuration("tcp", rules=rules, memories=memories, more=more, listen_only=True))
 
 
 # nmap

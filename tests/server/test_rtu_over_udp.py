@@ -237,7 +237,8 @@ def test_a_stranger_is_not_answered_and_counted(run: Run) -> None:
 
 def test_a_unit_in_listen_only_mode_keeps_silent(run: Run) -> None:
     units = {"sources": ["127.0.0.1"], "units": {1: "plant", 2: "plant"}, "access": "read-write"}
-    with RtuDatagrams(address(run(configuration("rtu-udp", rules=[units])))) as client:
+    appliance = run(configuration("rtu-udp", rules=[units], listen_only=True))
+    with RtuDatagrams(address(appliance)) as client:
         for request in (bytes.fromhex("0800040000"), READ, b"\x63"):
             client.send(lines.rtu(request, 1))
         assert client.ask(READ, 2) == ZERO

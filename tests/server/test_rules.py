@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
+from support import wire
 from support.config_folder import written
 from support.machine import needs_127_0_0_2
 from support.running import content, endpoint
@@ -334,6 +335,21 @@ def test_a_read_only_rule_denies_what_changes_the_state_of_the_listener(
 
     assert peer.ask(bytes([8, 0, sub_function, 0, 0])) == b"\x88\x01"
     assert peer.ask(READ) == ZERO
+
+
+def test_a_peer_cannot_silence_a_unit_for_others(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    plant = start(rule(["127.0.0.1"]))
+
+    assert plant.peer().ask(bytes.fromhex("0800040000")) == b"\x88\x01"
+    assert plant.peer().ask(READ) == ZERO
+    assert counters(plant.appliance)["connections"]["refused_listen_only"] == 1
+    plant.appliance.log_events(wire.DEADLINE)
+    [refused] = [each for each in caplog.records if each.message == "refused_listen_only"]
+    fields = refused.fields  # type: ignore[attr-defined]
+    assert fields["listener"] == "scada"
+    assert fields["peer"].startswith("127.0.0.1:")
 
 
 # Several listeners

@@ -505,7 +505,7 @@ def test_pipelined_requests_are_answered_as_the_oracle_says(
     ]
     stream = b"".join(wire.frame(pdu, unit, at) for at, (unit, pdu) in enumerate(asked))
     with (
-        holdfast.Server({1: memory}, bind="127.0.0.1:0", access=access) as server,
+        holdfast.Server({1: memory}, bind="127.0.0.1:0", access=access, listen_only=True) as server,
         wire.Connection(server.address) as client,
     ):
         client.send(stream)

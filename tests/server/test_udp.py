@@ -252,7 +252,7 @@ def test_a_sealed_memory_is_busy_until_it_is_opened(run: Run) -> None:
 
 def test_a_unit_in_listen_only_mode_keeps_silent(run: Run) -> None:
     units = {"sources": ["127.0.0.1"], "units": {1: "plant", 2: "plant"}, "access": "read-write"}
-    appliance = run(configuration("udp", rules=[units]))
+    appliance = run(configuration("udp", rules=[units], listen_only=True))
     with Datagrams(address(appliance)) as client:
         for request in (bytes.fromhex("0800040000"), READ, b"\x63"):
             client.send(wire.frame(request))

@@ -33,14 +33,16 @@ def configuration(
     link: dict[str, Any] | None = None,
     units: dict[int | str, Any] | None = None,
     rule: dict[str, Any] | None = None,
+    listener: dict[str, Any] | None = None,
     **more: Any,
 ) -> str:
     """One listener, `scada`. By default all its unit ids, 0 to 247, are behind the link `bus`."""
     units = units or {"0-247": {"route": "bus"}}
     rules = [{"sources": LOOPBACK, "access": "read-write", "units": units, **(rule or {})}]
+    scada = {"type": TYPES[kind], "bind": "127.0.0.1:0", "rules": rules, **(listener or {})}
     return written(
         {
-            "listeners": {"scada": {"type": TYPES[kind], "bind": "127.0.0.1:0", "rules": rules}},
+            "listeners": {"scada": scada},
             "links": {"bus": {"url": url, "timeout": wire.DEADLINE, **(link or {})}},
             **more,
         }

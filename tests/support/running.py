@@ -33,6 +33,7 @@ class ServerOptions(TypedDict, total=False):
     when_full: Literal["refuse", "evict"]
     idle_timeout: float
     request_timeout: float
+    listen_only: bool
     workers: int
     identity: Identity
 

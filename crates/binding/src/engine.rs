@@ -154,6 +154,7 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bo
         ("refused_role", &counters.refused_role),
         ("tls_failed", &counters.tls_failed),
         ("refused_full", &counters.refused_full),
+        ("refused_listen_only", &counters.refused_listen_only),
         ("evicted", &counters.evicted),
         ("idle", &counters.idle),
         ("request_timeout", &counters.request_timeout),

@@ -145,7 +145,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, tls=None, raw_ingest=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, raw_ingest=None))]
     fn new(
         name: String,
         bind: &str,
@@ -157,6 +157,7 @@ impl Listener {
         idle_timeout: f64,
         request_timeout: f64,
         frame_timeout: Option<f64>,
+        listen_only: bool,
         tls: Option<PyRef<'_, ServerTls>>,
         raw_ingest: Option<PyRef<'_, Listener>>,
     ) -> PyResult<Listener> {
@@ -187,6 +188,7 @@ impl Listener {
             frame_timeout: frame_timeout
                 .map(|time| time_to_wait("frame_timeout", time))
                 .transpose()?,
+            listen_only,
             tls: tls.map(|tls| Arc::clone(&tls.core)),
             raw_ingest,
         });
@@ -194,18 +196,20 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap"))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", listen_only=false))]
     fn udp(
         name: String,
         bind: &str,
         rules: Vec<PyRef<'_, Rule>>,
         framing: &str,
+        listen_only: bool,
     ) -> PyResult<Listener> {
         let framings = [("mbap", DatagramFraming::Mbap), ("rtu", DatagramFraming::Rtu)];
         let udp = UdpSettings {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
             rules: cores(&rules),
+            listen_only,
         };
         Ok(Listener { core: ListenerSettings { name, kind: ListenerKind::ModbusUdp(udp) } })
     }

@@ -127,6 +127,7 @@ impl Front {
             idle_timeout: None,
             request_timeout: PATIENCE,
             frame_timeout: None,
+            listen_only: false,
             tls: None,
             raw_ingest: None,
         };

@@ -63,8 +63,12 @@ fn within(memory: &Arc<Memory>, read: &[(u16, u32)], write: &[(u16, u32)]) -> Pe
 }
 
 fn unit_server() -> UnitServer {
+    unit_server_with(true)
+}
+
+fn unit_server_with(listen_only: bool) -> UnitServer {
     let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
-    UnitServer::new(Identity::new(&objects, &[]).unwrap())
+    UnitServer::new(Identity::new(&objects, &[]).unwrap(), listen_only)
 }
 
 fn ask(
@@ -163,6 +167,19 @@ fn a_unit_in_listen_only_mode_does_not_answer_denied_requests() {
     assert_eq!(ask(&unit_server, &elsewhere, 7, &[99]).unwrap(), [0xE3, 1]);
     assert_eq!(ask(&unit_server, &all, 7, RESTART), None);
     assert_eq!(ask(&unit_server, &all, 7, READ).unwrap(), [3, 2, 0, 0]);
+}
+
+#[test]
+fn listen_only_mode_is_refused_unless_the_listener_allows_it() {
+    let (memory, unit_server) = (memory(1), unit_server_with(false));
+    let rights = rights(&[(7, &memory)], AccessMode::ReadWrite);
+    for request in [LISTEN_ONLY, &[8, 0, 4], &[8, 0, 4, 0, 1]] {
+        assert_eq!(ask(&unit_server, &rights, 7, request).unwrap(), [0x88, 1]);
+        // The unit id is not looked up.
+        assert_eq!(ask(&unit_server, &rights, 9, request).unwrap(), [0x88, 1]);
+    }
+    assert_eq!(ask(&unit_server, &rights, 7, READ).unwrap(), [3, 2, 0, 0]);
+    assert_eq!(ask(&unit_server, &rights, 7, RESTART).unwrap(), RESTART);
 }
 
 #[test]

@@ -176,6 +176,7 @@ def listener(
                 idle_timeout=settings.idle_timeout,
                 request_timeout=settings.request_timeout,
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
+                listen_only=settings.listen_only,
                 tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
                 raw_ingest=_shared_port(name, settings, config, memories),
             )
@@ -186,6 +187,7 @@ def listener(
                 str(settings.bind),
                 rules,
                 framing="mbap" if isinstance(settings, ModbusUdpListener) else "rtu",
+                listen_only=settings.listen_only,
             )
         case ModbusRtuListener() | ModbusAsciiListener():
             line = settings.serial

@@ -166,6 +166,8 @@ class _ConnectionListener(Model):
     """Seconds without a request after which a connection is closed; 0: unlimited."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last."""
+    listen_only: bool = False
+    """Function 8 may set a unit to listen only mode, for all clients of this listener."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
     """For each unit id, the first rule whose sources contain the peer and that names it applies."""
 
@@ -258,6 +260,8 @@ class ModbusUdpListener(Model):
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
+    listen_only: bool = False
+    """Function 8 may set a unit to listen only mode, for all clients of this listener."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
     """For each unit id, the first rule whose sources contain the sender and that names it applies.
     """
@@ -270,6 +274,8 @@ class ModbusRtuOverUdpListener(Model):
     """The protocol."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
+    listen_only: bool = False
+    """Function 8 may set a unit to listen only mode, for all clients of this listener."""
     rules: Annotated[tuple[RuleConfig, ...], Strict(False), Field(min_length=1)]
     """For each unit id, the first rule whose sources contain the sender and that names it applies.
     """

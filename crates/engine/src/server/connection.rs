@@ -502,6 +502,9 @@ impl<F: Framing> Answering<F> {
         let Some(buffer) = room.and_then(<[u8]>::first_chunk_mut::<{ pdu::MAX_LEN }>) else {
             return 0;
         };
+        if self.unit_server.refuses_silence(request) {
+            self.context.refuse_listen_only(self.peer);
+        }
         let len = self.unit_server.answer(&self.rights, unit_id, request, buffer);
         if let Some(auditor) = &self.context.auditor {
             let reply = &buffer[..len.unwrap_or_default()];
@@ -564,7 +567,7 @@ mod tests {
         Answering::new(
             Arc::new(ListenerContext::for_tests()),
             SocketAddr::from(([127, 0, 0, 1], 1)),
-            Arc::new(UnitServer::new(Identity::new(&objects, &[]).unwrap())),
+            Arc::new(UnitServer::new(Identity::new(&objects, &[]).unwrap(), false)),
             Arc::new(PeerRights::new(&rule)),
         )
     }

@@ -57,7 +57,7 @@ impl PacketCounters {
     }
 }
 
-/// Connections, and datagrams from peers that no rule names.
+/// Connections, datagrams from peers that no rule names, and requests for listen only mode.
 #[derive(Debug, Default)]
 pub struct ConnectionCounters {
     pub accepted: Counter,
@@ -67,6 +67,8 @@ pub struct ConnectionCounters {
     pub refused_role: Counter,
     /// `max_connections` or `max_connections_per_source` was reached.
     pub refused_full: Counter,
+    /// A request asked for listen only mode, which the listener does not allow.
+    pub refused_listen_only: Counter,
     /// TLS failed, usually in the handshake.
     pub tls_failed: Counter,
     /// Closed in favour of a new connection.

@@ -126,9 +126,9 @@ impl Engine {
         let mut tasks: Vec<Task> = Vec::new();
         let mut listeners = Vec::new();
         for ListenerSettings { name, kind } in settings.listeners {
-            let unit_server = || -> Result<Arc<UnitServer>, StartError> {
+            let unit_server = |listen_only| -> Result<Arc<UnitServer>, StartError> {
                 let identity = Identity::new(&settings.identity, &settings.unit_names)?;
-                Ok(Arc::new(UnitServer::new(identity)))
+                Ok(Arc::new(UnitServer::new(identity, listen_only)))
             };
             let context = |limits: Option<ConnectionLimits>| {
                 let (reporter, auditor) = (reporter.clone(), auditor.clone());
@@ -138,7 +138,8 @@ impl Engine {
             let listener = match kind {
                 ListenerKind::ModbusStream(stream) => {
                     let (socket, address) = bound(&name, stream.bind, bind_tcp)?;
-                    let (context, unit_server) = (context(Some(stream.limits)), unit_server()?);
+                    let context = context(Some(stream.limits));
+                    let unit_server = unit_server(stream.listen_only)?;
                     let service = Arc::new(ModbusStream::new(&stream, Arc::clone(&unit_server)));
                     let raw_ingest = service.raw_ingest.clone();
                     tasks.push(Box::pin(accept(
@@ -169,7 +170,7 @@ impl Engine {
                 }
                 ListenerKind::ModbusUdp(udp) => {
                     let (socket, address) = bound(&name, udp.bind, bind_udp)?;
-                    let (context, unit_server) = (context(None), unit_server()?);
+                    let (context, unit_server) = (context(None), unit_server(udp.listen_only)?);
                     let service = ModbusUdp::new(&udp, Arc::clone(&unit_server));
                     tasks.push(Box::pin(service.serve(Arc::clone(&context), socket, stopping)));
                     Listener {
@@ -186,7 +187,7 @@ impl Engine {
                         device,
                         error,
                     })?;
-                    let (context, unit_server) = (context(None), unit_server()?);
+                    let (context, unit_server) = (context(None), unit_server(true)?);
                     let service = ModbusSerial::new(serial, Arc::clone(&unit_server));
                     tasks.push(Box::pin(service.serve(Arc::clone(&context), port, stopping)));
                     Listener { context, address: None, served: Served::Modbus(unit_server, None) }

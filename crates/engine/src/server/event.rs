@@ -34,6 +34,8 @@ pub enum Kind {
     /// No rule names the role of the peer. The event has the role.
     RefusedRole,
     RefusedFull,
+    /// A peer asked for listen only mode, which the listener does not allow.
+    RefusedListenOnly,
     /// TLS failed, usually in the handshake. The reason is a word for programs.
     TlsFailed(&'static str),
     AcceptError,
@@ -65,6 +67,7 @@ impl Kind {
             Kind::RefusedSource => "refused_source",
             Kind::RefusedRole => "refused_role",
             Kind::RefusedFull => "refused_full",
+            Kind::RefusedListenOnly => "refused_listen_only",
             Kind::TlsFailed(_) => "tls_failed",
             Kind::AcceptError => "accept_error",
             Kind::PacketRefused(_) => "packet_refused",

@@ -85,6 +85,11 @@ impl ListenerContext {
         self.report(Kind::RefusedSource, Some(peer));
     }
 
+    pub(crate) fn refuse_listen_only(&self, peer: SocketAddr) {
+        self.connections.refused_listen_only.add();
+        self.report(Kind::RefusedListenOnly, Some(peer));
+    }
+
     pub(crate) fn refuse_role(&self, peer: SocketAddr, role: &str) {
         self.connections.refused_role.add();
         self.reporter.report(&self.name, Kind::RefusedRole, Some(peer), Some(role));

@@ -51,6 +51,8 @@ pub struct StreamSettings {
     pub request_timeout: Duration,
     /// With RTU frames: the silence after which an incomplete request may be followed by the next.
     pub frame_timeout: Option<Duration>,
+    /// Whether function 8 may set a unit to listen only mode, for all connections.
+    pub listen_only: bool,
     /// `None` is plain TCP.
     pub tls: Option<Arc<ServerTls>>,
     /// Raw Ingest packets on the same port, only with MBAP frames over plain TCP.

@@ -51,6 +51,8 @@ pub struct UdpSettings {
     pub bind: SocketAddr,
     pub framing: DatagramFraming,
     pub rules: Vec<Rule>,
+    /// Whether function 8 may set a unit to listen only mode, for all peers.
+    pub listen_only: bool,
 }
 
 pub(crate) struct ModbusUdp {
@@ -224,6 +226,9 @@ impl ModbusUdp {
                     D::complete(output, tag, unit_id, len)
                 }
             };
+        }
+        if self.unit_server.refuses_silence(request) {
+            context.refuse_listen_only(peer);
         }
         let len = self.unit_server.answer(&rights, unit_id, request, buffer);
         if let Some(auditor) = &context.auditor {

@@ -24,6 +24,8 @@ use crate::link::{Asker, Coming};
 pub struct UnitServer {
     pub counters: Counters,
     identity: Identity,
+    /// Whether peers may set units to listen only mode. It lasts for all peers of the listener.
+    listen_only: bool,
     /// Units in listen only mode (V1.1b3, 6.8.1, sub-function 04).
     silent: [AtomicBool; 256],
     /// The last character of an ASCII frame (V1.1b3, 6.8.1, sub-function 03).
@@ -31,10 +33,11 @@ pub struct UnitServer {
 }
 
 impl UnitServer {
-    pub fn new(identity: Identity) -> UnitServer {
+    pub fn new(identity: Identity, listen_only: bool) -> UnitServer {
         let silent = [const { AtomicBool::new(false) }; 256];
         let ascii_delimiter = AtomicU8::new(b'\n');
-        UnitServer { counters: Counters::default(), identity, silent, ascii_delimiter }
+        let counters = Counters::default();
+        UnitServer { counters, identity, listen_only, silent, ascii_delimiter }
     }
 
     /// The character that follows the carriage return at the end of an ASCII frame.
@@ -72,6 +75,14 @@ impl UnitServer {
         }
     }
 
+    /// Whether a request would silence a unit for all peers, and the listener does not allow that.
+    #[inline]
+    pub(crate) fn refuses_silence(&self, request: &[u8]) -> bool {
+        !self.listen_only
+            && request.first() == Some(&Function::Diagnostics.code())
+            && SubFunction::from_pdu(request) == Some(SubFunction::ForceListenOnlyMode)
+    }
+
     /// Where a request goes that is not answered here.
     #[inline]
     pub(crate) fn elsewhere<'r>(
@@ -81,7 +92,7 @@ impl UnitServer {
         request: &[u8],
     ) -> Option<&'r Elsewhere> {
         rights.elsewhere(unit_id).filter(|place| match place {
-            Elsewhere::Device(_) => true,
+            Elsewhere::Device(_) => !self.refuses_silence(request),
             Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.takes(request),
         })
     }
@@ -178,8 +189,9 @@ impl UnitServer {
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
-        let denied =
-            !rights.allows(unit_id, function_code) || denied(rights, unit_id, pdu, &request);
+        let denied = !rights.allows(unit_id, function_code)
+            || self.refuses_silence(pdu)
+            || denied(rights, unit_id, pdu, &request);
         let memory = rights.memory(unit_id);
         if memory.is_some() && self.is_silent(unit_id) {
             if !denied {

@@ -13,6 +13,8 @@
 //! assert_eq!(rtu::decode(&frame[..len]), Ok((17, &[3, 0, 107, 0, 3][..])));
 //! ```
 
+use core::mem;
+
 use super::{FrameError, split};
 use crate::pdu;
 
@@ -50,7 +52,16 @@ pub fn decode(frame: &[u8]) -> Result<(u8, &[u8]), FrameError> {
 /// assert_eq!(holdfast_protocol::frame::rtu::crc(b"123456789"), 0x4B37);
 /// ```
 pub fn crc(bytes: &[u8]) -> u16 {
-    bytes.iter().fold(0xFFFF, |crc, byte| (crc >> 8) ^ TABLE[usize::from((crc as u8) ^ byte)])
+    bytes.iter().fold(CRC_START, |crc, byte| extended(crc, *byte))
+}
+
+const CRC_START: u16 = 0xFFFF;
+
+/// The CRC after one more byte. After a frame with the right CRC, it is 0.
+fn extended(crc: u16, byte: u8) -> u16 {
+    #[cfg(test)]
+    tests::count();
+    (crc >> 8) ^ TABLE[usize::from((crc as u8) ^ byte)]
 }
 
 const TABLE: [u16; 256] = {
@@ -136,12 +147,18 @@ pub fn next_request(bytes: &[u8]) -> Next<'_> {
 /// assert_eq!(rtu::resync(&received[..8]), None);
 /// ```
 pub fn resync(bytes: &[u8]) -> Option<usize> {
+    // Where earlier attempts came by: all of them failed.
+    let mut tried = [false; 2 * MAX_LEN];
     (1..bytes.len().min(MAX_LEN + 1)).find(|start| {
-        let mut rest = &bytes[*start..];
-        while let Some(len) = known_and_whole(rest) {
-            rest = &rest[len..];
+        let mut at = *start;
+        while at < bytes.len() {
+            if tried.get_mut(at).is_some_and(|tried| mem::replace(tried, true)) {
+                return false;
+            }
+            let Some(len) = known_and_whole(&bytes[at..]) else { return false };
+            at += len;
         }
-        rest.is_empty()
+        true
     })
 }
 
@@ -177,7 +194,12 @@ fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
 
 fn first_fit(bytes: &[u8]) -> Next<'_> {
     let longest = bytes.len().min(MAX_LEN);
-    let Some(first) = (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) else {
+    let mut crc = CRC_START;
+    let ends_here = |len: &usize| {
+        crc = extended(crc, bytes[len - 1]);
+        *len >= 4 && crc == 0
+    };
+    let Some(first) = (1..=longest).find(ends_here) else {
         return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
     };
     // When the last byte of the data equals the first byte of the CRC of the bytes before it, the
@@ -245,4 +267,108 @@ fn identification_len(data: &[u8]) -> Option<usize> {
         len += 2 + usize::from(*data.get(len + 1)?);
     }
     Some(len)
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+
+    use std::cell::Cell;
+    use std::vec;
+    use std::vec::Vec;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    std::thread_local! {
+        static STEPS: Cell<usize> = const { Cell::new(0) };
+    }
+
+    pub(super) fn count() {
+        STEPS.set(STEPS.get() + 1);
+    }
+
+    /// How many bytes the CRC ran over meanwhile.
+    fn steps<T>(work: impl FnOnce() -> T) -> usize {
+        STEPS.set(0);
+        work();
+        STEPS.get()
+    }
+
+    /// The search for the end of a frame with a CRC of its own for each length.
+    fn plain_first_fit(bytes: &[u8]) -> Next<'_> {
+        let longest = bytes.len().min(MAX_LEN);
+        let Some(first) = (4..=longest).find(|len| decode(&bytes[..*len]).is_ok()) else {
+            return if longest == MAX_LEN { Next::Broken } else { Next::Incomplete };
+        };
+        let longer =
+            first < longest && bytes[first] == 0 && known_and_whole(&bytes[first..]).is_none();
+        let len = first + usize::from(longer);
+        match decode(&bytes[..len]) {
+            Ok((unit_id, pdu)) => Next::Frame { unit_id, pdu, len },
+            Err(_) => Next::Damaged { len },
+        }
+    }
+
+    /// The search for frames after a damaged one that tries every start without a memory.
+    fn plain_resync(bytes: &[u8]) -> Option<usize> {
+        (1..bytes.len().min(MAX_LEN + 1)).find(|start| {
+            let mut rest = &bytes[*start..];
+            while let Some(len) = known_and_whole(rest) {
+                rest = &rest[len..];
+            }
+            rest.is_empty()
+        })
+    }
+
+    fn frame(unit_id: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = [0; MAX_LEN];
+        let len = encode(unit_id, pdu, &mut frame).unwrap();
+        frame[..len].to_vec()
+    }
+
+    /// Garbage and frames in any order, of known and unknown functions, and frames cut short.
+    fn stream() -> impl Strategy<Value = Vec<u8>> {
+        let code = prop_oneof![prop::sample::select(vec![3, 7, 16, 17, 23, 24, 43]), any::<u8>()];
+        let data = prop::collection::vec(any::<u8>(), 0..12);
+        let framed = (any::<u8>(), code, data)
+            .prop_map(|(unit, code, data)| frame(unit, &[&[code], &data[..]].concat()));
+        let known = any::<u8>().prop_map(|unit| frame(unit, &[3, 0, 0, 0, 1]));
+        let cut = framed.clone().prop_map(|frame| frame[..frame.len() - 1].to_vec());
+        let garbage = prop::collection::vec(any::<u8>(), 0..300);
+        let same = (any::<u8>(), 0..300_usize).prop_map(|(byte, count)| vec![byte; count]);
+        let parts = prop_oneof![4 => known, 4 => framed, 1 => cut, 1 => garbage, 1 => same];
+        prop::collection::vec(parts, 0..12).prop_map(|parts| parts.concat())
+    }
+
+    proptest! {
+        #[test]
+        fn the_searches_find_what_plain_searches_find(bytes in stream()) {
+            prop_assert_eq!(resync(&bytes), plain_resync(&bytes));
+            for start in 0..bytes.len().min(5) {
+                prop_assert_eq!(first_fit(&bytes[start..]), plain_first_fit(&bytes[start..]));
+            }
+        }
+    }
+
+    #[test]
+    fn the_search_for_an_end_looks_at_each_byte_once() {
+        let garbage = [0x64; 4096];
+        assert_eq!(plain_first_fit(&garbage), Next::Broken);
+        assert_eq!(next_request(&garbage), Next::Broken);
+        assert_eq!(steps(|| next_request(&garbage)), MAX_LEN);
+        // Each length with a CRC of its own: 2 to 254 bytes.
+        assert_eq!(steps(|| plain_first_fit(&garbage)), (2..=254).sum());
+    }
+
+    #[test]
+    fn frames_that_do_not_reach_the_end_are_looked_at_once() {
+        let frames = frame(1, &[17]).repeat(1000);
+        let bytes = [&[0x64][..], &frames, &[1]].concat();
+        assert_eq!(resync(&bytes), plain_resync(&bytes));
+        // One pass over the frames, of whose bytes a CRC covers two.
+        assert!(steps(|| resync(&bytes)) <= frames.len());
+        assert!(steps(|| plain_resync(&bytes)) > 30 * frames.len());
+    }
 }
