@@ -498,6 +498,8 @@ class BlockingClient:
     """A client with one request at a time, over any transport. Connects on the first call.
 
     Thread-safe: calls run one after the other. Releases the interpreter lock while a call waits.
+    In the main thread, signal handlers run meanwhile; their exceptions end the call and its
+    connection.
     """
 
     def __new__(cls, endpoint: Endpoint) -> BlockingClient: ...

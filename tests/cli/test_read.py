@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.cli import pace
-from support import cli, transports
+from support import cli, transports, wire
 from support.cli import answer, done, failure, invoke, usage_error
-from support.fake_device import FakeDevice, exception, registers
+from support.fake_device import FakeDevice, Stream, exception, registers, silent
 from support.terminal import Terminal, interruptible, plain
 
 if TYPE_CHECKING:
@@ -316,6 +316,30 @@ def test_a_signal_ends_repeated_readings(server: holdfast.Server) -> None:
         process.kill()
         process.communicate()
     assert (process.returncode, log) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "command", [("read", "hr", "0"), ("identify",), ("watch", "hr", "0"), ("map",)]
+)
+def test_ctrl_c_ends_a_command_that_waits_for_a_silent_device(command: tuple[str, ...]) -> None:
+    name, *arguments = command
+    with Stream("tcp", silent) as device:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "holdfast", name, device.url, *arguments, "--timeout", "60"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=interruptible,
+        )
+        try:
+            wire.until(lambda: len(device.requests) == 1, "the device has been asked")
+            process.send_signal(signal.SIGINT)
+            _, log = process.communicate(timeout=20)
+        finally:
+            process.kill()
+            process.communicate()
+    assert process.returncode == (0 if name == "watch" else 1)
+    assert "Traceback" not in log
 
 
 def test_changes_are_coloured_on_a_terminal_unless_that_is_not_wanted(

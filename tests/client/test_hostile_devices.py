@@ -7,10 +7,15 @@ next call works; no request is sent twice.
 from __future__ import annotations
 
 import asyncio
+import signal
 import socket
 import struct
+import sys
+import threading
 import time
-from contextlib import ExitStack, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,6 +24,7 @@ from hypothesis import strategies as st
 
 import holdfast
 from support import lines, wire
+from support.certificates import Certificates
 from support.faces import FACES, Dial, dialling, run
 from support.fake_device import (
     DATAGRAMS,
@@ -36,7 +42,6 @@ from support.fake_device import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from support.fake_device import Behaviour
 
@@ -1216,3 +1221,104 @@ def test_whatever_comes_is_a_reply_only_if_it_is_one(
     if kind == "udp" and len(sent) != 13:
         reply = None
     assert result == reply
+
+
+# Signals
+
+
+LONG = 60.0
+"""A timeout that is not waited for."""
+
+
+def is_calling() -> bool:
+    """Whether the main thread is inside the client."""
+    frame = sys._current_frames()[threading.main_thread().ident or 0]
+    return Path(frame.f_code.co_filename).parts[-3:-1] == ("holdfast", "client")
+
+
+@contextmanager
+def interrupt_when(happens: Callable[[], bool]) -> Iterator[None]:
+    """Expects that SIGINT ends a call soon after a condition is true."""
+
+    def interrupt() -> None:
+        wire.until(happens, "the device has been asked")
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    began = time.monotonic()
+    thread.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            yield
+        assert time.monotonic() - began < LONG / 2
+    finally:
+        thread.join()
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("kind", [*STREAMS, "ascii+tcp", *DATAGRAMS, *LINES])
+def test_a_signal_ends_the_wait_for_a_reply(kind: str, make: Make) -> None:
+    device = make(kind, silent)
+    with holdfast.SyncClient(device.url, timeout=LONG) as client:
+        with interrupt_when(lambda: len(device.requests) == 1):
+            client.read_holding_registers(7, 2)
+
+        assert client.read_holding_registers(7, 2) == [7, 8]
+
+
+def test_a_signal_ends_the_wait_for_a_turn(make: Make) -> None:
+    device = make("tcp", silent)
+    with (
+        holdfast.SyncClient(device.url, timeout=LONG) as client,
+        ThreadPoolExecutor(1) as executor,
+    ):
+        first = executor.submit(client.read_holding_registers, 7, 2)
+        wire.until(lambda: len(device.requests) == 1, "the first request")
+        with interrupt_when(is_calling):
+            client.read_holding_registers(0, 1)
+        assert len(device.requests) == 1
+        device.requests[0].answer()
+
+        assert first.result(wire.DEADLINE) == [7, 8]
+        assert client.read_holding_registers(5, 1) == [5]
+
+
+def test_a_signal_ends_a_handshake(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as accepted:
+        listener.settimeout(wire.DEADLINE)
+        url = f"tls://127.0.0.1:{listener.getsockname()[1]}?ca={Certificates(tmp_path).ca}"
+
+        def hello() -> bool:
+            peer = accepted.enter_context(listener.accept()[0])
+            return bool(peer.recv(1))
+
+        with holdfast.SyncClient(url, timeout=LONG) as client, interrupt_when(hello):
+            client.read_holding_registers(0, 1)
+
+
+def test_a_handler_that_does_not_raise_leaves_the_call_alone(make: Make) -> None:
+    device = make("tcp", silent)
+    refused: list[str] = []
+
+    def handle(*_: object) -> None:
+        try:
+            client.read_holding_registers(0, 1)
+        except RuntimeError as error:
+            refused.append(str(error))
+        device.requests[0].answer()
+
+    def interrupt() -> None:
+        wire.until(lambda: len(device.requests) == 1, "the device has been asked")
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, handle)
+    thread = threading.Thread(target=interrupt)
+    try:
+        with holdfast.SyncClient(device.url, timeout=LONG) as client:
+            thread.start()
+            assert client.read_holding_registers(7, 2) == [7, 8]
+        assert refused == ["this client is waiting for a reply: a signal handler can't use it"]
+    finally:
+        thread.join()
+        signal.signal(signal.SIGUSR1, before)

@@ -1,5 +1,6 @@
 //! `Request`, `Endpoint` and `BlockingClient`: requests, and their results or exceptions.
 
+use std::cell::Cell;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -15,7 +16,7 @@ use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, Function, Range, Registers, Request as CoreRequest,
     RequestError, Response, SubFunction, limit,
 };
-use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 
@@ -296,19 +297,53 @@ impl BlockingClient {
     ) -> PyResult<Bound<'py, PyAny>> {
         let unit = byte("unit", unit)?;
         let timeout = seconds("timeout", timeout)?;
-        let result = py.detach(|| {
-            self.core.call(unit, &request.encoded, timeout, |response, _| Reply::new(response))
-        });
+        let request = &request.encoded;
+        let take = |response: Response<'_>, _: &[u8]| Reply::new(response);
+        let result = self.interruptible(py, |interrupted| {
+            self.core.interruptible_call(interrupted, unit, request, timeout, take)
+        })?;
+        let result = result.expect("only an interrupted call has no result");
         result.map_err(raised)?.into_python(py)
     }
 
-    fn close(&self, py: Python<'_>) {
-        py.detach(|| self.core.close());
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        self.interruptible(py, |interrupted| self.core.interruptible_close(interrupted))
     }
 
     #[getter]
     fn late(&self) -> u64 {
         self.core.late()
+    }
+}
+
+thread_local! {
+    /// The client that runs signal handlers in this thread, as an address; 0 is none.
+    static CHECKING: Cell<usize> = const { Cell::new(0) };
+}
+
+impl BlockingClient {
+    /// Runs `work` without the interpreter. While it waits, handlers of Python signals run; an
+    /// exception of a handler ends it.
+    fn interruptible<T: Send>(
+        &self,
+        py: Python<'_>,
+        work: impl FnOnce(&mut dyn FnMut() -> bool) -> T + Send,
+    ) -> PyResult<T> {
+        let me = std::ptr::from_ref(self).addr();
+        if CHECKING.get() == me {
+            let message = "this client is waiting for a reply: a signal handler can't use it";
+            return Err(PyRuntimeError::new_err(message));
+        }
+        let mut raised = None;
+        let result = py.detach(|| {
+            work(&mut || {
+                let before = CHECKING.replace(me);
+                raised = Python::attach(|py| py.check_signals()).err();
+                CHECKING.set(before);
+                raised.is_some()
+            })
+        });
+        raised.map_or(Ok(result), Err)
     }
 }
 

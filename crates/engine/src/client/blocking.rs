@@ -5,6 +5,7 @@
 
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -14,6 +15,7 @@ use holdfast_protocol::pdu::{EncodedRequest, Response};
 
 use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
+use super::interrupt::{Interrupt, SLICE};
 use super::turns::Turns;
 use super::{ClientError, Endpoint, Lost};
 
@@ -79,16 +81,44 @@ impl BlockingClient {
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Result<T, ClientError> {
-        let _turn = self.turns.take();
+        let called = self.call_unless(Interrupt::new(None), (unit_id, request), timeout, take);
+        called.unwrap_or_else(|| unreachable!("nobody interrupts this call"))
+    }
+
+    /// The same, unless `interrupted` returns true. It is asked at most every 0.1 s. Returns `None`
+    /// then, and the connection is closed: a reply would still come.
+    pub fn interruptible_call<T>(
+        &self,
+        interrupted: &mut dyn FnMut() -> bool,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        take: impl FnOnce(Response<'_>, &[u8]) -> T,
+    ) -> Option<Result<T, ClientError>> {
+        self.call_unless(Interrupt::new(Some(interrupted)), (unit_id, request), timeout, take)
+    }
+
+    fn call_unless<T>(
+        &self,
+        mut interrupt: Interrupt<'_>,
+        (unit_id, request): (u8, &EncodedRequest),
+        timeout: Duration,
+        take: impl FnOnce(Response<'_>, &[u8]) -> T,
+    ) -> Option<Result<T, ClientError>> {
+        let interrupt = &mut interrupt;
+        let _turn = self.turns.take(interrupt)?;
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let mut take = Some(take);
         let mut call = Call { unit_id, request, attempt: Attempt::default() };
         let mut deadline = Instant::now() + timeout;
         loop {
-            let open = self.connected(&mut state, deadline, timeout)?;
+            let open = match self.connected(&mut state, deadline, timeout, interrupt)? {
+                Ok(open) => open,
+                Err(error) => return Some(Err(error)),
+            };
             let late = open.connection.late();
             let (mut result, mut again) = (None, None);
-            let lost = open.call(&call, deadline, &mut |done: Done<'_>| {
+            let lost = open.call(&call, deadline, interrupt, &mut |done: Done<'_>| {
                 let Some(take) = take.take_if(|_| done.outcome.is_ok() || done.again.is_none())
                 else {
                     assert!(done.again.is_some(), "a call has one result");
@@ -104,46 +134,89 @@ impl BlockingClient {
             if open.connection.closed().is_some() {
                 state.end();
             }
+            // A reply that has come is returned in spite of an interrupt.
+            if interrupt.is_hit() && !matches!(result, Some(Ok(_))) {
+                state.end();
+                return None;
+            }
             match (result, lost, again) {
                 (_, _, Some(attempt)) => {
-                    thread::sleep(attempt.pause());
+                    interrupt.sleep_until(Instant::now() + attempt.pause());
+                    if interrupt.is_hit() {
+                        state.end();
+                        return None;
+                    }
                     if attempt.has_own_timeout() {
                         deadline = Instant::now() + timeout;
                     }
                     call.attempt = attempt;
                 }
                 (Some(Err(ClientError::Lost(_))) | None, Some(error), None) => {
-                    return Err(self.lost(error));
+                    return Some(Err(self.lost(error)));
                 }
-                (Some(result), _, None) => return result,
+                (Some(result), _, None) => return Some(result),
                 (None, None, None) => unreachable!("a call ends with a result"),
             }
         }
     }
 
-    /// Returns a usable connection; opens one if necessary.
+    /// Returns a usable connection; opens one if necessary. `None` when interrupted.
     fn connected<'s>(
         &self,
         state: &'s mut State,
         deadline: Instant,
         timeout: Duration,
-    ) -> Result<&'s mut Open, ClientError> {
+        interrupt: &mut Interrupt<'_>,
+    ) -> Option<Result<&'s mut Open, ClientError>> {
         if state.open.as_mut().is_some_and(|open| !open.is_usable()) {
             state.end();
         }
         if state.open.is_none() {
             let from = state.ended.map(|ended| ended + self.endpoint.tolerance.reconnect);
             if let Some(from) = from.filter(|from| *from > Instant::now()) {
-                thread::sleep(from.min(deadline).saturating_duration_since(Instant::now()));
+                interrupt.sleep_until(from.min(deadline));
             }
-            let opened = Open::new(&self.endpoint, deadline, timeout);
-            if opened.is_err() {
-                state.end();
+            match self.open(deadline, timeout, interrupt) {
+                Some(Ok(open)) => state.open = Some(open),
+                failed => {
+                    state.end();
+                    return failed.map(|failed| failed.map(|_| unreachable!("it was not opened")));
+                }
             }
-            state.open = Some(opened?);
         }
         let Some(open) = &mut state.open else { unreachable!("it was just opened") };
-        Ok(open)
+        Some(Ok(open))
+    }
+
+    /// Opens a connection. If the caller can be interrupted, in a thread: neither the lookup of a name
+    /// nor a connect can be ended early, only left behind.
+    fn open(
+        &self,
+        deadline: Instant,
+        timeout: Duration,
+        interrupt: &mut Interrupt<'_>,
+    ) -> Option<Result<Open, ClientError>> {
+        if interrupt.is_hit() {
+            return None;
+        }
+        let endpoint = self.endpoint.clone();
+        let (sender, opened) = mpsc::sync_channel(1);
+        let work = move || {
+            // Whoever was interrupted does not receive it.
+            let _ = sender.send(Open::new(&endpoint, deadline, timeout));
+        };
+        let connecting = thread::Builder::new().name("holdfast-connect".into());
+        if !interrupt.is_possible() || connecting.spawn(work).is_err() {
+            return Some(Open::new(&self.endpoint, deadline, timeout));
+        }
+        loop {
+            match opened.recv_timeout(SLICE) {
+                Ok(opened) => return Some(opened),
+                Err(RecvTimeoutError::Timeout) if interrupt.is_hit() => return None,
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => unreachable!("the thread sends a result"),
+            }
+        }
     }
 
     fn lost(&self, error: StreamError) -> ClientError {
@@ -159,7 +232,16 @@ impl BlockingClient {
 
     /// Closes the connection after the calls before this one. The next call opens a new one.
     pub fn close(&self) {
-        let _turn = self.turns.take();
+        self.close_unless(Interrupt::new(None));
+    }
+
+    /// The same, unless `interrupted` returns true while calls before this one take their time.
+    pub fn interruptible_close(&self, interrupted: &mut dyn FnMut() -> bool) {
+        self.close_unless(Interrupt::new(Some(interrupted)));
+    }
+
+    fn close_unless(&self, mut interrupt: Interrupt<'_>) {
+        let Some(_turn) = self.turns.take(&mut interrupt) else { return };
         self.state.lock().unwrap_or_else(PoisonError::into_inner).end();
     }
 
@@ -209,9 +291,10 @@ impl Open {
         &mut self,
         call: &Call<'_>,
         deadline: Instant,
+        interrupt: &mut Interrupt<'_>,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Option<StreamError> {
-        let exchanged = self.exchange(call, deadline, sink);
+        let exchanged = self.exchange(call, deadline, interrupt, sink);
         self.used = Instant::now();
         let error = exchanged.err()?;
         self.connection.close(Closed::ByPeer, sink);
@@ -222,12 +305,14 @@ impl Open {
         &mut self,
         call: &Call<'_>,
         deadline: Instant,
+        interrupt: &mut Interrupt<'_>,
         sink: &mut impl FnMut(Done<'_>),
     ) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK];
         if matches!(self.transport, Transport::SerialRtu { .. } | Transport::SerialAscii { .. }) {
             // On a line that is never silent, the request times out.
             while Instant::now() < deadline
+                && !interrupt.is_hit()
                 && let Some(len) = self.stream.receive_now(&mut chunk)?
             {
                 self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
@@ -258,10 +343,17 @@ impl Open {
                 self.connection.sent(len);
             }
             let Some(until) = self.connection.deadline() else { return Ok(()) };
-            match self.stream.receive(&mut chunk, self.epoch + until) {
+            if interrupt.is_hit() {
+                self.connection.close(Closed::BySelf, sink);
+                return Ok(());
+            }
+            let until = self.epoch + until;
+            match self.stream.receive(&mut chunk, interrupt.slice(until)) {
                 Ok(len) => {
                     self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
                 }
+                // The end of a slice.
+                Err(StreamError::TimedOut) if Instant::now() < until => {}
                 Err(StreamError::TimedOut) => {
                     self.connection.advance(self.epoch.elapsed(), &mut *sink);
                 }

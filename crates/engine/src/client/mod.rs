@@ -7,6 +7,7 @@ mod blocking;
 mod byte_stream;
 mod connect;
 mod endpoint;
+mod interrupt;
 mod tls_stream;
 mod turns;
 

@@ -4,6 +4,7 @@ use std::io::{ErrorKind, Write};
 use std::time::Instant;
 
 use super::byte_stream::{ByteStream, StreamError, TcpByteStream};
+use super::interrupt::SLICE;
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -70,8 +71,9 @@ impl TlsStream {
         let mut chunk = [0; CHUNK];
         let len = self.stream.receive(&mut chunk, deadline)?;
         self.feed(&chunk[..len]);
+        // What the channel answers is sent even if the deadline was only the end of a slice.
         // A TLS failure takes precedence over a failure to send its alert.
-        self.flush(deadline)
+        self.flush(deadline.max(Instant::now() + SLICE))
             .or_else(|error| if self.broken.is_some() { Ok(()) } else { Err(error) })
     }
 

@@ -7,6 +7,8 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::{self, Thread};
 
+use super::interrupt::{Interrupt, SLICE};
+
 #[derive(Default)]
 pub(super) struct Turns {
     tickets: Mutex<Tickets>,
@@ -19,14 +21,16 @@ struct Tickets {
     /// The number of the caller inside, or of the next one to enter.
     current: u64,
     waiting: VecDeque<Thread>,
+    /// The numbers of callers that have left before their turn.
+    left: Vec<u64>,
 }
 
 /// The turn of one caller. It ends when it is dropped.
 pub(super) struct Turn<'t>(&'t Turns);
 
 impl Turns {
-    /// Waits for a turn.
-    pub(super) fn take(&self) -> Turn<'_> {
+    /// Waits for a turn. `None` when the caller is interrupted before.
+    pub(super) fn take(&self, interrupt: &mut Interrupt<'_>) -> Option<Turn<'_>> {
         let mut tickets = self.tickets();
         let mine = tickets.next;
         tickets.next += 1;
@@ -35,11 +39,22 @@ impl Turns {
         }
         while tickets.current != mine {
             drop(tickets);
-            thread::park();
+            if interrupt.is_possible() {
+                thread::park_timeout(SLICE);
+            } else {
+                thread::park();
+            }
+            let is_hit = interrupt.is_hit();
             tickets = self.tickets();
+            if is_hit && tickets.current != mine {
+                let me = thread::current().id();
+                tickets.waiting.retain(|thread| thread.id() != me);
+                tickets.left.push(mine);
+                return None;
+            }
         }
         drop(tickets);
-        Turn(self)
+        Some(Turn(self))
     }
 
     fn tickets(&self) -> MutexGuard<'_, Tickets> {
@@ -51,6 +66,10 @@ impl Drop for Turn<'_> {
     fn drop(&mut self) {
         let mut tickets = self.0.tickets();
         tickets.current += 1;
+        while let Some(at) = tickets.left.iter().position(|number| *number == tickets.current) {
+            tickets.left.swap_remove(at);
+            tickets.current += 1;
+        }
         if let Some(thread) = tickets.waiting.pop_front() {
             thread.unpark();
         }
@@ -69,11 +88,11 @@ mod tests {
         let turns = Turns::default();
         let served = AtomicU64::new(0);
         thread::scope(|threads| {
-            let first = turns.take();
+            let first = turns.take(&mut Interrupt::new(None));
             for number in 1..=20 {
                 let (turns, served) = (&turns, &served);
                 threads.spawn(move || {
-                    let _turn = turns.take();
+                    let _turn = turns.take(&mut Interrupt::new(None));
                     assert_eq!(served.fetch_add(1, Ordering::SeqCst) + 1, number);
                 });
                 while turns.tickets().next != number + 1 {
@@ -84,5 +103,26 @@ mod tests {
             drop(first);
         });
         assert_eq!(served.load(Ordering::SeqCst), 20);
+    }
+
+    #[test]
+    fn a_caller_that_leaves_does_not_stop_those_behind_it() {
+        let turns = Turns::default();
+        thread::scope(|threads| {
+            let first = turns.take(&mut Interrupt::new(None));
+            let leaves = threads.spawn(|| {
+                let mut check = || turns.tickets().next == 3;
+                turns.take(&mut Interrupt::new(Some(&mut check))).is_none()
+            });
+            while turns.tickets().next != 2 {
+                thread::yield_now();
+            }
+            let stays = threads.spawn(|| turns.take(&mut Interrupt::new(None)).is_some());
+            assert!(leaves.join().unwrap());
+            drop(first);
+            assert!(stays.join().unwrap());
+        });
+        assert!(turns.take(&mut Interrupt::new(None)).is_some());
+        assert!(turns.tickets().left.is_empty());
     }
 }
