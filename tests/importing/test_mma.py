@@ -85,7 +85,11 @@ def imported(tmp_path: Path) -> Import:
     def read(text: str, *, as_meant: bool = False, keep_published_tokens: bool = False) -> Imported:
         path = tmp_path / "mma.yaml"
         path.write_text(text, encoding="utf-8")
-        return read_mma(path, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
+        found = read_mma(path, as_meant=as_meant, keep_published_tokens=keep_published_tokens)
+        (tmp_path / "mqtt.password").write_text("x")
+        (tmp_path / "new.yaml").write_text(found.to_yaml(), encoding="utf-8")
+        load(tmp_path / "new.yaml")
+        return found
 
     return read
 

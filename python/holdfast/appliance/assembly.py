@@ -216,7 +216,7 @@ def listener(
                 when_full=settings.when_full,
                 request_timeout=settings.request_timeout,
                 packets=settings.packets,
-                idle_timeout=settings.idle_timeout,
+                idle_timeout=settings.idle_timeout or MAX_TIME,
                 after_refusal=settings.after_refusal,
             )
         case _:

@@ -380,8 +380,9 @@ class RawIngestListener(Model):
     after_refusal: Literal["close", "continue"] = "close"
     """With packets: many, after a refused packet whose header and CRC are valid: close ends the
     connection; continue reads the next packet."""
-    idle_timeout: Duration = 300.0
-    """With packets: many, seconds without a packet after which a connection is closed."""
+    idle_timeout: DurationOrZero = 300.0
+    """With packets: many, seconds without a packet after which a connection is closed; 0:
+    unlimited."""
     rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
     """The first rule whose sources contain the sender applies."""
 
