@@ -216,7 +216,6 @@ class _Running:
         event = self._engine.next_event(timeout)
         if event is not None:
             self._log_event(*event)
-        logs.tell_held_back()
         lost = self._engine.lost_events
         if lost > self._lost_events:
             logs.write(logging.WARNING, "events_lost", count=lost - self._lost_events)
@@ -230,8 +229,11 @@ class _Running:
                 logs.write(
                     logging.INFO, "seal", memory=name, state=state, opened=opened, closed=closed
                 )
-        if self._poller is not None and time.monotonic() - self._looked >= HEALTH_CHECK_INTERVAL:
-            self._looked = time.monotonic()
+        if time.monotonic() - self._looked < HEALTH_CHECK_INTERVAL:
+            return
+        self._looked = time.monotonic()
+        logs.tell_held_back()
+        if self._poller is not None:
             for name, told in self._poller.counters(report=False).items():
                 self._log_device(name, told)
 

@@ -12,7 +12,7 @@ from holdfast.config.words import listing, show
 from holdfast.importing.filters import ALL
 from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.peers import Peers, written
-from holdfast.importing.sections import section
+from holdfast.importing.sections import seconds, section
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_WORD
 
@@ -290,7 +290,6 @@ class Adapters:
         listener |= {"format": "crc", "crc": "none", "flags": "ignore", "packets": "many"}
         listener["when_full"] = "evict"
         if timeout is not None:
-            seconds = timeout / 1000 if timeout % 1000 else timeout // 1000
-            listener |= {"request_timeout": seconds, "idle_timeout": seconds}
+            listener |= {"request_timeout": seconds(timeout), "idle_timeout": seconds(timeout)}
         listener["rules"] = [{"sources": sources, **self.draft.grant(memories)}]
         self.draft.listeners[free_name("raw-ingest", set(self.draft.listeners))] = listener

@@ -10,7 +10,7 @@ from holdfast.config.devices import LAST_SLOT, MIN_INTERVAL
 from holdfast.config.words import show
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.names import unique_names
-from holdfast.importing.sections import Section, section
+from holdfast.importing.sections import Section, seconds, section
 from holdfast.net.addresses import joined
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
 from holdfast.types import AREAS, Area
@@ -53,7 +53,6 @@ class _Read:
 class _Unit:
     """One unit of the source, as far as it is valid."""
 
-    section: Section
     endpoint: str | None = None
     device: dict[str, Any] = field(default_factory=dict)
 
@@ -104,7 +103,7 @@ class _Units:
 
     def _id(self, unit: Section) -> str:
         name = unit.name("id", required=True)
-        if name is None and unit.get("id") is not None:
+        if name is None and isinstance(unit.get("id"), str):
             self.desk.problem(unit.at("id"), "found an empty text, allowed: text")
         return name or "unit"
 
@@ -113,7 +112,7 @@ class _Units:
         self.desk.note("check", path, partly)
 
     def _unit(self, one: Section) -> _Unit:
-        unit = _Unit(one)
+        unit = _Unit()
         source = one.mapping("source", required=True)
         poll = one.mapping("poll", required=True)
         reads = list(self._reads(one))
@@ -155,13 +154,13 @@ class _Units:
             message = f"raised to {MIN_INTERVAL * 1000:g} ms, the shortest interval"
             self.desk.note("changed", poll.at("interval_ms"), message)
             return MIN_INTERVAL
-        return None if given is None else _seconds(given)
+        return None if given is None else seconds(given)
 
     def _timeout(self, source: Section) -> float | None:
         """Seconds for a request; `None` if the source waits without an end."""
         given = source.integer("timeout_ms", -MAX_MS, MAX_MS, what="milliseconds")
         if given is not None and given > 0:
-            return _seconds(given)
+            return seconds(given)
         message = f"no timeout_ms: {DEVICE_TIMEOUT} s; the source waited without an end"
         self.desk.note("check", source.path, message)
         return None
@@ -297,8 +296,3 @@ class _Units:
             if unit.device and unit.endpoint is not None:
                 pause = soonest[unit.endpoint]
                 unit.device["retry"] = {"first": pause, "most": pause}
-
-
-def _seconds(milliseconds: int) -> float:
-    seconds = milliseconds / 1000
-    return int(seconds) if seconds.is_integer() else seconds

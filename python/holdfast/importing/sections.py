@@ -134,3 +134,8 @@ def section(desk: Desk, path: KeyPath, value: object) -> Section | None:
         return Section(desk, path, value)
     desk.problem(path, f"found {show(value)}, allowed: a mapping")
     return None
+
+
+def seconds(milliseconds: int) -> float:
+    """A time of the source, as configurations have it: an integer if it is whole."""
+    return milliseconds / 1000 if milliseconds % 1000 else milliseconds // 1000
