@@ -804,16 +804,18 @@ def test_a_receiver_gets_offsets_of_its_own_and_the_status_block(run: Run, serve
         return all(registers == [7] * 4 for registers in found)
 
     wire.until(arrived, "it is passed on")
-    wire.until(lambda: all(each.good_polls > 2 for each in told()), "it is told")
+    wire.until(lambda: all(each.good_polls > 2 for each in told()), "the block arrives")
     assert [(each.health, each.last_error) for each in told()] == [(OK, 0)] * 2
     assert [each.name.rstrip(b"\0") for each in told()] == [b"Pump 1", b"meter"]
 
     host, port = server.address
     server.stop()
-    wire.until(lambda: all(each.last_error == REFUSED for each in told()), "the failure is told")
+    wire.until(
+        lambda: all(each.last_error == REFUSED for each in told()), "the failure is forwarded"
+    )
     wire.until(lambda: all(each.seconds_in_error for each in told()), "so are the seconds")
     with holdfast.Server({1: source}, bind=f"{host}:{port}", access="read-only"):
-        wire.until(lambda: all(each.health == OK for each in told()), "the recovery is told")
+        wire.until(lambda: all(each.health == OK for each in told()), "the recovery arrives")
         assert [each.last_error for each in told()] == [REFUSED, 0]
 
 

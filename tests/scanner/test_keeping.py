@@ -11,6 +11,7 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
 from holdfast.scanner import keeping, kept_entries
@@ -78,26 +79,39 @@ def test_a_state_that_is_being_stored_is_removed_when_the_scanner_stops(
     server: holdfast.Server,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    begun, put = threading.Event(), KeyValue.put
+    begun, stopping, put = threading.Event(), threading.Event(), KeyValue.put
+    purge, stop = JetStreamContext.purge_stream, keeping.Keeper.stop
     sent: list[Future[int]] = []
+    arrived: list[bool] = []
 
     async def late(key: str, value: bytes) -> int:
         bucket = await caller.client.jetstream().key_value(BUCKET)
-        await asyncio.sleep(0.2)
-        return await put(bucket, key, value)
-
-    async def put_slowly(_: KeyValue, key: str, value: bytes) -> int:
         if "status" in key:
             begun.set()
+            assert await asyncio.to_thread(stopping.wait, wire.DEADLINE)
+        return await put(bucket, key, value)
+
+    async def put_late(_: KeyValue, key: str, value: bytes) -> int:
         # What is on its way arrives, also if nobody waits for it.
         sent.append(asyncio.run_coroutine_threadsafe(late(key, value), caller.loop))
         return await asyncio.shield(asyncio.wrap_future(sent[-1]))
 
-    monkeypatch.setattr(KeyValue, "put", put_slowly)
+    async def noted_purge(jetstream: JetStreamContext, name: str, **more: Any) -> bool:
+        arrived.append(all(each.done() for each in sent))
+        return await purge(jetstream, name, **more)
+
+    async def noted_stop(keeper: keeping.Keeper) -> None:
+        stopping.set()
+        await stop(keeper)
+
+    monkeypatch.setattr(KeyValue, "put", put_late)
+    monkeypatch.setattr(JetStreamContext, "purge_stream", noted_purge)
+    monkeypatch.setattr(keeping.Keeper, "stop", noted_stop)
     running = run_scanner()
     caller.publish("modbus.subscribe", subscription(server, tag("a", 0)))
     assert begun.wait(wire.DEADLINE)
     running.stop()
+    assert arrived[-1:] == [True]
     for each in sent:
         each.result(wire.DEADLINE)
     assert not [key for key in caller.kept(BUCKET) if "status" in key]
