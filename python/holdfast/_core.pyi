@@ -359,12 +359,37 @@ class Engine:
     def counters(self) -> dict[str, ListenerCounters]:
         """The counters of each listener since the start, by name."""
 
-    def next_event(
-        self, timeout: float
-    ) -> tuple[str, str, str | None, str | None, int | None] | None:
-        """Listener, kind, peer, reason and bytes of the next event; `None` after `timeout` seconds.
+    def reload(
+        self,
+        listeners: Sequence[Listener],
+        *,
+        identity: Sequence[tuple[int, str]],
+        unit_names: Sequence[tuple[int, str]] | None = None,
+        events: Literal["nothing", "refusals", "all"] = "nothing",
+    ) -> None:
+        """Serves these listeners from now on, in place of those before.
 
-        The reason of `refused_role` is the role. Only `bytes_dropped` has a number of bytes.
+        A listener with the name, protocol and address of a running one takes over its socket,
+        counters and connections: those without rights are ended, the others have their new rights
+        before their next request. Raises as the constructor; nothing has changed then.
+        """
+
+    def review(self) -> None:
+        """Judges the certificates of all open connections again, and ends those that fail."""
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """The open connections: listener, id, peer, opened (seconds since 1970), idle (seconds).
+
+        TLS peers have role, subject and serial too.
+        """
+
+    def end_session(self, listener: str, id: int) -> bool:
+        """Ends a connection. Returns whether there was one."""
+
+    def next_event(self, timeout: float) -> tuple[str, str, dict[str, object]] | None:
+        """Listener, kind and fields of the next event; `None` after `timeout` seconds.
+
+        Fields, as far as they apply: peer, role, subject and serial (TLS), reason, bytes.
         """
 
     @property

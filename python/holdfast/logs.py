@@ -20,10 +20,17 @@ LOGGER = logging.getLogger("holdfast")
 def configure(level: str, form: Literal["text", "json"]) -> None:
     """Sends the log to standard error; `level` is debug, info, warning or error."""
     handler = QueuedHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
+    handler.setFormatter(_formatter(form))
     LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(level.upper())
     LOGGER.propagate = False
+
+
+def change(level: str, form: Literal["text", "json"]) -> None:
+    """Changes level and format of a log that `configure` has begun."""
+    for handler in LOGGER.handlers:
+        handler.setFormatter(_formatter(form))
+    LOGGER.setLevel(level.upper())
 
 
 def dropped() -> int:
@@ -59,6 +66,10 @@ def tell_held_back() -> None:
         parts = of if isinstance(of, tuple) else (of,)
         shown = " ".join(str(part) for part in parts if part is not None)
         write(logging.WARNING, "held_back", of=event, kind=shown, count=count)
+
+
+def _formatter(form: Literal["text", "json"]) -> logging.Formatter:
+    return JsonFormatter() if form == "json" else TextFormatter()
 
 
 class TextFormatter(logging.Formatter):

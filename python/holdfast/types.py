@@ -73,6 +73,8 @@ class ConnectionCounters(TypedDict):
     refused_full: int
     refused_listen_only: int
     evicted: int
+    rights_revoked: int
+    ended: int
     idle: int
     request_timeout: int
     slow_reader: int

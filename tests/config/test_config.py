@@ -524,6 +524,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "log:\n"
         "  level: info\n"
         "  format: text\n"
+        "reload: on-request\n"
         "workers: 1\n"
     )
 

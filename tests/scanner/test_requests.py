@@ -187,7 +187,7 @@ def test_what_another_subscriber_uses_is_not_replaced(
 ) -> None:
     who = "historian"
     right = subscription(server, tag("a", 5), scanRate=60_000)
-    assert caller.request("modbus.subscribe", right)["success"]
+    assert caller.request("modbus.subscribe", right) == {"success": True, "count": 1}
     before = _browsed(caller)
     answer = caller.request("modbus.subscribe", right | {"subscriberId": who} | change)
     assert not answer["success"]

@@ -373,6 +373,7 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
                 "adapters": adapters(names),
                 "devices": devices(memories),
                 "links": st.builds(lambda link: {LINK: link}, LINKS),
+                "reload": st.sampled_from(["on-request", "on-change"]),
                 "workers": st.integers(1, 64),
             },
             optional=optional,

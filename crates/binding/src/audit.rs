@@ -12,7 +12,10 @@ use crate::peer;
 pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
     let line = PyDict::new(py);
     line.set_item("listener", &*record.listener)?;
-    line.set_item("peer", record.peer.map(peer::text))?;
+    match &record.peer {
+        Some(from) => peer::tell(&line, from)?,
+        None => line.set_item("peer", py.None())?,
+    }
     match &record.write {
         Written::Modbus { unit_id, pdu, refused, route } => {
             line.set_item("unit", unit_id)?;

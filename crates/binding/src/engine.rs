@@ -1,9 +1,11 @@
 //! `Engine`: runs listeners; reports addresses, counters, events and writes.
 
+use std::time::UNIX_EPOCH;
+
 use holdfast_engine::server::counters::PacketCounters;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::{
-    Engine as Core, ListenerCounters, ProtocolCounters, Settings, StartError,
+    Engine as Core, ListenerCounters, Listening, ProtocolCounters, Session, Settings, StartError,
 };
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
@@ -12,6 +14,7 @@ use pyo3::types::PyDict;
 use crate::arguments::{seconds, within, word};
 use crate::audit;
 use crate::listener::Listener;
+use crate::peer;
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Engine {
@@ -32,26 +35,42 @@ impl Engine {
         audit: bool,
     ) -> PyResult<Engine> {
         let workers = within("workers", workers, 1..=64)?;
-        let verbosities = [
-            ("nothing", Verbosity::Nothing),
-            ("refusals", Verbosity::Refusals),
-            ("all", Verbosity::All),
-        ];
-        let events = word("events", events, &verbosities)?;
-        let bytes = |texts: Vec<(u8, String)>| {
-            texts.into_iter().map(|(id, text)| (id, text.into_bytes())).collect()
-        };
-        let settings = Settings {
-            listeners: listeners.iter().map(|listener| listener.core.clone()).collect(),
-            identity: bytes(identity),
-            unit_names: bytes(unit_names.unwrap_or_default()),
-            workers,
-            events,
-            audit,
-        };
-        drop(listeners);
+        let listening = listening(listeners, identity, unit_names);
+        let settings = Settings { listening, workers, events: verbosity(events)?, audit };
         let core = py.detach(|| Core::start(settings)).map_err(start_error)?;
         Ok(Engine { core })
+    }
+
+    #[pyo3(signature = (listeners, *, identity, unit_names=None, events="nothing"))]
+    fn reload(
+        &self,
+        py: Python<'_>,
+        listeners: Vec<PyRef<'_, Listener>>,
+        identity: Vec<(u8, String)>,
+        unit_names: Option<Vec<(u8, String)>>,
+        events: &str,
+    ) -> PyResult<()> {
+        let (verbosity, listening) =
+            (verbosity(events)?, listening(listeners, identity, unit_names));
+        py.detach(|| self.core.reload(listening)).map_err(start_error)?;
+        self.core.set_verbosity(verbosity);
+        Ok(())
+    }
+
+    fn review(&self, py: Python<'_>) {
+        py.detach(|| self.core.review());
+    }
+
+    fn sessions<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyDict>>> {
+        let listeners = self.core.sessions();
+        let all = listeners.iter().flat_map(|(listener, sessions)| {
+            sessions.iter().map(move |session| (listener, session))
+        });
+        all.map(|(listener, session)| shown(py, listener, session)).collect()
+    }
+
+    fn end_session(&self, py: Python<'_>, listener: &str, id: u64) -> bool {
+        py.detach(|| self.core.end_session(listener, id))
     }
 
     #[getter]
@@ -63,20 +82,29 @@ impl Engine {
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
         for listener in self.core.counters() {
-            all.set_item(listener.name, counted(py, &listener)?)?;
+            all.set_item(listener.name(), counted(py, &listener)?)?;
         }
         Ok(all)
     }
 
-    fn next_event(&self, py: Python<'_>, timeout: f64) -> PyResult<Option<Event>> {
+    fn next_event<'py>(
+        &self,
+        py: Python<'py>,
+        timeout: f64,
+    ) -> PyResult<Option<(String, &'static str, Bound<'py, PyDict>)>> {
         let timeout = seconds("timeout", timeout)?;
-        let event = py.detach(|| self.core.next_event(timeout));
-        Ok(event.map(|event| {
-            let reason = event.role.or_else(|| event.kind.reason().map(Box::from));
-            let (kind, peer) = (event.kind.name(), event.peer.map(crate::peer::text));
-            let (reason, bytes) = (reason.map(String::from), event.kind.bytes());
-            (event.listener.to_string(), kind, peer, reason, bytes)
-        }))
+        let Some(event) = py.detach(|| self.core.next_event(timeout)) else { return Ok(None) };
+        let fields = PyDict::new(py);
+        if let Some(peer) = &event.peer {
+            peer::tell(&fields, peer)?;
+        }
+        if let Some(reason) = event.kind.reason() {
+            fields.set_item("reason", reason)?;
+        }
+        if let Some(bytes) = event.kind.bytes() {
+            fields.set_item("bytes", bytes)?;
+        }
+        Ok(Some((event.listener.to_string(), event.kind.name(), fields)))
     }
 
     fn next_writes<'py>(
@@ -105,9 +133,40 @@ impl Engine {
     }
 }
 
-/// Listener, kind, peer, reason and number of bytes. For a peer that was refused for its role, the
-/// reason is the role.
-type Event = (String, &'static str, Option<String>, Option<String>, Option<u64>);
+fn listening(
+    listeners: Vec<PyRef<'_, Listener>>,
+    identity: Vec<(u8, String)>,
+    unit_names: Option<Vec<(u8, String)>>,
+) -> Listening {
+    let bytes = |texts: Vec<(u8, String)>| {
+        texts.into_iter().map(|(id, text)| (id, text.into_bytes())).collect()
+    };
+    Listening {
+        listeners: listeners.iter().map(|listener| listener.core.clone()).collect(),
+        identity: bytes(identity),
+        unit_names: bytes(unit_names.unwrap_or_default()),
+    }
+}
+
+fn verbosity(events: &str) -> PyResult<Verbosity> {
+    let verbosities = [
+        ("nothing", Verbosity::Nothing),
+        ("refusals", Verbosity::Refusals),
+        ("all", Verbosity::All),
+    ];
+    word("events", events, &verbosities)
+}
+
+fn shown<'py>(py: Python<'py>, listener: &str, session: &Session) -> PyResult<Bound<'py, PyDict>> {
+    let all = PyDict::new(py);
+    all.set_item("listener", listener)?;
+    all.set_item("id", session.id)?;
+    peer::tell(&all, &session.peer)?;
+    let opened = session.opened.duration_since(UNIX_EPOCH).unwrap_or_default();
+    all.set_item("opened", opened.as_secs_f64())?;
+    all.set_item("idle", session.idle.as_secs_f64())?;
+    Ok(all)
+}
 
 fn counted_packets<'py>(
     py: Python<'py>,
@@ -125,10 +184,11 @@ fn counted_packets<'py>(
     Ok(packets)
 }
 
-fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bound<'py, PyDict>> {
+fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<'py, PyDict>> {
     let all = PyDict::new(py);
     match &listener.protocol {
-        ProtocolCounters::Modbus(counters, packets) => {
+        ProtocolCounters::Modbus(unit_server, packets) => {
+            let counters = &unit_server.counters;
             let frames = PyDict::new(py);
             frames.set_item("foreign", counters.frames.foreign.get())?;
             frames.set_item("broken", counters.frames.broken.get())?;
@@ -146,7 +206,7 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bo
             all.set_item("packets", counted_packets(py, packets)?)?;
         }
     }
-    let counters = listener.connections;
+    let counters = listener.connections();
     let connections = PyDict::new(py);
     for (key, counter) in [
         ("accepted", &counters.accepted),
@@ -156,6 +216,8 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters<'_>) -> PyResult<Bo
         ("refused_full", &counters.refused_full),
         ("refused_listen_only", &counters.refused_listen_only),
         ("evicted", &counters.evicted),
+        ("rights_revoked", &counters.rights_revoked),
+        ("ended", &counters.ended),
         ("idle", &counters.idle),
         ("request_timeout", &counters.request_timeout),
         ("slow_reader", &counters.slow_reader),

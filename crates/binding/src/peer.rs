@@ -1,8 +1,23 @@
-//! Formats peers for the logs of Python.
+//! Shows peers to the logs of Python.
 
 use std::net::SocketAddr;
+
+use holdfast_engine::server::Peer;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
 /// Formats the address of a peer. An IPv4-mapped IPv6 address is shown as IPv4.
 pub fn text(peer: SocketAddr) -> String {
     SocketAddr::new(peer.ip().to_canonical(), peer.port()).to_string()
+}
+
+/// Adds the address of a peer to a dictionary, and what its certificate says.
+pub fn tell(fields: &Bound<'_, PyDict>, peer: &Peer) -> PyResult<()> {
+    fields.set_item("peer", text(peer.address))?;
+    if let Some(certificate) = &peer.certificate {
+        fields.set_item("role", &certificate.role)?;
+        fields.set_item("subject", &certificate.subject)?;
+        fields.set_item("serial", &certificate.serial)?;
+    }
+    Ok(())
 }

@@ -16,7 +16,7 @@ use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::policy::{Elsewhere, Rule};
 use holdfast_engine::server::{
-    ConnectionLimits, Engine, ListenerKind, ListenerSettings, Settings, StreamFraming,
+    ConnectionLimits, Engine, ListenerKind, ListenerSettings, Listening, Settings, StreamFraming,
     StreamSettings, WhenFull,
 };
 use holdfast_protocol::frame::{mbap, rtu};
@@ -133,9 +133,11 @@ impl Front {
         };
         let kind = ListenerKind::ModbusStream(stream);
         let engine = Engine::start(Settings {
-            listeners: vec![ListenerSettings { name: "front".into(), kind }],
-            identity: vec![(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())],
-            unit_names: Vec::new(),
+            listening: Listening {
+                listeners: vec![ListenerSettings { name: "front".into(), kind }],
+                identity: vec![(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())],
+                unit_names: Vec::new(),
+            },
             workers: 2,
             events: Verbosity::Nothing,
             audit: false,

@@ -280,7 +280,10 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
 
 
 def mirror(config: Config, memories: Mapping[str, Memory]) -> None:
-    """Reserves the ranges that devices are read into, unless local writes are allowed there."""
+    """Reserves the ranges that devices are read into, unless local writes are allowed there.
+
+    Ranges of an earlier call are free again.
+    """
     mirrored: dict[str, list[tuple[Area, int, int]]] = {}
     for device in config.devices.values():
         if not device.enabled or device.writes == "local":
@@ -289,8 +292,8 @@ def mirror(config: Config, memories: Mapping[str, Memory]) -> None:
             if (into := read.into) is not None:
                 ranges = mirrored.setdefault(into.memory, [])
                 ranges.append((into.area, into.address, read.count))
-    for memory, ranges in mirrored.items():
-        memories[memory].mirror(ranges)
+    for name, made in memories.items():
+        made.mirror(mirrored.get(name, []))
 
 
 def _forward(device: str, settings: ForwardConfig) -> Forward:

@@ -9,16 +9,17 @@ import logging
 import threading
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
-from holdfast.appliance import assembly
+from holdfast.appliance import assembly, changes
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
-from holdfast.config import ModbusAsciiListener, ModbusRtuListener
+from holdfast.config import ModbusAsciiListener, ModbusRtuListener, ModbusTlsListener
+from holdfast.config.fingerprint import fingerprint
 from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
@@ -42,9 +43,12 @@ if TYPE_CHECKING:
 # All other events of a listener are refusals or faults.
 LEVELS = {
     "opened": logging.DEBUG,
+    "secured": logging.DEBUG,
     "closed": logging.DEBUG,
     "idle": logging.DEBUG,
     "line_back": logging.INFO,
+    "rights_revoked": logging.INFO,
+    "ended": logging.INFO,
 }
 
 # The most writes that are moved to the audit log at once.
@@ -107,6 +111,17 @@ class Appliance:
             running.stop()
             logs.write(logging.INFO, "stopped")
 
+    def reload(self, config: Config) -> list[str]:
+        """Takes over a configuration without touching memory or what it does not concern.
+
+        Returns the keys of what has changed. Raises `ReloadRefused` for changes that require a
+        restart, `OSError` for an address that can't be bound or a file that can't be opened, and
+        `UnknownAdapter`; nothing has changed then. Call it in the thread that calls `log_events`.
+        """
+        changed = self._parts().reload(config)
+        self.config = config
+        return changed
+
     @property
     def diagnostics(self) -> Diagnostics:
         """The diagnostics. Raises `RuntimeError` if not running."""
@@ -123,6 +138,14 @@ class Appliance:
         """
         self._parts().log_events(timeout)
 
+    def sessions(self) -> list[dict[str, Any]]:
+        """The open connections of all listeners. Thread-safe."""
+        return self._parts().sessions()
+
+    def end_session(self, listener: str, number: int) -> bool:
+        """Ends a connection. Returns whether there was one. Thread-safe."""
+        return self._parts().end_session(listener, number)
+
     def _parts(self) -> _Running:
         if self._running is None:
             raise RuntimeError("the appliance is not running")
@@ -135,13 +158,29 @@ class Appliance:
         self.stop()
 
 
+@dataclass(frozen=True)
+class _Part:
+    """An adapter, as a configuration describes it."""
+
+    fingerprint: str
+    factory: Callable[[], Adapter]
+    access: MemoryAccess | None = None
+    may_end: bool = False
+    port: Port | None = None
+
+
 class _Running:
     """The parts of a running appliance. The constructor starts all of them or none."""
 
     def __init__(self, config: Config, memories: dict[str, _core.Memory]) -> None:
         self._config = config
+        self._fingerprints = changes.fingerprints(config)
         self._memories = memories
-        self._supervisors: list[Supervisor] = []
+        self._supervisors: dict[str, Supervisor] = {}
+        self._fingerprint_of: dict[str, str] = {}
+        """The fingerprints that adapters were started with."""
+        self._accesses: dict[str, MemoryAccess] = {}
+        self._passages: dict[str, _core.Passage] = {}
         self._lost_events = 0
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         self._health = dict.fromkeys(config.devices, "unknown")
@@ -149,12 +188,9 @@ class _Running:
         self._unstored: dict[str, int] = {}
         self._forwarded: dict[tuple[str, int], Mapping[str, int]] = {}
         self._unreachable: set[tuple[str, int]] = set()
-        self._looked = time.monotonic()
+        self._looked = self._reviewed = time.monotonic()
         # Missing adapters and unusable TLS files are reported before any socket is opened.
-        for name, settings in config.adapters.items():
-            foreign.entry_point(name, settings)
-        if config.gateway is not None and config.gateway.tls is not None:
-            _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
+        _check_parts(config)
         assembly.mirror(config, memories)
         devices = [
             assembly.device(name, config, memories)
@@ -168,12 +204,12 @@ class _Running:
             # The links of listeners come first: the first use of an address decides its settings.
             self._poller: _core.Poller | None = None
             links = assembly.Links()
-            if devices or config.links or routed(config) or config.nats is not None:
+            if _requires_poller(config):
                 self._poller = _core.Poller([])
                 undo.callback(self._poller.stop)
                 links = assembly.links(config, memories, self._poller)
             self._engine = self._started_engine(links)
-            self._passages = links.passages
+            self._passages.update(links.passages)
             undo.callback(self._engine.stop)
             if self._poller is not None:
                 for device in devices:
@@ -183,13 +219,14 @@ class _Running:
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
-            self._add_adapters(self._ports)
+            for name, part in self._adapters(config, self._ports).items():
+                self._add(name, part)
             undo.pop_all()
         self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
         self._stopped = threading.Event()
         if self._audit is not None:
             self._auditing.start()
-        for supervisor in self._supervisors:
+        for supervisor in self._supervisors.values():
             supervisor.start()
 
     def stop(self) -> None:
@@ -198,11 +235,11 @@ class _Running:
         Links stop after all that use them: listeners and the gateway still answer the requests that
         they have passed on.
         """
-        for supervisor in self._supervisors:
+        for supervisor in self._supervisors.values():
             supervisor.stop()
         self._engine.stop()
         self._stopped.set()
-        for supervisor in self._supervisors:
+        for supervisor in self._supervisors.values():
             supervisor.join()
         if self._poller is not None:
             self._poller.stop()
@@ -221,18 +258,23 @@ class _Running:
             logs.write(logging.WARNING, "events_lost", count=lost - self._lost_events)
             self._lost_events = lost
         for name, memory in self._memories.items():
-            before, now = self._seals[name], memory.seal_changes
-            if now != before:
-                self._seals[name] = now
-                opened, closed = now[0] - before[0], now[1] - before[1]
+            before, changes_now = self._seals[name], memory.seal_changes
+            if changes_now != before:
+                self._seals[name] = changes_now
+                opened, closed = (now - past for now, past in zip(changes_now, before, strict=True))
                 state = "sealed" if memory.sealed else "open"
                 logs.write(
                     logging.INFO, "seal", memory=name, state=state, opened=opened, closed=closed
                 )
-        if time.monotonic() - self._looked < HEALTH_CHECK_INTERVAL:
+        now = time.monotonic()
+        if now - self._looked < HEALTH_CHECK_INTERVAL:
             return
-        self._looked = time.monotonic()
+        self._looked = now
         logs.tell_held_back()
+        interval = _review_interval(self._config)
+        if interval is not None and now - self._reviewed >= interval:
+            self._reviewed = now
+            self._engine.review()
         if self._poller is not None:
             for name, told in self._poller.counters(report=False).items():
                 self._log_device(name, told)
@@ -276,18 +318,13 @@ class _Running:
                 self._unreachable.add(key)
                 logs.write(logging.WARNING, "forward_failed", **fields)
 
-    def _log_event(
-        self, listener: str, event: str, peer: str | None, reason: str | None, count: int | None
-    ) -> None:
-        fields: dict[str, object] = {"listener": listener, "peer": peer or "-"}
-        if reason is not None:
-            fields["role" if event == "refused_role" else "reason"] = reason
-        if count is not None:
-            fields["bytes"] = count
+    def _log_event(self, listener: str, event: str, found: Mapping[str, object]) -> None:
+        fields = {"listener": listener, "peer": "-", **found}
         if event in LEVELS:
             logs.write(LEVELS[event], event, **fields)
         else:
-            logs.refused(event, kind=(listener, reason), **fields)
+            about = found.get("role" if event == "refused_role" else "reason")
+            logs.refused(event, kind=(listener, about), **fields)
 
     def _opened_audit(self, undo: ExitStack) -> Audit | None:
         settings = self._config.audit
@@ -300,13 +337,10 @@ class _Running:
     def _bound_ports(self, undo: ExitStack) -> dict[str, Port]:
         """Tries to bind the ports of the HTTP services. The others are tried again later."""
         ports: dict[str, Port] = {}
-        config = self._config
-        services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
-        for name, settings in services.items():
-            if settings is not None:
-                ports[name] = Port(name, settings.bind.host, settings.bind.port)
-                undo.callback(ports[name].close)
-                ports[name].bind()
+        for name, settings in _http_services(self._config).items():
+            ports[name] = Port(name, settings.bind.host, settings.bind.port)
+            undo.callback(ports[name].close)
+            ports[name].bind()
         return ports
 
     def _started_engine(self, links: assembly.Links) -> _core.Engine:
@@ -317,9 +351,124 @@ class _Running:
             identity=identity.objects(),
             unit_names=identity.names(),
             workers=config.workers,
-            events="all" if config.log.level == "debug" else "refusals",
+            events=_events(config),
             audit=self._audit is not None,
         )
+
+    def sessions(self) -> list[dict[str, Any]]:
+        return self._engine.sessions()
+
+    def end_session(self, listener: str, number: int) -> bool:
+        return self._engine.end_session(listener, number)
+
+    def reload(self, config: Config) -> list[str]:
+        """Takes over a configuration, see `Appliance.reload`."""
+        reasons = changes.restarts(self._config, config)
+        if reasons:
+            raise changes.ReloadRefused(reasons)
+        _check_parts(config)
+        fingerprints = changes.fingerprints(config)
+        changed = changes.differences(self._fingerprints, fingerprints)
+        known = self._memories
+        added = {
+            name: assembly.memory(settings)
+            for name, settings in config.memories.items()
+            if name not in known
+        }
+        memories = {**known, **added}
+        with ExitStack() as undo:
+            ports = self._taken_over_ports(config, undo)
+            poller, links = self._poller, assembly.Links()
+            if poller is None and _requires_poller(config):
+                poller = _core.Poller([])
+                undo.callback(poller.stop)
+            if poller is not None:
+                links = assembly.links(config, memories, poller)
+            devices = {
+                name: assembly.device(name, config, memories)
+                for name, device in config.devices.items()
+                if device.is_polled and f"devices.{name}" in changed
+            }
+            identity = assembly.identity(config.identity)
+            self._engine.reload(
+                [assembly.listener(name, config, memories, links) for name in config.listeners],
+                identity=identity.objects(),
+                unit_names=identity.names(),
+                events=_events(config),
+            )
+            undo.pop_all()
+        # From here on, nothing can be refused any more.
+        before, self._config, self._fingerprints = self._config, config, fingerprints
+        self._poller = self.diagnostics.poller = poller
+        known.update(added)
+        self._seals |= {name: memory.seal_changes for name, memory in added.items()}
+        assembly.mirror(config, memories)
+        self._passages.update(links.passages)
+        for name in [name for name in self._passages if name not in links.passages]:
+            del self._passages[name]
+        self.diagnostics.links = links.links
+        self._replace_devices(before, devices)
+        self.diagnostics.disabled = self._tell_disabled()
+        self._replace_adapters(ports)
+        logs.change(config.log.level, config.log.format)
+        return changed
+
+    def _taken_over_ports(self, config: Config, undo: ExitStack) -> dict[str, Port]:
+        """The ports of the HTTP services: those at the same address stay, new ones are bound."""
+        ports: dict[str, Port] = {}
+        services = _http_services(self._config)
+        for name, settings in _http_services(config).items():
+            if name in services and services[name].bind == settings.bind:
+                ports[name] = self._ports[name]
+                continue
+            ports[name] = Port(name, settings.bind.host, settings.bind.port)
+            undo.callback(ports[name].close)
+            if not ports[name].bind():
+                at = ports[name].bind_address
+                raise OSError(f"{name}: can't listen on {at}: {ports[name].error}")
+        return ports
+
+    def _replace_devices(self, before: Config, devices: Mapping[str, _core.PolledDevice]) -> None:
+        """Removes, replaces and adds polled devices. `devices` are those with other settings."""
+        polled = {name for name, device in before.devices.items() if device.is_polled}
+        now = {name for name, device in self._config.devices.items() if device.is_polled}
+        if self._poller is None:
+            return
+        for name in polled - now:
+            self._poller.remove(name)
+        for name, device in devices.items():
+            if name in polled:
+                self._poller.replace(name, device, at_once=False)
+            else:
+                self._poller.add(device)
+        for name in [*(polled - now), *devices]:
+            for kept in (self._health, self._plan_errors, self._unstored):
+                kept.pop(name, None)
+            self._forwarded = {key: at for key, at in self._forwarded.items() if key[0] != name}
+            self._unreachable = {key for key in self._unreachable if key[0] != name}
+        self._health |= dict.fromkeys(devices, "unknown")
+
+    def _replace_adapters(self, ports: dict[str, Port]) -> None:
+        """Stops the adapters with other settings, and starts those of the configuration."""
+        parts = self._adapters(self._config, ports)
+        ending = {
+            name: supervisor
+            for name, supervisor in self._supervisors.items()
+            if name not in parts or parts[name].fingerprint != self._fingerprint_of[name]
+        }
+        for supervisor in ending.values():
+            supervisor.stop()
+        for name, supervisor in ending.items():
+            supervisor.join()
+            del self._supervisors[name], self.diagnostics.adapters[name]
+        for name, port in self._ports.items():
+            if ports.get(name) is not port:
+                port.close()
+        self._ports = ports
+        for name, part in parts.items():
+            if name not in self._supervisors:
+                self._add(name, part)
+                self._supervisors[name].start()
 
     def _tell_disabled(self) -> list[str]:
         """Writes the status blocks of disabled devices. Returns the names of these devices."""
@@ -346,68 +495,75 @@ class _Running:
             endpoints.append(ListenAddress(name, "http", *port.address, service, port.error))
         return endpoints
 
-    def _add_adapters(self, ports: Mapping[str, Port]) -> None:
-        config = self._config
+    def _adapters(self, config: Config, ports: Mapping[str, Port]) -> dict[str, _Part]:
+        """The adapters of a configuration, by name."""
+        parts: dict[str, _Part] = {}
+        poller = self._poller
+
+        def add(name: str, factory: Callable[[], Adapter], *settings: object) -> _Part:
+            found = fingerprint(*settings, id(ports.get(name)))
+            parts[name] = _Part(found, factory, port=ports.get(name))
+            return parts[name]
+
         if config.rest is not None:
             from holdfast.adapters.rest import Rest
 
-            rest, memory_access = config.rest, self._memory_access("rest")
-            at = ports["rest"]
-            self._add(
+            rest, at, access = config.rest, ports["rest"], self._memory_access("rest")
+            part = add(
                 "rest",
-                memory_access,
-                lambda: Rest(rest, memory_access, self.diagnostics, at.listener),
-                port=at,
+                lambda: Rest(rest, access, self.diagnostics, at.listener),
+                rest,
+                sorted(self._memories),
             )
+            parts["rest"] = replace(part, access=access)
         if config.mqtt is not None:
             from holdfast.adapters.mqtt import Mqtt
 
             mqtt, to_mqtt = config.mqtt, self._memory_access("mqtt")
-            self._add("mqtt", to_mqtt, lambda: Mqtt(mqtt, to_mqtt))
+            parts["mqtt"] = replace(add("mqtt", lambda: Mqtt(mqtt, to_mqtt), mqtt), access=to_mqtt)
         if config.nats is not None:
             from holdfast.scanner.adapter import ScannerAdapter
 
-            scanner, poller = assembly.scanner(config.nats), self._poller
-            self._add("nats", None, lambda: ScannerAdapter(scanner, poller), may_end=True)
+            scanner = assembly.scanner(config.nats)
+            part = add("nats", lambda: ScannerAdapter(scanner, poller), config.nats)
+            parts["nats"] = replace(part, may_end=True)
         if config.gateway is not None:
             from holdfast.gateway import Gateway
 
             gateway, gateway_at = assembly.gateway(config.gateway), ports["gateway"]
-            self._add(
+            add(
                 "gateway",
-                None,
-                lambda: Gateway(gateway, gateway_at.listener, poller=self._poller),
-                port=gateway_at,
+                lambda: Gateway(gateway, gateway_at.listener, poller=poller),
+                config.gateway,
+                poller is None,
             )
         if config.metrics is not None:
             from holdfast.adapters.metrics import Metrics
 
             metrics, metrics_at = config.metrics, ports["metrics"]
-            self._add(
+            add(
                 "metrics",
-                None,
                 lambda: Metrics(metrics, self.diagnostics, metrics_at.listener),
-                port=metrics_at,
+                metrics,
             )
         for name, settings in config.adapters.items():
-            own_door = self._memory_access(name)
-            self._add(name, own_door, foreign.factory(name, settings, own_door))
+            own = self._memory_access(name)
+            part = add(name, foreign.factory(name, settings, own), settings)
+            parts[name] = replace(part, access=own)
+        return parts
 
     def _memory_access(self, name: str) -> MemoryAccess:
-        return MemoryAccess(name, self._memories, self._audit, self._passages)
+        """The way to memory of an adapter. It keeps its counters over reloads."""
+        if name not in self._accesses:
+            made = MemoryAccess(name, self._memories, self._audit, self._passages)
+            self._accesses[name] = made
+        return self._accesses[name]
 
-    def _add(
-        self,
-        name: str,
-        memory_access: MemoryAccess | None,
-        factory: Callable[[], Adapter],
-        *,
-        may_end: bool = False,
-        port: Port | None = None,
-    ) -> None:
-        supervisor = Supervisor(name, factory, may_end=may_end, port=port)
-        self._supervisors.append(supervisor)
-        self.diagnostics.adapters[name] = (supervisor, memory_access)
+    def _add(self, name: str, part: _Part) -> None:
+        supervisor = Supervisor(name, part.factory, may_end=part.may_end, port=part.port)
+        self._supervisors[name] = supervisor
+        self._fingerprint_of[name] = part.fingerprint
+        self.diagnostics.adapters[name] = (supervisor, part.access)
 
     def _take_writes(self) -> None:
         """Moves the writes of listeners to the audit log until the appliance has stopped."""
@@ -424,6 +580,36 @@ class _Running:
                 lost = missed
             if ended and not writes:
                 return
+
+
+def _check_parts(config: Config) -> None:
+    """Raises `UnknownAdapter` or `OSError` for what can be found before a socket is opened."""
+    for name, settings in config.adapters.items():
+        foreign.entry_point(name, settings)
+    if config.gateway is not None and config.gateway.tls is not None:
+        _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
+
+
+def _http_services(config: Config) -> dict[str, RestConfig | GatewayConfig | MetricsConfig]:
+    services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
+    return {name: settings for name, settings in services.items() if settings is not None}
+
+
+def _requires_poller(config: Config) -> bool:
+    polled = any(device.is_polled for device in config.devices.values())
+    return bool(polled or config.links or routed(config) or config.nats is not None)
+
+
+def _review_interval(config: Config) -> float | None:
+    """Seconds after which the certificates of open connections are judged again."""
+    listeners = config.listeners.values()
+    intervals = [each.tls.review for each in listeners if isinstance(each, ModbusTlsListener)]
+    return min(filter(None, intervals), default=None)
+
+
+def _events(config: Config) -> Literal["all", "refusals"]:
+    """The events of listeners that are logged."""
+    return "all" if config.log.level == "debug" else "refusals"
 
 
 def _check_files(name: str, tls: Tls) -> None:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 import shutil
 import sys
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import Appliance, assembly
+from holdfast.appliance.control import Control
 from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
+from holdfast.cli.reloading import Reloading
 from holdfast.cli.showing import ranges_shown
 from holdfast.cli.signals import Signals
 from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
@@ -68,15 +72,24 @@ def run(file: Path) -> None:
     and metrics are retried until they are free.
     """
     config = load_or_exit(file)
-    serve(config, lambda appliance: _greeting(appliance, file), named=str(file))
+    serve(config, lambda appliance: _greeting(appliance, file), named=str(file), file=file)
 
 
-def serve(config: Config, greeting: Callable[[Appliance], str], *, named: str) -> None:
-    """Runs an appliance until a signal. Exits with 1 or 2 if it can't start."""
+def serve(
+    config: Config,
+    greeting: Callable[[Appliance], str],
+    *,
+    named: str,
+    file: Path | None = None,
+) -> None:
+    """Runs an appliance until a signal. Exits with 1 or 2 if it can't start.
+
+    With `file`, it is reread at SIGHUP, at a request of `holdfast reload`, or when it changes.
+    """
     logs.configure(config.log.level, config.log.format)
     give_way()
     allow_open_files(_connections(config))
-    signals = Signals()
+    signals = Signals(reloads=file is not None)
     appliance = Appliance(config)
     try:
         appliance.start()
@@ -86,12 +99,31 @@ def serve(config: Config, greeting: Callable[[Appliance], str], *, named: str) -
     except UnknownAdapter as error:
         click.echo(f"{named}: {error}", err=True)
         sys.exit(WRONG)
-    try:
+    with ExitStack() as parts:
+        parts.callback(appliance.stop)
+        reloading = None
+        if file is not None:
+            reloading = Reloading(appliance, file)
+            parts.callback(_control(appliance, reloading, file))
         click.echo(greeting(appliance))
         while not signals.received:
             appliance.log_events(timeout=JOIN_TIMEOUT)
-    finally:
-        appliance.stop()
+            if reloading is not None:
+                reloading.step(requested=signals.take_reload())
+
+
+def _control(appliance: Appliance, reloading: Reloading, file: Path) -> Callable[[], object]:
+    """Opens the control socket. Returns what closes it. Without one, all the rest still works."""
+    handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
+        "reload": reloading.ask,
+        "sessions": lambda: {"sessions": appliance.sessions()},
+        "end": lambda listener, id: {"ended": appliance.end_session(listener, id)},
+    }
+    try:
+        return Control(file, handlers).close
+    except OSError as error:
+        logs.write(logging.WARNING, "control_unavailable", reason=str(error))
+        return lambda: None
 
 
 def _connections(config: Config) -> int:

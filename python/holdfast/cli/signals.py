@@ -1,4 +1,4 @@
-"""The signals that end a service."""
+"""The signals that end a service, or make it reread its configuration."""
 
 from __future__ import annotations
 
@@ -20,12 +20,27 @@ def ending_signals() -> Iterator[signal.Signals]:
 
 
 class Signals:
-    """Records the signals that end a service. The second signal ends the process at once."""
+    """Records the signals that end a service. The second signal ends the process at once.
 
-    def __init__(self) -> None:
+    With `reloads`, SIGHUP requests a reload instead, also that of a terminal that is closed.
+    """
+
+    def __init__(self, *, reloads: bool = False) -> None:
         self.received = False
+        self._reload = False
         for number in ending_signals():
             signal.signal(number, self._note)
+        hangup = getattr(signal, "SIGHUP", None)
+        if reloads and hangup is not None:
+            signal.signal(hangup, self._request_reload)
+
+    def take_reload(self) -> bool:
+        """Whether a reload was requested since the last call."""
+        requested, self._reload = self._reload, False
+        return requested
+
+    def _request_reload(self, _number: int, _frame: FrameType | None) -> None:
+        self._reload = True
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self.received = True

@@ -212,7 +212,7 @@ class ModbusTcpListener(_ConnectionListener):
 
 
 class ServerTlsConfig(Model):
-    """PEM files of a TLS server; they are read at the start."""
+    """PEM files of a TLS server; they are read at the start and at a reload."""
 
     cert_file: FilePath
     """The server's certificate, followed by its intermediate certificates."""
@@ -222,6 +222,9 @@ class ServerTlsConfig(Model):
     """Authorities of client certificates, and self-signed certificates of clients."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client."""
+    review: DurationOrZero = 3600.0
+    """At most so many seconds pass until the certificates of open connections are judged again; 0:
+    only at a reload."""
 
 
 class ModbusTlsListener(_ConnectionListener):

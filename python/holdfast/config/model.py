@@ -118,6 +118,9 @@ class Config(Model):
     """The log of every write."""
     log: LogConfig = Field(default_factory=LogConfig)
     """The log of the program."""
+    reload: Literal["on-request", "on-change"] = "on-request"
+    """When the configuration is reread. on-request: at a signal or a command; on-change: also when
+    this file, or one that it names, has changed."""
     workers: Annotated[int, Field(ge=1, le=64)] = 1
     """Threads that serve connections."""
 

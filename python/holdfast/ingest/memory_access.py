@@ -114,7 +114,7 @@ class MemoryAccess:
         self.name = name
         self.memories = memories
         self._audit = audit
-        self._passages = passages or {}
+        self._passages = {} if passages is None else passages
         self._counts = Counts()
         self._lock = threading.Lock()
 

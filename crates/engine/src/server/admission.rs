@@ -4,9 +4,12 @@ use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant, SystemTime};
 
 use tokio::task::AbortHandle;
+
+use super::peer::Peer;
+use crate::tls::server::PeerCertificate;
 
 /// What happens to a new connection when a limit is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,15 +40,13 @@ impl ConnectionLimits {
 
 #[derive(Debug)]
 pub(crate) struct Admission {
-    max_connections: usize,
-    max_per_source: usize,
-    when_full: WhenFull,
     epoch: Instant,
     table: Mutex<Table>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Table {
+    limits: ConnectionLimits,
     next_id: u64,
     held: HashMap<u64, Held>,
     per_source: HashMap<IpAddr, usize>,
@@ -53,18 +54,32 @@ struct Table {
 
 #[derive(Debug)]
 struct Held {
-    peer: SocketAddr,
+    peer: Peer,
+    opened: SystemTime,
     activity: Arc<Activity>,
     /// Set once the task of the connection runs.
     task: Option<AbortHandle>,
 }
 
-/// What decides which connection is evicted.
+/// What a connection and the table of connections tell each other without waiting.
 #[derive(Debug)]
 struct Activity {
     /// In microseconds since the epoch of the admission.
     last_request: AtomicU64,
     is_amid_packet: AtomicBool,
+    /// Whether the connection must look up its rights again.
+    is_outdated: AtomicBool,
+}
+
+/// An open connection.
+#[derive(Debug, Clone)]
+pub struct Session {
+    /// Its number among the connections of its listener.
+    pub id: u64,
+    pub peer: Peer,
+    pub opened: SystemTime,
+    /// The time since the last request, or since it was opened.
+    pub idle: Duration,
 }
 
 /// The limit is reached, and no connection can be evicted.
@@ -81,27 +96,27 @@ pub(crate) struct Ticket {
 
 impl Admission {
     pub(crate) fn new(limits: ConnectionLimits) -> Admission {
-        let ConnectionLimits { max_connections, max_connections_per_source, when_full } = limits;
-        Admission {
-            max_connections,
-            max_per_source: max_connections_per_source.unwrap_or(max_connections),
-            when_full,
-            epoch: Instant::now(),
-            table: Mutex::default(),
-        }
+        let table = Table { limits, next_id: 0, held: HashMap::new(), per_source: HashMap::new() };
+        Admission { epoch: Instant::now(), table: Mutex::new(table) }
+    }
+
+    /// Changes the limits. Open connections stay.
+    pub(crate) fn set_limits(&self, limits: ConnectionLimits) {
+        self.table().limits = limits;
     }
 
     /// Admits a connection from `peer`. Also returns the peer that was evicted for it.
     pub(crate) fn admit(
         self: &Arc<Self>,
         peer: SocketAddr,
-    ) -> Result<(Ticket, Option<SocketAddr>), Full> {
+    ) -> Result<(Ticket, Option<Peer>), Full> {
         let source = peer.ip().to_canonical();
         let mut table = self.table();
         let from_source = table.per_source.get(&source).copied().unwrap_or_default();
-        let evicted = if from_source >= self.max_per_source {
+        let ConnectionLimits { max_connections, max_connections_per_source, .. } = table.limits;
+        let evicted = if max_connections_per_source.is_some_and(|most| from_source >= most) {
             Some(self.evict(&mut table, Some(source))?)
-        } else if table.held.len() >= self.max_connections {
+        } else if table.held.len() >= max_connections {
             Some(self.evict(&mut table, None)?)
         } else {
             None
@@ -109,8 +124,10 @@ impl Admission {
         let id = table.next_id;
         table.next_id += 1;
         let last_request = AtomicU64::new(self.now());
-        let activity = Arc::new(Activity { last_request, is_amid_packet: AtomicBool::new(false) });
-        let held = Held { peer, activity: Arc::clone(&activity), task: None };
+        let (is_amid_packet, is_outdated) = (AtomicBool::new(false), AtomicBool::new(false));
+        let activity = Arc::new(Activity { last_request, is_amid_packet, is_outdated });
+        let (peer, opened) = (peer.into(), SystemTime::now());
+        let held = Held { peer, opened, activity: Arc::clone(&activity), task: None };
         table.held.insert(id, held);
         *table.per_source.entry(source).or_default() += 1;
         Ok((Ticket { id, activity, admission: Arc::clone(self) }, evicted))
@@ -118,8 +135,8 @@ impl Admission {
 
     /// Closes the connection that has been idle longest, of one source or of all; first those that are
     /// not in the middle of a packet.
-    fn evict(&self, table: &mut Table, source: Option<IpAddr>) -> Result<SocketAddr, Full> {
-        if self.when_full == WhenFull::Refuse {
+    fn evict(&self, table: &mut Table, source: Option<IpAddr>) -> Result<Peer, Full> {
+        if table.limits.when_full == WhenFull::Refuse {
             return Err(Full);
         }
         let of_source = |held: &Held| source.is_none_or(|ip| held.peer.ip().to_canonical() == ip);
@@ -127,17 +144,49 @@ impl Admission {
             table.held.iter().filter(|(_, held)| held.task.is_some() && of_source(held));
         let id = candidates
             .min_by_key(|(id, held)| {
-                let Activity { last_request, is_amid_packet } = &*held.activity;
+                let Activity { last_request, is_amid_packet, .. } = &*held.activity;
                 let is_amid_packet = is_amid_packet.load(Ordering::Relaxed);
                 (is_amid_packet, last_request.load(Ordering::Relaxed), **id)
             })
             .map(|(id, _)| *id)
             .ok_or(Full)?;
-        let held = table.remove(id).ok_or(Full)?;
-        if let Some(task) = held.task {
-            task.abort();
+        Ok(table.end(id).ok_or(Full)?.peer)
+    }
+
+    /// Ends the connections for which `ends` has a reason. The others look up their rights again,
+    /// before they answer the next request. Returns the reasons, and whom they concern.
+    pub(crate) fn review<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
+        let mut table = self.table();
+        let mut ending = Vec::new();
+        for (id, held) in &table.held {
+            match ends(&held.peer) {
+                Some(reason) => ending.push((*id, reason)),
+                None => held.activity.is_outdated.store(true, Ordering::Release),
+            }
         }
-        Ok(held.peer)
+        let ended = |(id, reason)| table.end(id).map(|held| (held.peer, reason));
+        ending.into_iter().filter_map(ended).collect()
+    }
+
+    /// Ends one connection. Returns its peer, `None` if there is no such connection.
+    pub(crate) fn end(&self, id: u64) -> Option<Peer> {
+        self.table().end(id).map(|held| held.peer)
+    }
+
+    /// The open connections, in the order in which they were opened.
+    pub(crate) fn sessions(&self) -> Vec<Session> {
+        let now = self.now();
+        let session = |(id, held): (&u64, &Held)| Session {
+            id: *id,
+            peer: held.peer.clone(),
+            opened: held.opened,
+            idle: Duration::from_micros(
+                now.saturating_sub(held.activity.last_request.load(Ordering::Relaxed)),
+            ),
+        };
+        let mut sessions: Vec<Session> = self.table().held.iter().map(session).collect();
+        sessions.sort_unstable_by_key(|session| session.id);
+        sessions
     }
 
     pub(crate) fn open(&self) -> usize {
@@ -154,6 +203,15 @@ impl Admission {
 }
 
 impl Table {
+    /// Removes a connection and aborts its task, which drops the socket.
+    fn end(&mut self, id: u64) -> Option<Held> {
+        let held = self.remove(id)?;
+        if let Some(task) = &held.task {
+            task.abort();
+        }
+        Some(held)
+    }
+
     fn remove(&mut self, id: u64) -> Option<Held> {
         let held = self.held.remove(&id)?;
         let source = held.peer.ip().to_canonical();
@@ -179,6 +237,20 @@ impl Ticket {
         self.activity.last_request.store(since.as_micros() as u64, Ordering::Relaxed);
     }
 
+    /// Records the certificate that the peer has proved to own.
+    pub(crate) fn identify(&self, certificate: Arc<PeerCertificate>) {
+        if let Some(held) = self.admission.table().held.get_mut(&self.id) {
+            held.peer.certificate = Some(certificate);
+        }
+    }
+
+    /// Whether rights must be looked up again. The next call returns false.
+    #[inline]
+    pub(crate) fn take_outdated(&self) -> bool {
+        self.activity.is_outdated.load(Ordering::Relaxed)
+            && self.activity.is_outdated.swap(false, Ordering::Acquire)
+    }
+
     /// Records whether part of a packet has arrived.
     pub(crate) fn set_amid_packet(&self, is_amid_packet: bool) {
         self.activity.is_amid_packet.store(is_amid_packet, Ordering::Relaxed);
@@ -187,8 +259,10 @@ impl Ticket {
 
 /// Sets the task of a connection, so that it can be evicted.
 pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
-    if let Some(held) = admission.table().held.get_mut(&id) {
-        held.task = Some(task);
+    match admission.table().held.get_mut(&id) {
+        Some(held) => held.task = Some(task),
+        // It was ended before its task ran, or its task has ended.
+        None => task.abort(),
     }
 }
 
@@ -259,7 +333,7 @@ mod tests {
             tickets[index].touch(later + Duration::from_secs(seconds));
         }
         let (_fourth, evicted) = admission.admit(peer(1, 4)).unwrap();
-        assert_eq!(evicted, Some(peer(1, 2)));
+        assert_eq!(evicted, Some(peer(1, 2).into()));
         assert_eq!(admission.open(), 3);
     }
 
@@ -276,15 +350,15 @@ mod tests {
         tickets[0].set_amid_packet(true);
         tickets[2].set_amid_packet(true);
         let (_fourth, evicted) = admit(4);
-        assert_eq!(evicted, Some(peer(1, 2)));
+        assert_eq!(evicted, Some(peer(1, 2).into()));
         let (fifth, evicted) = admit(5);
-        assert_eq!(evicted, Some(peer(1, 4)), "the silent one, although it is the newest");
+        assert_eq!(evicted, Some(peer(1, 4).into()), "the silent one, although it is the newest");
         fifth.set_amid_packet(true);
         let (sixth, evicted) = admit(6);
-        assert_eq!(evicted, Some(peer(1, 1)), "all are in the middle of a packet");
+        assert_eq!(evicted, Some(peer(1, 1).into()), "all are in the middle of a packet");
         sixth.set_amid_packet(true);
         fifth.set_amid_packet(false);
-        assert_eq!(admit(7).1, Some(peer(1, 5)), "its packet is complete");
+        assert_eq!(admit(7).1, Some(peer(1, 5).into()), "its packet is complete");
     }
 
     #[test]
@@ -297,6 +371,6 @@ mod tests {
             ticket
         });
         let (_third, evicted) = admission.admit(peer(2, 3)).unwrap();
-        assert_eq!(evicted, Some(peer(2, 2)));
+        assert_eq!(evicted, Some(peer(2, 2).into()));
     }
 }

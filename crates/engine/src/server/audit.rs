@@ -1,7 +1,6 @@
 //! Writes, for an audit log. Sending never blocks: when the queue is full, records are dropped and
 //! counted.
 
-use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,6 +10,7 @@ use holdfast_protocol::pdu::Function;
 use holdfast_protocol::raw_ingest;
 
 use super::functions::only_reads;
+use super::peer::Peer;
 
 /// The most bytes in the queue.
 const CAPACITY: usize = 32 << 20;
@@ -23,7 +23,7 @@ const OVERHEAD: usize = 128;
 pub struct Record {
     pub listener: Arc<str>,
     /// `None` on a serial line.
-    pub peer: Option<SocketAddr>,
+    pub peer: Option<Peer>,
     pub write: Written,
 }
 
@@ -79,7 +79,7 @@ impl Auditor {
     pub(crate) fn note(
         &self,
         listener: &Arc<str>,
-        peer: Option<SocketAddr>,
+        peer: Option<&Peer>,
         unit_id: u8,
         request: &[u8],
         reply: &[u8],
@@ -95,7 +95,7 @@ impl Auditor {
     pub(crate) fn note_forwarded(
         &self,
         listener: &Arc<str>,
-        peer: Option<SocketAddr>,
+        peer: Option<&Peer>,
         unit_id: u8,
         (route, request, reply): (Option<&Arc<str>>, &[u8], &[u8]),
     ) {
@@ -117,7 +117,7 @@ impl Auditor {
 
 fn record(
     listener: &Arc<str>,
-    peer: Option<SocketAddr>,
+    peer: Option<&Peer>,
     unit_id: u8,
     request: &[u8],
     reply: &[u8],
@@ -128,7 +128,7 @@ fn record(
         _ => None,
     };
     let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route };
-    Record { listener: Arc::clone(listener), peer, write }
+    Record { listener: Arc::clone(listener), peer: peer.cloned(), write }
 }
 
 impl Record {

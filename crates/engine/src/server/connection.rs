@@ -10,7 +10,6 @@ use std::cell::RefCell;
 use std::future::poll_fn;
 use std::io;
 use std::mem;
-use std::net::SocketAddr;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -26,6 +25,7 @@ use super::deferred::{Completed, Deferral, Deferred, MAX_WAITING};
 use super::event::Kind;
 use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
+use super::peer::Peer;
 use super::policy::PeerRights;
 use super::stream::{self, Stream};
 use super::unit_server::UnitServer;
@@ -78,10 +78,20 @@ pub(crate) struct Timeouts {
     pub(crate) frame: Option<Duration>,
 }
 
+/// What a connection may do, and how long it may take.
+pub(crate) struct Terms {
+    pub(crate) rights: Arc<PeerRights>,
+    pub(crate) timeouts: Timeouts,
+}
+
+/// Looks up the terms of a connection again; `None` if it has no rights any more.
+pub(crate) type Renewal = Box<dyn Fn() -> Option<Terms> + Send + Sync>;
+
 pub(crate) struct Connection<F: Framing, S> {
     stream: S,
     answering: Answering<F>,
     timeouts: Timeouts,
+    renewal: Renewal,
     ticket: Ticket,
     /// Bytes queued for the peer.
     unsent: Vec<u8>,
@@ -97,7 +107,7 @@ pub(crate) struct Connection<F: Framing, S> {
 /// The state that replies depend on.
 struct Answering<F: Framing> {
     context: Arc<ListenerContext>,
-    peer: SocketAddr,
+    peer: Peer,
     unit_server: Arc<UnitServer>,
     rights: Arc<PeerRights>,
     /// The beginning of an incomplete request.
@@ -124,9 +134,9 @@ impl<F: Framing, S: Stream> Connection<F, S> {
     pub(crate) fn new(
         context: Arc<ListenerContext>,
         unit_server: Arc<UnitServer>,
-        (stream, peer): (S, SocketAddr),
-        rights: Arc<PeerRights>,
-        timeouts: Timeouts,
+        (stream, peer): (S, Peer),
+        Terms { rights, timeouts }: Terms,
+        renewal: Renewal,
         ticket: Ticket,
     ) -> Connection<F, S> {
         let answering = Answering::new(context, peer, unit_server, rights);
@@ -135,6 +145,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             stream,
             answering,
             timeouts,
+            renewal,
             ticket,
             unsent: Vec::new(),
             last_request,
@@ -154,7 +165,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
 
     /// Serves until the connection ends. The end is counted before the peer can see it.
     pub(crate) async fn run(mut self, stop: watch::Receiver<bool>) {
-        let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer);
+        let (context, peer) = (Arc::clone(&self.answering.context), self.answering.peer.clone());
         // The engine waits until all receivers are dropped.
         let running = stop.clone();
         match self.serve(stop).await {
@@ -222,7 +233,9 @@ impl<F: Framing, S: Stream> Connection<F, S> {
                 return Poll::Pending;
             };
             self.turns += 1;
-            let answered = self.answering.answer(&input[..kept + read?], output);
+            let read = read?;
+            self.renew()?;
+            let answered = self.answering.answer(&input[..kept + read], output);
             self.note(&answered);
             let output = &output[..answered.len];
             if !output.is_empty() {
@@ -243,6 +256,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             let mut broken = false;
             let behind = self.answering.resume(input);
             if behind > 0 {
+                self.renew()?;
                 let answered = self.answering.answer(&input[..behind], &mut output[len..]);
                 len += answered.len;
                 broken = answered.broken;
@@ -255,6 +269,16 @@ impl<F: Framing, S: Stream> Connection<F, S> {
             }
             Poll::Ready(if broken { Err(Kind::BrokenFrame) } else { Ok(()) })
         })
+    }
+
+    /// Looks up rights and timeouts again after a reload.
+    #[inline]
+    fn renew(&mut self) -> Result<(), Kind> {
+        if self.ticket.take_outdated() {
+            let Terms { rights, timeouts } = (self.renewal)().ok_or(Kind::RightsRevoked)?;
+            (self.answering.rights, self.timeouts) = (rights, timeouts);
+        }
+        Ok(())
     }
 
     /// Updates the times that the deadlines depend on.
@@ -347,7 +371,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
 impl<F: Framing> Answering<F> {
     fn new(
         context: Arc<ListenerContext>,
-        peer: SocketAddr,
+        peer: Peer,
         unit_server: Arc<UnitServer>,
         rights: Arc<PeerRights>,
     ) -> Answering<F> {
@@ -457,7 +481,7 @@ impl<F: Framing> Answering<F> {
             if let Some(auditor) = &self.context.auditor {
                 let (name, passed) =
                     (&self.context.name, (route.as_ref(), &request[..], &reply[..]));
-                auditor.note_forwarded(name, Some(self.peer), unit_id, passed);
+                auditor.note_forwarded(name, Some(&self.peer), unit_id, passed);
             }
             let at = len.get_or_insert(0);
             let frame = &mut output[*at..];
@@ -475,14 +499,14 @@ impl<F: Framing> Answering<F> {
             return;
         };
         let (context, unit_server) = (Arc::clone(&self.context), Arc::clone(&self.unit_server));
-        let (peer, given_up) = (self.peer, deferred.give_up());
+        let (peer, given_up) = (self.peer.clone(), deferred.give_up());
         tokio::spawn(async move {
             for waiting in given_up {
                 let completed = waiting.complete(&unit_server).await;
                 if let (Some(completed), Some(auditor)) = (completed, &context.auditor) {
                     let Completed { unit_id, route, request, reply, .. } = completed;
                     let passed = (route.as_ref(), &request[..], &reply[..]);
-                    auditor.note_forwarded(&context.name, Some(peer), unit_id, passed);
+                    auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed);
                 }
             }
             // The engine waits for this until all receivers are dropped.
@@ -503,12 +527,12 @@ impl<F: Framing> Answering<F> {
             return 0;
         };
         if self.unit_server.refuses_silence(request) {
-            self.context.refuse_listen_only(self.peer);
+            self.context.refuse_listen_only(self.peer.clone());
         }
         let len = self.unit_server.answer(&self.rights, unit_id, request, buffer);
         if let Some(auditor) = &self.context.auditor {
             let reply = &buffer[..len.unwrap_or_default()];
-            auditor.note(&self.context.name, Some(self.peer), unit_id, request, reply);
+            auditor.note(&self.context.name, Some(&self.peer), unit_id, request, reply);
         }
         len.map_or(0, |len| F::complete(output, tag, unit_id, len))
     }
@@ -541,6 +565,8 @@ impl<F: Framing> Answering<F> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
+
     use holdfast_memory::{Area, Layout, Memory, Span};
     use holdfast_protocol::frame::{ascii, mbap};
 
@@ -566,7 +592,7 @@ mod tests {
         let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
         Answering::new(
             Arc::new(ListenerContext::for_tests()),
-            SocketAddr::from(([127, 0, 0, 1], 1)),
+            Peer::from(SocketAddr::from(([127, 0, 0, 1], 1))),
             Arc::new(UnitServer::new(Identity::new(&objects, &[]).unwrap(), false)),
             Arc::new(PeerRights::new(&rule)),
         )

@@ -73,6 +73,10 @@ pub struct ConnectionCounters {
     pub tls_failed: Counter,
     /// Closed in favour of a new connection.
     pub evicted: Counter,
+    /// Ended by a reload: no rule names the peer any more.
+    pub rights_revoked: Counter,
+    /// Ended by an operator.
+    pub ended: Counter,
     /// Closed after `idle_timeout`.
     pub idle: Counter,
     /// Closed because a request did not arrive within `request_timeout`.

@@ -1,9 +1,10 @@
 //! Runs listeners on worker threads. Either all listeners start or none.
 
 use std::io;
+use std::mem;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -11,18 +12,22 @@ use holdfast_protocol::pdu::identification::ObjectError;
 use thiserror::Error;
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
+use tokio::task::AbortHandle;
 
-use super::admission::ConnectionLimits;
-use super::audit::{Record, Records, auditing};
-use super::counters::{ConnectionCounters, Counters, PacketCounters};
-use super::event::{Event, Events, Verbosity, channel as event_channel};
+use super::admission::{ConnectionLimits, Session};
+use super::audit::{Auditor, Record, Records, auditing};
+use super::counters::{ConnectionCounters, PacketCounters};
+use super::event::{Event, Events, Kind, Reporter, Verbosity, channel as event_channel};
 use super::identity::Identity;
-use super::listener::{ListenerContext, accept, bind_tcp, bind_udp};
+use super::listener::{ListenerContext, Service, accept, bind_tcp, bind_udp};
+use super::live::Live;
+use super::policy::{PeerRights, Policy};
 use super::raw_ingest::{RawIngest, RawSettings};
 use super::serial::{ModbusSerial, SerialSettings};
 use super::tcp::{ModbusStream, StreamSettings};
-use super::udp::{ModbusUdp, UdpSettings};
+use super::udp::{DatagramFraming, ModbusUdp, UdpSettings};
 use super::unit_server::UnitServer;
+use crate::serial_line::SerialLine;
 
 /// The time that connections have to end when the engine stops.
 const GRACE: Duration = Duration::from_millis(500);
@@ -30,11 +35,7 @@ const GRACE: Duration = Duration::from_millis(500);
 /// Settings of an engine.
 #[derive(Debug, Clone)]
 pub struct Settings {
-    pub listeners: Vec<ListenerSettings>,
-    /// Identification objects by id (function 43/14); 0x00 to 0x02 are mandatory.
-    pub identity: Vec<(u8, Vec<u8>)>,
-    /// Names of single units, by unit id.
-    pub unit_names: Vec<(u8, Vec<u8>)>,
+    pub listening: Listening,
     /// The number of threads that serve connections, at least 1.
     pub workers: usize,
     pub events: Verbosity,
@@ -70,43 +71,79 @@ pub enum StartError {
 
 /// Running listeners, until the engine is stopped or dropped.
 pub struct Engine {
-    listeners: Vec<Listener>,
+    /// In the order of the settings. Locked during a reload.
+    listeners: Mutex<Vec<Arc<Listener>>>,
+    handles: Vec<Handle>,
     stop: Arc<watch::Sender<bool>>,
     workers: Mutex<Vec<JoinHandle<()>>>,
+    reporter: Reporter,
+    auditor: Option<Auditor>,
     events: Events,
     records: Option<Records>,
+}
+
+/// What a listener serves, and who may use it.
+#[derive(Debug, Clone)]
+pub struct Listening {
+    pub listeners: Vec<ListenerSettings>,
+    /// Identification objects by id (function 43/14); 0x00 to 0x02 are mandatory.
+    pub identity: Vec<(u8, Vec<u8>)>,
+    /// Names of single units, by unit id.
+    pub unit_names: Vec<(u8, Vec<u8>)>,
 }
 
 /// A running listener.
 struct Listener {
     context: Arc<ListenerContext>,
+    /// The address in the settings; with port 0 for one that the system picked.
+    bind: Option<SocketAddr>,
     /// `None` on a serial line.
     address: Option<SocketAddr>,
     served: Served,
+    task: OnceLock<AbortHandle>,
 }
 
 enum Served {
-    /// With the packets of the same port.
-    Modbus(Arc<UnitServer>, Option<Arc<RawIngest>>),
-    Packets(Arc<RawIngest>),
+    Stream(Arc<Live<ModbusStream>>, Arc<UnitServer>),
+    Datagrams(DatagramFraming, Arc<Live<Policy>>, Arc<UnitServer>),
+    Serial(SerialLine, Arc<Live<PeerRights>>, Arc<UnitServer>),
+    Packets(Arc<Live<RawIngest>>),
 }
 
 /// The counters of a listener.
-pub struct ListenerCounters<'e> {
-    pub name: &'e str,
-    pub connections: &'e ConnectionCounters,
+pub struct ListenerCounters {
+    context: Arc<ListenerContext>,
     pub open_connections: usize,
-    pub protocol: ProtocolCounters<'e>,
+    pub protocol: ProtocolCounters,
 }
 
-pub enum ProtocolCounters<'e> {
+pub enum ProtocolCounters {
     /// With those of packets on the same port.
-    Modbus(&'e Counters, Option<&'e PacketCounters>),
-    Packets(&'e PacketCounters),
+    Modbus(Arc<UnitServer>, Option<Arc<PacketCounters>>),
+    Packets(Arc<PacketCounters>),
+}
+
+impl ListenerCounters {
+    pub fn name(&self) -> &str {
+        &self.context.name
+    }
+
+    pub fn connections(&self) -> &ConnectionCounters {
+        &self.context.connections
+    }
 }
 
 /// The task of a listener. All tasks are started after all listeners are bound.
 type Task = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+/// Gives a running listener new settings.
+type Update = Box<dyn FnOnce(&Listener) + Send>;
+
+/// A change of a running listener, which can't fail any more.
+enum Change {
+    Keep(Arc<Listener>, Update),
+    Start(Arc<Listener>, Task),
+}
 
 impl Engine {
     /// Binds every listener, then starts to serve. If one cannot be bound, none is served.
@@ -121,89 +158,165 @@ impl Engine {
             .map(|_| Builder::new_current_thread().enable_io().enable_time().build())
             .collect::<Result<_, _>>()
             .map_err(StartError::Worker)?;
-        let handles: Vec<Handle> =
-            runtimes.iter().map(|runtime| runtime.handle().clone()).collect();
-        let mut tasks: Vec<Task> = Vec::new();
-        let mut listeners = Vec::new();
-        for ListenerSettings { name, kind } in settings.listeners {
-            let unit_server = |listen_only| -> Result<Arc<UnitServer>, StartError> {
-                let identity = Identity::new(&settings.identity, &settings.unit_names)?;
-                Ok(Arc::new(UnitServer::new(identity, listen_only)))
-            };
-            let context = |limits: Option<ConnectionLimits>| {
-                let (reporter, auditor) = (reporter.clone(), auditor.clone());
-                Arc::new(ListenerContext::new(&name, limits, reporter, auditor))
-            };
-            let (workers, stopping) = (handles.clone(), stopping.clone());
-            let listener = match kind {
-                ListenerKind::ModbusStream(stream) => {
-                    let (socket, address) = bound(&name, stream.bind, bind_tcp)?;
-                    let context = context(Some(stream.limits));
-                    let unit_server = unit_server(stream.listen_only)?;
-                    let service = Arc::new(ModbusStream::new(&stream, Arc::clone(&unit_server)));
-                    let raw_ingest = service.raw_ingest.clone();
-                    tasks.push(Box::pin(accept(
-                        Arc::clone(&context),
-                        service,
-                        socket,
-                        workers,
-                        stopping,
-                    )));
-                    Listener {
-                        context,
-                        address: Some(address),
-                        served: Served::Modbus(unit_server, raw_ingest),
-                    }
-                }
-                ListenerKind::RawIngest(raw) => {
-                    let (socket, address) = bound(&name, raw.bind, bind_tcp)?;
-                    let context = context(Some(raw.limits));
-                    let service = Arc::new(RawIngest::new(&raw));
-                    tasks.push(Box::pin(accept(
-                        Arc::clone(&context),
-                        Arc::clone(&service),
-                        socket,
-                        workers,
-                        stopping,
-                    )));
-                    Listener { context, address: Some(address), served: Served::Packets(service) }
-                }
-                ListenerKind::ModbusUdp(udp) => {
-                    let (socket, address) = bound(&name, udp.bind, bind_udp)?;
-                    let (context, unit_server) = (context(None), unit_server(udp.listen_only)?);
-                    let service = ModbusUdp::new(&udp, Arc::clone(&unit_server));
-                    tasks.push(Box::pin(service.serve(Arc::clone(&context), socket, stopping)));
-                    Listener {
-                        context,
-                        address: Some(address),
-                        served: Served::Modbus(unit_server, None),
-                    }
-                }
-                ListenerKind::ModbusSerial(serial) => {
-                    let _context = handles[0].enter();
-                    let device = serial.line.device.clone();
-                    let port = serial.line.open().map_err(|error| StartError::Open {
-                        listener: name.clone(),
-                        device,
-                        error,
-                    })?;
-                    let (context, unit_server) = (context(None), unit_server(true)?);
-                    let service = ModbusSerial::new(serial, Arc::clone(&unit_server));
-                    tasks.push(Box::pin(service.serve(Arc::clone(&context), port, stopping)));
-                    Listener { context, address: None, served: Served::Modbus(unit_server, None) }
-                }
-            };
-            listeners.push(listener);
-        }
-        for task in tasks {
-            handles[0].spawn(task);
-        }
-        let engine =
-            Engine { listeners, stop: Arc::new(stop), workers: Mutex::default(), events, records };
+        let engine = Engine {
+            listeners: Mutex::default(),
+            handles: runtimes.iter().map(|runtime| runtime.handle().clone()).collect(),
+            stop: Arc::new(stop),
+            workers: Mutex::default(),
+            reporter,
+            auditor,
+            events,
+            records,
+        };
+        engine.reload(settings.listening)?;
         for (index, runtime) in runtimes.into_iter().enumerate() {
             engine.work(index, runtime, stopping.clone())?;
         }
         Ok(engine)
+    }
+
+    /// Serves these listeners from now on. A listener with the name, protocol and address of a
+    /// running one takes over its socket, its counters and its connections: those that have no
+    /// rights any more are ended, the others get their new rights before their next request. Other
+    /// running listeners are ended.
+    ///
+    /// # Errors
+    /// [`StartError`]. Nothing has changed then.
+    pub fn reload(&self, listening: Listening) -> Result<(), StartError> {
+        let Listening { listeners: settings, identity, unit_names } = listening;
+        let identity = || Identity::new(&identity, &unit_names);
+        identity()?;
+        let mut listeners = self.listeners();
+        let mut changes = Vec::new();
+        for ListenerSettings { name, kind } in settings {
+            let running = listeners.iter().find(|running| *running.context.name == *name);
+            let update = running.and_then(|running| running.update(&kind, identity().ok()?));
+            changes.push(match (running, update) {
+                (Some(running), Some(update)) => Change::Keep(Arc::clone(running), update),
+                _ => {
+                    let (listener, task) = self.listener(&name, kind, identity()?)?;
+                    Change::Start(Arc::new(listener), task)
+                }
+            });
+        }
+        let before = mem::take(&mut *listeners);
+        for change in changes {
+            listeners.push(match change {
+                Change::Keep(listener, update) => {
+                    update(&listener);
+                    listener
+                }
+                Change::Start(listener, task) => {
+                    let task = self.handles[0].spawn(task);
+                    let _ = listener.task.set(task.abort_handle());
+                    listener
+                }
+            });
+        }
+        for listener in before {
+            if !listeners.iter().any(|kept| Arc::ptr_eq(kept, &listener)) {
+                listener.end();
+            }
+        }
+        Ok(())
+    }
+
+    /// Binds a listener. Nothing is served before its task runs.
+    fn listener(
+        &self,
+        name: &str,
+        kind: ListenerKind,
+        identity: Identity,
+    ) -> Result<(Listener, Task), StartError> {
+        let context = |limits: Option<ConnectionLimits>| {
+            let (reporter, auditor) = (self.reporter.clone(), self.auditor.clone());
+            Arc::new(ListenerContext::new(name, limits, reporter, auditor))
+        };
+        let unit_server = |listen_only| Arc::new(UnitServer::new(identity, listen_only));
+        let (workers, stopping) = (self.handles.clone(), self.stop.subscribe());
+        let (context, bind, address, served, task): (_, _, _, _, Task) = match kind {
+            ListenerKind::ModbusStream(stream) => {
+                let (socket, address) = bound(name, stream.bind, bind_tcp)?;
+                let context = context(Some(stream.limits));
+                let unit_server = unit_server(stream.listen_only);
+                let service = ModbusStream::new(&stream, Arc::clone(&unit_server), None);
+                let live = Arc::new(Live::new(service));
+                let served = Served::Stream(Arc::clone(&live), unit_server);
+                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
+                (context, Some(stream.bind), Some(address), served, Box::pin(task))
+            }
+            ListenerKind::RawIngest(raw) => {
+                let (socket, address) = bound(name, raw.bind, bind_tcp)?;
+                let context = context(Some(raw.limits));
+                let live = Arc::new(Live::new(RawIngest::new(&raw, Arc::default())));
+                let served = Served::Packets(Arc::clone(&live));
+                let task = accept(Arc::clone(&context), live, socket, workers, stopping);
+                (context, Some(raw.bind), Some(address), served, Box::pin(task))
+            }
+            ListenerKind::ModbusUdp(udp) => {
+                let (socket, address) = bound(name, udp.bind, bind_udp)?;
+                let (context, unit_server) = (context(None), unit_server(udp.listen_only));
+                let policy = Arc::new(Live::new(Policy::of(&udp.rules)));
+                let (rules, units) = (Arc::clone(&policy), Arc::clone(&unit_server));
+                let service = ModbusUdp::new(udp.framing, rules, units);
+                let served = Served::Datagrams(udp.framing, policy, unit_server);
+                let task = service.serve(Arc::clone(&context), socket, stopping);
+                (context, Some(udp.bind), Some(address), served, Box::pin(task))
+            }
+            ListenerKind::ModbusSerial(SerialSettings { line, rule }) => {
+                let _context = self.handles[0].enter();
+                let port = line.open().map_err(|error| StartError::Open {
+                    listener: name.to_owned(),
+                    device: line.device.clone(),
+                    error,
+                })?;
+                let (context, unit_server) = (context(None), unit_server(true));
+                let rights = Arc::new(Live::new(PeerRights::new(&rule)));
+                let (own, units) = (Arc::clone(&rights), Arc::clone(&unit_server));
+                let service = ModbusSerial::new(line.clone(), own, units);
+                let served = Served::Serial(line, rights, unit_server);
+                let task = service.serve(Arc::clone(&context), port, stopping);
+                (context, None, None, served, Box::pin(task))
+            }
+        };
+        let listener = Listener { context, bind, address, served, task: OnceLock::new() };
+        Ok((listener, task))
+    }
+
+    fn listeners(&self) -> MutexGuard<'_, Vec<Arc<Listener>>> {
+        self.listeners.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Judges all open connections again: a certificate may have expired.
+    pub fn review(&self) {
+        for listener in self.listeners().iter() {
+            if let Served::Stream(live, _) = &listener.served {
+                let service = live.get();
+                listener.context.review(&*service, &*service);
+            }
+        }
+    }
+
+    /// The open connections of each listener, by its name.
+    pub fn sessions(&self) -> Vec<(Arc<str>, Vec<Session>)> {
+        let listeners = self.listeners();
+        let sessions = |listener: &Arc<Listener>| {
+            (Arc::clone(&listener.context.name), listener.context.admission.sessions())
+        };
+        listeners.iter().map(sessions).collect()
+    }
+
+    /// Ends a connection. Returns whether there was one.
+    pub fn end_session(&self, listener: &str, id: u64) -> bool {
+        let listeners = self.listeners();
+        let found = listeners.iter().find(|running| *running.context.name == *listener);
+        let ended = found.and_then(|running| {
+            running.context.admission.end(id).map(|peer| (Arc::clone(running), peer))
+        });
+        drop(listeners);
+        let Some((running, peer)) = ended else { return false };
+        running.context.ended(Kind::Ended, peer);
+        true
     }
 
     /// Runs one worker until the engine stops and its connections have ended.
@@ -230,23 +343,17 @@ impl Engine {
 
     /// The address of each listener, in the order of the settings; `None` for serial lines.
     pub fn addresses(&self) -> Vec<Option<SocketAddr>> {
-        self.listeners.iter().map(|listener| listener.address).collect()
+        self.listeners().iter().map(|listener| listener.address).collect()
     }
 
     /// The counters of each listener, in the order of the settings.
-    pub fn counters(&self) -> impl Iterator<Item = ListenerCounters<'_>> {
-        self.listeners.iter().map(|Listener { context, served, .. }| ListenerCounters {
-            name: &context.name,
-            connections: &context.connections,
-            open_connections: context.admission.open(),
-            protocol: match served {
-                Served::Modbus(unit_server, raw) => {
-                    let packets = raw.as_ref().map(|raw| &raw.packets);
-                    ProtocolCounters::Modbus(&unit_server.counters, packets)
-                }
-                Served::Packets(service) => ProtocolCounters::Packets(&service.packets),
-            },
-        })
+    pub fn counters(&self) -> Vec<ListenerCounters> {
+        self.listeners().iter().map(|listener| listener.counters()).collect()
+    }
+
+    /// Changes which events are sent.
+    pub fn set_verbosity(&self, verbosity: Verbosity) {
+        self.reporter.set_verbosity(verbosity);
     }
 
     /// Takes up to `most` writes for the audit log. Waits up to `timeout` for the first.
@@ -276,6 +383,86 @@ impl Engine {
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         for worker in workers.drain(..) {
             let _ = worker.join();
+        }
+    }
+}
+
+impl Listener {
+    fn counters(&self) -> ListenerCounters {
+        let protocol = match &self.served {
+            Served::Stream(live, unit_server) => {
+                ProtocolCounters::Modbus(Arc::clone(unit_server), live.get().packets())
+            }
+            Served::Datagrams(_, _, unit_server) | Served::Serial(_, _, unit_server) => {
+                ProtocolCounters::Modbus(Arc::clone(unit_server), None)
+            }
+            Served::Packets(live) => ProtocolCounters::Packets(Arc::clone(&live.get().packets)),
+        };
+        let (context, open_connections) =
+            (Arc::clone(&self.context), self.context.admission.open());
+        ListenerCounters { context, open_connections, protocol }
+    }
+
+    /// Returns what gives this listener new settings; `None` if another one must take its place.
+    fn update(&self, kind: &ListenerKind, identity: Identity) -> Option<Update> {
+        match (&self.served, kind) {
+            (Served::Stream(live, units), ListenerKind::ModbusStream(new))
+                if self.bind == Some(new.bind) =>
+            {
+                let service = ModbusStream::new(new, Arc::clone(units), live.get().packets());
+                let (live, units) = (Arc::clone(live), Arc::clone(units));
+                let (limits, listen_only) = (new.limits, new.listen_only);
+                Some(Box::new(move |listener| {
+                    units.update(identity, listen_only);
+                    listener.take_over(&live, service, limits);
+                }))
+            }
+            (Served::Packets(live), ListenerKind::RawIngest(new))
+                if self.bind == Some(new.bind) =>
+            {
+                let service = RawIngest::new(new, Arc::clone(&live.get().packets));
+                let (live, limits) = (Arc::clone(live), new.limits);
+                Some(Box::new(move |listener| listener.take_over(&live, service, limits)))
+            }
+            (Served::Datagrams(framing, live, units), ListenerKind::ModbusUdp(new))
+                if self.bind == Some(new.bind) && *framing == new.framing =>
+            {
+                let policy = Arc::new(Policy::of(&new.rules));
+                let (live, units) = (Arc::clone(live), Arc::clone(units));
+                let listen_only = new.listen_only;
+                Some(Box::new(move |_| {
+                    units.update(identity, listen_only);
+                    live.replace(policy);
+                }))
+            }
+            (Served::Serial(line, live, units), ListenerKind::ModbusSerial(new))
+                if *line == new.line =>
+            {
+                let rights = Arc::new(PeerRights::new(&new.rule));
+                let (live, units) = (Arc::clone(live), Arc::clone(units));
+                Some(Box::new(move |_| {
+                    units.update(identity, true);
+                    live.replace(rights);
+                }))
+            }
+            _ => None,
+        }
+    }
+
+    fn take_over<S: Service>(&self, live: &Live<S>, service: S, limits: ConnectionLimits) {
+        self.context.admission.set_limits(limits);
+        let service = Arc::new(service);
+        let before = live.replace(Arc::clone(&service));
+        self.context.review(&*before, &*service);
+    }
+
+    /// Stops listening and closes all connections.
+    fn end(&self) {
+        if let Some(task) = self.task.get() {
+            task.abort();
+        }
+        for (peer, kind) in self.context.admission.review(|_| Some(Kind::RightsRevoked)) {
+            self.context.ended(kind, peer);
         }
     }
 }

@@ -1,23 +1,23 @@
 //! Events of connections, for a log. Sending never blocks: when the queue is full, events are
 //! dropped and counted.
 
-use std::net::SocketAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use holdfast_protocol::raw_ingest::Refusal;
 
+use super::peer::Peer;
+
 /// The most events in the queue.
 const CAPACITY: usize = 1024;
-
-/// The most characters of a role in an event.
-const MAX_ROLE_LEN: usize = 64;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Opened,
+    /// The TLS handshake is complete: the peer has a certificate.
+    Secured,
     /// The peer closed the connection, or the connection broke.
     Closed,
     /// Closed after `idle_timeout`.
@@ -30,8 +30,12 @@ pub enum Kind {
     BrokenFrame,
     /// Closed in favour of a new connection.
     Evicted,
+    /// Ended by a reload: no rule names the peer any more.
+    RightsRevoked,
+    /// Ended by an operator.
+    Ended,
     RefusedSource,
-    /// No rule names the role of the peer. The event has the role.
+    /// No rule names the role of the peer.
     RefusedRole,
     RefusedFull,
     /// A peer asked for listen only mode, which the listener does not allow.
@@ -52,18 +56,21 @@ pub enum Kind {
 impl Kind {
     /// Whether this event belongs to the normal life of a connection.
     const fn is_ordinary(self) -> bool {
-        matches!(self, Kind::Opened | Kind::Closed | Kind::Idle)
+        matches!(self, Kind::Opened | Kind::Secured | Kind::Closed | Kind::Idle)
     }
 
     pub const fn name(self) -> &'static str {
         match self {
             Kind::Opened => "opened",
+            Kind::Secured => "secured",
             Kind::Closed => "closed",
             Kind::Idle => "idle",
             Kind::RequestTimeout => "request_timeout",
             Kind::SlowReader => "slow_reader",
             Kind::BrokenFrame => "broken_frame",
             Kind::Evicted => "evicted",
+            Kind::RightsRevoked => "rights_revoked",
+            Kind::Ended => "ended",
             Kind::RefusedSource => "refused_source",
             Kind::RefusedRole => "refused_role",
             Kind::RefusedFull => "refused_full",
@@ -100,9 +107,7 @@ impl Kind {
 pub struct Event {
     pub listener: Arc<str>,
     pub kind: Kind,
-    pub peer: Option<SocketAddr>,
-    /// The role of a peer that was refused for it, cut to 64 characters.
-    pub role: Option<Box<str>>,
+    pub peer: Option<Peer>,
 }
 
 /// Which events are sent.
@@ -118,7 +123,7 @@ pub enum Verbosity {
 /// The sending side.
 #[derive(Debug, Clone)]
 pub(crate) struct Reporter {
-    verbosity: Verbosity,
+    verbosity: Arc<AtomicU8>,
     sender: SyncSender<Event>,
     lost: Arc<AtomicU64>,
 }
@@ -137,27 +142,22 @@ pub(crate) fn channel(verbosity: Verbosity) -> (Reporter, Events) {
     let lost = Arc::new(AtomicU64::new(0));
     let events =
         Events { receiver: Mutex::new(receiver), _sender: sender.clone(), lost: Arc::clone(&lost) };
+    let verbosity = Arc::new(AtomicU8::new(verbosity as u8));
     (Reporter { verbosity, sender, lost }, events)
 }
 
 impl Reporter {
-    pub(crate) fn report(
-        &self,
-        listener: &Arc<str>,
-        kind: Kind,
-        peer: Option<SocketAddr>,
-        role: Option<&str>,
-    ) {
-        let wanted = match self.verbosity {
-            Verbosity::Nothing => false,
-            Verbosity::Refusals => !kind.is_ordinary(),
-            Verbosity::All => true,
-        };
-        if !wanted {
+    pub(crate) fn set_verbosity(&self, verbosity: Verbosity) {
+        self.verbosity.store(verbosity as u8, Ordering::Relaxed);
+    }
+
+    pub(crate) fn report(&self, listener: &Arc<str>, kind: Kind, peer: Option<Peer>) {
+        let verbosity = self.verbosity.load(Ordering::Relaxed);
+        let least = if kind.is_ordinary() { Verbosity::All } else { Verbosity::Refusals };
+        if verbosity < least as u8 {
             return;
         }
-        let role = role.map(|role| role.chars().take(MAX_ROLE_LEN).collect());
-        let event = Event { listener: Arc::clone(listener), kind, peer, role };
+        let event = Event { listener: Arc::clone(listener), kind, peer };
         if self.sender.try_send(event).is_err() {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }

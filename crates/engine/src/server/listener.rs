@@ -17,6 +17,8 @@ use super::admission::{Admission, ConnectionLimits, Full, Ticket, attach};
 use super::audit::Auditor;
 use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
+use super::live::Live;
+use super::peer::Peer;
 
 /// The most connections that wait in the system to be accepted.
 const BACKLOG: i32 = 1024;
@@ -64,35 +66,44 @@ impl ListenerContext {
         ListenerContext::new("test", None, reporter, None)
     }
 
-    pub(crate) fn report(&self, kind: Kind, peer: Option<SocketAddr>) {
-        self.reporter.report(&self.name, kind, peer, None);
+    pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {
+        self.reporter.report(&self.name, kind, peer);
     }
 
     /// Counts and reports the end of a connection.
-    pub(crate) fn ended(&self, kind: Kind, peer: SocketAddr) {
+    pub(crate) fn ended(&self, kind: Kind, peer: impl Into<Peer>) {
         match kind {
             Kind::Idle => self.connections.idle.add(),
+            Kind::RightsRevoked => self.connections.rights_revoked.add(),
+            Kind::Ended => self.connections.ended.add(),
             Kind::RequestTimeout => self.connections.request_timeout.add(),
             Kind::SlowReader => self.connections.slow_reader.add(),
             Kind::TlsFailed(_) => self.connections.tls_failed.add(),
             _ => {}
         }
-        self.report(kind, Some(peer));
+        self.report(kind, Some(peer.into()));
+    }
+
+    /// Ends the connections that a service does not serve any more in the place of `before`.
+    pub(crate) fn review<S: Service>(&self, before: &S, service: &S) {
+        for (peer, kind) in self.admission.review(|peer| service.ends(before, peer)) {
+            self.ended(kind, peer);
+        }
     }
 
     pub(crate) fn refuse_source(&self, peer: SocketAddr) {
         self.connections.refused_source.add();
-        self.report(Kind::RefusedSource, Some(peer));
+        self.report(Kind::RefusedSource, Some(peer.into()));
     }
 
-    pub(crate) fn refuse_listen_only(&self, peer: SocketAddr) {
+    pub(crate) fn refuse_listen_only(&self, peer: impl Into<Peer>) {
         self.connections.refused_listen_only.add();
-        self.report(Kind::RefusedListenOnly, Some(peer));
+        self.report(Kind::RefusedListenOnly, Some(peer.into()));
     }
 
-    pub(crate) fn refuse_role(&self, peer: SocketAddr, role: &str) {
+    pub(crate) fn refuse_role(&self, peer: Peer) {
         self.connections.refused_role.add();
-        self.reporter.report(&self.name, Kind::RefusedRole, Some(peer), Some(role));
+        self.report(Kind::RefusedRole, Some(peer));
     }
 }
 
@@ -112,6 +123,10 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
 
     fn rights(&self, peer: IpAddr) -> Option<Arc<Self::PeerRights>>;
 
+    /// Why a connection ends that `before` served, now that this service has taken its place; `None`
+    /// if it stays.
+    fn ends(&self, before: &Self, peer: &Peer) -> Option<Kind>;
+
     /// Serves the connection immediately if that is possible without waiting. Otherwise returns it.
     fn serve_at_once(
         &self,
@@ -121,9 +136,10 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
         Some(connection)
     }
 
-    /// Serves a connection to its end.
+    /// Serves a connection to its end. `live` is this service, or what has taken its place.
     fn serve(
         self: Arc<Self>,
+        live: Arc<Live<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<Self::PeerRights>,
         stop: watch::Receiver<bool>,
@@ -133,7 +149,7 @@ pub(crate) trait Service: Send + Sync + Sized + 'static {
 /// Accepts connections until `stop`, and distributes them to the workers in turn.
 pub(crate) async fn accept<S: Service>(
     context: Arc<ListenerContext>,
-    service: Arc<S>,
+    service: Arc<Live<S>>,
     socket: std::net::TcpListener,
     workers: Vec<Handle>,
     mut stop: watch::Receiver<bool>,
@@ -162,20 +178,20 @@ pub(crate) async fn accept<S: Service>(
 /// Checks the rights and limits of a new connection, and starts to serve it.
 fn admit<S: Service>(
     context: &Arc<ListenerContext>,
-    service: &Arc<S>,
+    live: &Arc<Live<S>>,
     stream: TcpStream,
     peer: SocketAddr,
     workers: &[Handle],
     stop: &watch::Receiver<bool>,
 ) {
-    let Some(rights) = service.rights(peer.ip()) else {
+    if live.get().rights(peer.ip()).is_none() {
         return context.refuse_source(peer);
-    };
+    }
     let (ticket, evicted) = match context.admission.admit(peer) {
         Ok(admitted) => admitted,
         Err(Full) => {
             context.connections.refused_full.add();
-            return context.report(Kind::RefusedFull, Some(peer));
+            return context.report(Kind::RefusedFull, Some(peer.into()));
         }
     };
     if evicted.is_some() {
@@ -183,16 +199,21 @@ fn admit<S: Service>(
         context.report(Kind::Evicted, evicted);
     }
     context.connections.accepted.add();
-    context.report(Kind::Opened, Some(peer));
+    context.report(Kind::Opened, Some(peer.into()));
+    // A reload reviews the admitted connections. This one looks up its rights only now.
+    let service = live.get();
+    let Some(rights) = service.rights(peer.ip()) else {
+        return context.refuse_source(peer);
+    };
     let id = ticket.id();
     let connection = Admitted { stream, peer, rights, received: Vec::new(), ticket };
     let Some(connection) = service.serve_at_once(context, connection) else {
         return;
     };
-    let (context, service, stop) = (Arc::clone(context), Arc::clone(service), stop.clone());
+    let (context, live, stop) = (Arc::clone(context), Arc::clone(live), stop.clone());
     let admission = Arc::clone(&context.admission);
     let task = if let [worker] = workers {
-        worker.spawn(service.serve(context, connection, stop))
+        worker.spawn(service.serve(live, context, connection, stop))
     } else {
         let Admitted { stream, peer, rights, received, ticket } = connection;
         let Ok(stream) = stream.into_std() else { return };
@@ -201,7 +222,7 @@ fn admit<S: Service>(
             // The socket must be registered with the worker that serves it.
             let Ok(stream) = TcpStream::from_std(stream) else { return };
             let connection = Admitted { stream, peer, rights, received, ticket };
-            service.serve(context, connection, stop).await;
+            service.serve(live, context, connection, stop).await;
         })
     };
     attach(&admission, id, task.abort_handle());

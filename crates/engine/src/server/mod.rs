@@ -11,6 +11,8 @@ mod framing;
 pub mod functions;
 pub mod identity;
 mod listener;
+mod live;
+mod peer;
 pub mod policy;
 pub mod ranges;
 mod raw_ingest;
@@ -21,11 +23,12 @@ mod tls;
 mod udp;
 pub mod unit_server;
 
-pub use admission::{ConnectionLimits, WhenFull};
+pub use admission::{ConnectionLimits, Session, WhenFull};
 pub use engine::{
-    Engine, ListenerCounters, ListenerKind, ListenerSettings, ProtocolCounters, Settings,
-    StartError,
+    Engine, ListenerCounters, ListenerKind, ListenerSettings, Listening, ProtocolCounters,
+    Settings, StartError,
 };
+pub use peer::Peer;
 pub use raw_ingest::{AfterRefusal, Flags, PacketsPerConnection, RawRule, RawSettings};
 pub use serial::SerialSettings;
 pub use tcp::{StreamFraming, StreamSettings};

@@ -27,6 +27,8 @@ use super::audit::{Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
 use super::listener::{Admitted, ListenerContext, Service, drain};
+use super::live::Live;
+use super::peer::Peer;
 use super::policy::Grants;
 use super::stream::send_all;
 
@@ -123,7 +125,7 @@ pub(crate) struct RawGrant {
 
 #[derive(Debug)]
 pub(crate) struct RawIngest {
-    pub(crate) packets: PacketCounters,
+    pub(crate) packets: Arc<PacketCounters>,
     policy: Grants<RawGrant>,
     format: Format,
     flags: Flags,
@@ -153,8 +155,11 @@ enum Gone {
     Stopped,
 }
 
+/// Looks up the rights of a connection again; `None` if it has none any more.
+pub(crate) type Renewal = Box<dyn Fn() -> Option<Arc<RawGrant>> + Send + Sync>;
+
 impl RawIngest {
-    pub(crate) fn new(settings: &RawSettings) -> RawIngest {
+    pub(crate) fn new(settings: &RawSettings, packets: Arc<PacketCounters>) -> RawIngest {
         debug_assert!(!settings.crc_if_present || settings.packets == PacketsPerConnection::One);
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
@@ -165,7 +170,7 @@ impl RawIngest {
             PacketsPerConnection::Many { idle, after_refusal } => (Some(idle), after_refusal),
         };
         RawIngest {
-            packets: PacketCounters::default(),
+            packets,
             policy: Grants::new(rules),
             format: settings.format,
             flags: settings.flags,
@@ -313,11 +318,54 @@ impl RawIngest {
         }
     }
 
+    /// Serves the packets of a connection to its end.
+    pub(crate) async fn serve_packets(
+        &self,
+        context: Arc<ListenerContext>,
+        connection: Admitted<RawGrant>,
+        renewal: Renewal,
+        stop: watch::Receiver<bool>,
+    ) {
+        if let Some(idle) = self.many {
+            return self.serve_many(context, connection, renewal, idle, stop).await;
+        }
+        let Admitted { stream, peer, rights, received: mut packet, ticket } = connection;
+        let judged = self.receive(&stream, &rights, &mut packet, &ticket, stop.clone()).await;
+        let judged = match judged {
+            Err(Gone::Timeout) => return context.ended(Kind::RequestTimeout, peer),
+            Err(Gone::Closed | Gone::Stopped) => return context.ended(Kind::Closed, peer),
+            Ok(judged) => judged,
+        };
+        let written = judged.and_then(|()| match self.judge(&rights, &packet)? {
+            Packet::Whole { header, memory, payload } => {
+                self.write(&context, peer, (header, memory, payload))
+            }
+            Packet::Incomplete { .. } => Err(Refusal::Short),
+        });
+        ticket.set_amid_packet(false);
+        if let Err(refusal) = written {
+            self.refuse(&context, peer, &packet, refusal);
+            drop(packet);
+            let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
+            drain(&stream, usize::MAX, stop).await;
+        } else {
+            let mut dropped = RawIngest::confirm(&stream);
+            if self.crc_if_present {
+                // A CRC that comes too late must not reset the connection, reply and all.
+                dropped += drain(&stream, LATE_BYTES, stop).await;
+            }
+            self.drop_bytes(&context, peer, dropped);
+        }
+        context.ended(Kind::Closed, peer);
+        drop(ticket);
+    }
+
     /// Serves packets one after another.
     async fn serve_many(
         &self,
         context: Arc<ListenerContext>,
-        Admitted { stream, peer, rights, received: mut bytes, ticket }: Admitted<RawGrant>,
+        Admitted { stream, peer, mut rights, received: mut bytes, ticket }: Admitted<RawGrant>,
+        renewal: Renewal,
         idle: Duration,
         mut stop: watch::Receiver<bool>,
     ) {
@@ -326,6 +374,13 @@ impl RawIngest {
         let mut answered = 0;
         let mut packets: usize = 0;
         loop {
+            if ticket.take_outdated() {
+                let Some(renewed) = renewal() else {
+                    end = Kind::RightsRevoked;
+                    break;
+                };
+                rights = renewed;
+            }
             let refusal = match self.first_of(&context, peer, &rights, &bytes[answered..]) {
                 Ok(Some((len, reply))) => {
                     answered += len;
@@ -459,13 +514,13 @@ impl RawIngest {
     fn drop_bytes(&self, context: &ListenerContext, peer: SocketAddr, count: usize) {
         if count > 0 {
             self.packets.dropped_bytes.add_many(count as u64);
-            context.report(Kind::BytesDropped(count as u64), Some(peer));
+            context.report(Kind::BytesDropped(count as u64), Some(peer.into()));
         }
     }
 
     fn refuse(&self, context: &ListenerContext, peer: SocketAddr, packet: &[u8], refusal: Refusal) {
         self.packets.refuse(refusal);
-        context.report(Kind::PacketRefused(refusal), Some(peer));
+        context.report(Kind::PacketRefused(refusal), Some(peer.into()));
         let header = self.header(packet).ok().flatten();
         self.audit(context, peer, header, &[], Some(refusal));
     }
@@ -481,7 +536,8 @@ impl RawIngest {
         if let Some(auditor) = &context.auditor {
             let (format, payload) = (self.format, payload.to_vec());
             let write = Written::Packet { format, header, payload, refused };
-            auditor.send(Record { listener: Arc::clone(&context.name), peer: Some(peer), write });
+            let (listener, peer) = (Arc::clone(&context.name), Some(peer.into()));
+            auditor.send(Record { listener, peer, write });
         }
     }
 }
@@ -523,44 +579,20 @@ impl Service for RawIngest {
         Some(connection)
     }
 
+    fn ends(&self, _: &RawIngest, peer: &Peer) -> Option<Kind> {
+        self.rights(peer.ip()).is_none().then_some(Kind::RightsRevoked)
+    }
+
     async fn serve(
         self: Arc<Self>,
+        live: Arc<Live<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
     ) {
-        if let Some(idle) = self.many {
-            return self.serve_many(context, connection, idle, stop).await;
-        }
-        let Admitted { stream, peer, rights, received: mut packet, ticket } = connection;
-        let judged = self.receive(&stream, &rights, &mut packet, &ticket, stop.clone()).await;
-        let judged = match judged {
-            Err(Gone::Timeout) => return context.ended(Kind::RequestTimeout, peer),
-            Err(Gone::Closed | Gone::Stopped) => return context.ended(Kind::Closed, peer),
-            Ok(judged) => judged,
-        };
-        let written = judged.and_then(|()| match self.judge(&rights, &packet)? {
-            Packet::Whole { header, memory, payload } => {
-                self.write(&context, peer, (header, memory, payload))
-            }
-            Packet::Incomplete { .. } => Err(Refusal::Short),
-        });
-        ticket.set_amid_packet(false);
-        if let Err(refusal) = written {
-            self.refuse(&context, peer, &packet, refusal);
-            drop(packet);
-            let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
-            drain(&stream, usize::MAX, stop).await;
-        } else {
-            let mut dropped = RawIngest::confirm(&stream);
-            if self.crc_if_present {
-                // A CRC that comes too late must not reset the connection, reply and all.
-                dropped += drain(&stream, LATE_BYTES, stop).await;
-            }
-            self.drop_bytes(&context, peer, dropped);
-        }
-        context.ended(Kind::Closed, peer);
-        drop(ticket);
+        let peer = connection.peer.ip();
+        let renewal = Box::new(move || live.get().rights(peer));
+        self.serve_packets(context, connection, renewal, stop).await;
     }
 }
 
@@ -583,7 +615,7 @@ mod tests {
     use super::*;
 
     fn listener(format: Format, flags: Flags) -> RawIngest {
-        RawIngest::new(&RawSettings {
+        let settings = RawSettings {
             bind: SocketAddr::from(([127, 0, 0, 1], 0)),
             format,
             flags,
@@ -592,7 +624,8 @@ mod tests {
             limits: ConnectionLimits::NONE,
             request_timeout: Duration::from_secs(10),
             packets: PacketsPerConnection::One,
-        })
+        };
+        RawIngest::new(&settings, Arc::default())
     }
 
     /// Both ends of a connection.
@@ -650,7 +683,8 @@ mod tests {
         let (_engine, stop) = watch::channel(false);
         let mut turns = 0;
         runtime.block_on(async {
-            let serving = raw.serve_many(context, admitted, Duration::from_secs(10), stop);
+            let serving =
+                raw.serve_many(context, admitted, Box::new(|| None), Duration::from_secs(10), stop);
             tokio::select! {
                 biased;
                 () = serving => {}

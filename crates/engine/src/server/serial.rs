@@ -18,6 +18,7 @@ use super::deferred::come;
 use super::event::Kind;
 use super::framing::{Framing, Rtu};
 use super::listener::ListenerContext;
+use super::live::Live;
 use super::policy::{PeerRights, Rule};
 use super::unit_server::UnitServer;
 use crate::link::{Asker, exception, source};
@@ -45,16 +46,19 @@ pub struct SerialSettings {
 
 pub(crate) struct ModbusSerial {
     unit_server: Arc<UnitServer>,
-    rights: PeerRights,
+    rights: Arc<Live<PeerRights>>,
     line: SerialLine,
     /// The number of the line as a source of requests to devices.
     source: u64,
 }
 
 impl ModbusSerial {
-    pub(crate) fn new(settings: SerialSettings, unit_server: Arc<UnitServer>) -> ModbusSerial {
-        let rights = PeerRights::new(&settings.rule);
-        ModbusSerial { unit_server, rights, line: settings.line, source: source() }
+    pub(crate) fn new(
+        line: SerialLine,
+        rights: Arc<Live<PeerRights>>,
+        unit_server: Arc<UnitServer>,
+    ) -> ModbusSerial {
+        ModbusSerial { unit_server, rights, line, source: source() }
     }
 
     /// Serves the line until `stop`.
@@ -230,9 +234,10 @@ impl ModbusSerial {
             self.broadcast(context, request);
             return None;
         }
-        if let Some(place) = self.unit_server.elsewhere(&self.rights, unit_id, request) {
+        let rights = self.rights.get();
+        if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = Asker { source: self.source, peer: None, waiting: 0 };
-            let sent = self.unit_server.forward(&self.rights, place, &asker, unit_id, request);
+            let sent = self.unit_server.forward(&rights, place, &asker, unit_id, request);
             let (route, answered) = match sent {
                 Ok((route, coming)) => {
                     (Some(route), come(&self.unit_server, request, coming.await.ok()))
@@ -246,11 +251,11 @@ impl ModbusSerial {
             reply[..answered.len()].copy_from_slice(&answered);
             return (!answered.is_empty()).then_some(answered.len());
         }
-        if self.rights.memory(unit_id).is_none() {
+        if rights.memory(unit_id).is_none() {
             self.unit_server.counters.frames.other_unit.add();
             return None;
         }
-        let len = self.unit_server.answer(&self.rights, unit_id, request, reply);
+        let len = self.unit_server.answer(&rights, unit_id, request, reply);
         if let Some(auditor) = &context.auditor {
             let reply = &reply[..len.unwrap_or_default()];
             auditor.note(&context.name, None, unit_id, request, reply);
@@ -267,7 +272,7 @@ impl ModbusSerial {
             self.unit_server.counters.frames.other_unit.add();
             return;
         }
-        self.unit_server.broadcast(&self.rights, request, |reply| {
+        self.unit_server.broadcast(&self.rights.get(), request, |reply| {
             if let Some(auditor) = &context.auditor {
                 auditor.note(&context.name, None, BROADCAST, request, reply);
             }

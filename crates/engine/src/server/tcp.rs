@@ -10,10 +10,13 @@ use tokio::time::{Instant, timeout, timeout_at};
 
 use super::admission::ConnectionLimits;
 use super::admission::Ticket;
-use super::connection::{Connection, Timeouts};
+use super::connection::{Connection, Renewal, Terms, Timeouts};
+use super::counters::PacketCounters;
 use super::event::Kind;
 use super::framing::{Ascii, Framing, Mbap, MbapBesidePackets, Rtu};
 use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
+use super::live::Live;
+use super::peer::Peer;
 use super::policy::{PeerRights, Policy, Rule};
 use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
 use super::stream::Stream;
@@ -67,15 +70,23 @@ pub(crate) struct ModbusStream {
     timeouts: Timeouts,
     framing: StreamFraming,
     tls: Option<Arc<ServerTls>>,
-    pub(crate) raw_ingest: Option<Arc<RawIngest>>,
+    raw_ingest: Option<Arc<RawIngest>>,
 }
 
 impl ModbusStream {
-    pub(crate) fn new(settings: &StreamSettings, unit_server: Arc<UnitServer>) -> ModbusStream {
+    /// `packets` counts Raw Ingest packets on the same port.
+    pub(crate) fn new(
+        settings: &StreamSettings,
+        unit_server: Arc<UnitServer>,
+        packets: Option<Arc<PacketCounters>>,
+    ) -> ModbusStream {
         let may_share = settings.framing == StreamFraming::Mbap && settings.tls.is_none();
         debug_assert!(may_share || settings.raw_ingest.is_none());
         ModbusStream {
-            raw_ingest: settings.raw_ingest.as_ref().map(|raw| Arc::new(RawIngest::new(raw))),
+            raw_ingest: settings
+                .raw_ingest
+                .as_ref()
+                .map(|raw| Arc::new(RawIngest::new(raw, packets.unwrap_or_default()))),
             unit_server,
             policy: Policy::of(&settings.rules),
             nobody: Arc::new(PeerRights::none()),
@@ -89,8 +100,24 @@ impl ModbusStream {
         }
     }
 
+    /// The counters of Raw Ingest packets on the same port.
+    pub(crate) fn packets(&self) -> Option<Arc<PacketCounters>> {
+        self.raw_ingest.as_ref().map(|raw| Arc::clone(&raw.packets))
+    }
+
+    /// The terms of a connection: of any role, or of the role in its certificate.
+    fn terms(&self, peer: &Peer) -> Option<Terms> {
+        let rights = match &peer.certificate {
+            None => self.rights(peer.ip()),
+            Some(certificate) => self.policy.rights_of_role(peer.ip(), &certificate.role),
+        };
+        let rights = rights?;
+        Some(Terms { rights, timeouts: self.timeouts })
+    }
+
     async fn connection<F: Framing>(
         &self,
+        live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
@@ -98,11 +125,18 @@ impl ModbusStream {
         match &self.tls {
             None => {
                 let Admitted { stream, peer, rights, ticket, received } = admitted;
-                self.modbus::<F, _>(context, (stream, peer), (rights, received), ticket, stop)
-                    .await;
+                self.modbus::<F, _>(
+                    live,
+                    context,
+                    (stream, peer.into()),
+                    (rights, received),
+                    ticket,
+                    stop,
+                )
+                .await;
             }
             // In a box of its own, so that plain connections do not reserve memory for it.
-            Some(tls) => Box::pin(self.secure::<F>(tls, context, admitted, stop)).await,
+            Some(tls) => Box::pin(self.secure::<F>(tls, live, context, admitted, stop)).await,
         }
     }
 
@@ -111,6 +145,7 @@ impl ModbusStream {
     async fn secure<F: Framing>(
         &self,
         tls: &ServerTls,
+        live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
         mut stop: watch::Receiver<bool>,
@@ -126,8 +161,8 @@ impl ModbusStream {
             _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
             shaken = timeout(patience, stream.handshake(patience)) => shaken,
         };
-        let role = match shaken {
-            Ok(Ok(())) => stream.role(),
+        let certificate = match shaken {
+            Ok(Ok(())) => stream.peer_certificate(),
             Ok(Err(Kind::Closed)) => {
                 let reason = TlsFailure::ClosedDuringHandshake.event_reason();
                 return context.ended(Kind::TlsFailed(reason), peer);
@@ -135,33 +170,42 @@ impl ModbusStream {
             Ok(Err(end)) => Err(end),
             Err(_) => return context.ended(Kind::TlsFailed("timeout"), peer),
         };
-        let role = match role {
-            Ok(role) => role,
+        let certificate = match certificate {
+            Ok(certificate) => Arc::new(certificate),
             Err(end) => {
                 context.ended(end, peer);
                 drain(&stream.into_socket(), usize::MAX, stop).await;
                 return;
             }
         };
-        let rights = self.policy.rights_of_role(peer.ip(), &role).unwrap_or_else(|| {
+        ticket.identify(Arc::clone(&certificate));
+        let peer = Peer { address: peer, certificate: Some(certificate) };
+        context.report(Kind::Secured, Some(peer.clone()));
+        // A reload reviews connections by their roles. This one looks up its rights only now.
+        let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
             // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
-            context.refuse_role(peer, &role);
+            context.refuse_role(peer.clone());
             Arc::clone(&self.nobody)
         });
-        self.modbus::<F, _>(context, (stream, peer), (rights, Vec::new()), ticket, stop).await;
+        self.modbus::<F, _>(live, context, (stream, peer), (rights, Vec::new()), ticket, stop)
+            .await;
     }
 
     async fn modbus<F: Framing, S: Stream>(
         &self,
+        live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
-        stream: (S, SocketAddr),
+        (stream, peer): (S, Peer),
         (rights, received): (Arc<PeerRights>, Vec<u8>),
         ticket: Ticket,
         stop: watch::Receiver<bool>,
     ) {
         let unit_server = Arc::clone(&self.unit_server);
+        let (terms, renewal) =
+            (Terms { rights, timeouts: self.timeouts }, renewal(live, peer.clone()));
+        let stream = (stream, peer);
         let mut connection =
-            Connection::<F, S>::new(context, unit_server, stream, rights, self.timeouts, ticket);
+            Connection::<F, S>::new(context, unit_server, stream, terms, renewal, ticket);
         connection.begin_with(&received);
         connection.run(stop).await;
     }
@@ -170,6 +214,7 @@ impl ModbusStream {
     async fn shared(
         &self,
         raw: &Arc<RawIngest>,
+        live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         mut admitted: Admitted<PeerRights>,
         mut stop: watch::Receiver<bool>,
@@ -181,7 +226,9 @@ impl ModbusStream {
                 Beginning::Unknown => {}
                 Beginning::SomethingElse => {
                     admitted.ticket.set_amid_packet(false);
-                    return self.connection::<MbapBesidePackets>(context, admitted, stop).await;
+                    return self
+                        .connection::<MbapBesidePackets>(live, context, admitted, stop)
+                        .await;
                 }
                 Beginning::Packet => {
                     let Admitted { stream, peer, received, ticket, .. } = admitted;
@@ -189,7 +236,9 @@ impl ModbusStream {
                         return raw.refuse_peer(&context, (stream, peer), &received, stop).await;
                     };
                     let admitted = Admitted { stream, peer, rights, received, ticket };
-                    return Arc::clone(raw).serve(context, admitted, stop).await;
+                    let renewal =
+                        Box::new(move || live.get().raw_ingest.as_ref()?.rights(peer.ip()));
+                    return raw.serve_packets(context, admitted, renewal, stop).await;
                 }
             }
             let is_new = admitted.received.is_empty();
@@ -220,6 +269,16 @@ impl ModbusStream {
     }
 }
 
+/// Looks up the rights of a connection after a reload. One that had none by its role has none still.
+fn renewal(live: Arc<Live<ModbusStream>>, peer: Peer) -> Renewal {
+    Box::new(move || {
+        let service = live.get();
+        let nobody = || Terms { rights: Arc::clone(&service.nobody), timeouts: service.timeouts };
+        let terms = service.terms(&peer);
+        terms.or_else(|| peer.certificate.is_some().then(nobody))
+    })
+}
+
 impl Service for ModbusStream {
     type PeerRights = PeerRights;
 
@@ -231,20 +290,34 @@ impl Service for ModbusStream {
         })
     }
 
+    fn ends(&self, before: &ModbusStream, peer: &Peer) -> Option<Kind> {
+        let is_other = self.framing != before.framing || self.tls.is_some() != before.tls.is_some();
+        if is_other || self.rights(peer.ip()).is_none() {
+            return Some(Kind::RightsRevoked);
+        }
+        let (tls, certificate) = (self.tls.as_ref()?, peer.certificate.as_ref()?);
+        if let Err(error) = tls.judge(certificate) {
+            return Some(Kind::TlsFailed(TlsFailure::from(&error).event_reason()));
+        }
+        // A session that never had rights keeps its exceptions.
+        (self.terms(peer).is_none() && before.terms(peer).is_some()).then_some(Kind::RightsRevoked)
+    }
+
     async fn serve(
         self: Arc<Self>,
+        live: Arc<Live<Self>>,
         context: Arc<ListenerContext>,
         connection: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
     ) {
         set_options(&connection.stream);
         if let Some(raw) = &self.raw_ingest {
-            return self.shared(raw, context, connection, stop).await;
+            return self.shared(raw, live, context, connection, stop).await;
         }
         match self.framing {
-            StreamFraming::Mbap => self.connection::<Mbap>(context, connection, stop).await,
-            StreamFraming::Rtu => self.connection::<Rtu>(context, connection, stop).await,
-            StreamFraming::Ascii => self.connection::<Ascii>(context, connection, stop).await,
+            StreamFraming::Mbap => self.connection::<Mbap>(live, context, connection, stop).await,
+            StreamFraming::Rtu => self.connection::<Rtu>(live, context, connection, stop).await,
+            StreamFraming::Ascii => self.connection::<Ascii>(live, context, connection, stop).await,
         }
     }
 }

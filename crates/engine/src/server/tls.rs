@@ -15,7 +15,7 @@ use tokio::net::TcpStream;
 
 use super::event::Kind;
 use super::stream::{self, Stream};
-use crate::tls::server::{self, ServerTls};
+use crate::tls::server::{self, PeerCertificate, ServerTls};
 use crate::tls::{Channel, TlsFailure};
 
 /// Bytes per read of a socket.
@@ -73,9 +73,9 @@ impl ServerTlsStream {
         Ok(())
     }
 
-    /// The role in the certificate of the peer; empty for the null role.
-    pub(crate) fn role(&self) -> Result<String, Kind> {
-        server::role(&self.channel).map_err(|error| failed(&error))
+    /// The certificate of the peer, after the handshake.
+    pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, Kind> {
+        server::peer_certificate(&self.channel).map_err(|error| failed(&error))
     }
 
     pub(crate) fn into_socket(self) -> TcpStream {

@@ -17,6 +17,7 @@ use tokio::task::JoinSet;
 use super::deferred::come;
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
+use super::live::Live;
 use super::policy::{Policy, Rule};
 use super::unit_server::UnitServer;
 use crate::link::{Asker, source};
@@ -57,14 +58,17 @@ pub struct UdpSettings {
 
 pub(crate) struct ModbusUdp {
     unit_server: Arc<UnitServer>,
-    policy: Policy,
+    policy: Arc<Live<Policy>>,
     framing: DatagramFraming,
 }
 
 impl ModbusUdp {
-    pub(crate) fn new(settings: &UdpSettings, unit_server: Arc<UnitServer>) -> ModbusUdp {
-        let policy = Policy::of(&settings.rules);
-        ModbusUdp { unit_server, policy, framing: settings.framing }
+    pub(crate) fn new(
+        framing: DatagramFraming,
+        policy: Arc<Live<Policy>>,
+        unit_server: Arc<UnitServer>,
+    ) -> ModbusUdp {
+        ModbusUdp { unit_server, policy, framing }
     }
 
     /// Answers datagrams until `stop`, then those that the system has already received.
@@ -156,7 +160,7 @@ impl ModbusUdp {
         let reply = come(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
             let passed = (Some(&route), &request[..], &reply[..]);
-            auditor.note_forwarded(&context.name, Some(meta.addr), unit_id, passed);
+            auditor.note_forwarded(&context.name, Some(&meta.addr.into()), unit_id, passed);
         }
         if !reply.is_empty() {
             let mut frame = [0; MAX_FRAME_LEN];
@@ -176,7 +180,7 @@ impl ModbusUdp {
         later: &mut Later,
     ) -> usize {
         let peer = meta.addr;
-        let Some(rights) = self.policy.rights(peer.ip()) else {
+        let Some(rights) = self.policy.get().rights(peer.ip()) else {
             context.refuse_source(peer);
             return 0;
         };
@@ -221,7 +225,7 @@ impl ModbusUdp {
                     let len = reply::exception(function_code, code, buffer);
                     if let Some(auditor) = &context.auditor {
                         let refused = (None, request, &buffer[..len]);
-                        auditor.note_forwarded(&context.name, Some(peer), unit_id, refused);
+                        auditor.note_forwarded(&context.name, Some(&peer.into()), unit_id, refused);
                     }
                     D::complete(output, tag, unit_id, len)
                 }
@@ -233,7 +237,7 @@ impl ModbusUdp {
         let len = self.unit_server.answer(&rights, unit_id, request, buffer);
         if let Some(auditor) = &context.auditor {
             let reply = &buffer[..len.unwrap_or_default()];
-            auditor.note(&context.name, Some(peer), unit_id, request, reply);
+            auditor.note(&context.name, Some(&peer.into()), unit_id, request, reply);
         }
         len.map_or(0, |len| D::complete(output, tag, unit_id, len))
     }

@@ -16,6 +16,7 @@ use holdfast_protocol::pdu::{
 
 use super::counters::{Bus, Counters};
 use super::identity::Identity;
+use super::live::Live;
 use super::policy::{Elsewhere, PeerRights};
 use crate::link::{Asker, Coming};
 
@@ -23,9 +24,9 @@ use crate::link::{Asker, Coming};
 #[derive(Debug)]
 pub struct UnitServer {
     pub counters: Counters,
-    identity: Identity,
+    identity: Live<Identity>,
     /// Whether peers may set units to listen only mode. It lasts for all peers of the listener.
-    listen_only: bool,
+    listen_only: AtomicBool,
     /// Units in listen only mode (V1.1b3, 6.8.1, sub-function 04).
     silent: [AtomicBool; 256],
     /// The last character of an ASCII frame (V1.1b3, 6.8.1, sub-function 03).
@@ -36,8 +37,15 @@ impl UnitServer {
     pub fn new(identity: Identity, listen_only: bool) -> UnitServer {
         let silent = [const { AtomicBool::new(false) }; 256];
         let ascii_delimiter = AtomicU8::new(b'\n');
-        let counters = Counters::default();
+        let (counters, identity) = (Counters::default(), Live::new(identity));
+        let listen_only = AtomicBool::new(listen_only);
         UnitServer { counters, identity, listen_only, silent, ascii_delimiter }
+    }
+
+    /// Changes what a reload can change.
+    pub(crate) fn update(&self, identity: Identity, listen_only: bool) {
+        self.identity.replace(Arc::new(identity));
+        self.listen_only.store(listen_only, Ordering::Relaxed);
     }
 
     /// The character that follows the carriage return at the end of an ASCII frame.
@@ -78,7 +86,7 @@ impl UnitServer {
     /// Whether a request would silence a unit for all peers, and the listener does not allow that.
     #[inline]
     pub(crate) fn refuses_silence(&self, request: &[u8]) -> bool {
-        !self.listen_only
+        !self.listen_only.load(Ordering::Relaxed)
             && request.first() == Some(&Function::Diagnostics.code())
             && SubFunction::from_pdu(request) == Some(SubFunction::ForceListenOnlyMode)
     }
@@ -266,12 +274,13 @@ impl UnitServer {
                 Ok(reply::event_counter(false, self.counters.bus().events as u16, reply))
             }
             Request::ReportServerId => {
-                let text = &self.identity.card(unit_id).text;
+                let identity = self.identity.get();
+                let text = &identity.card(unit_id).text;
                 let len = reply::server_id(&[unit_id], true, text, reply);
                 Ok(len.expect("the text of an identity fits into a reply"))
             }
             Request::ReadDeviceIdentification { code, object_id } => {
-                self.identity.card(unit_id).objects.reply(code, object_id, reply)
+                self.identity.get().card(unit_id).objects.reply(code, object_id, reply)
             }
         }
         .map(Some)

@@ -35,6 +35,10 @@ const CURVES: [ObjectIdentifier; 3] = [
 const MIN_RSA_BITS: usize = 2048;
 const MAX_RSA_BITS: usize = 8192;
 
+/// The most characters of a subject and bytes of a serial number in a log.
+const MAX_SUBJECT_LEN: usize = 256;
+const MAX_SERIAL_LEN: usize = 32;
+
 /// The side that a peer is on. Its certificate must allow it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Purpose {
@@ -220,6 +224,20 @@ impl Parsed {
     fn key_algorithm(&self) -> Option<Vec<u8>> {
         let der = self.key().algorithm.to_der().ok()?;
         AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
+    }
+
+    /// The subject for a log, as RFC 4514 writes it. Control characters are replaced.
+    pub(super) fn subject_text(&self) -> String {
+        let text = self.0.tbs_certificate().subject().to_string();
+        let shown =
+            |found: char| if found.is_control() { char::REPLACEMENT_CHARACTER } else { found };
+        text.chars().take(MAX_SUBJECT_LEN).map(shown).collect()
+    }
+
+    /// The serial number for a log, in hexadecimal digits.
+    pub(super) fn serial_text(&self) -> String {
+        let number = self.0.tbs_certificate().serial_number().as_bytes().iter();
+        number.take(MAX_SERIAL_LEN).map(|byte| format!("{byte:02x}")).collect()
     }
 
     /// The subject, for the list of accepted issuers that a server sends to clients.

@@ -40,7 +40,10 @@ pub struct ServerFiles {
 }
 
 /// The TLS configuration of a server.
-pub struct ServerTls(Arc<ServerConfig>);
+pub struct ServerTls {
+    config: Arc<ServerConfig>,
+    clients: Arc<Clients>,
+}
 
 impl ServerTls {
     /// Reads the files.
@@ -54,16 +57,23 @@ impl ServerTls {
             .with_safe_default_protocol_versions()
             .map_err(|error| FileError::content(&files.cert_file, error.to_string()))?;
         let mut config = config
-            .with_client_cert_verifier(clients)
+            .with_client_cert_verifier(Arc::clone(&clients) as Arc<dyn ClientCertVerifier>)
             .with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
         config.session_storage = Arc::new(NoServerSessionStorage {});
         config.send_tls13_tickets = 0;
-        Ok(ServerTls(Arc::new(config)))
+        Ok(ServerTls { config: Arc::new(config), clients })
+    }
+
+    /// Judges the certificate of an open session again, as a handshake would now.
+    pub(crate) fn judge(&self, certificate: &PeerCertificate) -> Result<(), Error> {
+        let (presented, intermediates) =
+            certificate.chain.split_first().ok_or(Error::NoCertificatesPresented)?;
+        self.clients.judge(presented, intermediates, UnixTime::now())
     }
 
     /// Creates the channel of an accepted connection.
     pub(crate) fn channel(&self) -> Result<Channel, Error> {
-        Ok(Channel::new(ServerConnection::new(Arc::clone(&self.0))?))
+        Ok(Channel::new(ServerConnection::new(Arc::clone(&self.config))?))
     }
 }
 
@@ -73,11 +83,29 @@ impl fmt::Debug for ServerTls {
     }
 }
 
-/// The role in the certificate of the peer, after the handshake; empty for the null role.
-pub(crate) fn role(channel: &Channel) -> Result<String, Error> {
-    let certificate = channel.0.peer_certificates().and_then(<[_]>::first);
-    let certificate = certificate.ok_or(Error::NoCertificatesPresented)?;
-    Ok(Parsed::new(certificate)?.role()?)
+/// The certificate of a client, which it has proved to own.
+#[derive(Debug, PartialEq, Eq)]
+pub struct PeerCertificate {
+    /// The role of MB-TCP-Security; empty for the null role.
+    pub role: String,
+    /// The distinguished name, as RFC 4514 writes it.
+    pub subject: String,
+    /// The serial number, in hexadecimal digits.
+    pub serial: String,
+    /// The certificate and its intermediates, as the peer sent them.
+    pub(crate) chain: Vec<CertificateDer<'static>>,
+}
+
+/// The certificate of the peer, after the handshake.
+pub(crate) fn peer_certificate(channel: &Channel) -> Result<PeerCertificate, Error> {
+    let chain = channel.0.peer_certificates().unwrap_or_default();
+    let parsed = Parsed::new(chain.first().ok_or(Error::NoCertificatesPresented)?)?;
+    Ok(PeerCertificate {
+        role: parsed.role()?,
+        subject: parsed.subject_text(),
+        serial: parsed.serial_text(),
+        chain: chain.iter().cloned().map(CertificateDer::into_owned).collect(),
+    })
 }
 
 /// Verifies the certificates of clients.
@@ -100,6 +128,16 @@ impl Clients {
             None => Vec::new(),
         };
         Ok(Clients { trust: Trust::new(listed, revoked), subjects })
+    }
+
+    fn judge(
+        &self,
+        presented: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<(), Error> {
+        Parsed::new(presented)?.role()?;
+        self.trust.judge(presented, intermediates, Purpose::Client, now)
     }
 }
 
@@ -143,8 +181,7 @@ impl ClientCertVerifier for Clients {
         intermediates: &[CertificateDer<'_>],
         now: UnixTime,
     ) -> Result<ClientCertVerified, Error> {
-        Parsed::new(end_entity)?.role()?;
-        self.trust.judge(end_entity, intermediates, Purpose::Client, now)?;
+        self.judge(end_entity, intermediates, now)?;
         Ok(ClientCertVerified::assertion())
     }
 

@@ -1,0 +1,22 @@
+//! What a reload replaces while connections use it.
+
+use std::sync::{Arc, PoisonError, RwLock};
+
+/// A value that is replaced as a whole. Whoever has taken the value before keeps it.
+#[derive(Debug)]
+pub(crate) struct Live<T>(RwLock<Arc<T>>);
+
+impl<T> Live<T> {
+    pub(crate) fn new(value: T) -> Live<T> {
+        Live(RwLock::new(Arc::new(value)))
+    }
+
+    pub(crate) fn get(&self) -> Arc<T> {
+        Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Returns the value before.
+    pub(crate) fn replace(&self, value: Arc<T>) -> Arc<T> {
+        std::mem::replace(&mut *self.0.write().unwrap_or_else(PoisonError::into_inner), value)
+    }
+}

@@ -1,0 +1,26 @@
+//! Who is at the other end of a connection.
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+
+use crate::tls::server::PeerCertificate;
+
+/// The peer of a connection or datagram.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Peer {
+    pub address: SocketAddr,
+    /// The certificate that a TLS peer has proved to own.
+    pub certificate: Option<Arc<PeerCertificate>>,
+}
+
+impl Peer {
+    pub(crate) fn ip(&self) -> IpAddr {
+        self.address.ip()
+    }
+}
+
+impl From<SocketAddr> for Peer {
+    fn from(address: SocketAddr) -> Peer {
+        Peer { address, certificate: None }
+    }
+}

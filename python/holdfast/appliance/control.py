@@ -1,0 +1,167 @@
+"""Requests to a running appliance from its own machine: reload, list sessions, end one.
+
+A local socket (on Windows a named pipe) that only the user of the appliance can open. Its name
+follows from the path of the configuration. Requests and answers are JSON objects.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import threading
+from multiprocessing.connection import Client, Listener
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from multiprocessing.connection import Connection
+
+    Handler = Callable[..., Mapping[str, Any]]
+
+MAX_REQUEST = 64 * 1024
+MAX_ANSWER = 64 * 1024 * 1024
+"""Bytes of a message."""
+
+PATIENCE = 5.0
+"""Seconds in which a request must arrive."""
+
+LONGEST = 60.0
+"""Seconds that `ask` waits for the answer."""
+
+MODE = 0o700
+
+
+class NotRunning(Exception):
+    """No appliance with that configuration can be reached from here."""
+
+
+class Control:
+    """Answers requests until `close`. Raises `OSError` if the socket can't be created."""
+
+    def __init__(self, file: Path, handlers: Mapping[str, Handler]) -> None:
+        self._handlers = handlers
+        self._closed = False
+        self.address = _own_address(file)
+        self._listener = _listen(self.address)
+        self._thread = threading.Thread(target=self._accept, name="holdfast-control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Frees the socket."""
+        self._closed = True
+        with contextlib.suppress(OSError, EOFError), Client(self.address):
+            pass  # Wakes the thread.
+        self._thread.join(PATIENCE)
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while not self._closed:
+            try:
+                connection = self._listener.accept()
+            except (OSError, EOFError):
+                continue
+            threading.Thread(
+                target=self._serve, args=(connection,), name="holdfast-control", daemon=True
+            ).start()
+
+    def _serve(self, connection: Connection) -> None:
+        with contextlib.suppress(OSError, EOFError), connection:
+            if not connection.poll(PATIENCE):
+                return
+            answer = self._answer(connection.recv_bytes(MAX_REQUEST))
+            connection.send_bytes(json.dumps(answer).encode())
+
+    def _answer(self, body: bytes) -> Mapping[str, Any]:
+        try:
+            request = json.loads(body)
+            handler = self._handlers[request.pop("do")]
+            return handler(**request)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            return {"error": f"invalid request: {error}"}
+
+
+def ask(file: Path, do: str, **fields: object) -> dict[str, Any]:
+    """Sends a request to the appliance that runs this configuration. Raises `NotRunning`."""
+    for address in _addresses(file):
+        try:
+            connection = Client(address)
+        except OSError:
+            continue
+        with connection:
+            try:
+                connection.send_bytes(json.dumps({"do": do, **fields}).encode())
+                if not connection.poll(LONGEST):
+                    raise NotRunning(f"{file}: the appliance has not answered in {LONGEST:g} s")
+                answer: dict[str, Any] = json.loads(connection.recv_bytes(MAX_ANSWER))
+            except (OSError, EOFError) as error:
+                raise NotRunning(f"{file}: the appliance ended the connection") from error
+        return answer
+    tried = ", ".join(_addresses(file))
+    raise NotRunning(f"{file}: no appliance of this user runs it on this machine (tried {tried})")
+
+
+def _listen(address: str) -> Listener:
+    try:
+        listener = Listener(address)
+    except OSError:
+        if sys.platform == "win32" or _is_alive(address):
+            raise
+        # An appliance that was killed has left it.
+        Path(address).unlink(missing_ok=True)
+        listener = Listener(address)
+    if sys.platform != "win32":
+        Path(address).chmod(0o600)
+    return listener
+
+
+def _is_alive(address: str) -> bool:
+    try:
+        Client(address).close()
+    except OSError:
+        return False
+    return True
+
+
+def _own_address(file: Path) -> str:
+    """The address to listen at: in the first folder that this user can write to."""
+    if sys.platform == "win32":
+        return _name(file)
+    problem: OSError | None = None
+    for folder in _folders():
+        try:
+            folder.mkdir(mode=MODE, exist_ok=True)
+            if folder.stat().st_uid == os.getuid() and os.access(folder, os.W_OK):
+                return str(folder / _name(file))
+        except OSError as error:
+            problem = error
+    raise problem or PermissionError("no folder for the control socket")
+
+
+def _addresses(file: Path) -> list[str]:
+    """The addresses where the appliance of a configuration can be."""
+    if sys.platform == "win32":
+        return [_name(file)]
+    return [str(folder / _name(file)) for folder in _folders()]
+
+
+def _folders() -> Iterator[Path]:
+    given = os.environ.get("RUNTIME_DIRECTORY")
+    if given:
+        yield Path(given.split(":")[0])
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime:
+        yield Path(runtime) / "holdfast"
+    yield Path("/run/holdfast")
+    yield Path(tempfile.gettempdir()) / f"holdfast-{os.getuid()}"
+
+
+def _name(file: Path) -> str:
+    digest = hashlib.sha256(str(file.resolve()).encode()).hexdigest()[:16]
+    if sys.platform == "win32":
+        return rf"\\.\pipe\holdfast-{digest}"
+    return f"{digest}.sock"

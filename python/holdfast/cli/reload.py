@@ -1,0 +1,36 @@
+"""`holdfast reload`: has a running appliance reread its configuration."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from holdfast.appliance.control import NotRunning, ask
+
+REFUSED = 2
+
+
+@click.command(epilog="Example: holdfast reload plant.yaml")
+@click.argument("file", type=click.Path(path_type=Path))
+def reload(file: Path) -> None:
+    """Have the appliance that runs FILE on this machine reread it.
+
+    The whole configuration and all files that it names are checked first. If anything is wrong, the
+    appliance goes on as before, and every problem is printed. Exit codes: 0 reloaded, 1 no
+    appliance of this user runs FILE, 2 refused.
+    """
+    try:
+        answer = ask(file, "reload")
+    except NotRunning as error:
+        click.echo(f"holdfast: {error}", err=True)
+        sys.exit(1)
+    problems = answer.get("problems") or [answer[key] for key in ("error",) if key in answer]
+    if problems:
+        for problem in problems:
+            click.echo(problem, err=True)
+        click.echo("Nothing has changed.", err=True)
+        sys.exit(REFUSED)
+    changed = answer["changed"]
+    click.echo(f"Reloaded: {', '.join(changed)}" if changed else "Reloaded: nothing has changed")

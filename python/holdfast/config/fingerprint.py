@@ -1,0 +1,61 @@
+"""Digests of settings with the contents of the files that they name, to notice changes."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.base import Model
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from holdfast.config.model import Config
+    from holdfast.net.tls import Tls
+
+
+def signature(file: Path, config: Config) -> tuple[object, ...]:
+    """What changes when a configuration, or a file that it names, is written."""
+    return tuple(map(_written, [file, *_files(config)]))
+
+
+def _written(file: Path) -> object:
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size, status.st_ino
+
+
+def fingerprint(*settings: object) -> str:
+    """A digest of settings and of the files that they name. An unreadable file counts as empty."""
+    digest = hashlib.sha256()
+    for each in settings:
+        plain = each.model_dump() if isinstance(each, Model) else each
+        digest.update(repr(plain).encode())
+        for file in _files(each):
+            try:
+                content = file.read_bytes()
+            except OSError:
+                content = b""
+            digest.update(hashlib.sha256(content).digest())
+    return digest.hexdigest()
+
+
+def _files(value: Any) -> Iterator[Path]:
+    """The files that settings name: as a path, or in the URL of a device."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, Model):
+        tls: Tls | None = getattr(getattr(value, "target", None), "tls", None)
+        if tls is not None:
+            yield from (Path(file) for _, file in tls.files())
+        for name in type(value).model_fields:
+            yield from _files(getattr(value, name))
+    elif isinstance(value, dict):
+        for each in value.values():
+            yield from _files(each)
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _files(each)

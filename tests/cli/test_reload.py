@@ -1,0 +1,164 @@
+"""`holdfast reload` and `holdfast sessions` as a user has them, and the signal that reloads."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.appliance.control import ask
+from support import wire
+from support.cli import RunCommand, answer, done, failure, invoke
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+CONFIGURATION = """
+memories:
+  plant: {{holding_registers: {size}}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules:
+      - {{sources: [127.0.0.0/8], units: {{1: plant}}, access: {access}}}
+{more}
+"""
+
+WRITE = bytes.fromhex("0600070001")
+FORBIDDEN = bytes.fromhex("8601")
+
+
+class Running:
+    """A running appliance, whose log is in a file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "plant.yaml"
+        self.write()
+        self.command = RunCommand(self.file)
+        self.address = self.command.wait_until_it_serves()
+
+    def write(self, *, size: int = 100, access: str = "read-write", more: str = "") -> None:
+        self.file.write_text(CONFIGURATION.format(size=size, access=access, more=more))
+
+    def end(self) -> str:
+        code, log = self.command.end(signal.SIGTERM)
+        assert code == 0
+        assert "Traceback" not in log
+        return log
+
+
+@pytest.fixture
+def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    # The path of a socket is short, and those of tests can be long.
+    with tempfile.TemporaryDirectory(prefix="hf") as runtime:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", runtime)
+        made = Running(tmp_path)
+        yield made
+        made.command.process.kill()
+        made.command.process.communicate()
+
+
+def test_reload_says_what_has_changed(running: Running) -> None:
+    with wire.Connection(running.address) as client:
+        assert client.ask(WRITE) == WRITE
+        running.write(access="read-only")
+        assert done("reload", str(running.file)) == ["Reloaded: listeners.scada"]
+        assert client.ask(WRITE) == FORBIDDEN
+        assert done("reload", str(running.file)) == ["Reloaded: nothing has changed"]
+    log = running.end()
+    assert "info reloaded changed=listeners.scada sha256=" in log
+
+
+def test_a_wrong_configuration_changes_nothing_and_every_problem_is_printed(
+    running: Running,
+) -> None:
+    with wire.Connection(running.address) as client:
+        running.write(access="read-only", more="workers: 0\nlog: {level: loud}")
+        result = invoke("reload", str(running.file))
+        lines = result.stderr.splitlines()
+        assert (result.exit_code, result.stdout, len(lines)) == (2, "", 3)
+        assert "workers: found 0, allowed: " in lines[1] + lines[0]
+        assert lines[2] == "Nothing has changed."
+        running.write(size=101)
+        result = invoke("reload", str(running.file))
+        reason = "memories.plant: areas or seal changed; requires a restart"
+        assert result.stderr == f"{running.file}: {reason}\nNothing has changed.\n"
+        assert client.ask(WRITE) == WRITE
+    log = running.end()
+    assert log.count("error reload_refused problem=") == 3
+
+
+def test_sighup_reloads_also_that_of_a_closed_terminal(running: Running) -> None:
+    with wire.Connection(running.address) as client:
+        running.write(access="read-only")
+        running.command.process.send_signal(signal.SIGHUP)
+        wire.until(lambda: client.ask(WRITE) == FORBIDDEN, "the rule has changed")
+    assert "info reloaded" in running.end()
+
+
+def test_a_watched_file_reloads_when_it_has_changed(running: Running) -> None:
+    watch = "reload: on-change"
+    with wire.Connection(running.address) as client:
+        running.write(more=watch)
+        assert done("reload", str(running.file)) == ["Reloaded: nothing has changed"]
+        running.write(access="read-only", more=watch)
+        wire.until(lambda: client.ask(WRITE) == FORBIDDEN, "the file was noticed")
+        running.write(access="wrong", more=watch)
+        running.write(access="read-write", more=watch)
+        wire.until(lambda: client.ask(WRITE) == WRITE, "it was noticed again")
+    log = running.end()
+    assert log.count("info reloaded") == 3
+
+
+def test_sessions_are_listed_and_ended(running: Running) -> None:
+    assert done("sessions", str(running.file)) == ["no open connections"]
+    with wire.Connection(running.address) as first, wire.Connection(running.address) as second:
+        assert first.ask(WRITE) == second.ask(WRITE) == WRITE
+        head, *rows = done("sessions", str(running.file))
+        assert head.split() == ["id", "peer", "opened", "idle", "role", "subject", "serial"]
+        peers = ["{}:{}".format(*each.socket.getsockname()) for each in (first, second)]
+        assert [row.split()[1] for row in rows] == peers
+        ids = [row.split()[0] for row in rows]
+        assert ids == ["scada/0", "scada/1"]
+        assert done("sessions", str(running.file), "--end", ids[1]) == ["ended scada/1"]
+        assert second.rest() == b""
+        assert first.ask(WRITE) == WRITE
+        (left,) = answer("sessions", str(running.file))["sessions"]
+        assert (left["listener"], left["id"], left["peer"]) == ("scada", 0, peers[0])
+        gone = failure("sessions", str(running.file), "--end", ids[1])
+        assert gone == ["holdfast: scada/1: no such connection"]
+    assert invoke("sessions", str(running.file), "--end", "scada").exit_code == 2
+
+
+def test_without_an_appliance_both_say_so(tmp_path: Path) -> None:
+    for command in ("reload", "sessions"):
+        (line,) = failure(command, str(tmp_path / "other.yaml"))
+        assert line.startswith(f"holdfast: {tmp_path}/other.yaml: no appliance of this user runs")
+
+
+@pytest.mark.usefixtures("running")
+def test_only_the_user_of_the_appliance_can_open_the_control_socket() -> None:
+    (control,) = Path(os.environ["XDG_RUNTIME_DIR"]).glob("holdfast/*.sock")
+    assert stat.S_IMODE(control.stat().st_mode) == 0o600
+    assert stat.S_IMODE(control.parent.stat().st_mode) == 0o700
+
+
+def test_a_wrong_request_at_the_control_socket_is_answered_with_an_error(running: Running) -> None:
+    assert "invalid request" in ask(running.file, "dance")["error"]
+    assert "invalid request" in ask(running.file, "end", other=1)["error"]
+    assert ask(running.file, "sessions") == {"sessions": []}
+
+
+def test_the_socket_of_a_killed_appliance_is_taken_over(running: Running) -> None:
+    running.command.process.kill()
+    running.command.process.communicate()
+    running.command = RunCommand(running.file)
+    running.command.wait_until_it_serves()
+    assert done("sessions", str(running.file)) == ["no open connections"]
+    assert "control_unavailable" not in running.end()
