@@ -1,5 +1,6 @@
 //! `Engine`: runs listeners; reports addresses, counters, events and writes.
 
+use holdfast_engine::server::audit::Unrecordable;
 use holdfast_engine::server::counters::PacketCounters;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::{
@@ -21,7 +22,7 @@ pub struct Engine {
 #[pymethods]
 impl Engine {
     #[new]
-    #[pyo3(signature = (listeners, *, identity, unit_names=None, workers=1, events="nothing", audit=false))]
+    #[pyo3(signature = (listeners, *, identity, unit_names=None, workers=1, events="nothing", audit=None))]
     fn new(
         py: Python<'_>,
         listeners: Vec<PyRef<'_, Listener>>,
@@ -29,7 +30,7 @@ impl Engine {
         unit_names: Option<Vec<(u8, String)>>,
         workers: i128,
         events: &str,
-        audit: bool,
+        audit: Option<&str>,
     ) -> PyResult<Engine> {
         let workers = within("workers", workers, 1..=64)?;
         let verbosities = [
@@ -38,6 +39,8 @@ impl Engine {
             ("all", Verbosity::All),
         ];
         let events = word("events", events, &verbosities)?;
+        let unrecordable = [("open", Unrecordable::Write), ("closed", Unrecordable::Refuse)];
+        let audit = audit.map(|given| word("audit", given, &unrecordable)).transpose()?;
         let bytes = |texts: Vec<(u8, String)>| {
             texts.into_iter().map(|(id, text)| (id, text.into_bytes())).collect()
         };
@@ -88,6 +91,10 @@ impl Engine {
         let timeout = seconds("timeout", timeout)?;
         let records = py.detach(|| self.core.next_writes(timeout, most));
         records.iter().map(|record| audit::to_python(py, record)).collect()
+    }
+
+    fn set_audit_failing(&self, failing: bool) {
+        self.core.set_audit_failing(failing);
     }
 
     #[getter]

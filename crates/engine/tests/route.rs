@@ -138,7 +138,7 @@ impl Front {
             unit_names: Vec::new(),
             workers: 2,
             events: Verbosity::Nothing,
-            audit: false,
+            audit: None,
         });
         Front { engine: engine.unwrap(), poller, link }
     }
