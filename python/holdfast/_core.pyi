@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
 from typing import Any, Final, Literal, final
 
@@ -176,10 +176,14 @@ class BatchRefused(ValueError):
     """`invalid_type`: a value of another type, or with `index` `None`, values that are not a
     sequence of integers. `invalid_value`: an integer out of range."""
 
-def write_across(writes: Iterable[tuple[Memory, Area, int, Iterable[int]]]) -> int:
+def write_across(
+    writes: Iterable[tuple[Memory, Area, int, Iterable[int]]],
+    before: Callable[[], object] | None = None,
+) -> int:
     """Writes to several memories (memory, area, address, values) in one step.
 
-    Returns the number of written values. Readers of the memories see all writes or none.
+    Returns the number of written values. Readers of the memories see all writes or none. `before`
+    is called once every check has passed; if it raises, nothing is written.
 
     Raises `BatchRefused` for the first write with an invalid area, number of values or range, else
     for the first invalid value. An error prevents all writes. An exception from the iterable
@@ -336,7 +340,8 @@ class Engine:
     """Runs listeners on native threads, from construction to `stop`.
 
     `identity` has identification objects by id and requires objects 0 to 2. `events` selects the
-    listeners' events that are queued for `next_event`; `audit` queues writes for `next_writes`.
+    listeners' events that are queued for `next_event`. `audit` queues writes for `next_writes`:
+    writes that the queue has no room for are carried out if it is `open`, and refused if `closed`.
 
     Raises `OSError` if a listener can't be bound or a serial device can't be opened, and then runs
     no listener; raises `ValueError` for an invalid identity.
@@ -350,7 +355,7 @@ class Engine:
         unit_names: Sequence[tuple[int, str]] | None = None,
         workers: int = 1,
         events: Literal["nothing", "refusals", "all"] = "nothing",
-        audit: bool = False,
+        audit: Literal["open", "closed"] | None = None,
     ) -> Engine: ...
     @property
     def addresses(self) -> list[tuple[str, int] | None]:
@@ -399,7 +404,13 @@ class Engine:
     def next_writes(self, timeout: float, most: int) -> list[dict[str, object]]:
         """Up to `most` received writes, executed or refused, as fields of an audit log.
 
-        Waits up to `timeout` seconds for the first write.
+        Waits up to `timeout` seconds for the first write. `stop` ends the wait.
+        """
+
+    def set_audit_failing(self, failing: bool) -> None:
+        """Whether the audit log can't be written: with `audit` closed, refuses writes then.
+
+        Ends a wait for writes.
         """
 
     @property

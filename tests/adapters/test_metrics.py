@@ -259,15 +259,31 @@ def test_it_shows_the_moment(
     assert seen["holdfast_memory_sealed", "gated"] == 1
 
 
-@pytest.mark.parametrize("audit", [None, {"lines": 5, "failed": 1}])
+AUDIT = {
+    "lines": 5,
+    "failed": 1,
+    "waiting": 0,
+    "failing": True,
+    "copies": {"syslog": {"sent": 3, "failed": 2, "dropped": 1, "waiting": 4}},
+}
+
+
+@pytest.mark.parametrize("audit", [None, AUDIT])
 def test_the_audit_log_when_there_is_one(
-    client: web.Client, diagnostics: Diagnostics, audit: dict[str, int] | None
+    client: web.Client, diagnostics: Diagnostics, audit: dict[str, object] | None
 ) -> None:
     log: Any = None if audit is None else SimpleNamespace(counts=lambda: audit)
     diagnostics.audit = log
     seen = samples(client.get("/metrics").body.decode())
     assert seen.get(("holdfast_audit_lines_total",)) == (None if audit is None else 5)
     assert seen.get(("holdfast_audit_failed_total",)) == (None if audit is None else 1)
+    assert seen.get(("holdfast_audit_failing",)) == (None if audit is None else 1)
+    copies = {key[1:]: value for key, value in seen.items() if "audit_copies" in key[0]}
+    assert copies == (
+        {}
+        if audit is None
+        else {("sent", "syslog"): 3, ("failed", "syslog"): 2, ("dropped", "syslog"): 1}
+    )
 
 
 def test_a_real_server_is_shown(

@@ -16,11 +16,12 @@ import holdfast
 from holdfast import logs
 from holdfast.adapters import Grant, MemoryAccess, Stop
 from holdfast.adapters.rest import openapi
-from holdfast.ingest.audit import Audit
+from holdfast.audit import Audit
 from holdfast.web.admission import ConnectionLimits
 from holdfast.web.host import Host
 from holdfast.web.port import listen
 from support import web, wire
+from support.audits import writes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -685,9 +686,8 @@ def test_writes_are_audited_and_reads_are_not(
     stranger.read("coils", 0, 1)
     stranger.get("/nowhere")
     stranger.ingest(GOOD)
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
     audit.close()
-    assert [(line["source"], line["outcome"]) for line in lines] == [
+    assert [(line["source"], line["outcome"]) for line in writes(file)] == [
         ("admin", "done"),
         ("admin", "invalid_value"),
         ("-", "unauthorized"),

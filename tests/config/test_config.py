@@ -33,6 +33,7 @@ from holdfast.config import (
     Seal,
     SerialRuleConfig,
     Span,
+    SyslogConfig,
     TokenConfig,
     json_schema,
     load,
@@ -347,7 +348,17 @@ def test_an_audit_file_has_the_documented_limits(
     loaded: Callable[..., Config], tmp_path: Path
 ) -> None:
     audit = loaded((SMALL % "") + "audit: {file: a.log}\n").audit
-    assert audit == AuditConfig(file=tmp_path / "a.log", max_bytes=104857600, keep=10)
+    assert audit == AuditConfig(
+        file=tmp_path / "a.log", max_bytes=104857600, keep=10, fail="open", journald=False
+    )
+
+
+def test_syslog_or_the_journal_can_replace_the_audit_file(loaded: Callable[..., Config]) -> None:
+    audit = loaded((SMALL % "") + "audit: {syslog: {url: 'tcp://10.0.0.9'}}\n").audit
+    assert audit is not None
+    assert (audit.file, audit.syslog) == (None, SyslogConfig(url="tcp://10.0.0.9"))
+    audit = loaded((SMALL % "") + "audit: {journald: true}\n").audit
+    assert audit == AuditConfig(journald=True)
 
 
 METER = "url: tcp://10.0.0.9, unit: 1, interval: 1"
@@ -613,7 +624,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
     assert required == {
         "AdapterConfig": ["type", "memories", "areas", "access"],
         "AsciiSerialConfig": ["device"],
-        "AuditConfig": ["file"],
+        "AuditConfig": None,
         "ClientTlsConfig": None,
         "CostConfig": ["per_request", "per_register"],
         "DestinationConfig": ["memory", "area", "address"],
@@ -657,6 +668,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "Span": ["size"],
         "StatusConfig": ["area", "slot", "memory"],
         "SubscriptionConfig": ["topic", "memories", "areas"],
+        "SyslogConfig": ["url"],
         "TlsRuleConfig": ["sources", "units", "access"],
         "TokenConfig": ["name", "sha256", "memories", "areas", "access"],
         "ToleranceConfig": None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from support import routed, wire
+from support.audits import await_writes
 from support.fake_device import FakeDevice, Serial, Stream, Udp, exception, good, silent
 from support.lines import ASCII, RTU, Line, Mode
 from support.routed import Held, await_count, configuration, counters
@@ -83,12 +83,6 @@ def await_nobody(appliance: Appliance, others: int = 0) -> None:
     wire.until(
         lambda: stats()["listeners"]["scada"]["connections"]["open"] == others, "the client is gone"
     )
-
-
-def lines_of(file: Path, count: int) -> list[dict[str, Any]]:
-    """Returns the lines of an audit log, when there are so many."""
-    wire.until(lambda: file.read_text().count("\n") >= count, f"{count} lines")
-    return [json.loads(line) for line in file.read_text().splitlines()]
 
 
 # What passes
@@ -607,7 +601,7 @@ def test_what_is_passed_on_is_in_the_audit_log(
 
     found = [
         {key: value for key, value in line.items() if key not in ("time", "peer", "listener")}
-        for line in lines_of(tmp_path / "audit.log", 4)
+        for line in await_writes(tmp_path / "audit.log", 4)
     ]
     register = {"area": "holding_registers", "address": 5}
     assert found[0] == {
@@ -643,7 +637,7 @@ def test_a_write_under_way_is_recorded_although_its_client_has_gone(
     held.release()
 
     await_count(appliance, "withdrawn", 1)
-    [line] = lines_of(tmp_path / "audit.log", 1)
+    [line] = await_writes(tmp_path / "audit.log", 1)
     assert (line["unit"], line["function"], line["outcome"]) == (1, 6, "done")
     device.await_requests(1)
 
@@ -680,7 +674,7 @@ def test_a_request_under_way_is_answered_before_the_end(
 
     assert front.receive().pdu == WRITE
     assert front.rest() == b""
-    assert [line["outcome"] for line in lines_of(tmp_path / "audit.log", 1)] == ["done"]
+    assert [line["outcome"] for line in await_writes(tmp_path / "audit.log", 1)] == ["done"]
 
 
 def test_the_end_does_not_wait_for_a_silent_device(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
 from support import web, wire
+from support.audits import writes
 from support.fake_device import Asked, Stream, exception, good
 from support.polled import configuration, counters, device, read, until_polled
 from support.running import endpoint
@@ -248,6 +248,28 @@ def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
         assert "meter did not take the write: exception 04" in refused.json["detail"]
 
 
+@pytest.mark.parametrize(("fail", "status"), [("open", 200), ("closed", 503)])
+def test_a_full_disk_keeps_closed_audit_logs_from_passing_writes_on(
+    run: Run, fail: str, status: int
+) -> None:
+    with plc() as source:
+        meter = device(source.url, *READS, **RARELY)
+        audit = {"file": "/dev/full", "fail": fail}
+        appliance = run(configuration({"meter": meter}, **MORE, audit=audit))
+        until_read(appliance)
+        rest = web.Client(endpoint(appliance, "rest"))
+        with contextlib.closing(rest):
+            answer = rest.ingest(web.command("holding_registers", 10, [3], "mirror"))
+        assert answer.status == status
+        with client(appliance) as scada:
+            if fail == "open":
+                scada.write_register(11, 7)
+            else:
+                with pytest.raises(holdfast.ModbusException, match="Server Device Failure"):
+                    scada.write_register(11, 7)
+        assert any(asked.pdu[0] in (6, 16) for asked in source.requests) == (fail == "open")
+
+
 def test_the_audit_log_names_the_device(run: Run, tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
     with plc() as source:
@@ -257,6 +279,6 @@ def test_the_audit_log_names_the_device(run: Run, tmp_path: Path) -> None:
         with client(appliance) as scada:
             scada.write_register(11, 7)
         appliance.stop()
-    (line,) = [json.loads(line) for line in log.read_text().splitlines()]
+    (line,) = writes(log)
     told = [line[key] for key in ("route", "unit", "address", "outcome")]
     assert told == ["meter", 1, 11, "done"]

@@ -6,7 +6,6 @@ and the reply to the next request is the first that comes.
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import struct
@@ -21,6 +20,7 @@ from pymodbus.framer import FramerType
 
 from holdfast.types import AREAS
 from support import lines, wire
+from support.audits import writes
 from support.config_folder import written
 from support.lines import ASCII, RTU, UNIT, Cable, Line, Mode
 from support.machine import tool
@@ -671,7 +671,7 @@ def test_the_writes_of_a_line_are_audited(start: Start, tmp_path: Path) -> None:
         plant.line.ask(pdu)
     plant.appliance.stop()
 
-    found = [json.loads(text) for text in (tmp_path / "audit.log").read_text().splitlines()]
+    found = writes(tmp_path / "audit.log")
     assert {(line["listener"], line["peer"], line["function"]) for line in found} == {
         ("line", None, 6)
     }

@@ -322,7 +322,16 @@ IDENTITIES = st.fixed_dictionaries(
 METRICS = st.fixed_dictionaries({"bind": st.just("[::1]:81")}, optional={"sources": SOURCES})
 AUDITS = st.fixed_dictionaries(
     {"file": st.just("a.log")},
-    optional={"max_bytes": st.integers(65536, 2**60), "keep": st.integers(1, 1000)},
+    optional={
+        "max_bytes": st.integers(65536, 2**60),
+        "keep": st.integers(1, 1000),
+        "fail": st.sampled_from(["open", "closed"]),
+        "journald": st.booleans(),
+        "syslog": st.fixed_dictionaries(
+            {"url": st.sampled_from(["udp://10.0.0.9", "tcp://[::1]:6514", "unix:///dev/log"])},
+            optional={"facility": st.sampled_from(["auth", "local7"])},
+        ),
+    },
 )
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     import holdfast
     from holdfast._core import Engine
-    from holdfast.ingest.audit import Audit
+    from holdfast.audit import Audit
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 JSON = {"Content-Type": "application/json"}

@@ -1,9 +1,9 @@
 //! `write_across`: writes a batch to several memories, or reports the value that was refused.
 //!
-//! It first consumes all iterables, then checks all values, then writes. So an iterable that raises
-//! has changed nothing, and its exception takes precedence over a refused value.
+//! It first consumes all iterables, then checks all values, then calls `before`, then writes. So an
+//! iterable that raises has changed nothing, and its exception takes precedence over a refused value.
 
-use holdfast_memory::{Access, Area, Memory as Core, Refusal, Write};
+use holdfast_memory::{Access, Area, Memory as Core, Refusal, Refused, Write};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyList, PyString};
@@ -28,7 +28,12 @@ struct Pending<'py> {
 
 /// Writes to several memories atomically. Returns the number of values written.
 #[pyfunction]
-pub fn write_across(py: Python<'_>, writes: &Bound<'_, PyAny>) -> PyResult<usize> {
+#[pyo3(signature = (writes, before=None))]
+pub fn write_across(
+    py: Python<'_>,
+    writes: &Bound<'_, PyAny>,
+    before: Option<&Bound<'_, PyAny>>,
+) -> PyResult<usize> {
     let (mut pending, mut len) = (Vec::new(), 0);
     for (command, write) in writes.try_iter()?.enumerate() {
         let write = Pending::new(command, &write?)?;
@@ -43,8 +48,12 @@ pub fn write_across(py: Python<'_>, writes: &Bound<'_, PyAny>) -> PyResult<usize
         rest = behind;
         packed.push((&write.memory.get().core, write.packed(command, bytes)?));
     }
-    py.detach(|| holdfast_memory::write_across(Access::Ingest, &packed))
-        .map_err(|refused| refusal(py, refused.index, None, reason(refused.refusal)))?;
+    let refused = |refused: Refused| refusal(py, refused.index, None, reason(refused.refusal));
+    if let Some(before) = before {
+        holdfast_memory::check_across(Access::Ingest, &packed).map_err(refused)?;
+        before.call0()?;
+    }
+    py.detach(|| holdfast_memory::write_across(Access::Ingest, &packed)).map_err(refused)?;
     Ok(pending.iter().map(|write| write.count).sum())
 }
 

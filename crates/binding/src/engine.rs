@@ -2,6 +2,7 @@
 
 use std::time::UNIX_EPOCH;
 
+use holdfast_engine::server::audit::Unrecordable;
 use holdfast_engine::server::counters::PacketCounters;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::{
@@ -24,7 +25,7 @@ pub struct Engine {
 #[pymethods]
 impl Engine {
     #[new]
-    #[pyo3(signature = (listeners, *, identity, unit_names=None, workers=1, events="nothing", audit=false))]
+    #[pyo3(signature = (listeners, *, identity, unit_names=None, workers=1, events="nothing", audit=None))]
     fn new(
         py: Python<'_>,
         listeners: Vec<PyRef<'_, Listener>>,
@@ -32,9 +33,11 @@ impl Engine {
         unit_names: Option<Vec<(u8, String)>>,
         workers: i128,
         events: &str,
-        audit: bool,
+        audit: Option<&str>,
     ) -> PyResult<Engine> {
         let workers = within("workers", workers, 1..=64)?;
+        let unrecordable = [("open", Unrecordable::Write), ("closed", Unrecordable::Refuse)];
+        let audit = audit.map(|given| word("audit", given, &unrecordable)).transpose()?;
         let listening = listening(listeners, identity, unit_names);
         let settings = Settings { listening, workers, events: verbosity(events)?, audit };
         let core = py.detach(|| Core::start(settings)).map_err(start_error)?;
@@ -116,6 +119,10 @@ impl Engine {
         let timeout = seconds("timeout", timeout)?;
         let records = py.detach(|| self.core.next_writes(timeout, most));
         records.iter().map(|record| audit::to_python(py, record)).collect()
+    }
+
+    fn set_audit_failing(&self, failing: bool) {
+        self.core.set_audit_failing(failing);
     }
 
     #[getter]

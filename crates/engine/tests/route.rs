@@ -140,7 +140,7 @@ impl Front {
             },
             workers: 2,
             events: Verbosity::Nothing,
-            audit: false,
+            audit: None,
         });
         Front { engine: engine.unwrap(), poller, link }
     }

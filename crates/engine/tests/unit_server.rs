@@ -78,13 +78,13 @@ fn ask(
     request: &[u8],
 ) -> Option<Vec<u8>> {
     let mut reply = [0; pdu::MAX_LEN];
-    let len = unit_server.answer(rights, unit_id, request, &mut reply)?;
+    let len = unit_server.answer(rights, unit_id, request, true, &mut reply)?;
     Some(reply[..len].to_vec())
 }
 
 fn broadcast(unit_server: &UnitServer, rights: &PeerRights, request: &[u8]) -> Vec<Vec<u8>> {
     let mut replies = Vec::new();
-    unit_server.broadcast(rights, request, |reply| replies.push(reply.to_vec()));
+    unit_server.broadcast(rights, request, || Some(()), |reply, _| replies.push(reply.to_vec()));
     replies
 }
 
@@ -229,4 +229,31 @@ fn a_sealed_memory_does_not_show_which_ranges_a_peer_has() {
         let reply = ask(&unit_server(), &rights, 7, &[3, 0, address, 0, 1]);
         assert_eq!(reply.unwrap(), [0x83, 6]);
     }
+}
+
+#[test]
+fn a_write_that_is_not_permitted_is_refused_after_rights_and_form_and_before_the_memory() {
+    let (one, unit_server) = (memory(1), unit_server());
+    let rights = rights(&[(7, &one)], AccessMode::ReadWrite);
+    let refused = |unit_id, request: &[u8]| {
+        let mut reply = [0; pdu::MAX_LEN];
+        let len = unit_server.answer(&rights, unit_id, request, false, &mut reply).unwrap();
+        (reply[0] >= 0x80).then(|| reply[..len][1])
+    };
+    assert_eq!(refused(7, WRITE), Some(4));
+    assert_eq!(refused(9, WRITE), Some(0x0B));
+    assert_eq!(refused(7, &WRITE[..3]), Some(3));
+    assert_eq!(refused(7, &[0x41]), Some(1));
+    let before = ask(&unit_server, &rights, 7, READ);
+    let mut replies = Vec::new();
+    unit_server.broadcast(
+        &rights,
+        WRITE,
+        || None::<()>,
+        |reply, permit| {
+            replies.push((reply.to_vec(), permit));
+        },
+    );
+    assert_eq!(replies, [(vec![WRITE[0] | 0x80, 4], None)]);
+    assert_eq!(ask(&unit_server, &rights, 7, READ), before);
 }

@@ -25,5 +25,5 @@ mod operation;
 
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
-pub use memory::{Access, Gate, GateMode, Memory, Mirrored, write_across};
+pub use memory::{Access, Gate, GateMode, Memory, Mirrored, check_across, write_across};
 pub use operation::{Read, Write};

@@ -354,11 +354,7 @@ impl Content {
 /// these checks. Then [`Refusal::Sealed`] (for a client), with the index of the first write to a
 /// sealed memory. Nothing has changed then.
 pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
-    for (index, (memory, write)) in writes.iter().enumerate() {
-        memory
-            .writable(access, std::slice::from_ref(write))
-            .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
-    }
+    check_across(access, writes)?;
     let mut placed: Vec<Placed> = writes
         .iter()
         .enumerate()
@@ -380,6 +376,19 @@ pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(
         })
         .collect();
     apply_across(access, &runs)
+}
+
+/// Checks what [`write_across`] checks before it takes the locks: everything but seals.
+///
+/// # Errors
+/// As [`write_across`], without [`Refusal::Sealed`].
+pub fn check_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
+    for (index, (memory, write)) in writes.iter().enumerate() {
+        memory
+            .writable(access, std::slice::from_ref(write))
+            .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
+    }
+    Ok(())
 }
 
 /// A write that has been checked, with the memory it was checked for.

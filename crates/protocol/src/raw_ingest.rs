@@ -109,6 +109,8 @@ codes! {
         Late = 11, "late";
         /// Bytes follow the packet.
         Extra = 12, "extra";
+        /// The receiver must record the write, and can't.
+        Unrecorded = 13, "unrecorded";
     }
 }
 

@@ -137,11 +137,25 @@ class Figures(Collector):
                 "Lines that could not be written to the audit log.",
                 stats["audit"]["failed"],
             )
+            yield from _of_audit(stats["audit"])
         yield from _of_listeners(stats["listeners"])
         yield from _of_devices(stats["devices"])
         yield from _of_links(stats["links"])
         yield from _of_adapters(stats["adapters"])
         yield from _of_memories(self._diagnostics.memories())
+
+
+def _of_audit(audit: Mapping[str, Any]) -> Iterator[Metric]:
+    yield GaugeMetricFamily(
+        "holdfast_audit_failing",
+        "1 if the file of the audit log could not be written last time.",
+        audit["failing"],
+    )
+    copies = _counter("audit_copies", "Copies of audit lines, by outcome.", "receiver", "outcome")
+    for name, counted in audit["copies"].items():
+        for outcome in ("sent", "failed", "dropped"):
+            copies.add_metric([name, outcome], counted[outcome])
+    yield copies
 
 
 def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:

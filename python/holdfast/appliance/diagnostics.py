@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
     from holdfast._core import Engine, Link, Memory, Poller
     from holdfast.appliance.supervision import Supervisor
+    from holdfast.audit import Audit
     from holdfast.ingest import MemoryAccess
-    from holdfast.ingest.audit import Audit
 
 
 class Diagnostics:

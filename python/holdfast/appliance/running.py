@@ -6,7 +6,6 @@ It only connects these parts. It parses no protocol, and takes no part in answer
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
-from holdfast.appliance import assembly, changes
+from holdfast.appliance import assembly, auditing, changes
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
@@ -23,7 +22,6 @@ from holdfast.config.fingerprint import fingerprint
 from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
-from holdfast.ingest.audit import Audit
 from holdfast.net.addresses import joined
 from holdfast.web.port import Port
 
@@ -51,14 +49,8 @@ LEVELS = {
     "ended": logging.INFO,
 }
 
-# The most writes that are moved to the audit log at once.
-AUDIT_BATCH = 1000
-
 # Seconds between checks of the health of devices.
 HEALTH_CHECK_INTERVAL = 1.0
-
-# Seconds that a thread waits for the next write before it checks for a stop.
-WAIT_TIMEOUT = 0.2
 
 
 @dataclass(frozen=True)
@@ -199,7 +191,9 @@ class _Running:
         ]
         disabled = self._tell_disabled()
         with ExitStack() as undo:
-            self._audit = self._opened_audit(undo)
+            self._audit = auditing.opened(config)
+            if self._audit is not None:
+                undo.callback(auditing.closed, self._audit, config)
             self._ports = self._bound_ports(undo)
             # The links of listeners come first: the first use of an address decides its settings.
             self._poller: _core.Poller | None = None
@@ -222,10 +216,10 @@ class _Running:
             for name, part in self._adapters(config, self._ports).items():
                 self._add(name, part)
             undo.pop_all()
-        self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
-        self._stopped = threading.Event()
+        self._recorder: auditing.WriteRecorder | None = None
         if self._audit is not None:
-            self._auditing.start()
+            self._recorder = auditing.WriteRecorder(self._audit, self._engine)
+            self._recorder.start()
         for supervisor in self._supervisors.values():
             supervisor.start()
 
@@ -238,16 +232,16 @@ class _Running:
         for supervisor in self._supervisors.values():
             supervisor.stop()
         self._engine.stop()
-        self._stopped.set()
         for supervisor in self._supervisors.values():
             supervisor.join()
         if self._poller is not None:
             self._poller.stop()
         for port in self._ports.values():
             port.close()
+        if self._recorder is not None:
+            self._recorder.finish()
         if self._audit is not None:
-            self._auditing.join()
-            self._audit.close()
+            auditing.closed(self._audit, self._config)
 
     def log_events(self, timeout: float) -> None:
         event = self._engine.next_event(timeout)
@@ -326,14 +320,6 @@ class _Running:
             about = found.get("role" if event == "refused_role" else "reason")
             logs.refused(event, kind=(listener, about), **fields)
 
-    def _opened_audit(self, undo: ExitStack) -> Audit | None:
-        settings = self._config.audit
-        if settings is None:
-            return None
-        audit = Audit(settings.file, max_bytes=settings.max_bytes, keep=settings.keep)
-        undo.callback(audit.close)
-        return audit
-
     def _bound_ports(self, undo: ExitStack) -> dict[str, Port]:
         """Tries to bind the ports of the HTTP services. The others are tried again later."""
         ports: dict[str, Port] = {}
@@ -352,7 +338,7 @@ class _Running:
             unit_names=identity.names(),
             workers=config.workers,
             events=_events(config),
-            audit=self._audit is not None,
+            audit=None if config.audit is None else config.audit.fail,
         )
 
     def sessions(self) -> list[dict[str, Any]]:
@@ -411,6 +397,9 @@ class _Running:
         self.diagnostics.disabled = self._tell_disabled()
         self._replace_adapters(ports)
         logs.change(config.log.level, config.log.format)
+        if self._audit is not None:
+            self._audit.reopen()
+            auditing.record(self._audit, "reload", config)
         return changed
 
     def _taken_over_ports(self, config: Config, undo: ExitStack) -> dict[str, Port]:
@@ -564,22 +553,6 @@ class _Running:
         self._supervisors[name] = supervisor
         self._fingerprint_of[name] = part.fingerprint
         self.diagnostics.adapters[name] = (supervisor, part.access)
-
-    def _take_writes(self) -> None:
-        """Moves the writes of listeners to the audit log until the appliance has stopped."""
-        audit, lost = self._audit, 0
-        assert audit is not None
-        while True:
-            ended = self._stopped.is_set()
-            writes = self._engine.next_writes(0 if ended else WAIT_TIMEOUT, AUDIT_BATCH)
-            audit.write_all(writes)
-            missed = self._engine.lost_writes
-            if missed > lost:
-                audit.write(lost=missed - lost)
-                logs.write(logging.ERROR, "audit_lost", count=missed - lost)
-                lost = missed
-            if ended and not writes:
-                return
 
 
 def _check_parts(config: Config) -> None:

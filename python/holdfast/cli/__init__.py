@@ -13,6 +13,7 @@ import click
 from holdfast import __version__
 
 COMMANDS = {
+    "audit": "holdfast.cli.audit:audit",
     "bench": "holdfast.cli.bench:bench",
     "check": "holdfast.cli.check:check",
     "completion": "holdfast.cli.completion:completion",

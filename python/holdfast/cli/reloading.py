@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import threading
 import time
@@ -68,9 +67,7 @@ class Reloading:
     def _reload(self) -> Mapping[str, Any]:
         problems: list[str] = []
         changed: list[str] = []
-        digest = None
         try:
-            digest = hashlib.sha256(self._file.read_bytes()).hexdigest()
             config = load_whole(self._file)
             changed = self._appliance.reload(config)
         except ConfigError as error:
@@ -88,5 +85,7 @@ class Reloading:
             return {"problems": problems}
         for warning in config.warnings:
             logs.write(logging.WARNING, "config_warning", warning=str(warning))
-        logs.write(logging.INFO, "reloaded", changed=" ".join(changed) or "nothing", sha256=digest)
-        return {"changed": changed, "sha256": digest}
+        logs.write(
+            logging.INFO, "reloaded", changed=" ".join(changed) or "nothing", sha256=config.sha256
+        )
+        return {"changed": changed, "sha256": config.sha256}

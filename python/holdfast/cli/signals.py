@@ -10,10 +10,30 @@ if TYPE_CHECKING:
     from types import FrameType
 
 
+OTHERS = (
+    "SIGHUP",
+    "SIGQUIT",
+    "SIGBREAK",
+    "SIGUSR1",
+    "SIGUSR2",
+    "SIGALRM",
+    "SIGVTALRM",
+    "SIGPROF",
+    "SIGIO",
+    "SIGPWR",
+    "SIGXCPU",
+)
+"""Signals that would end the process at once, where the system has them: no write may go
+unrecorded."""
+
+
 def ending_signals() -> Iterator[signal.Signals]:
-    """The signals that end a service: Ctrl-C, a stop, a closed terminal unless `nohup` is used."""
+    """The signals that end a service: Ctrl-C, a stop, a closed terminal unless `nohup` is used.
+
+    And every other one that ends a process and can be caught, except those of a crash.
+    """
     yield from (signal.SIGINT, signal.SIGTERM)
-    for name in ("SIGHUP", "SIGQUIT", "SIGBREAK"):
+    for name in OTHERS:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             yield number

@@ -60,6 +60,7 @@ from holdfast.config.services import (
     NatsPingConfig,
     RestConfig,
     SubscriptionConfig,
+    SyslogConfig,
     TokenConfig,
 )
 from holdfast.net.addresses import Network
@@ -115,6 +116,7 @@ __all__ = [
     "Span",
     "StatusConfig",
     "SubscriptionConfig",
+    "SyslogConfig",
     "TlsRuleConfig",
     "TokenConfig",
     "UnitMemoryConfig",

@@ -6,6 +6,7 @@ file, so an error in one does not hide an error in the other.
 
 from __future__ import annotations
 
+import hashlib
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,8 @@ def load(path: Path | str) -> Config:
     Valid settings without effect are in `Config.warnings`.
     """
     file = str(path)
-    document, problems = source.parse(source.read_text(Path(path), file), file)
+    content = source.read_bytes(Path(path), file)
+    document, problems = source.parse(source.decoded(content, file), file)
     found = _foreign(document.data)
     if found is not None:
         message = f"found {found}, allowed: {allowed((), None)}"
@@ -52,6 +54,7 @@ def load(path: Path | str) -> Config:
         raise ConfigError(file, problems)
     doubt_grants(config, report)
     doubt_routes(config, report)
+    config.with_sha256(hashlib.sha256(content).hexdigest())
     return config.with_warnings(sorted(report.doubts, key=lambda doubt: doubt.line or 0))
 
 

@@ -125,6 +125,7 @@ class Config(Model):
     """Threads that serve connections."""
 
     _warnings: tuple[Problem, ...] = PrivateAttr(default=())
+    _sha256: str | None = PrivateAttr(default=None)
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
@@ -136,8 +137,18 @@ class Config(Model):
         self._warnings = tuple(warnings)
         return self
 
+    @property
+    def sha256(self) -> str | None:
+        """The SHA-256 of the file that this configuration was loaded from, if it was."""
+        return self._sha256
+
+    def with_sha256(self, sha256: str) -> Self:
+        """This configuration, loaded from a file with that SHA-256."""
+        self._sha256 = sha256
+        return self
+
     def __eq__(self, other: object) -> bool:
-        """Whether all settings are equal; warnings are not compared."""
+        """Whether all settings are equal; warnings and file are not compared."""
         return isinstance(other, Config) and dict(self) == dict(other)
 
     def dump(self) -> str:

@@ -40,6 +40,7 @@ from holdfast.config.scanning import (
     parse_server,
     written_pollable,
 )
+from holdfast.config.syslog import parse_syslog
 from holdfast.config.unit_keys import EXAMPLE, UnitKey, parse_unit_key
 from holdfast.config.words import choice, shape, show
 from holdfast.net.addresses import Network
@@ -113,6 +114,11 @@ def parse_sha256(value: object) -> str:
 
 def _broker_url(value: object) -> str:
     parse_broker(value)
+    return str(value)
+
+
+def _syslog_url(value: object) -> str:
+    parse_syslog(value)
     return str(value)
 
 
@@ -308,6 +314,16 @@ BrokerUrl = Annotated[
     PlainValidator(_broker_url),
     WithJsonSchema(
         {"type": "string", "examples": ["mqtt://127.0.0.1:1883", "mqtts://broker.example"]}
+    ),
+]
+SyslogUrl = Annotated[
+    str,
+    PlainValidator(_syslog_url),
+    WithJsonSchema(
+        {
+            "type": "string",
+            "examples": ["udp://10.0.0.9:514", "tcp://log.example:601", "unix:///dev/log"],
+        }
     ),
 ]
 NatsUrl = Annotated[

@@ -48,7 +48,8 @@ class ServiceChecks:
         self._gateway(mapping(data.get("gateway")))
         for name, adapter in mapping(data.get("adapters")).items():
             self.grants.grant(("adapters", name), mapping(adapter))
-        self._audit(mapping(data.get("audit")).get("file"))
+        if isinstance(data.get("audit"), dict):
+            self._audit(data["audit"])
 
     def _served(self, data: dict[Any, Any]) -> None:
         """Reports a missing server, and missing memories if a section uses them."""
@@ -148,7 +149,22 @@ class ServiceChecks:
     def _readable(self, path: KeyPath, file: object) -> None:
         check_readable(path, file, self.folder, self.report)
 
-    def _audit(self, file: object) -> None:
+    def _audit(self, audit: dict[Any, Any]) -> None:
+        if "file" in audit:
+            self._audit_file(audit["file"])
+            return
+        if "syslog" not in audit and audit.get("journald") is not True:
+            message = "missing, allowed: text (optional with syslog or journald: true)"
+            self.report.add(("audit", "file"), message)
+        if audit.get("fail") == "closed":
+            message = "found 'closed' without file, allowed: only with it"
+            self.report.add(("audit", "fail"), message)
+        for key in ("max_bytes", "keep"):
+            if key in audit:
+                message = "found without file, allowed: only with it"
+                self.report.add(("audit", key), message, of_key=True)
+
+    def _audit_file(self, file: object) -> None:
         if not isinstance(file, str) or not file or "\0" in file:
             return
         path = self.folder / file

@@ -28,6 +28,7 @@ from holdfast.config.scalars import (
     Sha256,
     Sources,
     SubjectPrefix,
+    SyslogUrl,
     TopicFilter,
     whole_number,
 )
@@ -51,6 +52,7 @@ from holdfast.config.scanning import (
     Publish,
     Writes,
 )
+from holdfast.config.syslog import Facility
 from holdfast.net.addresses import LOOPBACK
 from holdfast.net.tls import Tls
 from holdfast.types import Access
@@ -294,11 +296,27 @@ class MetricsConfig(Model):
     """Networks and addresses of the clients, IPv4 or IPv6."""
 
 
-class AuditConfig(Model):
-    """A file that records every write, one line each."""
+class SyslogConfig(Model):
+    """A syslog receiver of copies of the audit log."""
 
-    file: FilePath
-    """The file, in an existing folder."""
+    url: SyslogUrl
+    """Where to: udp://host:port, tcp://host:port or unix:///path."""
+    facility: Facility = "local0"
+    """The facility of the messages."""
+
+
+class AuditConfig(Model):
+    """A log that records every write, one line each: a file, syslog, the journal."""
+
+    file: Annotated[FilePath | None, NotNull()] = None
+    """The file, in an existing folder; optional with syslog or journald."""
+    fail: Literal["open", "closed"] = "open"
+    """Whether writes that can't be recorded in the file are carried out (open) or refused
+    (closed)."""
+    syslog: Annotated[SyslogConfig | None, NotNull()] = None
+    """A syslog receiver of copies of all lines."""
+    journald: bool = False
+    """Whether the journal of systemd receives copies of all lines."""
     max_bytes: Annotated[int, Field(ge=65536)] = 100 * 2**20
     """The size in bytes at which the file is rotated."""
     keep: Annotated[int, Field(ge=1, le=1000)] = 10

@@ -103,12 +103,23 @@ class Document:
 
 def read_text(path: Path, file: str) -> str:
     """Reads a file; messages call it `file`. Raises `ConfigError`."""
+    return decoded(read_bytes(path, file), file)
+
+
+def decoded(data: bytes, file: str) -> str:
+    """Decodes the content of a file. Raises `ConfigError`."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         message = "not UTF-8, allowed: YAML or CSV in UTF-8"
         raise ConfigError(file, [Problem(file, line, None, "", message)]) from None
+
+
+def read_bytes(path: Path, file: str) -> bytes:
+    """Reads a file without decoding it. Raises `ConfigError`."""
+    try:
+        return path.read_bytes()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         message = f"can't be read: {reason}"

@@ -10,11 +10,13 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
 from holdfast import _core, logs
+from holdfast.audit import Unrecorded
 from holdfast.protocol import EXCEPTIONS
 from holdfast.types import AREAS, BIT_AREAS
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from holdfast._core import Memory, Passage
-    from holdfast.ingest.audit import Audit
+    from holdfast.audit import Audit
 
 MAX_SHOWN = 40
 
@@ -199,35 +201,46 @@ class MemoryAccess:
         else:
             batch = [document]
         single = batch is not document
+        record = partial(self._record, batch, grant, peer) if self._audit is not None else None
         try:
             # Commands are checked one by one: native code stops at the first refused command.
             values = _core.write_across(
-                self._checked(command, grant, None if single else index)  # type: ignore[misc]
-                for index, command in enumerate(batch)
+                (
+                    self._checked(command, grant, None if single else index)  # type: ignore[misc]
+                    for index, command in enumerate(batch)
+                ),
+                record,
             )
+        except Unrecorded:
+            raise _unrecorded(batch[0] if single else None) from None
         except _core.BatchRefused as refused:
             command = batch[refused.command]
             device = self._device(command) if single and refused.reason == "mirrored" else None
             if device is None:
                 raise self._refused(command, refused, None if single else refused.command) from None
-            values = self._pass(command, device)
+            values = self._pass(command, device, grant, peer)
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
-        if self._audit is not None:
-            for command in batch:
-                self._audit.write(
-                    listener=self.name,
-                    peer=peer,
-                    source=grant.name,
-                    function="write",
-                    memory=command["memory"],
-                    area=command["area"],
-                    address=command["address"],
-                    values=[int(item) for item in _values(command)],
-                    outcome="done",
-                )
         return Written(len(batch), values, batch[0]["memory"] if single else None)
+
+    def _record(self, batch: Sequence[Mapping[str, Any]], grant: Grant, peer: str) -> None:
+        """Records commands that are about to be carried out. Raises `Unrecorded`."""
+        assert self._audit is not None
+        self._audit.write_first(self._done(command, grant, peer) for command in batch)
+
+    def _done(self, command: Mapping[str, Any], grant: Grant, peer: str) -> dict[str, object]:
+        return {
+            "listener": self.name,
+            "peer": peer,
+            "source": grant.name,
+            "function": "write",
+            "memory": command["memory"],
+            "area": command["area"],
+            "address": command["address"],
+            "values": [int(item) for item in _values(command)],
+            "outcome": "done",
+        }
 
     def _device(self, command: Mapping[str, Any]) -> str | None:
         """The device that takes a write, if its range is written through to one."""
@@ -235,16 +248,23 @@ class MemoryAccess:
         count = len(_values(command))
         return passage and passage.device_of(command["area"], command["address"], count)
 
-    def _pass(self, command: Mapping[str, Any], device: str) -> int:
+    def _pass(self, command: Mapping[str, Any], device: str, grant: Grant, peer: str) -> int:
         """Writes to a device. Returns the number of values. Raises `Refused`."""
         memory, area, address = command["memory"], command["area"], command["address"]
         where = _where(None, memory, area, address)
         values = [int(value) for value in _values(command)]
+        if self._audit is not None:
+            try:
+                self._audit.require()
+            except Unrecorded:
+                raise _unrecorded(command) from None
         try:
             code = self._passages[memory].write(area, address, values)
         except ValueError as error:
             raise Refused("out_of_range", f"{error}, in one write to {device}", **where) from None
         if code == 0:
+            if self._audit is not None:
+                self._audit.write_all([self._done(command, grant, peer)], done=True)
             return len(values)
         name = EXCEPTIONS.get(code, "unknown")
         detail = f"{device} did not take the write: exception {code:02X} ({name})"
@@ -373,6 +393,15 @@ def _where(index: int | None, memory: str, area: str, address: int) -> dict[str,
         "area": area[:MAX_SHOWN],
         "address": address if -(2**63) < address < 2**63 else _shown(address),
     }
+
+
+def _unrecorded(command: Mapping[str, Any] | None) -> Refused:
+    """A refusal of one command, or of a batch."""
+    where = {}
+    if command is not None:
+        where = _where(None, command["memory"], command["area"], command["address"])
+    detail = "the audit log can't be written, and no write is carried out without a record"
+    return Refused("unrecorded", detail, **where)
 
 
 def _malformed(index: int | None, detail: str, where: Mapping[str, Any] | None = None) -> Refused:

@@ -1,7 +1,8 @@
-//! Writes, for an audit log. Sending never blocks: when the queue is full, records are dropped and
-//! counted.
+//! Writes, for an audit log. Sending never blocks. When the queue is full, records are dropped and
+//! counted, or the writes are refused: then each write takes room for its record before it is carried
+//! out.
 
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -17,6 +18,15 @@ const CAPACITY: usize = 32 << 20;
 
 /// Bytes of a record without its data.
 const OVERHEAD: usize = 128;
+
+/// What happens to a write that can't be recorded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unrecordable {
+    /// It is carried out. Its record is missing.
+    Write,
+    /// It is refused.
+    Refuse,
+}
 
 /// A write that was carried out or refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -44,49 +54,99 @@ pub enum Written {
 /// The sending side.
 #[derive(Debug, Clone)]
 pub(crate) struct Auditor {
-    sender: Sender<Record>,
+    sender: Sender<Option<Record>>,
     shared: Arc<Shared>,
+    unrecordable: Unrecordable,
+}
+
+/// Permission to carry out a request.
+#[derive(Debug, Default)]
+pub(crate) struct Permit {
+    room: Option<Room>,
+}
+
+/// Room in the queue for one record, until this is dropped.
+#[derive(Debug)]
+struct Room {
+    shared: Arc<Shared>,
+    size: usize,
 }
 
 /// The receiving side.
 #[derive(Debug)]
 pub(crate) struct Records {
-    receiver: Mutex<Receiver<Record>>,
+    /// `None` only wakes whoever waits.
+    receiver: Mutex<Receiver<Option<Record>>>,
     /// Without listeners, nobody else can send: whoever waits must still wait.
-    _sender: Sender<Record>,
+    sender: Sender<Option<Record>>,
     shared: Arc<Shared>,
 }
 
 #[derive(Debug, Default)]
 struct Shared {
+    /// The size of the records in the queue, and of the room that is taken.
     waiting: AtomicUsize,
     lost: AtomicU64,
+    /// Whether the log can't be written at present.
+    failing: AtomicBool,
 }
 
-pub(crate) fn auditing() -> (Auditor, Records) {
+pub(crate) fn auditing(unrecordable: Unrecordable) -> (Auditor, Records) {
     let (sender, receiver) = channel();
     let shared = Arc::new(Shared::default());
     let records = Records {
         receiver: Mutex::new(receiver),
-        _sender: sender.clone(),
+        sender: sender.clone(),
         shared: Arc::clone(&shared),
     };
-    (Auditor { sender, shared }, records)
+    (Auditor { sender, shared, unrecordable }, records)
 }
 
 impl Auditor {
+    /// Permits a request to a memory. `None` if it writes and can't be recorded.
+    pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
+        match self.unrecordable {
+            Unrecordable::Refuse if is_write(request) => self.take_room(request.len()),
+            _ => Some(Permit::default()),
+        }
+    }
+
+    /// Permits a request to a device. `None` if it may write and can't be recorded.
+    pub(crate) fn permit_forwarded(&self, request: &[u8]) -> Option<Permit> {
+        match self.unrecordable {
+            Unrecordable::Refuse if !only_reads(request) => self.take_room(request.len()),
+            _ => Some(Permit::default()),
+        }
+    }
+
+    /// Permits the write of a packet. `None` if it can't be recorded.
+    pub(crate) fn permit_packet(&self, payload: &[u8]) -> Option<Permit> {
+        match self.unrecordable {
+            Unrecordable::Refuse => self.take_room(payload.len()),
+            Unrecordable::Write => Some(Permit::default()),
+        }
+    }
+
+    fn take_room(&self, len: usize) -> Option<Permit> {
+        if self.shared.failing.load(Ordering::Relaxed) {
+            return None;
+        }
+        let room = Room { shared: Arc::clone(&self.shared), size: OVERHEAD + len };
+        let waiting = self.shared.waiting.fetch_add(room.size, Ordering::Relaxed);
+        (waiting <= CAPACITY).then_some(Permit { room: Some(room) })
+    }
+
     /// Records a Modbus request if it writes. `reply` is its reply; empty when there is none.
     pub(crate) fn note(
         &self,
         listener: &Arc<str>,
         peer: Option<&Peer>,
         unit_id: u8,
-        request: &[u8],
-        reply: &[u8],
+        (request, reply): (&[u8], &[u8]),
+        permit: Option<Permit>,
     ) {
-        let function = request.first().copied().and_then(Function::from_code);
-        if function.is_some_and(Function::is_write) {
-            self.send(record(listener, peer, unit_id, request, reply, None));
+        if is_write(request) {
+            self.send(record(listener, peer, unit_id, request, reply, None), permit);
         }
     }
 
@@ -98,21 +158,40 @@ impl Auditor {
         peer: Option<&Peer>,
         unit_id: u8,
         (route, request, reply): (Option<&Arc<str>>, &[u8], &[u8]),
+        permit: Option<Permit>,
     ) {
         if !only_reads(request) {
-            self.send(record(listener, peer, unit_id, request, reply, route.cloned()));
+            self.send(record(listener, peer, unit_id, request, reply, route.cloned()), permit);
         }
     }
 
-    pub(crate) fn send(&self, record: Record) {
+    /// Queues a record, in the room that the permit has taken, if it has.
+    pub(crate) fn send(&self, record: Record, permit: Option<Permit>) {
         let size = record.size();
-        if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > CAPACITY
-            || self.sender.send(record).is_err()
-        {
+        if let Some(mut room) = permit.and_then(|permit| permit.room) {
+            debug_assert_eq!(room.size, size);
+            // Who takes the record releases its room.
+            room.size = 0;
+        } else if self.shared.waiting.fetch_add(size, Ordering::Relaxed) > CAPACITY {
+            self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
+            self.shared.lost.fetch_add(1, Ordering::Relaxed);
+            return;
+        }
+        if self.sender.send(Some(record)).is_err() {
             self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
         }
     }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.shared.waiting.fetch_sub(self.size, Ordering::Relaxed);
+    }
+}
+
+fn is_write(request: &[u8]) -> bool {
+    request.first().copied().and_then(Function::from_code).is_some_and(Function::is_write)
 }
 
 fn record(
@@ -147,10 +226,22 @@ impl Records {
         let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
         let first = receiver.recv_timeout(timeout).ok();
         let records: Vec<Record> =
-            first.into_iter().chain(receiver.try_iter()).take(most).collect();
+            first.into_iter().chain(receiver.try_iter()).flatten().take(most).collect();
         let size = records.iter().map(Record::size).sum();
         self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
         records
+    }
+
+    /// Ends the wait of whoever takes records.
+    pub(crate) fn wake(&self) {
+        let _ = self.sender.send(None);
+    }
+
+    /// Whether the log can't be written, so that writes which must be recorded are refused. Wakes
+    /// whoever takes records: it has to try again.
+    pub(crate) fn set_failing(&self, failing: bool) {
+        self.shared.failing.store(failing, Ordering::Relaxed);
+        self.wake();
     }
 
     /// The number of dropped records.
@@ -165,9 +256,78 @@ mod tests {
 
     use super::*;
 
+    const WRITE: &[u8] = &[6, 0, 1, 0, 7];
+    const READ: &[u8] = &[3, 0, 1, 0, 1];
+
+    fn send(auditor: &Auditor, permit: Option<Permit>) {
+        auditor.note(&"scada".into(), None, 1, (WRITE, WRITE), permit);
+    }
+
+    #[test]
+    fn a_write_that_must_be_recorded_takes_room_before_it_is_carried_out() {
+        let (auditor, records) = auditing(Unrecordable::Refuse);
+        let most = CAPACITY / (OVERHEAD + WRITE.len()) + 1;
+        let permits: Vec<Permit> = (0..most).map_while(|_| auditor.permit(WRITE)).collect();
+        assert_eq!(permits.len(), most);
+        assert!(auditor.permit(WRITE).is_none());
+        assert!(auditor.permit_forwarded(WRITE).is_none());
+        assert!(auditor.permit_packet(&[0, 1]).is_none());
+        assert!(auditor.permit(READ).is_some() && auditor.permit_forwarded(READ).is_some());
+        for permit in permits {
+            send(&auditor, Some(permit));
+        }
+        assert_eq!((records.take(Duration::ZERO, usize::MAX).len(), records.lost()), (most, 0));
+        assert!(auditor.permit(WRITE).is_some());
+    }
+
+    #[test]
+    fn room_that_is_not_used_is_released() {
+        let (auditor, records) = auditing(Unrecordable::Refuse);
+        let taken = |_| auditor.permit(WRITE).is_some();
+        assert!((0..2 * CAPACITY / OVERHEAD).all(taken));
+        assert_eq!(records.shared.waiting.load(Ordering::Relaxed), 0);
+    }
+
+    #[test]
+    fn without_room_that_was_taken_records_are_dropped_and_counted() {
+        for unrecordable in [Unrecordable::Write, Unrecordable::Refuse] {
+            let (auditor, records) = auditing(unrecordable);
+            let most = CAPACITY / (OVERHEAD + WRITE.len()) + 1;
+            for _ in 0..most + 5 {
+                send(&auditor, None);
+            }
+            assert_eq!(records.lost(), 5);
+            assert_eq!(auditor.permit(WRITE).is_some(), unrecordable == Unrecordable::Write);
+            assert_eq!(records.take(Duration::ZERO, usize::MAX).len(), most);
+            assert!(auditor.permit(WRITE).is_some());
+        }
+    }
+
+    #[test]
+    fn while_the_log_fails_only_writes_that_must_be_recorded_are_refused() {
+        for (unrecordable, refused) in [(Unrecordable::Write, false), (Unrecordable::Refuse, true)]
+        {
+            let (auditor, records) = auditing(unrecordable);
+            for failing in [true, false] {
+                records.set_failing(failing);
+                assert_eq!(auditor.permit(WRITE).is_none(), refused && failing);
+                assert!(auditor.permit(READ).is_some());
+            }
+        }
+    }
+
+    #[test]
+    fn whoever_waits_for_writes_can_be_woken() {
+        let (_auditor, records) = auditing(Unrecordable::Write);
+        records.wake();
+        assert_eq!(records.take(Duration::MAX, 10), []);
+        records.set_failing(true);
+        assert_eq!(records.take(Duration::MAX, 10), []);
+    }
+
     #[test]
     fn whoever_waits_for_writes_waits_even_if_there_are_no_listeners() {
-        let (auditor, records) = auditing();
+        let (auditor, records) = auditing(Unrecordable::Write);
         drop(auditor);
         let (began, timeout) = (Instant::now(), Duration::from_millis(20));
         assert_eq!(records.take(timeout, 10), []);

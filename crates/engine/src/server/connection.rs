@@ -406,7 +406,7 @@ impl<F: Framing> Answering<F> {
                     let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
                     if place.is_some() || self.deferred.is_some() {
                         let deferred = self.deferred.get_or_insert_default();
-                        let ours = (&*self.unit_server, &*self.rights);
+                        let ours = (&*self.unit_server, &*self.rights, &*self.context);
                         let request = (tag, unit_id, pdu);
                         match deferred.defer(ours, place, self.peer.ip(), request) {
                             Deferral::Later => {
@@ -477,11 +477,11 @@ impl<F: Framing> Answering<F> {
         let deferred = self.deferred.as_mut()?;
         let mut len = None;
         while let Poll::Ready(completed) = deferred.poll_next(&self.unit_server, context) {
-            let Completed { tag, unit_id, route, request, reply } = completed;
+            let Completed { tag, unit_id, route, request, reply, permit } = completed;
             if let Some(auditor) = &self.context.auditor {
                 let (name, passed) =
                     (&self.context.name, (route.as_ref(), &request[..], &reply[..]));
-                auditor.note_forwarded(name, Some(&self.peer), unit_id, passed);
+                auditor.note_forwarded(name, Some(&self.peer), unit_id, passed, permit);
             }
             let at = len.get_or_insert(0);
             let frame = &mut output[*at..];
@@ -504,9 +504,9 @@ impl<F: Framing> Answering<F> {
             for waiting in given_up {
                 let completed = waiting.complete(&unit_server).await;
                 if let (Some(completed), Some(auditor)) = (completed, &context.auditor) {
-                    let Completed { unit_id, route, request, reply, .. } = completed;
+                    let Completed { unit_id, route, request, reply, permit, .. } = completed;
                     let passed = (route.as_ref(), &request[..], &reply[..]);
-                    auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed);
+                    auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed, permit);
                 }
             }
             // The engine waits for this until all receivers are dropped.
@@ -529,10 +529,12 @@ impl<F: Framing> Answering<F> {
         if self.unit_server.refuses_silence(request) {
             self.context.refuse_listen_only(self.peer.clone());
         }
-        let len = self.unit_server.answer(&self.rights, unit_id, request, buffer);
+        let permit = self.context.permit(request);
+        let permitted = permit.is_some();
+        let len = self.unit_server.answer(&self.rights, unit_id, request, permitted, buffer);
         if let Some(auditor) = &self.context.auditor {
-            let reply = &buffer[..len.unwrap_or_default()];
-            auditor.note(&self.context.name, Some(&self.peer), unit_id, request, reply);
+            let asked = (request, &buffer[..len.unwrap_or_default()]);
+            auditor.note(&self.context.name, Some(&self.peer), unit_id, asked, permit);
         }
         len.map_or(0, |len| F::complete(output, tag, unit_id, len))
     }

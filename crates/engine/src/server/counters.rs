@@ -42,7 +42,7 @@ pub struct PacketCounters {
     pub values: Counter,
     /// Bytes behind accepted packets that were dropped.
     pub dropped_bytes: Counter,
-    refused: [Counter; 13],
+    refused: [Counter; 14],
 }
 
 impl PacketCounters {

@@ -12,6 +12,8 @@ use std::task::{Context, Poll};
 
 use holdfast_protocol::pdu::ExceptionCode;
 
+use super::audit::Permit;
+use super::listener::ListenerContext;
 use super::policy::{Elsewhere, PeerRights};
 use super::unit_server::UnitServer;
 use crate::link::{Asker, Coming, exception, source};
@@ -33,6 +35,7 @@ pub(super) struct Waiting {
     route: Option<Arc<str>>,
     request: Vec<u8>,
     reply: Expected,
+    permit: Option<Permit>,
 }
 
 enum Expected {
@@ -49,6 +52,7 @@ pub(super) struct Completed {
     pub(super) request: Vec<u8>,
     /// A PDU; empty when there is no reply.
     pub(super) reply: Vec<u8>,
+    pub(super) permit: Option<Permit>,
 }
 
 /// What becomes of a request.
@@ -80,7 +84,7 @@ impl Deferred {
     /// Sends a request on its way, if its unit is elsewhere and there is room.
     pub(super) fn defer(
         &mut self,
-        (unit_server, rights): (&UnitServer, &PeerRights),
+        (unit_server, rights, context): (&UnitServer, &PeerRights, &ListenerContext),
         place: Option<&Elsewhere>,
         peer: IpAddr,
         (tag, unit_id, request): (u16, u8, &[u8]),
@@ -92,12 +96,15 @@ impl Deferred {
             _ => return Deferral::Wait,
         };
         let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
-        let (route, reply) = match unit_server.forward(rights, place, &asker, unit_id, request) {
+        let permit = context.permit_forwarded(request);
+        let permitted = permit.is_some();
+        let sent = unit_server.forward(rights, place, &asker, unit_id, request, permitted);
+        let (route, reply) = match sent {
             Ok((route, coming)) => (Some(route), Expected::Coming(coming)),
             Err(code) => (None, Expected::Known(exception(request, code.code()))),
         };
         let request = request.to_vec();
-        self.waiting.push_back(Waiting { tag, unit_id, route, request, reply });
+        self.waiting.push_back(Waiting { tag, unit_id, route, request, reply, permit });
         Deferral::Later
     }
 
@@ -136,24 +143,25 @@ impl Deferred {
             let Poll::Ready(reply) = Pin::new(coming).poll(context) else { return Poll::Pending };
             first.reply = Expected::Known(come(unit_server, &first.request, reply.ok()));
         }
-        let Some(Waiting { tag, unit_id, route, request, reply: Expected::Known(reply) }) =
+        let Some(Waiting { tag, unit_id, route, request, reply, permit }) =
             self.waiting.pop_front()
         else {
-            unreachable!("the first reply is known")
+            unreachable!("there is a first request")
         };
-        Poll::Ready(Completed { tag, unit_id, route, request, reply })
+        let Expected::Known(reply) = reply else { unreachable!("its reply is known") };
+        Poll::Ready(Completed { tag, unit_id, route, request, reply, permit })
     }
 }
 
 impl Waiting {
     /// Waits for the reply. `None` if the request was not sent.
     pub(super) async fn complete(self, unit_server: &UnitServer) -> Option<Completed> {
-        let Waiting { tag, unit_id, route, request, reply } = self;
+        let Waiting { tag, unit_id, route, request, reply, permit } = self;
         let reply = match reply {
             Expected::Coming(coming) => come(unit_server, &request, Some(coming.await.ok()?)),
             Expected::Known(reply) => reply,
         };
-        Some(Completed { tag, unit_id, route, request, reply })
+        Some(Completed { tag, unit_id, route, request, reply, permit })
     }
 }
 

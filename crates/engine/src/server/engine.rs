@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use super::admission::{ConnectionLimits, Session};
-use super::audit::{Auditor, Record, Records, auditing};
+use super::audit::{Auditor, Record, Records, Unrecordable, auditing};
 use super::counters::{ConnectionCounters, PacketCounters};
 use super::event::{Event, Events, Kind, Reporter, Verbosity, channel as event_channel};
 use super::identity::Identity;
@@ -39,8 +39,8 @@ pub struct Settings {
     /// The number of threads that serve connections, at least 1.
     pub workers: usize,
     pub events: Verbosity,
-    /// Whether writes are recorded for an audit log.
-    pub audit: bool,
+    /// Whether writes are recorded for an audit log, and what happens to those that can't be.
+    pub audit: Option<Unrecordable>,
 }
 
 #[derive(Debug, Clone)]
@@ -152,7 +152,7 @@ impl Engine {
     /// [`StartError`]. Nothing is left running then.
     pub fn start(settings: Settings) -> Result<Engine, StartError> {
         let (reporter, events) = event_channel(settings.events);
-        let (auditor, records) = settings.audit.then(auditing).unzip();
+        let (auditor, records) = settings.audit.map(auditing).unzip();
         let (stop, stopping) = watch::channel(false);
         let runtimes: Vec<Runtime> = (0..settings.workers.max(1))
             .map(|_| Builder::new_current_thread().enable_io().enable_time().build())
@@ -361,6 +361,14 @@ impl Engine {
         self.records.as_ref().map_or_else(Vec::new, |records| records.take(timeout, most))
     }
 
+    /// Whether the audit log can't be written, so that writes which must be recorded are refused.
+    /// Ends a wait for writes.
+    pub fn set_audit_failing(&self, failing: bool) {
+        if let Some(records) = &self.records {
+            records.set_failing(failing);
+        }
+    }
+
     /// The number of writes that were dropped because the audit queue was full.
     pub fn lost_writes(&self) -> u64 {
         self.records.as_ref().map_or(0, Records::lost)
@@ -377,12 +385,15 @@ impl Engine {
     }
 
     /// Stops listening, answers what has been received, and closes every connection. Returns within
-    /// a second. A second call waits for the first.
+    /// a second. A second call waits for the first. Ends a wait for writes.
     pub fn stop(&self) {
         let _ = self.stop.send(true);
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         for worker in workers.drain(..) {
             let _ = worker.join();
+        }
+        if let Some(records) = &self.records {
+            records.wake();
         }
     }
 }

@@ -14,7 +14,7 @@ use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
 use super::admission::{Admission, ConnectionLimits, Full, Ticket, attach};
-use super::audit::Auditor;
+use super::audit::{Auditor, Permit};
 use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
 use super::live::Live;
@@ -64,6 +64,27 @@ impl ListenerContext {
     pub(crate) fn for_tests() -> ListenerContext {
         let (reporter, _) = super::event::channel(super::event::Verbosity::Nothing);
         ListenerContext::new("test", None, reporter, None)
+    }
+
+    /// Permits a request to a memory. `None` if it can't be recorded, although it must.
+    #[inline]
+    pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
+        self.permitted(|auditor| auditor.permit(request))
+    }
+
+    /// As `permit`, for a request to a device.
+    pub(crate) fn permit_forwarded(&self, request: &[u8]) -> Option<Permit> {
+        self.permitted(|auditor| auditor.permit_forwarded(request))
+    }
+
+    /// As `permit`, for the write of a packet.
+    pub(crate) fn permit_packet(&self, payload: &[u8]) -> Option<Permit> {
+        self.permitted(|auditor| auditor.permit_packet(payload))
+    }
+
+    #[inline]
+    fn permitted(&self, ask: impl FnOnce(&Auditor) -> Option<Permit>) -> Option<Permit> {
+        self.auditor.as_ref().map_or_else(|| Some(Permit::default()), ask)
     }
 
     pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {

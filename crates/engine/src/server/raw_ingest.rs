@@ -23,7 +23,7 @@ use tokio::time::{Instant, timeout_at};
 use crate::packet_area::of_packet;
 
 use super::admission::{ConnectionLimits, Ticket};
-use super::audit::{Record, Written};
+use super::audit::{Permit, Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
 use super::listener::{Admitted, ListenerContext, Service, drain};
@@ -266,10 +266,11 @@ impl RawIngest {
             count: usize::from(count),
             bytes: payload,
         };
+        let permit = context.permit_packet(payload).ok_or(Refusal::Unrecorded)?;
         memory.write(Access::Ingest, write).map_err(|_| Refusal::Range)?;
         self.packets.accepted.add();
         self.packets.values.add_many(u64::from(count));
-        self.audit(context, peer, Some(header), payload, None);
+        self.audit(context, peer, (Some(header), payload), Ok(permit));
         Ok(())
     }
 
@@ -488,7 +489,11 @@ impl RawIngest {
             Ok(()) => Ok(Some((len, DONE))),
             // The packet ends where its header says, so the next one can be found.
             Err(
-                refusal @ (Refusal::Unit | Refusal::Memory | Refusal::NotGranted | Refusal::Range),
+                refusal @ (Refusal::Unit
+                | Refusal::Memory
+                | Refusal::NotGranted
+                | Refusal::Range
+                | Refusal::Unrecorded),
             ) if continues => {
                 self.refuse(context, peer, packet, refusal);
                 Ok(Some((len, REFUSED)))
@@ -522,22 +527,22 @@ impl RawIngest {
         self.packets.refuse(refusal);
         context.report(Kind::PacketRefused(refusal), Some(peer.into()));
         let header = self.header(packet).ok().flatten();
-        self.audit(context, peer, header, &[], Some(refusal));
+        self.audit(context, peer, (header, &[]), Err(refusal));
     }
 
     fn audit(
         &self,
         context: &ListenerContext,
         peer: SocketAddr,
-        header: Option<Header>,
-        payload: &[u8],
-        refused: Option<Refusal>,
+        (header, payload): (Option<Header>, &[u8]),
+        outcome: Result<Permit, Refusal>,
     ) {
         if let Some(auditor) = &context.auditor {
-            let (format, payload) = (self.format, payload.to_vec());
-            let write = Written::Packet { format, header, payload, refused };
+            let (format, payload, refused) =
+                (self.format, payload.to_vec(), outcome.as_ref().err());
+            let write = Written::Packet { format, header, payload, refused: refused.copied() };
             let (listener, peer) = (Arc::clone(&context.name), Some(peer.into()));
-            auditor.send(Record { listener, peer, write });
+            auditor.send(Record { listener, peer, write }, outcome.ok());
         }
     }
 }

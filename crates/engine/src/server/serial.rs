@@ -237,7 +237,10 @@ impl ModbusSerial {
         let rights = self.rights.get();
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = Asker { source: self.source, peer: None, waiting: 0 };
-            let sent = self.unit_server.forward(&rights, place, &asker, unit_id, request);
+            let permit = context.permit_forwarded(request);
+            let permitted = permit.is_some();
+            let sent =
+                self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted);
             let (route, answered) = match sent {
                 Ok((route, coming)) => {
                     (Some(route), come(&self.unit_server, request, coming.await.ok()))
@@ -246,7 +249,7 @@ impl ModbusSerial {
             };
             if let Some(auditor) = &context.auditor {
                 let passed = (route.as_ref(), request, &answered[..]);
-                auditor.note_forwarded(&context.name, None, unit_id, passed);
+                auditor.note_forwarded(&context.name, None, unit_id, passed, permit);
             }
             reply[..answered.len()].copy_from_slice(&answered);
             return (!answered.is_empty()).then_some(answered.len());
@@ -255,10 +258,12 @@ impl ModbusSerial {
             self.unit_server.counters.frames.other_unit.add();
             return None;
         }
-        let len = self.unit_server.answer(&rights, unit_id, request, reply);
+        let permit = context.permit(request);
+        let permitted = permit.is_some();
+        let len = self.unit_server.answer(&rights, unit_id, request, permitted, reply);
         if let Some(auditor) = &context.auditor {
-            let reply = &reply[..len.unwrap_or_default()];
-            auditor.note(&context.name, None, unit_id, request, reply);
+            let asked = (request, &reply[..len.unwrap_or_default()]);
+            auditor.note(&context.name, None, unit_id, asked, permit);
         }
         len
     }
@@ -272,9 +277,10 @@ impl ModbusSerial {
             self.unit_server.counters.frames.other_unit.add();
             return;
         }
-        self.unit_server.broadcast(&self.rights.get(), request, |reply| {
+        let permit = || context.permit(request);
+        self.unit_server.broadcast(&self.rights.get(), request, permit, |reply, permit| {
             if let Some(auditor) = &context.auditor {
-                auditor.note(&context.name, None, BROADCAST, request, reply);
+                auditor.note(&context.name, None, BROADCAST, (request, reply), permit);
             }
         });
     }

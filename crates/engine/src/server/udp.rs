@@ -14,6 +14,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
+use super::audit::Permit;
 use super::deferred::come;
 use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
@@ -155,12 +156,13 @@ impl ModbusUdp {
         &self,
         context: &ListenerContext,
         socket: &Datagrams,
-        Completed { tag, unit_id, meta, route, request, reply }: Completed,
+        Completed { tag, unit_id, meta, route, request, reply, permit }: Completed,
     ) {
         let reply = come(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
             let passed = (Some(&route), &request[..], &reply[..]);
-            auditor.note_forwarded(&context.name, Some(&meta.addr.into()), unit_id, passed);
+            let peer = meta.addr.into();
+            auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed, permit);
         }
         if !reply.is_empty() {
             let mut frame = [0; MAX_FRAME_LEN];
@@ -206,8 +208,10 @@ impl ModbusUdp {
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let waiting = later.replies.len();
             let asker = Asker { source: later.source, peer: Some(peer.ip()), waiting };
+            let permit = context.permit_forwarded(request);
+            let permitted = permit.is_some();
             let coming = if waiting < MAX_LATER {
-                self.unit_server.forward(&rights, place, &asker, unit_id, request)
+                self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             } else {
                 Err(ExceptionCode::ServerDeviceBusy)
             };
@@ -216,7 +220,7 @@ impl ModbusUdp {
                     let (meta, request) = (*meta, request.to_vec());
                     later.replies.spawn(async move {
                         let reply = coming.await.ok();
-                        Completed { tag, unit_id, meta, route, request, reply }
+                        Completed { tag, unit_id, meta, route, request, reply, permit }
                     });
                     0
                 }
@@ -225,7 +229,14 @@ impl ModbusUdp {
                     let len = reply::exception(function_code, code, buffer);
                     if let Some(auditor) = &context.auditor {
                         let refused = (None, request, &buffer[..len]);
-                        auditor.note_forwarded(&context.name, Some(&peer.into()), unit_id, refused);
+                        let peer = peer.into();
+                        auditor.note_forwarded(
+                            &context.name,
+                            Some(&peer),
+                            unit_id,
+                            refused,
+                            permit,
+                        );
                     }
                     D::complete(output, tag, unit_id, len)
                 }
@@ -234,10 +245,12 @@ impl ModbusUdp {
         if self.unit_server.refuses_silence(request) {
             context.refuse_listen_only(peer);
         }
-        let len = self.unit_server.answer(&rights, unit_id, request, buffer);
+        let permit = context.permit(request);
+        let permitted = permit.is_some();
+        let len = self.unit_server.answer(&rights, unit_id, request, permitted, buffer);
         if let Some(auditor) = &context.auditor {
-            let reply = &buffer[..len.unwrap_or_default()];
-            auditor.note(&context.name, Some(&peer.into()), unit_id, request, reply);
+            let asked = (request, &buffer[..len.unwrap_or_default()]);
+            auditor.note(&context.name, Some(&peer.into()), unit_id, asked, permit);
         }
         len.map_or(0, |len| D::complete(output, tag, unit_id, len))
     }
@@ -257,6 +270,7 @@ struct Completed {
     route: Arc<str>,
     request: Vec<u8>,
     reply: Option<Vec<u8>>,
+    permit: Option<Permit>,
 }
 
 /// A socket that reports the local address of each datagram.

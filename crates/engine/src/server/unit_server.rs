@@ -2,8 +2,8 @@
 //! transport.
 //!
 //! The checks run in this order: the function is known and allowed (exception 01), the unit is
-//! mapped (0B), form, quantity and value are right (03), the memory is not sealed (06), the range
-//! is inside its area (02). A denied function is refused before the unit is looked up, so that a
+//! mapped (0B), form, quantity and value are right (03), a write can be recorded (04), the memory is
+//! not sealed (06), the range is inside its area (02). A denied function is refused before the unit is looked up, so that a
 //! peer without rights cannot discover units. A unit in listen only mode never answers.
 
 use std::sync::Arc;
@@ -54,18 +54,19 @@ impl UnitServer {
     }
 
     /// Carries out a request and writes the reply. Returns its length, or `None` when there is no
-    /// reply.
+    /// reply. A request that is not `permitted` could not be recorded, and is refused.
     #[inline]
     pub fn answer(
         &self,
         rights: &PeerRights,
         unit_id: u8,
         request: &[u8],
+        permitted: bool,
         reply: &mut Buffer,
     ) -> Option<usize> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
-        match self.serve(rights, unit_id, function_code, request, reply) {
+        match self.serve(rights, unit_id, (function_code, request), permitted, reply) {
             Ok(Some(len)) => {
                 if function_code != Function::GetCommEventCounter.code() {
                     self.counters.events.add();
@@ -116,6 +117,7 @@ impl UnitServer {
         asker: &Asker,
         unit_id: u8,
         request: &[u8],
+        permitted: bool,
     ) -> Result<(Arc<str>, Coming), ExceptionCode> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
@@ -124,11 +126,12 @@ impl UnitServer {
             Elsewhere::Device(_) if rights.denies(unit_id, request) => {
                 Err(ExceptionCode::IllegalFunction)
             }
-            Elsewhere::Device(route) => {
-                route.ask(asker, unit_id, request).map(|coming| (Arc::clone(&route.name), coming))
-            }
+            _ if !permitted => Err(ExceptionCode::ServerDeviceFailure),
             Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
                 Err(out_of_ranges(&passage.memory))
+            }
+            Elsewhere::Device(route) => {
+                route.ask(asker, unit_id, request).map(|coming| (Arc::clone(&route.name), coming))
             }
             Elsewhere::Mirror(passage) => passage.ask(request),
         };
@@ -152,9 +155,15 @@ impl UnitServer {
     }
 
     /// Carries out a broadcast write (Serial Line V1.02, 2.1). It counts as one message without a
-    /// reply, even if several memories carry it out. `note` receives the reply that each would have
-    /// sent.
-    pub fn broadcast(&self, rights: &PeerRights, request: &[u8], mut note: impl FnMut(&[u8])) {
+    /// reply, even if several memories carry it out. `permit` is asked before each, and `note` receives
+    /// the permit and the reply that each would have sent.
+    pub fn broadcast<P>(
+        &self,
+        rights: &PeerRights,
+        request: &[u8],
+        mut permit: impl FnMut() -> Option<P>,
+        mut note: impl FnMut(&[u8], Option<P>),
+    ) {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         self.counters.unanswered.add();
@@ -162,8 +171,9 @@ impl UnitServer {
         let may =
             |unit_id| rights.allows(unit_id, function_code) && !outside(rights, unit_id, request);
         for unit_id in rights.one_unit_of_each_memory(|unit_id| !self.is_silent(unit_id), may) {
-            let mut reply = [0; pdu::MAX_LEN];
-            let len = match self.serve(rights, unit_id, function_code, request, &mut reply) {
+            let (permit, mut reply) = (permit(), [0; pdu::MAX_LEN]);
+            let (asked, permitted) = ((function_code, request), permit.is_some());
+            let len = match self.serve(rights, unit_id, asked, permitted, &mut reply) {
                 Ok(len) => {
                     carried_out = true;
                     len.unwrap_or_default()
@@ -173,7 +183,7 @@ impl UnitServer {
                     reply::exception(function_code, code, &mut reply)
                 }
             };
-            note(&reply[..len]);
+            note(&reply[..len], permit);
         }
         match refused {
             Some(code) => self.counters.exception(code),
@@ -192,8 +202,8 @@ impl UnitServer {
         &self,
         rights: &PeerRights,
         unit_id: u8,
-        function_code: u8,
-        pdu: &[u8],
+        (function_code, pdu): (u8, &[u8]),
+        permitted: bool,
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
@@ -212,6 +222,9 @@ impl UnitServer {
         }
         let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
         let request = request?;
+        if !permitted {
+            return Err(ExceptionCode::ServerDeviceFailure);
+        }
         if rights.ranges(unit_id).is_some_and(|ranges| !ranges.allow(&request)) {
             return Err(out_of_ranges(memory));
         }

@@ -60,6 +60,12 @@ REFUSALS = Refusals(
         "drive_7 did not take the write: exception 02 (Illegal Data Address)",
     ),
     Refusal(
+        503,
+        ("unrecorded",),
+        "The audit log can't be written, and no write is carried out without a record",
+        "the audit log can't be written, and no write is carried out without a record",
+    ),
+    Refusal(
         415,
         ("not_json",),
         "The body is not `application/json`, or is compressed",
@@ -73,4 +79,4 @@ QUERY = ("malformed",)
 MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 """Refusals of a range by the memory access."""
 
-VALUES = ("invalid_value", "mirrored", "device_refused")
+VALUES = ("invalid_value", "mirrored", "device_refused", "unrecorded")

@@ -134,7 +134,30 @@ DIAGNOSTICS: dict[str, Schema] = {
             "log_dropped": COUNTER,
             "audit": {
                 "type": ["object", "null"],
-                "description": "Lines written, and lines that failed",
+                "required": ["lines", "failed", "waiting", "failing", "copies"],
+                "properties": {
+                    "lines": COUNTER | {"description": "Lines written"},
+                    "failed": COUNTER | {"description": "Lines that are missing in the file"},
+                    "waiting": COUNTER | {"description": "With fail: closed, lines that wait"},
+                    "failing": {
+                        "type": "boolean",
+                        "description": "Whether the file could not be written last time",
+                    },
+                    "copies": {
+                        "type": "object",
+                        "description": "By name of the receiver: syslog, journald",
+                        "additionalProperties": {
+                            "type": "object",
+                            "required": ["sent", "failed", "dropped", "waiting"],
+                            "properties": {
+                                "sent": COUNTER,
+                                "failed": COUNTER | {"description": "Failed attempts"},
+                                "dropped": COUNTER,
+                                "waiting": COUNTER,
+                            },
+                        },
+                    },
+                },
             },
         }
     ),

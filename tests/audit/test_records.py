@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import errno
-import json
-import os
 import socket
-import stat
+import threading
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+import holdfast
+from holdfast import _core
+from holdfast.appliance import auditing
+from holdfast.audit import Audit, verify
 from holdfast.ingest import Grant, MemoryAccess, Refused
-from holdfast.ingest.audit import Audit
 from support import wire
+from support.audits import await_writes, lines, writes
 from support.running import endpoint
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from holdfast.appliance import Appliance
     from support.running import Connect, Run
 
 CONFIGURATION = """
@@ -44,16 +45,10 @@ audit: {file: audit.log}
 """
 
 
-def lines(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "audit.log").read_text().splitlines()]
-
-
-def audited(appliance: Appliance, folder: Path, count: int) -> list[dict[str, Any]]:
+def audited(folder: Path, count: int) -> list[dict[str, Any]]:
     """The first lines, without what changes from run to run."""
-    wire.until(lambda: appliance.diagnostics.stats()["audit"]["lines"] >= count, "all are audited")
-    found = lines(folder)
+    found = await_writes(folder / "audit.log", count)
     for line in found:
-        assert line.pop("time").endswith("Z")
         assert line.pop("peer").startswith("127.0.0.1:")
     return found
 
@@ -80,7 +75,7 @@ def test_modbus_writes_are_audited_with_their_values(
     scada = {"listener": "scada", "unit": 1}
     registers, coils = {"area": "holding_registers"}, {"area": "coils"}
     done = {"outcome": "done"}
-    assert audited(appliance, tmp_path, 10) == [
+    assert audited(tmp_path, 10) == [
         {**scada, "function": 6, **registers, "address": 1, "values": [500], **done},
         {**scada, "function": 5, **coils, "address": 3, "values": [0], **done},
         {**scada, "function": 5, **coils, "address": 3, "values": [1], **done},
@@ -142,7 +137,7 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
             sender.recv(1)
     raw = {"listener": "raw", "function": "raw-ingest"}
     registers = {"memory_id": 3, "area": "holding_registers"}
-    assert audited(appliance, tmp_path, 5) == [
+    assert audited(tmp_path, 5) == [
         {
             "listener": "datagrams",
             "unit": 1,
@@ -174,15 +169,69 @@ def test_what_comes_by_a_door_is_audited_before_it_is_answered(run: Run, tmp_pat
     grant = Grant("gateway", ("plant",), ("coils",))
     good = {"memory": "plant", "area": "coils", "address": 1, "bools": [True, 0]}
     memory_access.write([good], grant, "127.0.0.1:9")
-    assert len(lines(tmp_path)) == 1
+    assert len(writes(tmp_path / "audit.log")) == 1
     with pytest.raises(Refused):
         memory_access.write([good, good | {"bools": [2]}], grant, "127.0.0.1:9")
     rest = {"listener": "rest", "source": "gateway", "function": "write"}
     place = {"memory": "plant", "area": "coils", "address": 1}
-    assert audited(appliance, tmp_path, 2) == [
+    assert audited(tmp_path, 2) == [
         {**rest, **place, "values": [1, 0], "outcome": "done"},
         {**rest, **place, "index": 0, "value": "2", "command": 1, "outcome": "invalid_value"},
     ]
+
+
+def test_a_record_is_written_without_waiting_for_a_timeout(
+    run: Run, connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither does the stop. The thread waits longer than the test unless it is woken."""
+    monkeypatch.setattr(auditing, "PATIENCE", 2 * wire.DEADLINE)
+    appliance = run(CONFIGURATION)
+    client = connect(endpoint(appliance, "scada"))
+    for count in range(1, 4):
+        client.ask(bytes.fromhex("06000101f4"))
+        assert len(await_writes(tmp_path / "audit.log", count)) == count
+    stopping = threading.Thread(target=appliance.stop)
+    stopping.start()
+    wire.until(lambda: not stopping.is_alive(), "it has stopped")
+
+
+def test_the_thread_ends_although_the_engine_has_stopped_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(auditing, "PATIENCE", 2 * wire.DEADLINE)
+    engine = _core.Engine([], identity=[(0, "a"), (1, "b"), (2, "c")], audit="open")
+    engine.stop()
+    assert engine.next_writes(0, 1) == []
+    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
+    recorder = auditing.WriteRecorder(audit, engine)
+    assert engine.next_writes(0, 1) == []
+    recorder.start()
+    finishing = threading.Thread(target=recorder.finish)
+    finishing.start()
+    wire.until(lambda: not finishing.is_alive(), "it has finished")
+    audit.close()
+
+
+def test_start_and_stop_are_recorded_with_the_digest_of_the_configuration(
+    run: Run, tmp_path: Path
+) -> None:
+    appliance = run(CONFIGURATION)
+    appliance.stop()
+    events = [line for line in lines(tmp_path / "audit.log") if line["event"] != "chain"]
+    digests = {sha256(file.read_bytes()).hexdigest() for file in tmp_path.glob("*.yaml")}
+    assert [line["event"] for line in events] == ["start", "stop"]
+    assert {line["config_sha256"] for line in events} == digests
+    assert {line["version"] for line in events} == {holdfast.__version__}
+    assert verify([tmp_path / "audit.log"]).gaps is False
+
+
+def test_a_start_that_fails_is_recorded_with_its_stop(run: Run, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match="scada"):
+            run(CONFIGURATION.replace("bind: 127.0.0.1:0", f"bind: 127.0.0.1:{port}", 1))
+    events = [line["event"] for line in lines(tmp_path / "audit.log")]
+    assert events == ["chain", "start", "stop"]
 
 
 def test_writes_that_were_under_way_at_the_stop_are_audited(
@@ -192,68 +241,4 @@ def test_writes_that_were_under_way_at_the_stop_are_audited(
     client = connect(endpoint(appliance, "scada"))
     client.ask_many([bytes.fromhex("06000101f4")] * 5000)
     appliance.stop()
-    assert len(lines(tmp_path)) == 5000
-
-
-def test_an_old_file_is_put_aside_and_none_is_lost(tmp_path: Path) -> None:
-    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=2)
-    for number in range(3000):
-        audit.write(number=number)
-    audit.close()
-    assert audit.counts() == {"lines": 3000, "failed": 0}
-    files = sorted(tmp_path.iterdir(), reverse=True)
-    assert [file.name for file in files] == ["audit.log.2", "audit.log.1", "audit.log"]
-    kept = [json.loads(line)["number"] for file in files for line in file.read_text().splitlines()]
-    assert kept == list(range(3000))
-    assert all(file.stat().st_size <= 65536 for file in files)
-
-
-def test_lines_that_could_not_be_written_are_counted_and_leave_a_mark(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
-    audit.write(number=1)
-    write, room = os.write, 10
-
-    def written(descriptor: int, data: bytes) -> int:
-        nonlocal room
-        if room == 0:
-            raise OSError(errno.ENOSPC, "no space left on device")
-        data, room = data[:room], 0
-        return write(descriptor, data)
-
-    with monkeypatch.context() as full:
-        full.setattr(os, "write", written)
-        audit.write_all([{"number": 2}, {"number": 3}])
-        audit.write(number=4)
-        assert [line["number"] for line in lines(tmp_path)] == [1]
-    audit.write(number=5)
-    audit.write(number=6)
-    audit.close()
-    assert audit.counts() == {"lines": 3, "failed": 3}
-    assert "audit_failed" in caplog.messages
-    found = [{**line, "time": ""} for line in lines(tmp_path)]
-    kept: list[dict[str, Any]] = [{"number": 1}, {"lost": 3}, {"number": 5}, {"number": 6}]
-    assert found == [{"time": "", **each} for each in kept]
-
-
-def test_a_file_that_can_not_be_renamed_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "audit.log.1" / "in the way").mkdir(parents=True)
-    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
-    audit.write_all([{"number": number} for number in range(3000)])
-    audit.close()
-    assert audit.counts() == {"lines": 3000, "failed": 0}
-    assert "audit_not_rotated" in caplog.messages
-    assert [line["number"] for line in lines(tmp_path)] == list(range(3000))
-
-
-def test_a_file_that_was_renamed_by_others_is_created_anew(tmp_path: Path) -> None:
-    audit = Audit(tmp_path / "audit.log", max_bytes=65536, keep=1)
-    audit.write(number=1)
-    (tmp_path / "audit.log").rename(tmp_path / "audit-2026-11-22.log")
-    audit.write(number=2)
-    audit.close()
-    assert [line["number"] for line in lines(tmp_path)] == [2]
-    assert stat.S_IMODE((tmp_path / "audit.log").stat().st_mode) & ~0o640 == 0
+    assert len(writes(tmp_path / "audit.log")) == 5000

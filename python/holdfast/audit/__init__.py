@@ -1,0 +1,14 @@
+"""The audit log: a chain of lines, one for each write, that shows later changes.
+
+`Audit` writes it to a file, and copies it to syslog and the journal. `verify` checks files.
+"""
+
+from __future__ import annotations
+
+from holdfast.audit.copies import Copies
+from holdfast.audit.journal import Journal
+from holdfast.audit.log import Audit, Unrecorded
+from holdfast.audit.syslog import Syslog
+from holdfast.audit.verification import Findings, verify
+
+__all__ = ["Audit", "Copies", "Findings", "Journal", "Syslog", "Unrecorded", "verify"]

@@ -1,0 +1,111 @@
+"""`holdfast audit`: verifies audit logs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.audit import verify as verified
+from holdfast.cli.configuration import WRONG
+from holdfast.config.scalars import parse_sha256
+
+if TYPE_CHECKING:
+    from holdfast.audit import Findings
+
+CHANGED = 1
+GAPS = 3
+
+
+@click.group(epilog="Example: holdfast audit verify audit.log*")
+def audit() -> None:
+    """Verify audit logs."""
+
+
+def _digests(
+    _context: click.Context, _parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[str, ...]:
+    try:
+        return tuple(parse_sha256(value) for value in values)
+    except ValueError:
+        raise click.BadParameter("allowed: 64 hexadecimal digits") from None
+
+
+@audit.command(epilog="Example: holdfast audit verify audit.log*")
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--anchor",
+    "anchors",
+    metavar="DIGEST",
+    multiple=True,
+    callback=_digests,
+    help="Digest of a line that must be in the files, as printed by an earlier verification.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
+def verify(files: tuple[Path, ...], anchors: tuple[str, ...], as_json: bool) -> None:
+    """Verify that lines in the FILES of an audit log are unchanged, complete and in order.
+
+    The files can be given in any order. Exit codes: 0 intact, 1 a line was changed, deleted,
+    inserted or moved, or an anchor is missing, 2 a file can't be read, 3 intact, but the log itself
+    reports missing lines.
+    """
+    try:
+        findings = verified(files, anchors)
+    except OSError as error:
+        click.echo(f"holdfast: {error.filename}: {error.strerror}", err=True)
+        sys.exit(WRONG)
+    click.echo(_as_json(findings) if as_json else _as_text(findings))
+    if findings.error is not None or findings.missing_anchors:
+        sys.exit(CHANGED)
+    if findings.gaps:
+        sys.exit(GAPS)
+
+
+def _as_json(findings: Findings) -> str:
+    return json.dumps(
+        {
+            "files": [str(file) for file in findings.files],
+            "lines": findings.lines,
+            "error": findings.error,
+            "missing_anchors": sorted(findings.missing_anchors),
+            "lost": findings.lost,
+            "breaks": dict(findings.breaks),
+            "unchained": findings.unchained,
+            "starts_without_stop": findings.unended,
+            "first_prev": findings.first,
+            "last_digest": findings.last,
+        },
+        indent=2,
+    )
+
+
+def _as_text(findings: Findings) -> str:
+    lines = []
+    if findings.error is not None:
+        lines.append(f"not intact: {findings.error}")
+    lines += [f"not intact: no line has the digest {each}" for each in findings.missing_anchors]
+    if not lines:
+        lines.append("intact")
+    files = _counted(len(findings.files), "file")
+    lines.append(f"verified: {_counted(findings.lines, 'line')} in {files}")
+    if findings.lost:
+        lines.append(f"gap: {_counted(findings.lost, 'line')} could not be written")
+    lines += [
+        f"gap: {reason}, {_counted(count, 'time')}" for reason, count in findings.breaks.items()
+    ]
+    if findings.unchained:
+        lines.append(f"gap: {_counted(findings.unchained, 'line')} without a place in the chain")
+    if findings.unended:
+        lines.append(f"starts without a stop before: {findings.unended}")
+    if findings.first is not None:
+        lines.append(f"begins after the line with the digest {findings.first}")
+    if findings.last is not None:
+        lines.append(f"digest of the last line: {findings.last}")
+    return "\n".join(lines)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"

@@ -1,0 +1,201 @@
+"""What `verify` and `holdfast audit verify` find in files of an audit log."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.audit import Audit, verify
+from holdfast.audit.chain import digest_of
+from holdfast.cli import main
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from click.testing import Result
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A log of one file: a line that begins the chain, then nine others."""
+    file = tmp_path / "audit.log"
+    audit = Audit(file, max_bytes=65536, keep=1)
+    audit.write_all([{"number": number} for number in range(2, 11)])
+    audit.close()
+    return file
+
+
+def asked(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["audit", "verify", *map(str, arguments)])
+
+
+def changed(lines: list[bytes], at: int, change: Callable[[bytes], bytes]) -> list[bytes]:
+    return [*lines[:at], change(lines[at]), *lines[at + 1 :]]
+
+
+def forged(line: bytes) -> bytes:
+    return line.replace(b'"number":', b'"number":1')
+
+
+def renumbered(line: bytes) -> bytes:
+    return line.replace(b'"seq":5', b'"seq":6')
+
+
+def unlinked(line: bytes) -> bytes:
+    return line.replace(b'"prev":"', b'"prev":"0')
+
+
+def spaced(line: bytes) -> bytes:
+    return line[:-2] + b" }\n"
+
+
+def garbled(_: bytes) -> bytes:
+    return b"not a record\n"
+
+
+CHANGES: dict[str, tuple[Callable[[list[bytes]], list[bytes]], str]] = {
+    "a value is changed": (lambda x: changed(x, 4, forged), "5: changed"),
+    "a number is changed": (lambda x: changed(x, 4, renumbered), "5: changed: seq is 6, not 5"),
+    "a digest is changed": (lambda x: changed(x, 4, unlinked), "5: changed"),
+    "a line is replaced": (lambda x: changed(x, 4, garbled), "5: changed, or inserted"),
+    "two lines are replaced": (
+        lambda x: changed(changed(x, 4, garbled), 5, garbled),
+        "5: changed",
+    ),
+    "the first line is changed": (
+        lambda x: changed(x, 0, spaced),
+        "1: changed",
+    ),
+    "the last line but one is changed": (lambda x: changed(x, 8, forged), "9: changed"),
+    "a line is deleted": (
+        lambda x: x[:4] + x[5:],
+        "5: deleted before this line: seq 5",
+    ),
+    "three lines are deleted": (
+        lambda x: x[:4] + x[7:],
+        "5: deleted before this line: seq 5 to 7",
+    ),
+    "a line is repeated": (lambda x: [*x[:6], x[2], *x[6:]], "7: inserted"),
+    "a line is inserted": (lambda x: [*x[:6], garbled(b""), *x[6:]], "7: changed, or inserted"),
+    "a chained line is inserted": (
+        lambda x: [*x[:6], b'{"seq":7,"prev":"%b"}\n' % digest_of(x[5]).encode(), *x[6:]],
+        "7: inserted",
+    ),
+    "two lines are exchanged": (lambda x: [*x[:4], x[5], x[4], *x[6:]], "5: reordered"),
+    "a line is moved down": (lambda x: [*x[:3], *x[4:8], x[3], *x[8:]], "4: reordered"),
+    "a line is moved up": (lambda x: [*x[:3], x[7], *x[3:7], *x[8:]], "4: reordered"),
+}
+
+
+@pytest.mark.parametrize(("change", "found"), CHANGES.values(), ids=CHANGES)
+def test_the_first_change_is_found_with_its_place(
+    log: Path, change: Callable[[list[bytes]], list[bytes]], found: str
+) -> None:
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(change(lines)))
+    error = verify([log]).error
+    assert error is not None
+    assert error.startswith(f"{log}:{found}")
+    result = asked(log)
+    assert result.exit_code == 1
+    assert result.stdout.startswith(f"not intact: {log}:{found}")
+
+
+@pytest.mark.parametrize("at", range(9))
+def test_each_line_but_the_last_is_protected_by_the_next(log: Path, at: int) -> None:
+    lines = log.read_bytes().splitlines(keepends=True)
+    for byte in range(len(lines[at]) - 1):
+        flipped = bytearray(lines[at])
+        flipped[byte] ^= 1
+        log.write_bytes(b"".join([*lines[:at], bytes(flipped), *lines[at + 1 :]]))
+        assert verify([log]).error is not None
+
+
+def test_an_untouched_log_is_intact(log: Path) -> None:
+    result = asked(log)
+    assert result.exit_code == 0
+    lines = log.read_bytes().splitlines(keepends=True)
+    assert result.stdout.splitlines() == [
+        "intact",
+        "verified: 10 lines in 1 file",
+        f"digest of the last line: {digest_of(lines[-1])}",
+    ]
+
+
+def test_files_are_verified_in_the_order_of_their_chain(log: Path) -> None:
+    audit = Audit(log, max_bytes=1, keep=20)
+    audit.write_all([{"number": number} for number in range(11, 22)])
+    audit.close()
+    files = sorted(log.parent.iterdir())
+    findings = verify(files)
+    assert (findings.error, findings.gaps, findings.lines) == (None, False, 21)
+    assert findings.files[0].name == "audit.log.11"
+    assert findings.files[-1] == log
+    (log.parent / "audit.log.3").unlink()
+    findings = verify(file for file in files if file.exists())
+    assert findings.error == (f"{log.parent}/audit.log.2:1: deleted before this line: seq 18")
+
+
+def test_what_the_log_itself_reports_is_counted(log: Path) -> None:
+    log.write_bytes(log.read_bytes()[:-5])
+    audit = Audit(log, max_bytes=65536, keep=1)
+    audit.write(lost=17)
+    audit.write(event="start")
+    audit.write(event="start")
+    audit.write(event="stop")
+    audit.close()
+    result = asked("--json", log)
+    assert result.exit_code == 3
+    told = json.loads(result.stdout)
+    assert told["error"] is None
+    assert (told["lost"], told["breaks"], told["starts_without_stop"]) == (17, {"torn": 1}, 1)
+    assert "gap: 17 lines could not be written" in asked(log).stdout
+
+
+def test_an_incomplete_last_line_is_a_gap(log: Path) -> None:
+    log.write_bytes(log.read_bytes()[:-5])
+    assert asked(log).exit_code == 3
+    assert verify([log]).breaks == {"torn": 1}
+
+
+def test_anchors_find_what_the_chain_can_not(log: Path) -> None:
+    lines = log.read_bytes().splitlines(keepends=True)
+    last = digest_of(lines[-1])
+    assert asked("--anchor", last.upper(), log).exit_code == 0
+    log.write_bytes(b"".join(lines[:-1]))
+    assert asked(log).exit_code == 0
+    result = asked("--anchor", last, "--anchor", digest_of(lines[0]), log)
+    assert result.exit_code == 1
+    assert result.stdout.startswith(f"not intact: no line has the digest {last}\n")
+    assert asked("--anchor", "1234", log).exit_code == 2
+
+
+def test_a_second_beginning_is_a_gap(log: Path) -> None:
+    other = log.with_name("other.log")
+    audit = Audit(other, max_bytes=65536, keep=1)
+    audit.close()
+    log.with_name("both.log").write_bytes(log.read_bytes() + log.read_bytes())
+    assert verify([log.with_name("both.log")]).breaks == {"new": 1}
+
+
+def test_a_file_that_can_not_be_read_is_an_error(log: Path) -> None:
+    result = asked(log, log.with_name("none.log"))
+    assert result.exit_code == 2
+    assert result.stderr == f"holdfast: {log.parent}/none.log: No such file or directory\n"
+
+
+@given(st.lists(st.binary(max_size=40), max_size=6))
+def test_any_bytes_are_judged(tmp_path_factory: pytest.TempPathFactory, parts: list[bytes]) -> None:
+    file = tmp_path_factory.mktemp("any") / "audit.log"
+    file.write_bytes(b"\n".join(parts))
+    assert verify([file]).lines >= 0
+    audit = Audit(file, max_bytes=65536, keep=1)
+    audit.write(number=1)
+    audit.close()
+    assert json.loads(file.read_bytes().splitlines()[-1])["number"] == 1
