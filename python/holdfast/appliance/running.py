@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
-from holdfast.appliance import assembly
+from holdfast.appliance import assembly, configured_certificates
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
-from holdfast.config import ModbusAsciiListener, ModbusRtuListener
+from holdfast.config import HTTP_SERVICES, ModbusAsciiListener, ModbusRtuListener
 from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         MetricsConfig,
         RestConfig,
     )
+    from holdfast.web.https import Https
 
 # All other events of a listener are refusals or faults.
 LEVELS = {
@@ -153,8 +154,9 @@ class _Running:
         # Missing adapters and unusable TLS files are reported before any socket is opened.
         for name, settings in config.adapters.items():
             foreign.entry_point(name, settings)
-        if config.gateway is not None and config.gateway.tls is not None:
-            _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
+        if config.gateway is not None and config.gateway.device_tls is not None:
+            _check_files("gateway.device_tls", assembly.gateway_tls(config.gateway))
+        self._https = _loaded_https(config)
         assembly.mirror(config, memories)
         devices = [
             assembly.device(name, config, memories)
@@ -183,6 +185,7 @@ class _Running:
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
+            self.diagnostics.expiries = configured_certificates.expiries(config)
             self._add_adapters(self._ports)
             undo.pop_all()
         self._auditing = threading.Thread(target=self._take_writes, name="holdfast-audit")
@@ -301,8 +304,8 @@ class _Running:
         """Tries to bind the ports of the HTTP services. The others are tried again later."""
         ports: dict[str, Port] = {}
         config = self._config
-        services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
-        for name, settings in services.items():
+        for name in HTTP_SERVICES:
+            settings = getattr(config, name)
             if settings is not None:
                 ports[name] = Port(name, settings.bind.host, settings.bind.port)
                 undo.callback(ports[name].close)
@@ -343,7 +346,8 @@ class _Running:
                 endpoints.append(ListenAddress(name, settings.type, *address, settings))
         for name, port in self._ports.items():
             service = getattr(self._config, name)
-            endpoints.append(ListenAddress(name, "http", *port.address, service, port.error))
+            scheme = "http" if service.tls is None else "https"
+            endpoints.append(ListenAddress(name, scheme, *port.address, service, port.error))
         return endpoints
 
     def _add_adapters(self, ports: Mapping[str, Port]) -> None:
@@ -356,7 +360,9 @@ class _Running:
             self._add(
                 "rest",
                 memory_access,
-                lambda: Rest(rest, memory_access, self.diagnostics, at.listener),
+                lambda: Rest(
+                    rest, memory_access, self.diagnostics, at.listener, https=self._https["rest"]
+                ),
                 port=at,
             )
         if config.mqtt is not None:
@@ -376,7 +382,12 @@ class _Running:
             self._add(
                 "gateway",
                 None,
-                lambda: Gateway(gateway, gateway_at.listener, poller=self._poller),
+                lambda: Gateway(
+                    gateway,
+                    gateway_at.listener,
+                    poller=self._poller,
+                    https=self._https["gateway"],
+                ),
                 port=gateway_at,
             )
         if config.metrics is not None:
@@ -386,7 +397,9 @@ class _Running:
             self._add(
                 "metrics",
                 None,
-                lambda: Metrics(metrics, self.diagnostics, metrics_at.listener),
+                lambda: Metrics(
+                    metrics, self.diagnostics, metrics_at.listener, https=self._https["metrics"]
+                ),
                 port=metrics_at,
             )
         for name, settings in config.adapters.items():
@@ -424,6 +437,19 @@ class _Running:
                 lost = missed
             if ended and not writes:
                 return
+
+
+def _loaded_https(config: Config) -> dict[str, Https | None]:
+    """The TLS settings of each HTTP service. Raises `OSError` with the setting's name."""
+    loaded: dict[str, Https | None] = {}
+    for name in HTTP_SERVICES:
+        settings = getattr(config, name)
+        tls = None if settings is None else settings.tls
+        try:
+            loaded[name] = None if tls is None else assembly.https(tls)
+        except ValueError as error:
+            raise OSError(f"{name}.tls: {error}") from error
+    return loaded
 
 
 def _check_files(name: str, tls: Tls) -> None:

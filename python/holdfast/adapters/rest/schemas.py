@@ -136,6 +136,17 @@ DIAGNOSTICS: dict[str, Schema] = {
                 "type": ["object", "null"],
                 "description": "Lines written, and lines that failed",
             },
+            "certificates": {
+                "type": "object",
+                "description": "For each configured file, when its first certificate expires, in "
+                "Unix time",
+                "additionalProperties": {"type": "number"},
+            },
+            "revocation_lists": {
+                "type": "object",
+                "description": "For each configured file, the first nextUpdate, in Unix time",
+                "additionalProperties": {"type": "number"},
+            },
         }
     ),
     "Mqtt": {
