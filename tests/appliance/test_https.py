@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import ssl
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -103,6 +104,33 @@ def test_the_expiry_of_each_file_is_a_metric(files: Files, tmp_path: Path) -> No
         f'{name}{{file="{files.authority.ca}"}}': ca.not_valid_after_utc.timestamp(),
         f'{lists}{{file="{revoked}"}}': crl.next_update_utc.timestamp(),
     }
+
+
+def test_certificates_are_reloaded_all_or_none(files: Files, tmp_path: Path) -> None:
+    def serial(appliance: Appliance) -> int:
+        with socket.create_connection(endpoint(appliance, "rest"), wire.DEADLINE) as raw:
+            trust = context(files.authority.ca)
+            with trust.wrap_socket(raw, server_hostname="localhost") as client:
+                return int(str((client.getpeercert() or {})["serialNumber"]), 16)
+
+    def number(issued: Issued) -> int:
+        return x509.load_pem_x509_certificate(issued.certificate.read_bytes()).serial_number
+
+    renewed = files.authority.issue("renewed", NAMES)
+    with Appliance(load(configured(tmp_path, files.tls(), "rest", "gateway"))) as appliance:
+        assert serial(appliance) == number(files.server)
+        config = load(configured(tmp_path, files.tls(renewed), "rest", "gateway"))
+        appliance.reload_https(config)
+        assert serial(appliance) == number(renewed)
+        assert [str(renewed.certificate)] == list(appliance.diagnostics.stats()["certificates"])
+        broken = load(configured(tmp_path, files.tls(), "rest", "gateway"))
+        assert broken.gateway is not None
+        assert broken.gateway.tls is not None
+        unusable = broken.gateway.tls.model_copy(update={"key_file": renewed.key})
+        gateway = broken.gateway.model_copy(update={"tls": unusable})
+        with pytest.raises(OSError, match=r"gateway\.tls: .*not the key of the certificate"):
+            appliance.reload_https(broken.model_copy(update={"gateway": gateway}))
+        assert serial(appliance) == number(renewed)
 
 
 # What `check` finds.

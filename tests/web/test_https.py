@@ -366,19 +366,20 @@ def test_an_authority_that_is_removed_is_not_trusted_any_more(
     service = start(https)
     assert is_served(service, files.trust(files.client))
     own = files.server
-    https.reload(HttpsFiles(own.certificate, own.key, client_ca_file=other.ca))
+    https.adopt(Https(HttpsFiles(own.certificate, own.key, client_ca_file=other.ca)))
     assert refusal(service, files.trust(files.client), log) == "unknown_authority"
     assert is_served(service, files.trust(other.issue("panel", CLIENT)))
 
 
 def test_unusable_files_change_nothing(start: Start, files: Files, tmp_path: Path) -> None:
-    https = files.https()
+    own = tmp_path / "own.pem"
+    own.write_bytes(files.server.certificate.read_bytes())
+    https = Https(HttpsFiles(own, files.server.key))
     service = start(https)
-    (tmp_path / "empty.pem").write_text("")
-    with pytest.raises(UnusableFile, match=r"empty\.pem: found no certificate"):
-        https.reload(HttpsFiles(tmp_path / "empty.pem", files.server.key))
+    own.write_text("")
+    with pytest.raises(UnusableFile, match=r"own\.pem: found no certificate"):
+        https.reload()
     assert is_served(service, files.trust())
-    https.reload()
 
 
 # Files.

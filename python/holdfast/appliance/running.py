@@ -117,6 +117,14 @@ class Appliance:
         """Returns the addresses of all listeners and services, in configuration order."""
         return self._parts().endpoints()
 
+    def reload_https(self, config: Config) -> None:
+        """Loads the certificates of HTTPS services in `config`, for new connections.
+
+        Raises `OSError` with the setting's name and changes nothing if a file can't be used. A
+        service that has begun with HTTP stays with HTTP.
+        """
+        self._parts().reload_https(config)
+
     def log_events(self, timeout: float) -> None:
         """Waits up to `timeout` seconds for a listener event and logs it.
 
@@ -214,6 +222,14 @@ class _Running:
         if self._audit is not None:
             self._auditing.join()
             self._audit.close()
+
+    def reload_https(self, config: Config) -> None:
+        loaded = _loaded_https(config)
+        for name, https in self._https.items():
+            fresh = loaded[name]
+            if https is not None and fresh is not None:
+                https.adopt(fresh)
+        self.diagnostics.expiries = configured_certificates.expiries(config)
 
     def log_events(self, timeout: float) -> None:
         event = self._engine.next_event(timeout)

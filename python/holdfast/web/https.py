@@ -43,15 +43,17 @@ class Https:
         self.context = _context(files)
         """The context for new connections. Open connections keep theirs."""
 
-    def reload(self, files: HttpsFiles | None = None) -> None:
-        """Loads the files again, or other files, for new connections.
+    def reload(self) -> None:
+        """Loads the files again, for new connections. Thread-safe.
 
-        Raises `UnusableFile` and changes nothing if a file can't be used. Thread-safe.
+        Raises `UnusableFile` and changes nothing if a file can't be used.
         """
-        chosen = self._files if files is None else files
-        # A new context: in the old one, certificates and authorities could only be added.
-        self.context = _context(chosen)
-        self._files = chosen
+        self.adopt(Https(self._files))
+
+    def adopt(self, other: Https) -> None:
+        """Uses the files and certificates of another one for new connections. Thread-safe."""
+        # A whole context: in the old one, certificates and authorities could only be added.
+        self.context, self._files = other.context, other._files
 
 
 def _context(files: HttpsFiles) -> ssl.SSLContext:
