@@ -248,11 +248,14 @@ def _shared_port(
 
 def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
     """Loads the certificates of a listener. Raises `ValueError` for an unusable file."""
+    from holdfast.certificates.pem import unlocked
+
     return _core.ServerTls(
         cert_file=settings.cert_file,
         key_file=settings.key_file,
         ca_file=settings.ca_file,
         crl_file=settings.crl_file,
+        key=unlocked(settings.key_file, settings.key_passphrase_file),
     )
 
 
