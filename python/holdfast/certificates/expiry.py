@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
-from holdfast.certificates.pem import UnusableFile, certificates, revocation_lists
+from holdfast.certificates.pem import MALFORMED, certificates, revocation_lists
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,7 +57,7 @@ def of_certificates(file: File) -> list[Expiry]:
             )
             for each in certificates(file)
         ]
-    except UnusableFile:
+    except MALFORMED:
         return []
 
 
@@ -65,7 +65,7 @@ def of_revocation_lists(file: File) -> list[Expiry]:
     """Returns the dates of all revocation lists of a file; none if it can't be read."""
     try:
         return list(_lists(file))
-    except UnusableFile:
+    except MALFORMED:
         return []
 
 

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from holdfast.certificates.pem import UnusableFile, certificates, key, passphrase
+from holdfast.certificates.pem import (
+    MALFORMED,
+    UnusableFile,
+    certificates,
+    key,
+    passphrase,
+    public_key,
+)
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.types import PublicKeyTypes
@@ -17,9 +24,11 @@ if TYPE_CHECKING:
 
 def check_own(cert_file: File, key_file: File, passphrase_file: File | None = None) -> None:
     """Checks that the files are readable and belong together. Raises `UnusableFile`."""
-    own = certificates(cert_file)[0]
+    own = public_key(certificates(cert_file)[0])
     secret = None if passphrase_file is None else passphrase(passphrase_file)
-    if _spki(own.public_key()) != _spki(key(key_file, secret).public_key()):
+    if own is None:
+        raise UnusableFile(cert_file, "the certificate has a key of an unknown kind")
+    if _spki(own) != _spki(key(key_file, secret).public_key()):
         raise UnusableFile(key_file, f"it is not the key of the certificate in {cert_file}")
 
 
@@ -35,7 +44,7 @@ def nameless(cert_file: File) -> str | None:
         names = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         found = "no subjectAltName"
-    except ValueError:
+    except MALFORMED:
         return None
     else:
         if any(isinstance(each, x509.DNSName | x509.IPAddress) for each in names):

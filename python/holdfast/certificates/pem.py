@@ -14,6 +14,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 if TYPE_CHECKING:
     from os import PathLike
 
+    from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
+
     File: TypeAlias = str | PathLike[str]
 
 PrivateKey: TypeAlias = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey | rsa.RSAPrivateKey
@@ -27,6 +29,17 @@ KEYS = "RSA, an EC key on P-256, P-384 or P-521, or Ed25519"
 LOCKED = "the key is encrypted, and no passphrase is given"
 
 _BLOCK = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----.*?-----END \1-----", re.DOTALL)
+
+
+MALFORMED = (
+    ValueError,
+    TypeError,
+    UnsupportedAlgorithm,
+    x509.DuplicateExtension,
+    x509.InvalidVersion,
+    x509.UnsupportedGeneralNameType,
+)
+"""What `cryptography` raises for malformed files, for some parts only when they are used."""
 
 
 class UnusableFile(ValueError):
@@ -61,8 +74,16 @@ def certificates(file: File) -> list[x509.Certificate]:
         raise UnusableFile(file, _missing(text, "certificate"))
     try:
         return [x509.load_pem_x509_certificate(block) for block in found]
-    except ValueError as error:
+    except MALFORMED as error:
         raise UnusableFile(file, f"a certificate can't be read: {error}") from error
+
+
+def public_key(certificate: x509.Certificate) -> CertificatePublicKeyTypes | None:
+    """Returns the key of a certificate; `None` for a key of an unknown kind."""
+    try:
+        return certificate.public_key()
+    except MALFORMED:
+        return None
 
 
 def revocation_lists(file: File) -> list[x509.CertificateRevocationList]:
@@ -73,7 +94,7 @@ def revocation_lists(file: File) -> list[x509.CertificateRevocationList]:
         raise UnusableFile(file, _missing(text, "revocation list (X509 CRL)"))
     try:
         return [x509.load_pem_x509_crl(block) for block in found]
-    except ValueError as error:
+    except MALFORMED as error:
         raise UnusableFile(file, f"a revocation list can't be read: {error}") from error
 
 
@@ -102,7 +123,7 @@ def key(file: File, secret: bytes | None = None) -> PrivateKey:
         raise UnusableFile(file, "found a key without a passphrase, but a passphrase is given")
     try:
         made = serialization.load_pem_private_key(found[0], secret)
-    except (ValueError, UnsupportedAlgorithm) as error:
+    except MALFORMED as error:
         wrong = "the passphrase is wrong, or the key can't be read"
         raise UnusableFile(file, wrong if secret else f"the key can't be read: {error}") from error
     if not isinstance(made, PrivateKey):

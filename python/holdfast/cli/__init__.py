@@ -14,6 +14,7 @@ from holdfast import __version__
 
 COMMANDS = {
     "bench": "holdfast.cli.bench:bench",
+    "cert": "holdfast.cli.cert:cert",
     "check": "holdfast.cli.check:check",
     "completion": "holdfast.cli.completion:completion",
     "gateway": "holdfast.cli.gateway:gateway",
