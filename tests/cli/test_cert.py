@@ -424,3 +424,21 @@ def test_show_names_a_key_that_does_not_fit(plant: Pki) -> None:
 def test_show_refuses_what_it_can_not_read(pki: Pki, text: str) -> None:
     (pki / "x.pem").write_text(text)
     assert pki.refuses("show", str(pki / "x.pem")).startswith(f"holdfast: {pki / 'x.pem'}: ")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal")
+def test_passphrases_are_asked_for_and_not_shown(tmp_path: Path) -> None:
+    from support.terminal import Terminal
+
+    where = ("--folder", str(tmp_path))
+    with Terminal("cert", "ca", "authority", "--passphrase", *where) as terminal:
+        for asked in ("Passphrase of the new key: ", "Repeat for confirmation: "):
+            terminal.until(asked)
+            terminal.keys("over the hills\n")
+        assert terminal.end() == 0
+        assert "hills" not in terminal.shown
+    with Terminal("cert", "client", "panel", *where) as terminal:
+        terminal.until("Passphrase of the authority's key: ")
+        terminal.keys("over the hills\n")
+        assert terminal.end() == 0
+    assert verified(Pki(tmp_path), "panel.pem", "sslclient") == ""

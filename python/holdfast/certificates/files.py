@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+"""Flags for a new file; Windows would convert line ends without `O_BINARY`."""
+
 SECRET = 0o600
 PUBLIC = 0o644
 """The modes of files with keys, and of other files."""
@@ -25,7 +28,7 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
     written: list[Path] = []
     try:
         for file, (content, mode) in contents.items():
-            descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            descriptor = os.open(file, NEW, mode)
             written.append(file)
             with os.fdopen(descriptor, "wb") as opened:
                 opened.write(content)

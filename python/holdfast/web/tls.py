@@ -186,7 +186,7 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
             return
         rest = memoryview(data)
         try:
-            while rest:  # One call encrypts at most one record.
+            while rest:  # One call may take a part only.
                 rest = rest[self._tls.write(rest) :]
         except ssl.SSLError as error:
             self._fail(reason(error))
