@@ -250,6 +250,16 @@ def test_peers_without_a_handshake_lock_nobody_out(start: Start, files: Files) -
         assert service.connections()["evicted"] >= 3
 
 
+def test_a_client_that_reads_nothing_is_given_up(start: Start, files: Files) -> None:
+    service = start(files.https(), request_timeout=2)
+    path = f"{web.READ}?memory=plant_a&area=holding_registers&address=0&count=65536"
+    with Peer(service.address, files.trust(), receive_buffer=4096) as peer:
+        peer.shake()
+        peer.send(web.head("GET", path) * 64)
+        service.until_counted("slow_reader")
+    wire.until(lambda: service.connections()["open"] == 0, "its connection is closed")
+
+
 def test_a_client_that_does_not_trust_the_server_is_counted(
     start: Start, files: Files, log: web.Records
 ) -> None:
