@@ -234,8 +234,8 @@ class ServerTls:
     """Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 
     `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
-    `crl_file` has the revocation lists of these authorities. Raises `ValueError` for a file that
-    can't be used.
+    `crl_file` has the revocation lists of these authorities. `key` is the content of `key_file`
+    without its passphrase, if it has one. Raises `ValueError` for a file that can't be used.
     """
 
     def __new__(
@@ -245,6 +245,7 @@ class ServerTls:
         key_file: str | PathLike[str],
         ca_file: str | PathLike[str],
         crl_file: str | PathLike[str] | None = None,
+        key: bytes | None = None,
     ) -> ServerTls: ...
 
 @final

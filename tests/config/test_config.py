@@ -633,6 +633,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "ForwardedStatusConfig": ["area", "slot"],
         "GatewayConfig": ["bind", "sources", "allow", "access", "tokens"],
         "GatewayTokenConfig": ["name", "sha256"],
+        "HttpsConfig": ["cert_file", "key_file"],
         "IdentityConfig": None,
         "LinkConfig": ["url"],
         "LogConfig": None,

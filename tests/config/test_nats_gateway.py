@@ -144,7 +144,8 @@ def test_the_scanner_serves_the_programs_of_tentacle_next(folder: Folder) -> Non
 
 def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) -> None:
     text = changed(GATEWAY, "[10.0.0.0/8]\n  access: read-only", "['10.0.0.5:*', '[fd00::]/8']\n"
-                   "  in_flight: 4\n  tls: {ca_file: p.yaml}\n  access: read-write")  # fmt: skip
+                   "  in_flight: 4\n  device_tls: {ca_file: p.yaml}\n"
+                   "  access: read-write")  # fmt: skip
     settings = assembly.gateway(gateway_of(folder, text))
     assert [str(entry) for entry in settings.allow] == ["10.0.0.5:*", "[fd00::]/8"]
     assert [str(network) for network in settings.sources] == ["10.0.0.0/8"]
@@ -390,7 +391,7 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
         ("  access", "  in_flight: 65\n  access",
          "5: in_flight: found 65, allowed: an integer from 1 to 64"),
         ("  access", "  writes: true\n  access", "5: writes: unknown key, allowed: bind, sources, "
-         "allow, access, tokens, tls, in_flight"),
+         "allow, access, tokens, tls, device_tls, in_flight"),
         ("panel", "''", f"7: tokens[0].name: found '', allowed: {NAME}"),
         ("    - name: panel\n      sha256", "    - sha256",
          "7: tokens[0].name: missing, allowed: text"),

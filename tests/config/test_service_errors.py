@@ -98,7 +98,7 @@ def test_listeners_are_not_empty_text(folder: Folder) -> None:
          "7: request_timeout: found 0, allowed: a number from 0.001 to 31622400"),
         ("  tokens:", "  token: []\n  tokens:",
          "7: token: unknown key, allowed: bind, sources, tokens, max_body, max_connections, "
-         "max_connections_per_source, when_full, request_timeout; did you mean 'tokens'?"),
+         "max_connections_per_source, when_full, request_timeout, tls; did you mean 'tokens'?"),
         ("name: edge", "name: ''", f"8: tokens[0].name: found '', allowed: {NAME}"),
         ("[plant]", "[]", f"10: tokens[0].memories: found an empty list, allowed: {SOME}"),
         ("[plant]", "[plan]", "10: tokens[0].memories[0]: found 'plan', allowed: plant, other; "

@@ -371,7 +371,8 @@ def test_a_configuration_has_them_too(
 ) -> None:
     file = files / "plant.yaml"
     file.write_text(
-        CONFIGURATION + "  tls: {ca_file: ca.pem, cert_file: panel.pem, key_file: panel.key}\n"
+        CONFIGURATION
+        + "  device_tls: {ca_file: ca.pem, cert_file: panel.pem, key_file: panel.key}\n"
     )
     asking = context(plc, asks=authority.ca)
     with Relay(behind, asking) as relay, Appliance(load(file)) as appliance:
@@ -386,11 +387,12 @@ def test_a_configuration_has_them_too(
 @pytest.mark.parametrize(
     ("tls", "problem"),
     [
-        ("ca_file: none.pem", "tls.ca_file: found 'none.pem', which can't be read: No such file or "
-         "directory"),
-        ("cert_file: panel.pem", "tls.cert_file: found without key_file, allowed: both or neither"),
-        ("name: plc", "tls.name: unknown key, allowed: ca_file, cert_file, key_file"),
-        ("ca_file: text.pem", "tls: {folder}/text.pem: found no certificate, allowed: a "
+        ("ca_file: none.pem", "device_tls.ca_file: found 'none.pem', which can't be read: No such "
+         "file or directory"),
+        ("cert_file: panel.pem", "device_tls.cert_file: found without key_file, allowed: both or "
+         "neither"),
+        ("name: plc", "device_tls.name: unknown key, allowed: ca_file, cert_file, key_file"),
+        ("ca_file: text.pem", "device_tls: {folder}/text.pem: found no certificate, allowed: a "
          "certificate in PEM"),
     ],
 )  # fmt: skip
@@ -398,7 +400,7 @@ def test_what_is_wrong_with_them_is_told_with_its_place(
     files: Path, tls: str, problem: str
 ) -> None:
     file = files / "plant.yaml"
-    file.write_text(f"{CONFIGURATION}  tls: {{{tls}}}\n")
+    file.write_text(f"{CONFIGURATION}  device_tls: {{{tls}}}\n")
     for command in ("check", "run"):
         result = CliRunner().invoke(main, [command, str(file)])
         assert result.exit_code == 2
@@ -408,8 +410,8 @@ def test_what_is_wrong_with_them_is_told_with_its_place(
 
 def test_a_file_that_breaks_before_the_start_is_told_by_the_appliance(files: Path) -> None:
     file = files / "plant.yaml"
-    file.write_text(f"{CONFIGURATION}  tls: {{ca_file: ca.pem}}\n")
+    file.write_text(f"{CONFIGURATION}  device_tls: {{ca_file: ca.pem}}\n")
     config = load(file)
     (files / "ca.pem").write_text("text\n")
-    with pytest.raises(OSError, match=r"gateway\.tls: .*ca\.pem: found no certificate"):
+    with pytest.raises(OSError, match=r"gateway\.device_tls: .*ca\.pem: found no certificate"):
         Appliance(config).start()

@@ -722,7 +722,7 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         (
             {"key_file": locked.key},
             locked.key,
-            "the key is encrypted; use a key without a passphrase",
+            "the key is encrypted, and no passphrase is given",
         ),
         (
             {"cert_file": odd.certificate, "key_file": odd.key},

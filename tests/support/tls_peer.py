@@ -157,6 +157,10 @@ class Peer:
             return str(refused)
         return "close_notify"
 
+    def rest(self) -> bytes:
+        """Returns all plain text until the end of the connection."""
+        return b"".join(iter(self._read, b""))
+
     def _read(self) -> bytes:
         """Returns decrypted bytes; empty at the end of the connection."""
         while True:

@@ -24,11 +24,13 @@ from holdfast.web.port import listen
 from support import wire
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Iterator, Mapping
 
     import holdfast
     from holdfast._core import Engine
     from holdfast.audit import Audit
+    from holdfast.web.https import Https
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
 JSON = {"Content-Type": "application/json"}
@@ -77,8 +79,17 @@ class Answer:
 class Client:
     """A connection that stays open, as far as the server allows it."""
 
-    def __init__(self, address: tuple[str, int], secret: str | None = None) -> None:
-        self._connection = http.client.HTTPConnection(*address, timeout=wire.DEADLINE)
+    def __init__(
+        self,
+        address: tuple[str, int],
+        secret: str | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._connection = (
+            http.client.HTTPConnection(*address, timeout=wire.DEADLINE)
+            if tls is None
+            else http.client.HTTPSConnection(*address, timeout=wire.DEADLINE, context=tls)
+        )
         self._more = {} if secret is None else {"Authorization": f"Bearer {secret}"}
 
     def ask(
@@ -132,8 +143,10 @@ class Service:
         *,
         audit: Audit | None = None,
         bind: str = "127.0.0.1:0",
+        https: Https | None = None,
         **settings: Any,
     ) -> None:
+        self.https = https
         given = {"bind": bind, "sources": LOOPBACK, "tokens": "none", **settings}
         self.settings = RestConfig.model_validate(given)
         self.memories = memories
@@ -144,7 +157,8 @@ class Service:
         self.diagnostics.adapters["rest"] = (self.supervisor, self.memory_access)
 
     def made(self) -> Rest:
-        return Rest(self.settings, self.memory_access, self.diagnostics, self.listener)
+        parts = (self.settings, self.memory_access, self.diagnostics, self.listener)
+        return Rest(*parts, https=self.https)
 
     @property
     def address(self) -> tuple[str, int]:

@@ -122,15 +122,16 @@ pub struct ServerTls {
 #[pymethods]
 impl ServerTls {
     #[new]
-    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None))]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, key=None))]
     fn new(
         cert_file: PathBuf,
         key_file: PathBuf,
         ca_file: PathBuf,
         crl_file: Option<PathBuf>,
+        key: Option<&[u8]>,
     ) -> PyResult<ServerTls> {
         let files = ServerFiles { cert_file, key_file, ca_file, crl_file };
-        let core = CoreServerTls::load(&files);
+        let core = CoreServerTls::load(&files, key);
         let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
         Ok(ServerTls { core: Arc::new(core) })
     }

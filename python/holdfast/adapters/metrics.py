@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from holdfast.config import MetricsConfig
     from holdfast.stop import Stop
     from holdfast.web.host import Receive, Scope, Send
+    from holdfast.web.https import Https
 
 LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
@@ -34,6 +35,19 @@ STATES = ("running", "failed", "stopped")
 HEALTH = ("unknown", "ok", "error", "stale", "disabled")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
 """The outcomes of requests to a device."""
+EXPIRIES = (
+    (
+        "certificates",
+        "certificate_expiry_timestamp_seconds",
+        "Unix time at which the first certificate of a configured file expires.",
+    ),
+    (
+        "revocation_lists",
+        "revocation_list_expiry_timestamp_seconds",
+        "Unix time of the first nextUpdate in a configured file of revocation lists.",
+    ),
+)
+"""Statistics that are times: their key, metric and description."""
 LINK_OUTCOMES = (
     "replies",
     "timeouts",
@@ -51,7 +65,12 @@ class Metrics:
     """The metrics adapter, on a listening socket."""
 
     def __init__(
-        self, settings: MetricsConfig, diagnostics: DiagnosticsSource, listener: socket.socket
+        self,
+        settings: MetricsConfig,
+        diagnostics: DiagnosticsSource,
+        listener: socket.socket,
+        *,
+        https: Https | None = None,
     ) -> None:
         registry = CollectorRegistry()
         registry.register(Figures(diagnostics))
@@ -65,6 +84,7 @@ class Metrics:
             sources=settings.sources,
             limits=LIMITS,
             request_timeout=REQUEST_TIMEOUT,
+            https=https,
         )
 
     def run(self, stop: Stop) -> None:
@@ -138,6 +158,11 @@ class Figures(Collector):
                 stats["audit"]["failed"],
             )
             yield from _of_audit(stats["audit"])
+        for key, name, text in EXPIRIES:
+            family = _gauge(name, text, "file")
+            for file, ends in stats[key].items():
+                family.add_metric([file], ends)
+            yield family
         yield from _of_listeners(stats["listeners"])
         yield from _of_devices(stats["devices"])
         yield from _of_links(stats["links"])

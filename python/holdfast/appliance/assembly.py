@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         Config,
         DestinationConfig,
         GatewayConfig,
+        HttpsConfig,
         IdentityConfig,
         Listener,
         MemoryConfig,
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from holdfast.net.tls import Tls
     from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area, Forward, NarrowedRights, StatusBlock
+    from holdfast.web.https import Https
 
 _FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
     "modbus-tcp": "mbap",
@@ -246,11 +248,14 @@ def _shared_port(
 
 def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
     """Loads the certificates of a listener. Raises `ValueError` for an unusable file."""
+    from holdfast.certificates.pem import unlocked
+
     return _core.ServerTls(
         cert_file=settings.cert_file,
         key_file=settings.key_file,
         ca_file=settings.ca_file,
         crl_file=settings.crl_file,
+        key=unlocked(settings.key_file, settings.key_passphrase_file),
     )
 
 
@@ -338,7 +343,22 @@ def gateway(settings: GatewayConfig) -> GatewaySettings:
 
 def gateway_tls(settings: GatewayConfig) -> Tls:
     """Returns the certificates that the gateway uses for TLS devices."""
-    return NO_FILES if settings.tls is None else settings.tls.files
+    return NO_FILES if settings.device_tls is None else settings.device_tls.files
+
+
+def https(settings: HttpsConfig) -> Https:
+    """Loads the certificates of an HTTP service. Raises `ValueError` for an unusable file."""
+    from holdfast.web.https import Https, HttpsFiles
+
+    return Https(
+        HttpsFiles(
+            settings.cert_file,
+            settings.key_file,
+            settings.key_passphrase_file,
+            settings.client_ca_file,
+            settings.crl_file,
+        )
+    )
 
 
 def scanner(settings: NatsConfig) -> ScannerSettings:

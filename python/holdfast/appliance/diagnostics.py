@@ -6,6 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast import logs
+from holdfast.appliance.configured_certificates import Expiries
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,6 +31,9 @@ class Diagnostics:
         """What listeners pass requests on to."""
         self.disabled: Sequence[str] = ()
         """Devices that are not polled."""
+
+        self.expiries = Expiries()
+        """When the configured certificates expire."""
 
     def memories(self) -> dict[str, Any]:
         """Returns, for each memory, the start and size of its areas and the state of its seal."""
@@ -57,6 +61,8 @@ class Diagnostics:
             "events_lost": self._engine.lost_events,
             "log_dropped": logs.dropped(),
             "audit": None if self.audit is None else self.audit.counts(),
+            "certificates": self.expiries.certificates,
+            "revocation_lists": self.expiries.revocation_lists,
         }
 
     def devices(self) -> dict[str, dict[str, Any]]:

@@ -13,11 +13,16 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
-from holdfast.appliance import assembly, auditing, changes
+from holdfast.appliance import assembly, auditing, changes, configured_certificates
 from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
-from holdfast.config import ModbusAsciiListener, ModbusRtuListener, ModbusTlsListener
+from holdfast.config import (
+    HTTP_SERVICES,
+    ModbusAsciiListener,
+    ModbusRtuListener,
+    ModbusTlsListener,
+)
 from holdfast.config.fingerprint import fingerprint
 from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
@@ -37,6 +42,7 @@ if TYPE_CHECKING:
         MetricsConfig,
         RestConfig,
     )
+    from holdfast.web.https import Https
 
 # All other events of a listener are refusals or faults.
 LEVELS = {
@@ -183,6 +189,7 @@ class _Running:
         self._looked = self._reviewed = time.monotonic()
         # Missing adapters and unusable TLS files are reported before any socket is opened.
         _check_parts(config)
+        self._https = _loaded_https(config)
         assembly.mirror(config, memories)
         devices = [
             assembly.device(name, config, memories)
@@ -213,6 +220,7 @@ class _Running:
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
+            self.diagnostics.expiries = configured_certificates.expiries(config)
             for name, part in self._adapters(config, self._ports).items():
                 self._add(name, part)
             undo.pop_all()
@@ -355,6 +363,7 @@ class _Running:
         _check_parts(config)
         fingerprints = changes.fingerprints(config)
         changed = changes.differences(self._fingerprints, fingerprints)
+        https = _loaded_https(config)
         known = self._memories
         added = {
             name: assembly.memory(settings)
@@ -395,6 +404,13 @@ class _Running:
         self.diagnostics.links = links.links
         self._replace_devices(before, devices)
         self.diagnostics.disabled = self._tell_disabled()
+        self.diagnostics.expiries = configured_certificates.expiries(config)
+        for name, fresh in https.items():
+            serving = self._https[name]
+            if serving is not None and fresh is not None:
+                serving.adopt(fresh)
+            else:
+                self._https[name] = fresh
         self._replace_adapters(ports)
         logs.change(config.log.level, config.log.format)
         if self._audit is not None:
@@ -481,7 +497,8 @@ class _Running:
                 endpoints.append(ListenAddress(name, settings.type, *address, settings))
         for name, port in self._ports.items():
             service = getattr(self._config, name)
-            endpoints.append(ListenAddress(name, "http", *port.address, service, port.error))
+            scheme = "http" if service.tls is None else "https"
+            endpoints.append(ListenAddress(name, scheme, *port.address, service, port.error))
         return endpoints
 
     def _adapters(self, config: Config, ports: Mapping[str, Port]) -> dict[str, _Part]:
@@ -500,8 +517,10 @@ class _Running:
             rest, at, access = config.rest, ports["rest"], self._memory_access("rest")
             part = add(
                 "rest",
-                lambda: Rest(rest, access, self.diagnostics, at.listener),
-                rest,
+                lambda: Rest(
+                    rest, access, self.diagnostics, at.listener, https=self._https["rest"]
+                ),
+                *_apart_from_files(rest),
                 sorted(self._memories),
             )
             parts["rest"] = replace(part, access=access)
@@ -522,8 +541,10 @@ class _Running:
             gateway, gateway_at = assembly.gateway(config.gateway), ports["gateway"]
             add(
                 "gateway",
-                lambda: Gateway(gateway, gateway_at.listener, poller=poller),
-                config.gateway,
+                lambda: Gateway(
+                    gateway, gateway_at.listener, poller=poller, https=self._https["gateway"]
+                ),
+                *_apart_from_files(config.gateway),
                 poller is None,
             )
         if config.metrics is not None:
@@ -532,8 +553,10 @@ class _Running:
             metrics, metrics_at = config.metrics, ports["metrics"]
             add(
                 "metrics",
-                lambda: Metrics(metrics, self.diagnostics, metrics_at.listener),
-                metrics,
+                lambda: Metrics(
+                    metrics, self.diagnostics, metrics_at.listener, https=self._https["metrics"]
+                ),
+                *_apart_from_files(metrics),
             )
         for name, settings in config.adapters.items():
             own = self._memory_access(name)
@@ -559,13 +582,18 @@ def _check_parts(config: Config) -> None:
     """Raises `UnknownAdapter` or `OSError` for what can be found before a socket is opened."""
     for name, settings in config.adapters.items():
         foreign.entry_point(name, settings)
-    if config.gateway is not None and config.gateway.tls is not None:
-        _check_files("gateway.tls", assembly.gateway_tls(config.gateway))
+    if config.gateway is not None and config.gateway.device_tls is not None:
+        _check_files("gateway.device_tls", assembly.gateway_tls(config.gateway))
 
 
 def _http_services(config: Config) -> dict[str, RestConfig | GatewayConfig | MetricsConfig]:
-    services = {"rest": config.rest, "gateway": config.gateway, "metrics": config.metrics}
+    services = {name: getattr(config, name) for name in HTTP_SERVICES}
     return {name: settings for name, settings in services.items() if settings is not None}
+
+
+def _apart_from_files(service: RestConfig | GatewayConfig | MetricsConfig) -> tuple[object, bool]:
+    """What an HTTP service must start again for: other certificates are for new connections."""
+    return service.model_copy(update={"tls": None}), service.tls is None
 
 
 def _requires_poller(config: Config) -> bool:
@@ -583,6 +611,19 @@ def _review_interval(config: Config) -> float | None:
 def _events(config: Config) -> Literal["all", "refusals"]:
     """The events of listeners that are logged."""
     return "all" if config.log.level == "debug" else "refusals"
+
+
+def _loaded_https(config: Config) -> dict[str, Https | None]:
+    """The TLS settings of each HTTP service. Raises `OSError` with the setting's name."""
+    loaded: dict[str, Https | None] = {}
+    for name in HTTP_SERVICES:
+        settings = getattr(config, name)
+        tls = None if settings is None else settings.tls
+        try:
+            loaded[name] = None if tls is None else assembly.https(tls)
+        except ValueError as error:
+            raise OSError(f"{name}.tls: {error}") from error
+    return loaded
 
 
 def _check_files(name: str, tls: Tls) -> None:

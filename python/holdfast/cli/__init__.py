@@ -15,6 +15,7 @@ from holdfast import __version__
 COMMANDS = {
     "audit": "holdfast.cli.audit:audit",
     "bench": "holdfast.cli.bench:bench",
+    "cert": "holdfast.cli.cert:cert",
     "check": "holdfast.cli.check:check",
     "completion": "holdfast.cli.completion:completion",
     "gateway": "holdfast.cli.gateway:gateway",

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.appliance import assembly
+from holdfast.appliance import assembly, configured_certificates
 from holdfast.client.endpoint import check_files, endpoint
-from holdfast.config import ConfigError, ModbusTlsListener, load, source
+from holdfast.config import HTTP_SERVICES, ConfigError, ModbusTlsListener, load, source
 from holdfast.config.report import Report
 
 if TYPE_CHECKING:
@@ -52,16 +52,28 @@ def load_whole(path: Path | str) -> Config:
             device_tls.check(assembly.scanner(config.nats).device_tls)
         except OSError as error:
             problems["nats", "device_tls"] = str(error)
-    if config.gateway is not None and config.gateway.tls is not None:
+    if config.gateway is not None and config.gateway.device_tls is not None:
         try:
             check_files(assembly.gateway_tls(config.gateway))
         except (OSError, ValueError) as error:
-            problems["gateway", "tls"] = str(error)
-    if problems:
+            problems["gateway", "device_tls"] = str(error)
+    for name in HTTP_SERVICES:
+        service = getattr(config, name)
+        if service is not None and service.tls is not None:
+            try:
+                assembly.https(service.tls)
+            except ValueError as error:
+                problems[name, "tls"] = str(error)
+    doubts = [] if problems else configured_certificates.doubts(config)
+    if problems or doubts:
         report = Report(source.parse(source.read_text(Path(path), file), file)[0])
         for where, message in problems.items():
             report.add(where, message)
-        raise ConfigError(file, report.problems)
+        if problems:
+            raise ConfigError(file, report.problems)
+        for where, message in doubts:
+            report.doubt(where, message)
+        config.with_warnings([*config.warnings, *report.doubts])
     return config
 
 

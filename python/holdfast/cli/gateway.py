@@ -16,7 +16,7 @@ from holdfast import logs
 from holdfast.cli.parsing import by
 from holdfast.cli.run import JOIN_TIMEOUT
 from holdfast.cli.signals import Signals
-from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
+from holdfast.cli.tls_options import DEVICES, https_of, https_options, tls_of, tls_options
 from holdfast.client.endpoint import check_files
 from holdfast.config.egress import parse_allowed
 from holdfast.config.ip_addresses import parse_bind, parse_source
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork
     from holdfast.net.tls import Tls
+    from holdfast.web.https import Https
 
 FAILED = 1
 
@@ -74,6 +75,7 @@ FAILED = 1
     help="Clients that may connect to the gateway; repeatable.",
 )
 @tls_options("tls", DEVICES, " for devices")
+@https_options
 @click.option(
     "--in-flight",
     type=click.IntRange(1, 64),
@@ -92,6 +94,10 @@ def gateway(
     tls_ca: str | None,
     tls_cert: str | None,
     tls_key: str | None,
+    https_cert: Path | None,
+    https_key: Path | None,
+    https_passphrase_file: Path | None,
+    https_client_ca: Path | None,
     in_flight: int,
     json_log: bool,
 ) -> None:
@@ -106,6 +112,8 @@ def gateway(
     With TLS, certificates of devices are verified with --tls-ca. Devices that require a client
     certificate receive --tls-cert.
 
+    With --https-cert and --https-key, clients of the gateway use HTTPS.
+
     Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage.
     """
     settings = Settings(
@@ -118,6 +126,7 @@ def gateway(
     )
     if not settings.tokens and any(not each.is_loopback for each in sources):
         raise click.UsageError("--sources beyond this machine require --token-file.")
+    https = https_of(https_cert, https_key, https_passphrase_file, https_client_ca)
     logs.configure("info", "json" if json_log else "text")
     signals = Signals()
     try:
@@ -126,16 +135,18 @@ def gateway(
         click.echo(f"holdfast: can't listen on {bind}: {explained(error)}", err=True)
         sys.exit(FAILED)
     with listener:
-        _serve(settings, listener, signals)
+        _serve(settings, listener, signals, https)
 
 
-def _serve(settings: Settings, listener: socket.socket, signals: Signals) -> None:
+def _serve(
+    settings: Settings, listener: socket.socket, signals: Signals, https: Https | None
+) -> None:
     """Serves in a thread until a signal arrives."""
-    served = Gateway(settings, listener)
+    served = Gateway(settings, listener, https=https)
     stop = Stop()
     with ThreadPoolExecutor(1, "gateway") as threads:
         running: Future[None] = threads.submit(served.run, stop)
-        click.echo(_greeting(served.address, settings))
+        click.echo(_greeting(served.url, settings))
         while not signals.received and not running.done():
             wait_for([running], JOIN_TIMEOUT)
             logs.tell_held_back()
@@ -165,9 +176,10 @@ def _tls(ca: str | None, cert: str | None, key: str | None) -> Tls:
     return tls
 
 
-def _greeting(address: str, settings: Settings) -> str:
+def _greeting(served: str, settings: Settings) -> str:
+    scheme, _, address = served.partition("://")
     at, _, port = address.rpartition(":")
-    url = f"http://{joined(reachable(unbracketed(at)), int(port))}"
+    url = f"{scheme}://{joined(reachable(unbracketed(at)), int(port))}"
     can = "reads and writes" if settings.writes else "reads"
     who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
     example, its_port = _example(settings.allow[0])
@@ -175,6 +187,8 @@ def _greeting(address: str, settings: Settings) -> str:
     header = "-H 'Content-Type: application/json'"
     if settings.tokens:
         header += ' -H "Authorization: Bearer $TOKEN"'
+    if scheme == "https":
+        header += " --cacert ca.pem"
     return "\n".join(
         [
             f"Console: {url}/, API documentation: {url}/docs",

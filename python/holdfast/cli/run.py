@@ -171,7 +171,9 @@ def _address(endpoint: ListenAddress) -> str:
     if endpoint.port is None:
         return f"{endpoint.type}  {endpoint.host}"
     address = joined(endpoint.host, endpoint.port)
-    return f"http://{address}" if endpoint.type == "http" else f"{endpoint.type}  {address}"
+    if endpoint.type in ("http", "https"):
+        return f"{endpoint.type}://{address}"
+    return f"{endpoint.type}  {address}"
 
 
 def _polled(device: DeviceConfig) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 from urllib.parse import urlencode
 
 from holdfast.cli.device import read_raw
+from holdfast.cli.pinned import pinned
 from holdfast.config import ModbusTcpListener
 from holdfast.config.rights import items, matching, together
 from holdfast.net.addresses import joined, parse_address, reachable
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.client import SyncClient
-    from holdfast.config import Config
+    from holdfast.config import Config, RestConfig
     from holdfast.config.ip_addresses import Bind
     from holdfast.config.rights import UnitRights
     from holdfast.types import Area
@@ -87,13 +88,22 @@ class Rest:
     """Blocks of memories, read over the REST interface of an appliance."""
 
     def __init__(
-        self, bind: Bind, blocks: Sequence[WatchedRange], token: str | None, timeout: float
+        self,
+        settings: RestConfig,
+        blocks: Sequence[WatchedRange],
+        token: str | None,
+        timeout: float,
     ) -> None:
-        self.where = f"REST at http://{_shown(bind)}"
+        bind = settings.bind
+        scheme = "http" if settings.tls is None else "https"
+        self.where = f"REST at {scheme}://{_shown(bind)}"
         self.blocks = list(blocks)
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._connection = http.client.HTTPConnection(
-            reachable(bind.host), bind.port, timeout=timeout
+        address = reachable(bind.host), bind.port
+        self._connection = (
+            http.client.HTTPConnection(*address, timeout=timeout)
+            if settings.tls is None
+            else pinned(*address, settings.tls.cert_file, timeout=timeout)
         )
 
     def read(self) -> list[list[int]]:
@@ -133,6 +143,8 @@ def by_rest(config: Config, token: str | None) -> list[WatchedRange]:
     rest = config.rest
     assert rest is not None
     _check_port("rest", rest.bind)
+    if rest.tls is not None and rest.tls.client_ca_file is not None:
+        raise Unwatchable("rest requires client certificates, which holdfast watch does not have")
     memories, areas = set(config.memories), set(AREAS)
     if rest.tokens != "none":
         if token is None:

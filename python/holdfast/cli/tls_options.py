@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -10,6 +11,8 @@ from holdfast.net.tls import Tls, alone
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from holdfast.web.https import Https
 
 Command = TypeVar("Command", bound="Callable[..., Any]")
 
@@ -41,3 +44,39 @@ def tls_of(prefix: str, ca: str | None, cert: str | None, key: str | None) -> Tl
         given, missing = lonely
         raise click.UsageError(f"--{prefix}-{given} requires --{prefix}-{missing}.")
     return Tls(ca, cert, key)
+
+
+def https_options(command: Command) -> Command:
+    """Adds `--https-cert`, `--https-key`, `--https-passphrase-file` and `--https-client-ca`."""
+    file = click.Path(exists=True, dir_okay=False, path_type=Path)
+    told = {
+        "cert": "Serve HTTPS with this certificate, followed by its intermediate certificates.",
+        "key": "Its key.",
+        "passphrase-file": "File that contains the passphrase of the key.",
+        "client-ca": "Require client certificates of these authorities.",
+    }
+    for name, text in reversed(told.items()):
+        command = click.option(f"--https-{name}", type=file, metavar="FILE", help=text)(command)
+    return command
+
+
+def https_of(
+    cert: Path | None, key: Path | None, passphrase_file: Path | None, client_ca: Path | None
+) -> Https | None:
+    """The TLS settings of the options; `None` for HTTP. Raises `click.UsageError`."""
+    lonely = alone(cert=cert is not None, key=key is not None)
+    if lonely is not None:
+        given, missing = lonely
+        raise click.UsageError(f"--https-{given} requires --https-{missing}.")
+    if cert is None or key is None:
+        if passphrase_file is not None or client_ca is not None:
+            raise click.UsageError(
+                "--https-passphrase-file and --https-client-ca require --https-cert."
+            )
+        return None
+    from holdfast.web.https import Https, HttpsFiles
+
+    try:
+        return Https(HttpsFiles(cert, key, passphrase_file, client_ca))
+    except ValueError as error:
+        raise click.UsageError(f"HTTPS: {error}.") from error

@@ -171,7 +171,7 @@ def _appliance(
         sys.exit(WRONG)
     if config.rest is not None:
         needed = None if config.rest.tokens == "none" else token
-        return sources.Rest(config.rest.bind, blocks, needed, timeout)
+        return sources.Rest(config.rest, blocks, needed, timeout)
     url = sources.url_of(bind)
     client = device.connect(url, blocks[0].unit, timeout)
     return sources.DeviceSource(f"listener {name} at {url}", client, blocks)

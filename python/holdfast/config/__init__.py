@@ -47,11 +47,13 @@ from holdfast.config.model import Config, IdentityConfig, LogConfig
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.schema import json_schema
 from holdfast.config.services import (
+    HTTP_SERVICES,
     AdapterConfig,
     AuditConfig,
     ClientTlsConfig,
     GatewayConfig,
     GatewayTokenConfig,
+    HttpsConfig,
     MetricsConfig,
     MqttConfig,
     NatsConfig,
@@ -66,6 +68,7 @@ from holdfast.config.services import (
 from holdfast.net.addresses import Network
 
 __all__ = [
+    "HTTP_SERVICES",
     "AdapterConfig",
     "AsciiSerialConfig",
     "AuditConfig",
@@ -79,6 +82,7 @@ __all__ = [
     "ForwardConfig",
     "GatewayConfig",
     "GatewayTokenConfig",
+    "HttpsConfig",
     "IdentityConfig",
     "InitialRun",
     "LinkConfig",

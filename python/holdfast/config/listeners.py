@@ -217,7 +217,9 @@ class ServerTlsConfig(Model):
     cert_file: FilePath
     """The server's certificate, followed by its intermediate certificates."""
     key_file: FilePath
-    """The key of that certificate, without a passphrase."""
+    """The key of that certificate."""
+    key_passphrase_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that contains the passphrase of the key."""
     ca_file: FilePath
     """Authorities of client certificates, and self-signed certificates of clients."""
     crl_file: Annotated[FilePath | None, NotNull()] = None

@@ -13,8 +13,8 @@ from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.scanning import check_dialect, parse_server
-from holdfast.config.services import RestConfig
-from holdfast.config.tls_checks import check_client_tls
+from holdfast.config.services import HTTP_SERVICES, RestConfig
+from holdfast.config.tls_checks import check_client_tls, check_https
 from holdfast.config.unique import Owners
 from holdfast.config.words import choice, listing, show
 
@@ -50,6 +50,9 @@ class ServiceChecks:
             self.grants.grant(("adapters", name), mapping(adapter))
         if isinstance(data.get("audit"), dict):
             self._audit(data["audit"])
+        for name in HTTP_SERVICES:
+            tls = mapping(mapping(data.get(name)).get("tls"))
+            check_https((name, "tls"), tls, self.folder, self.report)
 
     def _served(self, data: dict[Any, Any]) -> None:
         """Reports a missing server, and missing memories if a section uses them."""
@@ -73,7 +76,7 @@ class ServiceChecks:
 
     def _gateway(self, gateway: dict[Any, Any]) -> None:
         self._tokens("gateway", gateway)
-        self._tls(("gateway", "tls"), gateway.get("tls"))
+        self._tls(("gateway", "device_tls"), gateway.get("device_tls"))
         if gateway.get("tokens") != "none":
             return
         for index, source in enumerate(entries(gateway.get("sources"))):

@@ -90,6 +90,22 @@ Tokens: TypeAlias = Annotated[
 ]
 
 
+class HttpsConfig(Model):
+    """PEM files of an HTTPS server; they are read at the start."""
+
+    cert_file: FilePath
+    """The server's certificate, followed by its intermediate certificates."""
+    key_file: FilePath
+    """The key of that certificate."""
+    key_passphrase_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that contains the passphrase of the key."""
+    client_ca_file: Annotated[FilePath | None, NotNull()] = None
+    """Authorities of client certificates. Default: clients need no certificate."""
+    crl_file: Annotated[FilePath | None, NotNull()] = None
+    """Certificate revocation lists: one of each authority above a client; requires client_ca_file.
+    """
+
+
 class RestConfig(Model):
     """The REST interface: JSON in and out over HTTP."""
 
@@ -109,6 +125,8 @@ class RestConfig(Model):
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last."""
+    tls: Annotated[HttpsConfig | None, NotNull()] = None
+    """Certificates for HTTPS. Default: HTTP."""
 
 
 class ClientTlsConfig(Model):
@@ -266,7 +284,9 @@ class GatewayConfig(Model):
     """Whether it may write to devices."""
     tokens: Tokens[GatewayTokenConfig]
     """The tokens. none: everyone has access; only on loopback addresses."""
-    tls: Annotated[ClientTlsConfig | None, NotNull()] = None
+    tls: Annotated[HttpsConfig | None, NotNull()] = None
+    """Certificates for HTTPS. Default: HTTP."""
+    device_tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates for TLS connections to devices."""
     in_flight: Annotated[int, Field(ge=1, le=64)] = 1
     """Maximum number of requests in flight to one device."""
@@ -294,6 +314,8 @@ class MetricsConfig(Model):
     """Where to listen: an IP address and a port."""
     sources: Sources = LOOPBACK
     """Networks and addresses of the clients, IPv4 or IPv6."""
+    tls: Annotated[HttpsConfig | None, NotNull()] = None
+    """Certificates for HTTPS. Default: HTTP."""
 
 
 class SyslogConfig(Model):
@@ -321,3 +343,7 @@ class AuditConfig(Model):
     """The size in bytes at which the file is rotated."""
     keep: Annotated[int, Field(ge=1, le=1000)] = 10
     """How many rotated files to keep."""
+
+
+HTTP_SERVICES = ("rest", "gateway", "metrics")
+"""The sections of services over HTTP, each with `bind`, `sources` and `tls`."""

@@ -14,7 +14,14 @@ if TYPE_CHECKING:
     from holdfast.config.source import KeyPath
 
 CLIENT_FILES = ("ca_file", "cert_file", "key_file")
-SERVER_FILES = ("cert_file", "key_file", "ca_file", "crl_file")
+SERVER_FILES = (
+    "cert_file",
+    "key_file",
+    "key_passphrase_file",
+    "ca_file",
+    "client_ca_file",
+    "crl_file",
+)
 
 
 def check_client_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:
@@ -29,6 +36,14 @@ def check_client_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: R
 
 
 def check_server_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:
-    """Reports files of a TLS server that can't be read. The model reports missing keys."""
+    """Reports files of a TLS or HTTPS server that can't be read. The model reports missing keys."""
     for key in SERVER_FILES:
         check_readable((*path, key), tls.get(key), folder, report)
+
+
+def check_https(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:
+    """Reports problems with the files of an HTTPS server."""
+    check_server_tls(path, tls, folder, report)
+    if "crl_file" in tls and "client_ca_file" not in tls:
+        message = "found without client_ca_file, allowed: only with it"
+        report.add((*path, "crl_file"), message, of_key=True)

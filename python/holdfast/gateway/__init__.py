@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
     from holdfast.stop import Stop
+    from holdfast.web.https import Https
 
 __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
 
@@ -37,11 +38,15 @@ class Gateway:
         resolve: Resolve | None = None,
         dial: Dial = dial,
         poller: Poller | None = None,
+        https: Https | None = None,
     ) -> None:
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
         """The address it listens on."""
-        self._app = App(settings, self.address, resolve=resolve, dial=dial, poller=poller)
+        scheme = "http" if https is None else "https"
+        self.url = f"{scheme}://{self.address}"
+        """The URL of its root."""
+        self._app = App(settings, self.url, resolve=resolve, dial=dial, poller=poller)
         self._host = Host(
             "gateway",
             self._app,
@@ -51,6 +56,7 @@ class Gateway:
             request_timeout=settings.limits.request_timeout,
             leaving=True,
             rejection=rejection,
+            https=https,
         )
 
     def run(self, stop: Stop) -> None:

@@ -60,7 +60,7 @@ class App:
     def __init__(
         self,
         settings: Settings,
-        address: str,
+        url: str,
         *,
         resolve: Resolve | None = None,
         dial: Dial = dial,
@@ -88,7 +88,7 @@ class App:
         self._loop: asyncio.AbstractEventLoop | None = None
         document = openapi.document(__version__, ENDPOINTS, settings)
         self._document = msgspec.json.encode(document)
-        self._page = page.render(document, f"http://{address}")
+        self._page = page.render(document, url)
         self.routes: dict[str, tuple[str, Handler]] = {
             **{each.path: ("POST", self._handler(each)) for each in ENDPOINTS},
             surveying.PATH: ("POST", self._map),

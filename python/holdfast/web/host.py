@@ -27,6 +27,7 @@ from holdfast import logs
 from holdfast.net.addresses import holds, joined, parse_address
 from holdfast.web.admission import Admission, Full, Waiting
 from holdfast.web.port import BACKLOG
+from holdfast.web.tls import TlsTransport
 
 if TYPE_CHECKING:
     import socket
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Network
     from holdfast.stop import Stop
     from holdfast.web.admission import ConnectionLimits
+    from holdfast.web.https import Https
 
     Scope: TypeAlias = MutableMapping[str, Any]
     Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -94,6 +96,7 @@ class Counts:
     request_timeout: int = 0
     slow_reader: int = 0
     broken_request: int = 0
+    tls_failed: int = 0
     open: int = 0
 
 
@@ -105,6 +108,8 @@ class Host:
     `LATE_ANSWER_TIMEOUT` seconds to answer before the connection is dropped.
 
     `rejection` creates the response to requests that never reach the application.
+
+    With `https`, connections use TLS; the limits and `request_timeout` include the handshake.
 
     A peer that half-closes the connection still gets its responses. With `leaving`, a half-close
     means that the client is gone, because a full close looks the same to the server.
@@ -121,8 +126,10 @@ class Host:
         request_timeout: float,
         leaving: bool = False,
         rejection: Rejection = rejection,
+        https: Https | None = None,
     ) -> None:
         self.name = name
+        self.https = https
         self.rejection = rejection
         self.leaving = leaving
         self.request_timeout = request_timeout
@@ -162,11 +169,12 @@ class Host:
         """Frees the place of a connection that was closed."""
         self._admission.release(connection)
 
-    def note(self, event: str, peer: str) -> None:
+    def note(self, event: str, peer: str, **fields: str) -> None:
         """Counts and logs an event of a connection. Called in the thread of `run`."""
         setattr(self.counted, event, getattr(self.counted, event) + 1)
         if event != "idle":
-            logs.refused(event, kind=(self.name, event), listener=self.name, peer=peer)
+            kind = (self.name, event, *fields.values())
+            logs.refused(event, kind=kind, listener=self.name, peer=peer, **fields)
 
     async def _serve(self, stop: Stop) -> None:
         loop = asyncio.get_running_loop()
@@ -190,12 +198,13 @@ class Host:
         state = ServerState()
         self.counted.open = 0
         self._admission = Admission(self._limits)
+
+        def connection() -> asyncio.Protocol:
+            https, made = self.https, _Connection(config, state, {}, loop, host=self)
+            return made if https is None else TlsTransport(https.context, made)
+
         with self._listener.dup() as listener:
-            server = await loop.create_server(
-                lambda: _Connection(config, state, {}, loop, host=self),
-                sock=listener,
-                backlog=BACKLOG,
-            )
+            server = await loop.create_server(connection, sock=listener, backlog=BACKLOG)
             while not stopped.is_set():
                 state.default_headers = [(b"date", formatdate(usegmt=True).encode())]
                 with contextlib.suppress(TimeoutError):
@@ -360,9 +369,13 @@ class _Connection(HttpToolsProtocol):
         self.held = b""
         super().connection_lost(exc)
 
+    def begun(self) -> None:
+        """Called with the first bytes of a peer, which may be those of a TLS handshake."""
+        self._used = True
+
     def data_received(self, data: bytes) -> None:
         """Buffers and parses received bytes."""
-        self._used = True
+        self.begun()
         if not self._broken and not self.transport.is_closing():
             self.held += data
             self._parse()
@@ -386,6 +399,14 @@ class _Connection(HttpToolsProtocol):
         self._since = self.loop.time()
         self._reply_due = math.inf
         super().resume_writing()
+
+    def tls_failed(self, reason: str) -> None:
+        """Called when TLS failed, before the connection is closed."""
+        self.host.note("tls_failed", self.app_state["peer"], reason=reason)
+
+    def plain_answer(self) -> bytes:
+        """Returns the response to a request without TLS."""
+        return self._refusal(400, "this port takes HTTPS: use a URL that begins with https://")
 
     # Called by the parser.
 
@@ -511,10 +532,13 @@ class _Connection(HttpToolsProtocol):
         elif self.pipeline or (self._busy() and self.cycle.response_started):
             self.transport.abort()
         else:
-            headers, body = self.host.rejection("malformed", detail)
-            lines = [b"%b: %b\r\n" % header for header in [*headers, (b"connection", b"close")]]
-            self.transport.write(b"".join([STATUS_LINE[status], *lines, b"\r\n", body]))
+            self.transport.write(self._refusal(status, detail))
             self.transport.close()
+
+    def _refusal(self, status: int, detail: str) -> bytes:
+        headers, body = self.host.rejection("malformed", detail)
+        lines = [b"%b: %b\r\n" % header for header in [*headers, (b"connection", b"close")]]
+        return b"".join([STATUS_LINE[status], *lines, b"\r\n", body])
 
     # A limit is reached.
 
@@ -560,7 +584,10 @@ class _Connection(HttpToolsProtocol):
     def _be_late(self) -> None:
         """Lets the application answer if it waits for the body; otherwise drops the connection."""
         cycle = self.cycle
-        if not (self._busy() and cycle.more_body) or self.pipeline:
+        if self.transport.get_extra_info("handshaking", False):
+            self.tls_failed("timeout")
+            self.transport.abort()
+        elif not (self._busy() and cycle.more_body) or self.pipeline:
             self.host.note("request_timeout", self.app_state["peer"])
             self.transport.abort()
         elif "late" in cycle.scope["state"]:

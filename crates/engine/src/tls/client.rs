@@ -74,7 +74,7 @@ impl ClientTls {
             Some(file) => Listed::of_file(file)?,
             None => of_system()?,
         };
-        let own = settings.own.map(|(file, key_file)| own(file, key_file)).transpose()?;
+        let own = settings.own.map(|(file, key_file)| own(file, key_file, None)).transpose()?;
         let shown = own.as_ref().map_or_else(Vec::new, |own| own.cert.clone());
         let verifier = Arc::new(Servers(Trust::new(Arc::clone(&trusted), Vec::new())));
         let builder = ClientConfig::builder_with_provider(provider())

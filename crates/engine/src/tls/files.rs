@@ -57,14 +57,21 @@ pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, 
 /// # Errors
 /// [`FileError`]
 pub(super) fn key(file: &Path) -> Result<PrivateKeyDer<'static>, FileError> {
-    let text = read(file)?;
+    key_of(file, &read(file)?)
+}
+
+/// Reads the first key of a text, which is the content of `file`.
+///
+/// # Errors
+/// [`FileError`]
+pub(super) fn key_of(file: &Path, text: &[u8]) -> Result<PrivateKeyDer<'static>, FileError> {
     if text.windows(9).any(|word| word == b"ENCRYPTED") {
         let flaw = "the key is encrypted; use a key without a passphrase";
         return Err(FileError::content(file, flaw));
     }
-    match PrivateKeyDer::pem_slice_iter(&text).next() {
+    match PrivateKeyDer::pem_slice_iter(text).next() {
         Some(found) => found.map_err(|error| FileError::content(file, error.to_string())),
-        None => Err(FileError::content(file, missing(&text, "key"))),
+        None => Err(FileError::content(file, missing(text, "key"))),
     }
 }
 

@@ -8,16 +8,25 @@ use rustls::sign::{CertifiedKey, SigningKey};
 use rustls::{Error, InconsistentKeys};
 
 use super::certificate::Parsed;
-use super::files::{FileError, certificates, key};
+use super::files::{FileError, certificates, key, key_of};
 use super::provider::{KEYS, provider};
 use super::rsa_pss::PssKey;
 
-/// Reads a certificate, with its intermediates, and its key.
+/// Reads a certificate, with its intermediates, and its key. With `unlocked`, that is the content of
+/// the key's file.
 ///
 /// # Errors
 /// [`FileError`] for an unusable file, or a key that does not belong to the certificate.
-pub(super) fn own(cert_file: &Path, key_file: &Path) -> Result<Arc<CertifiedKey>, FileError> {
-    let (chain, key) = (certificates(cert_file)?, key(key_file)?);
+pub(super) fn own(
+    cert_file: &Path,
+    key_file: &Path,
+    unlocked: Option<&[u8]>,
+) -> Result<Arc<CertifiedKey>, FileError> {
+    let chain = certificates(cert_file)?;
+    let key = match unlocked {
+        Some(text) => key_of(key_file, text)?,
+        None => key(key_file)?,
+    };
     let wrong = |flaw: String| FileError::content(key_file, flaw);
     let [end_entity, ..] = chain.as_slice() else {
         return Err(FileError::content(cert_file, "found no certificate"));

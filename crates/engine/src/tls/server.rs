@@ -31,7 +31,7 @@ use super::trust::{Listed, Trust};
 pub struct ServerFiles {
     /// The certificate of the server, with its intermediates.
     pub cert_file: PathBuf,
-    /// The key of the certificate, without a passphrase.
+    /// The key of the certificate.
     pub key_file: PathBuf,
     /// Authorities of clients, and self-signed certificates of clients.
     pub ca_file: PathBuf,
@@ -46,12 +46,12 @@ pub struct ServerTls {
 }
 
 impl ServerTls {
-    /// Reads the files.
+    /// Reads the files. `key` is the content of `key_file` without its passphrase, if it has one.
     ///
     /// # Errors
     /// [`FileError`] for an unusable file.
-    pub fn load(files: &ServerFiles) -> Result<ServerTls, FileError> {
-        let own = own(&files.cert_file, &files.key_file)?;
+    pub fn load(files: &ServerFiles, key: Option<&[u8]>) -> Result<ServerTls, FileError> {
+        let own = own(&files.cert_file, &files.key_file, key)?;
         let clients = Arc::new(Clients::load(files)?);
         let config = ServerConfig::builder_with_provider(provider())
             .with_safe_default_protocol_versions()

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.stop import Stop
+    from holdfast.web.https import Https
 
 __all__ = ["Rest"]
 
@@ -28,10 +29,13 @@ class Rest:
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
         listener: socket.socket,
+        *,
+        https: Https | None = None,
     ) -> None:
+        scheme = "http" if https is None else "https"
         self._host = Host(
             "rest",
-            App(settings, memory_access, diagnostics, listener),
+            App(settings, memory_access, diagnostics, listener, scheme),
             listener,
             sources=settings.sources,
             limits=ConnectionLimits(
@@ -40,6 +44,7 @@ class Rest:
                 settings.when_full,
             ),
             request_timeout=settings.request_timeout,
+            https=https,
         )
 
     def run(self, stop: Stop) -> None:

@@ -55,6 +55,7 @@ class App:
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
         listener: socket.socket,
+        scheme: str,
     ) -> None:
         self._memory_access = memory_access
         self._diagnostics = diagnostics
@@ -78,7 +79,7 @@ class App:
         host, port, *_ = listener.getsockname()
         document = openapi.document(__version__, self._max_body, secured=self._anyone is None)
         self._document = msgspec.json.encode(document)
-        self._page = page.render(document, f"http://{address_of(host, port)}")
+        self._page = page.render(document, f"{scheme}://{address_of(host, port)}")
         handlers: dict[str, Handler] = {
             "ingest": self._ingest,
             "read": self._read,

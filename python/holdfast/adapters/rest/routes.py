@@ -208,6 +208,8 @@ ROUTES = (
                 "events_lost": 0,
                 "log_dropped": 0,
                 "audit": None,
+                "certificates": {"/etc/holdfast/server.pem": 1893456000.0},
+                "revocation_lists": {},
             },
         ),
     ),

@@ -159,6 +159,17 @@ DIAGNOSTICS: dict[str, Schema] = {
                     },
                 },
             },
+            "certificates": {
+                "type": "object",
+                "description": "For each configured file, when its first certificate expires, in "
+                "Unix time",
+                "additionalProperties": {"type": "number"},
+            },
+            "revocation_lists": {
+                "type": "object",
+                "description": "For each configured file, the first nextUpdate, in Unix time",
+                "additionalProperties": {"type": "number"},
+            },
         }
     ),
     "Mqtt": {

@@ -1,0 +1,324 @@
+"""Describes certificates, keys and revocation lists, and what MB-TCP-Security requires of them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed448, ed25519, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from holdfast.certificates.authority import ROLE, UTF8_STRING, is_authority
+from holdfast.certificates.expiry import Expiry, now
+from holdfast.certificates.pem import (
+    MALFORMED,
+    UnusableFile,
+    blocks,
+    content,
+    is_locked,
+    key,
+    public_key,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.certificates.pem import File
+
+MIN_RSA_BITS = 2048
+
+_PURPOSES = {
+    ExtendedKeyUsageOID.SERVER_AUTH: "server",
+    ExtendedKeyUsageOID.CLIENT_AUTH: "client",
+    ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE: "any",
+}
+
+
+@dataclass
+class Described:
+    """A certificate, a key or a revocation list of a file."""
+
+    kind: str
+    """`certificate`, `key` or `revocation list`."""
+    fields: dict[str, Any] = field(default_factory=dict)
+    flaws: list[str] = field(default_factory=list)
+    """Requirements that it does not meet, each with its number if it is one of MB-TCP-Security."""
+    advice: list[str] = field(default_factory=list)
+    """Recommendations that it does not follow."""
+
+
+def describe(file: File, passphrase: bytes | None = None) -> list[Described]:
+    """Describes everything in a PEM file, in order. Raises `UnusableFile`."""
+    try:
+        return _described(file, passphrase)
+    except UnusableFile:
+        raise
+    except MALFORMED as error:  # Parts of certificates are parsed when they are used.
+        raise UnusableFile(file, f"it can't be read: {error}") from error
+
+
+def _described(file: File, passphrase: bytes | None) -> list[Described]:
+    text = content(file)
+    found = blocks(text)
+    chain = [_certificate(file, block) for label, block in found if label == "CERTIFICATE"]
+    described: list[Described] = []
+    rest = iter(chain)
+    for label, block in found:
+        if label == "CERTIFICATE":
+            described.append(_of_certificate(next(rest)))
+        elif label == "X509 CRL":
+            described.append(_of_list(file, block))
+        elif label.endswith("PRIVATE KEY"):
+            described.append(_of_key(file, block, passphrase, chain))
+    if not described:
+        form = "DER" if text[:1] == b"\x30" else "something else"
+        raise UnusableFile(file, f"found {form}, allowed: certificates, keys or lists in PEM")
+    if chain and not is_authority(chain[0]):
+        _judge_chain(chain, next(each for each in described if each.kind == "certificate"))
+    return described
+
+
+def role_of(certificate: x509.Certificate) -> str | None:
+    """Returns the role of a certificate, `None` without one.
+
+    Raises `ValueError` if it is malformed.
+    """
+    try:
+        value = certificate.extensions.get_extension_for_oid(ROLE).value
+    except x509.ExtensionNotFound:
+        return None
+    assert isinstance(value, x509.UnrecognizedExtension)
+    return _utf8_string(value.value)
+
+
+def _utf8_string(der: bytes) -> str:
+    """The text of a UTF8String in DER."""
+    if der[:1] != bytes([UTF8_STRING]):
+        raise ValueError("R-22: the role is not a UTF8String")
+    size, start = der[1] if len(der) > 1 else 0, 2
+    if size & 0x80:
+        start = 2 + (size & 0x7F)
+        size = int.from_bytes(der[2:start], "big")
+    if len(der) != start + size:
+        raise ValueError("R-22: the role is not valid DER")
+    try:
+        return der[start:].decode()
+    except UnicodeDecodeError as error:
+        raise ValueError("R-22: the role is not UTF-8") from error
+
+
+def _certificate(file: File, block: bytes) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(block)
+    except MALFORMED as error:
+        raise UnusableFile(file, f"a certificate can't be read: {error}") from error
+
+
+def _of_certificate(certificate: x509.Certificate) -> Described:
+    made = Described("certificate")
+    made.fields = {
+        "subject": certificate.subject.rfc4514_string(),
+        "issuer": certificate.issuer.rfc4514_string(),
+        "serial": serial_text(certificate.serial_number),
+        "not_before": certificate.not_valid_before_utc.isoformat(),
+        "not_after": certificate.not_valid_after_utc.isoformat(),
+        "key": key_text(public_key(certificate)),
+        "signature": _signature_text(_hash_of(certificate)),
+        "sha256": certificate.fingerprint(hashes.SHA256()).hex(":"),
+    }
+    if certificate.version != x509.Version.v3:
+        made.flaws.append("R-03: the certificate is not of X.509 version 3")
+        return made
+    try:
+        extensions = certificate.extensions
+    except x509.DuplicateExtension as error:
+        role = "R-65: the role occurs twice"
+        other = f"R-47: the extension {error.oid.dotted_string} occurs twice"
+        made.flaws.append(role if error.oid == ROLE else other)
+        return made
+    except MALFORMED as error:
+        made.flaws.append(f"R-47: the extensions can't be read: {error}")
+        return made
+    authority = is_authority(certificate)
+    made.fields["authority"] = authority
+    purposes = _purposes(extensions)
+    made.fields["purpose"] = ["authority"] if authority else purposes
+    names = _names(extensions)
+    if names:
+        made.fields["names"] = names
+    _judge_dates(certificate, made)
+    _judge_key(certificate, made)
+    if not authority:
+        _judge_role(certificate, extensions, purposes, made)
+        if "server" in purposes and not names:
+            made.flaws.append("RFC 9525: a server without a DNS name or IP address is refused")
+    return made
+
+
+def _judge_dates(certificate: x509.Certificate, made: Described) -> None:
+    dates = Expiry(
+        "the certificate", certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    )
+    doubt = dates.doubt(now())
+    if doubt is not None:
+        valid = dates.begins <= now() < dates.ends
+        (made.advice if valid else made.flaws).append(doubt if valid else f"R-47: {doubt}")
+
+
+def _judge_key(certificate: x509.Certificate, made: Described) -> None:
+    public = public_key(certificate)
+    if public is None:
+        made.flaws.append("the key is of an unknown kind")
+    if isinstance(public, rsa.RSAPublicKey) and public.key_size < MIN_RSA_BITS:
+        made.flaws.append(f"the key has {public.key_size} bits, required: {MIN_RSA_BITS}")
+    if isinstance(public, dsa.DSAPublicKey | ed448.Ed448PublicKey):
+        made.flaws.append("no cipher suite of Modbus devices takes this kind of key")
+    if isinstance(_hash_of(certificate), hashes.SHA1 | hashes.MD5):
+        made.flaws.append("the certificate is signed with a broken hash, required: SHA-256 or more")
+    elif isinstance(public, ed25519.Ed25519PublicKey) or (
+        isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name != "secp256r1"
+    ):
+        made.advice.append("R-61: devices need not support curves other than P-256")
+
+
+def _judge_role(
+    certificate: x509.Certificate,
+    extensions: x509.Extensions,
+    purposes: Sequence[str],
+    made: Described,
+) -> None:
+    try:
+        role = role_of(certificate)
+    except ValueError as error:
+        made.flaws.append(str(error))
+        return
+    if role is not None:
+        made.fields["role"] = role
+        if extensions.get_extension_for_oid(ROLE).critical:
+            made.flaws.append("the role is critical, which most devices refuse")
+    elif "client" in purposes or "any" in purposes:
+        made.advice.append("R-20: a client's certificate should have a role")
+
+
+def _judge_chain(chain: Sequence[x509.Certificate], made: Described) -> None:
+    """The first certificate must come with all above it, the root included."""
+    at, left = chain[0], list(chain[1:])
+    if at.issuer == at.subject:
+        made.advice.append("R-45: the certificate should be signed by an authority")
+        return
+    while at.issuer != at.subject:
+        above = next((each for each in left if _has_signed(each, at)), None)
+        if above is None:
+            issuer = at.issuer.rfc4514_string()
+            made.flaws.append(f"R-46: the chain is incomplete: the file has no {issuer}")
+            return
+        left.remove(above)
+        at = above
+
+
+def _has_signed(authority: x509.Certificate, certificate: x509.Certificate) -> bool:
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (InvalidSignature, *MALFORMED):
+        return False
+    return True
+
+
+def _of_list(file: File, block: bytes) -> Described:
+    try:
+        read = x509.load_pem_x509_crl(block)
+    except MALFORMED as error:
+        raise UnusableFile(file, f"a revocation list can't be read: {error}") from error
+    ends = read.next_update_utc
+    made = Described("revocation list")
+    made.fields = {
+        "issuer": read.issuer.rfc4514_string(),
+        "this_update": read.last_update_utc.isoformat(),
+        "next_update": None if ends is None else ends.isoformat(),
+        "revoked": [_revoked(entry) for entry in read],
+    }
+    if ends is not None:
+        doubt = Expiry("the list", read.last_update_utc, ends).doubt(now())
+        if doubt is not None:
+            (made.flaws if ends <= now() else made.advice).append(doubt)
+    return made
+
+
+def _revoked(entry: x509.RevokedCertificate) -> dict[str, str]:
+    try:
+        reason = entry.extensions.get_extension_for_class(x509.CRLReason).value.reason.value
+    except (x509.ExtensionNotFound, *MALFORMED):
+        reason = "unspecified"
+    return {
+        "serial": serial_text(entry.serial_number),
+        "date": entry.revocation_date_utc.isoformat(),
+        "reason": reason,
+    }
+
+
+def _of_key(
+    file: File, block: bytes, passphrase: bytes | None, chain: Sequence[x509.Certificate]
+) -> Described:
+    locked = is_locked(block)
+    made = Described("key", {"encrypted": locked})
+    if locked and passphrase is None:
+        return made
+    public = key(file, passphrase if locked else None).public_key()
+    made.fields["key"] = key_text(public)
+    spki = public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    made.fields["public_key_sha256"] = hashlib.sha256(spki).digest().hex(":")
+    if chain:
+        fits = public == public_key(chain[0])
+        made.fields["fits_certificate"] = fits
+        if not fits:
+            made.flaws.append("it is not the key of the first certificate")
+    return made
+
+
+def _hash_of(certificate: x509.Certificate) -> hashes.HashAlgorithm | None:
+    try:
+        return certificate.signature_hash_algorithm
+    except MALFORMED:
+        return None
+
+
+def serial_text(serial: int) -> str:
+    """Returns a serial number as pairs of hexadecimal digits."""
+    text = f"{abs(serial):x}"
+    text = text if len(text) % 2 == 0 else f"0{text}"
+    return ("-" if serial < 0 else "") + bytes.fromhex(text).hex(":")
+
+
+def key_text(public: object) -> str:
+    """Returns the kind of a key."""
+    names = {"secp256r1": "P-256", "secp384r1": "P-384", "secp521r1": "P-521"}
+    if isinstance(public, ec.EllipticCurvePublicKey):
+        return names.get(public.curve.name, public.curve.name)
+    if isinstance(public, rsa.RSAPublicKey):
+        return f"RSA, {public.key_size} bits"
+    return "unknown" if public is None else type(public).__name__.removesuffix("PublicKey")
+
+
+def _signature_text(algorithm: hashes.HashAlgorithm | None) -> str:
+    return "without a hash" if algorithm is None else algorithm.name.upper().replace("SHA", "SHA-")
+
+
+def _purposes(extensions: x509.Extensions) -> list[str]:
+    try:
+        usages = extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    except x509.ExtensionNotFound:
+        return ["any"]
+    return [_PURPOSES.get(usage, usage.dotted_string) for usage in usages]
+
+
+def _names(extensions: x509.Extensions) -> list[str]:
+    try:
+        names = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return []
+    return [str(each.value) for each in names if isinstance(each, x509.DNSName | x509.IPAddress)]
