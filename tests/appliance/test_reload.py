@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import socket
@@ -591,3 +592,17 @@ def test_reloads_under_load_lose_no_request(rig: Rig, connect: Connect) -> None:
     assert rig.counted()["connections"]["accepted"] == len(clients)
     assert json.dumps(rig.appliance.sessions())
     assert len(rig.appliance.sessions()) == len(clients)
+
+
+def test_a_reload_is_recorded_and_reopens_a_renamed_audit_log(rig: Rig, connect: Connect) -> None:
+    audit = {"audit": {"file": "audit.log"}}
+    file = rig.file.parent / "audit.log"
+    rig.start(plant(**audit))
+    file.rename(file.with_name("kept.log"))
+    rig.reload(plant(log={"level": "warning"}, **audit))
+    (digest,) = {hashlib.sha256(rig.file.read_bytes()).hexdigest()}
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [(each["event"], each.get("config_sha256")) for each in lines][-1] == ("reload", digest)
+    assert connect(rig.address()).ask(WRITE) == WRITE
+    with pytest.raises(ReloadRefused, match="audit: changed; requires a restart"):
+        rig.reload(plant(audit={"file": "audit.log", "fail": "closed"}))

@@ -66,7 +66,7 @@ def test_a_status_has_its_headers() -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("ingest", {400, 403, 404, 405, 408, 409, 413, 415, 502}),
+        ("ingest", {400, 403, 404, 405, 408, 409, 413, 415, 502, 503}),
         ("read", {400, 403, 404, 405}),
         ("health", {405}),
         ("memories", {405}),
