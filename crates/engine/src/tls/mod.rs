@@ -12,6 +12,8 @@ mod p521;
 mod provider;
 mod rsa_pss;
 pub mod server;
+#[cfg(test)]
+pub(crate) mod test_party;
 mod trust;
 
 use std::io::{Read, Write};
