@@ -248,10 +248,11 @@ class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
     `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
-    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. With `listen_only`, function 8
-    may set a unit to listen only mode, for all peers. `raw_ingest`, only with `mbap`
-    and without TLS, is a listener for packets whose connections come to the same port: its own bind
-    and limits are ignored. Raises `ValueError` for an invalid address, limit or time.
+    enables TLS, with at most `max_handshakes` connections that are not authenticated yet, beside
+    `max_connections`. Times are in seconds; `idle_timeout` 0 is unlimited. With `listen_only`,
+    function 8 may set a unit to listen only mode, for all peers. `raw_ingest`, only with `mbap` and
+    without TLS, is a listener for packets whose connections come to the same port: its own bind and
+    limits are ignored. Raises `ValueError` for an invalid address, limit or time.
     """
 
     def __new__(
@@ -269,6 +270,7 @@ class Listener:
         frame_timeout: float | None = None,
         listen_only: bool = False,
         tls: ServerTls | None = None,
+        max_handshakes: int = 256,
         raw_ingest: Listener | None = None,
     ) -> Listener: ...
     @staticmethod

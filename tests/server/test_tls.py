@@ -530,15 +530,90 @@ def test_a_connection_without_a_request_ends_after_the_idle_timeout(run: Run, pa
     assert connections(appliance)["idle"] == 1
 
 
-def test_the_idlest_gives_way_also_amid_its_handshake(run: Run, party: Party) -> None:
-    more = {"max_connections": 1, "when_full": "evict"}
-    appliance = run(configuration(party.files(), BY_ROLE, **more))
+def shaken(appliance: Appliance, party: Party, number: int, opened: contextlib.ExitStack) -> Any:
+    """Returns clients with an open session that was used."""
     trust = context(party.authority.ca, party.engineer)
-    with wire.Connection(address(appliance)) as silent:
-        wire.until(lambda: connections(appliance)["open"] == 1, "it is admitted")
-        assert verdict(appliance, trust) == "served"
-        assert silent.rest() == b""
-    wire.until(lambda: connections(appliance)["evicted"] == 1, "it is counted")
+    clients = [opened.enter_context(peer(appliance, trust)) for _ in range(number)]
+    for client in clients:
+        assert client.shake().ask(READ) == ZERO
+    return clients
+
+
+@pytest.mark.parametrize("when_full", ["evict", "refuse"])
+def test_silent_connections_displace_each_other_and_no_session(
+    run: Run, party: Party, when_full: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    limits = {"max_connections": 4, "max_handshakes": 10, "when_full": when_full}
+    appliance = run(configuration(party.files(), BY_ROLE, **limits))
+    with contextlib.ExitStack() as opened:
+        clients = shaken(appliance, party, 3, opened)
+        silent = [opened.enter_context(wire.Connection(address(appliance))) for _ in range(25)]
+        assert [each.rest() for each in silent[:15]] == [b""] * 15
+        assert all(client.ask(READ) == ZERO for client in clients)
+        # The handshake of this one displaces another silent connection, and succeeds.
+        clients += shaken(appliance, party, 1, opened)
+        assert silent[15].rest() == b""
+        assert all(client.ask(WRITE) == WRITE for client in clients)
+
+        counted = connections(appliance)
+        assert (counted["evicted"], counted["evicted_handshakes"]) == (0, 16)
+        assert (counted["open"], counted["tls_failed"], counted["refused_full"]) == (13, 0, 0)
+        appliance.log_events(wire.DEADLINE)
+        logged = [each for each in caplog.records if each.message == "evicted"]
+        assert {each.fields["reason"] for each in logged} == {"handshake"}  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("many_files")
+def test_1500_half_open_handshakes_beside_sessions_that_notice_nothing(
+    run: Run, party: Party
+) -> None:
+    limits = {"max_connections": 20, "max_handshakes": 100, "when_full": "evict"}
+    appliance = run(configuration(party.files(), BY_ROLE, **limits))
+    with contextlib.ExitStack() as opened:
+        clients = shaken(appliance, party, 19, opened)
+        hello = Peer(address(appliance), context(party.authority.ca), source=None)
+        begun = opened.enter_context(hello).hello()
+        for number in range(1500):
+            half_open = opened.enter_context(wire.Connection(address(appliance)))
+            with contextlib.suppress(ConnectionError):
+                half_open.send(begun[: 1 + number % len(begun)])
+            if number % 50 == 0:
+                assert clients[number % len(clients)].ask(READ) == ZERO
+        assert all(client.ask(WRITE) == WRITE for client in clients)
+        assert shaken(appliance, party, 1, opened)
+        counted = connections(appliance)
+        assert (counted["evicted"], counted["refused_full"]) == (0, 0)
+        assert counted["evicted_handshakes"] > 1000
+
+
+def test_a_new_session_displaces_the_one_that_is_idle_longest(run: Run, party: Party) -> None:
+    limits = {"max_connections": 2, "when_full": "evict"}
+    appliance = run(configuration(party.files(), BY_ROLE, **limits))
+    with contextlib.ExitStack() as opened:
+        first, second = shaken(appliance, party, 2, opened)
+        assert first.ask(READ) == ZERO
+        [third] = shaken(appliance, party, 1, opened)
+        assert second.end() == "cut"
+        assert first.ask(READ) == third.ask(READ) == ZERO
+    assert connections(appliance)["evicted"] == 1
+
+
+def test_a_full_listener_refuses_a_new_session(run: Run, party: Party) -> None:
+    appliance = run(configuration(party.files(), BY_ROLE, max_connections=1))
+    trust = context(party.authority.ca, party.engineer)
+    with contextlib.ExitStack() as opened:
+        early = opened.enter_context(peer(appliance, trust))
+        hello = early.hello()
+        early.wire.send(hello[:20])
+        wire.until(lambda: connections(appliance)["open"] == 1, "its handshake has begun")
+        [first] = shaken(appliance, party, 1, opened)
+        late = opened.enter_context(wire.Connection(address(appliance)))
+        assert late.rest() == b""
+        early.wire.send(hello[20:])
+        early.shake()
+        assert early.end() == "close_notify"
+        assert first.ask(READ) == ZERO
+    assert connections(appliance)["refused_full"] == 2
 
 
 def slow(client: Peer, number: int) -> None:

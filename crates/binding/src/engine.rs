@@ -216,6 +216,7 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
         ("refused_full", &counters.refused_full),
         ("refused_listen_only", &counters.refused_listen_only),
         ("evicted", &counters.evicted),
+        ("evicted_handshakes", &counters.evicted_handshakes),
         ("rights_revoked", &counters.rights_revoked),
         ("ended", &counters.ended),
         ("idle", &counters.idle),

@@ -145,7 +145,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, raw_ingest=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, max_handshakes=256, raw_ingest=None))]
     fn new(
         name: String,
         bind: &str,
@@ -159,6 +159,7 @@ impl Listener {
         frame_timeout: Option<f64>,
         listen_only: bool,
         tls: Option<PyRef<'_, ServerTls>>,
+        max_handshakes: i128,
         raw_ingest: Option<PyRef<'_, Listener>>,
     ) -> PyResult<Listener> {
         let raw_ingest = match raw_ingest.map(|listener| listener.core.kind.clone()) {
@@ -173,6 +174,8 @@ impl Listener {
             }
         };
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
+        let max_handshakes = within("max_handshakes", max_handshakes, 1..=65_535)?;
+        let limits = limits(max_connections, max_connections_per_source, when_full)?;
         let framings = [
             ("mbap", StreamFraming::Mbap),
             ("rtu", StreamFraming::Rtu),
@@ -182,7 +185,10 @@ impl Listener {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
             rules: cores(&rules),
-            limits: limits(max_connections, max_connections_per_source, when_full)?,
+            limits: ConnectionLimits {
+                max_handshakes: tls.is_some().then_some(max_handshakes),
+                ..limits
+            },
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             frame_timeout: frame_timeout
@@ -328,6 +334,7 @@ fn limits(
         max_connections: within("max_connections", max_connections, 1..=65_535)?,
         max_connections_per_source: of_source,
         when_full: word("when_full", when_full, &allowed)?,
+        max_handshakes: None,
     })
 }
 

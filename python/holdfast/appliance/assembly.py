@@ -165,6 +165,7 @@ def listener(
             | ModbusAsciiOverTcpListener()
         ):
             rtu = settings if isinstance(settings, ModbusRtuOverTcpListener) else None
+            secure = settings if isinstance(settings, ModbusTlsListener) else None
             return _core.Listener(
                 name,
                 str(settings.bind),
@@ -177,7 +178,8 @@ def listener(
                 request_timeout=settings.request_timeout,
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
                 listen_only=settings.listen_only,
-                tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
+                tls=None if secure is None else server_tls(secure.tls),
+                max_handshakes=256 if secure is None else secure.max_handshakes,
                 raw_ingest=_shared_port(name, settings, config, memories),
             )
         case ModbusUdpListener() | ModbusRtuOverUdpListener():

@@ -30,6 +30,8 @@ pub enum Kind {
     BrokenFrame,
     /// Closed in favour of a new connection.
     Evicted,
+    /// Closed during the handshake in favour of a new connection.
+    EvictedHandshake,
     /// Ended by a reload: no rule names the peer any more.
     RightsRevoked,
     /// Ended by an operator.
@@ -68,7 +70,7 @@ impl Kind {
             Kind::RequestTimeout => "request_timeout",
             Kind::SlowReader => "slow_reader",
             Kind::BrokenFrame => "broken_frame",
-            Kind::Evicted => "evicted",
+            Kind::Evicted | Kind::EvictedHandshake => "evicted",
             Kind::RightsRevoked => "rights_revoked",
             Kind::Ended => "ended",
             Kind::RefusedSource => "refused_source",
@@ -89,6 +91,7 @@ impl Kind {
         match self {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
             Kind::TlsFailed(reason) => Some(reason),
+            Kind::EvictedHandshake => Some("handshake"),
             _ => None,
         }
     }

@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
-use super::admission::{Admission, ConnectionLimits, Full, Ticket, attach};
+use super::admission::{Admission, ConnectionLimits, Evicted, Full, Ticket, attach};
 use super::audit::Auditor;
 use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
@@ -89,6 +89,26 @@ impl ListenerContext {
         for (peer, kind) in self.admission.review(|peer| service.ends(before, peer)) {
             self.ended(kind, peer);
         }
+    }
+
+    /// Counts and reports a connection that was closed for another.
+    pub(crate) fn evicted(&self, evicted: Option<Evicted>) {
+        match evicted {
+            None => {}
+            Some(Evicted::Session(peer)) => {
+                self.connections.evicted.add();
+                self.report(Kind::Evicted, Some(peer));
+            }
+            Some(Evicted::Handshake(peer)) => {
+                self.connections.evicted_handshakes.add();
+                self.report(Kind::EvictedHandshake, Some(peer));
+            }
+        }
+    }
+
+    pub(crate) fn refuse_full(&self, peer: impl Into<Peer>) {
+        self.connections.refused_full.add();
+        self.report(Kind::RefusedFull, Some(peer.into()));
     }
 
     pub(crate) fn refuse_source(&self, peer: SocketAddr) {
@@ -189,15 +209,9 @@ fn admit<S: Service>(
     }
     let (ticket, evicted) = match context.admission.admit(peer) {
         Ok(admitted) => admitted,
-        Err(Full) => {
-            context.connections.refused_full.add();
-            return context.report(Kind::RefusedFull, Some(peer.into()));
-        }
+        Err(Full) => return context.refuse_full(peer),
     };
-    if evicted.is_some() {
-        context.connections.evicted.add();
-        context.report(Kind::Evicted, evicted);
-    }
+    context.evicted(evicted);
     context.connections.accepted.add();
     context.report(Kind::Opened, Some(peer.into()));
     // A reload reviews the admitted connections. This one looks up its rights only now.

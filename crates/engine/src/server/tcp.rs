@@ -8,8 +8,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout, timeout_at};
 
-use super::admission::ConnectionLimits;
-use super::admission::Ticket;
+use super::admission::{ConnectionLimits, Full, Ticket};
 use super::connection::{Connection, Renewal, Terms, Timeouts};
 use super::counters::PacketCounters;
 use super::event::Kind;
@@ -180,6 +179,13 @@ impl ModbusStream {
         };
         ticket.identify(Arc::clone(&certificate));
         let peer = Peer { address: peer, certificate: Some(certificate) };
+        match ticket.establish() {
+            Ok(evicted) => context.evicted(evicted),
+            Err(Full) => {
+                context.refuse_full(peer);
+                return stream.refuse(stop).await;
+            }
+        }
         context.report(Kind::Secured, Some(peer.clone()));
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {

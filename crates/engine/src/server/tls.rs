@@ -14,8 +14,10 @@ use std::time::Duration;
 use socket2::SockRef;
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
+use tokio::sync::watch;
 
 use super::event::Kind;
+use super::listener::drain;
 use super::stream::{self, Stream};
 use crate::tls::server::{self, PeerCertificate, ServerTls};
 use crate::tls::{Channel, TlsFailure};
@@ -79,6 +81,14 @@ impl ServerTlsStream {
     /// The certificate of the peer, after the handshake.
     pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, Kind> {
         server::peer_certificate(&self.channel).map_err(|error| failed(&error))
+    }
+
+    /// Announces the end, and closes the connection.
+    pub(crate) async fn refuse(mut self, stop: watch::Receiver<bool>) {
+        let mut unsent = Vec::new();
+        self.channel.end(&mut unsent);
+        let _ = stream::write(&self.socket, &mut unsent);
+        drain(&self.socket, usize::MAX, stop).await;
     }
 
     pub(crate) fn into_socket(self) -> TcpStream {
