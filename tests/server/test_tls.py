@@ -210,18 +210,53 @@ def test_a_role_that_can_not_be_read_is_refused(
     assert reasons(appliance, caplog) == ["bad_certificate"]
 
 
-def test_a_role_is_that_of_the_certificate_at_every_connection(
-    secure: Appliance, party: Party
+def resumable(appliance: Appliance, trust: ssl.SSLContext) -> ssl.SSLSession:
+    """A session of a connection that was served."""
+    with peer(appliance, trust) as first:
+        assert first.shake().ask(READ) == ZERO
+        assert not first.tls.session_reused
+        assert first.tls.session is not None
+        return first.tls.session
+
+
+@versions
+def test_a_resumed_session_has_the_role_of_its_certificate(
+    secure: Appliance, party: Party, version: str
 ) -> None:
-    """A session that is offered again is not resumed: the certificate is shown again."""
-    for version in ("1.2", "1.3"):
-        trust = context(party.authority.ca, party.operator, version)
-        with peer(secure, trust) as first:
-            assert first.shake().ask(READ) == ZERO
-            session = first.tls.session
-        with peer(secure, trust, session=session) as second:
-            assert second.shake().ask(WRITE) == FORBIDDEN
-            assert not second.tls.session_reused
+    trust = context(party.authority.ca, party.operator, version)
+    session = resumable(secure, trust)
+    for _ in range(2):
+        with peer(secure, trust, session=session) as again:
+            assert again.shake().ask(WRITE) == FORBIDDEN
+            assert again.ask(READ) == ZERO
+            assert again.tls.session_reused
+            session = again.tls.session
+    assert connections(secure)["tls_failed"] == 0
+
+
+@versions
+def test_a_session_from_before_a_revocation_is_not_resumed(
+    run: Run, version: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority = Certificates(tmp_path)
+    server, client = authority.issue("server", "DNS:localhost"), authority.issue("lost", "DNS:lost")
+    files = {
+        "cert_file": server.certificate,
+        "key_file": server.key,
+        "ca_file": authority.ca,
+        "crl_file": authority.revoke(),
+    }
+    trust = context(authority.ca, client, version)
+    before = run(configuration(files, ANYONE))
+    session = resumable(before, trust)
+    before.stop()
+    authority.revoke(client)
+    after = run(configuration(files, ANYONE))
+
+    refusal = pytest.raises(Refused, match="ALERT_CERTIFICATE_REVOKED")
+    with peer(after, trust, session=session) as again, refusal:
+        again.shake().ask(READ)
+    assert reasons(after, caplog) == ["revoked"]
 
 
 # Trust

@@ -19,8 +19,8 @@ use tokio::sync::watch;
 use super::event::Kind;
 use super::listener::drain;
 use super::stream::{self, Stream};
-use crate::tls::server::{self, PeerCertificate, ServerTls};
-use crate::tls::{Channel, TlsFailure};
+use crate::tls::TlsFailure;
+use crate::tls::server::{PeerCertificate, ServerChannel, ServerTls};
 
 /// Bytes per read of a socket.
 const INPUT: usize = 4096;
@@ -45,7 +45,7 @@ thread_local! {
 
 pub(crate) struct ServerTlsStream {
     socket: TcpStream,
-    channel: Channel,
+    channel: ServerChannel,
     records: Records,
     /// Plain text that did not fit into the input of the connection, and how much of it was read.
     plain: Vec<u8>,
@@ -56,7 +56,7 @@ pub(crate) struct ServerTlsStream {
 
 impl ServerTlsStream {
     pub(crate) fn new(socket: TcpStream, tls: &ServerTls) -> Result<ServerTlsStream, Kind> {
-        let channel = tls.channel().map_err(|error| failed(&error))?;
+        let channel = tls.channel().map_err(|error| failed(&TlsFailure::from(error)))?;
         let records = Records::default();
         Ok(ServerTlsStream { socket, channel, records, plain: Vec::new(), taken: 0, ended: None })
     }
@@ -80,7 +80,7 @@ impl ServerTlsStream {
 
     /// The certificate of the peer, after the handshake.
     pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, Kind> {
-        server::peer_certificate(&self.channel).map_err(|error| failed(&error))
+        self.channel.peer_certificate().map_err(|failure| failed(&failure))
     }
 
     /// Announces the end, and closes the connection.
@@ -202,8 +202,8 @@ fn acknowledge(_socket: &TcpStream) {
     let _ = SockRef::from(_socket).set_tcp_quickack(true);
 }
 
-fn failed(error: &rustls::Error) -> Kind {
-    Kind::TlsFailed(TlsFailure::from(error).event_reason())
+fn failed(failure: &TlsFailure) -> Kind {
+    Kind::TlsFailed(failure.event_reason())
 }
 
 /// Finds the boundaries of records.

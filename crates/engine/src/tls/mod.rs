@@ -7,11 +7,13 @@ mod certificate;
 pub mod client;
 mod failure;
 mod files;
+mod notes;
 mod own;
 mod p521;
 mod provider;
 mod rsa_pss;
 pub mod server;
+mod sessions;
 #[cfg(test)]
 pub(crate) mod test_party;
 mod trust;

@@ -1,7 +1,7 @@
 //! The server side: its certificate, the clients that it trusts, and their roles.
 //!
-//! Mutual authentication is mandatory, as MB-TCP-Security requires. Sessions are never resumed: the
-//! certificate of a client and its dates are checked for every connection.
+//! Mutual authentication is mandatory, as MB-TCP-Security requires. The certificate of a client and its
+//! dates are checked for every connection, also if it resumes a session.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -10,21 +10,23 @@ use std::sync::Arc;
 use rustls::client::danger::HandshakeSignatureValid;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, UnixTime};
-use rustls::server::NoServerSessionStorage;
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::sign::SingleCertAndKey;
+use rustls::time_provider::{DefaultTimeProvider, TimeProvider};
 use rustls::{
     DigitallySignedStruct, DistinguishedName, Error, ServerConfig, ServerConnection,
     SignatureScheme,
 };
 use webpki::{CertRevocationList, OwnedCertRevocationList};
 
-use super::Channel;
 use super::certificate::{Parsed, Purpose};
 use super::files::FileError;
+use super::notes::{Chain, Notes, noted};
 use super::own::own;
 use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
+use super::sessions::Sessions;
 use super::trust::{Listed, Trust};
+use super::{Channel, TlsFailure};
 
 /// The PEM files of a server.
 #[derive(Debug, Clone)]
@@ -43,6 +45,7 @@ pub struct ServerFiles {
 pub struct ServerTls {
     config: Arc<ServerConfig>,
     clients: Arc<Clients>,
+    sessions: Arc<Sessions>,
 }
 
 impl ServerTls {
@@ -51,29 +54,37 @@ impl ServerTls {
     /// # Errors
     /// [`FileError`] for an unusable file.
     pub fn load(files: &ServerFiles) -> Result<ServerTls, FileError> {
+        ServerTls::with_clock(files, Arc::new(DefaultTimeProvider))
+    }
+
+    fn with_clock(
+        files: &ServerFiles,
+        clock: Arc<dyn TimeProvider>,
+    ) -> Result<ServerTls, FileError> {
         let own = own(&files.cert_file, &files.key_file)?;
         let clients = Arc::new(Clients::load(files)?);
-        let config = ServerConfig::builder_with_provider(provider())
+        let sessions = Arc::new(Sessions::new(Arc::clone(&clients), Arc::clone(&clock)));
+        let config = ServerConfig::builder_with_details(provider(), clock)
             .with_safe_default_protocol_versions()
             .map_err(|error| FileError::content(&files.cert_file, error.to_string()))?;
         let mut config = config
             .with_client_cert_verifier(Arc::clone(&clients) as Arc<dyn ClientCertVerifier>)
             .with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
-        config.session_storage = Arc::new(NoServerSessionStorage {});
-        config.send_tls13_tickets = 0;
-        Ok(ServerTls { config: Arc::new(config), clients })
+        config.session_storage = Arc::clone(&sessions) as _;
+        config.send_tls13_tickets = 1;
+        Ok(ServerTls { config: Arc::new(config), clients, sessions })
     }
 
     /// Judges the certificate of an open session again, as a handshake would now.
     pub(crate) fn judge(&self, certificate: &PeerCertificate) -> Result<(), Error> {
-        let (presented, intermediates) =
-            certificate.chain.split_first().ok_or(Error::NoCertificatesPresented)?;
-        self.clients.judge(presented, intermediates, UnixTime::now())
+        self.clients.judge(&certificate.chain, UnixTime::now())
     }
 
     /// Creates the channel of an accepted connection.
-    pub(crate) fn channel(&self) -> Result<Channel, Error> {
-        Ok(Channel::new(ServerConnection::new(Arc::clone(&self.config))?))
+    pub(crate) fn channel(&self) -> Result<ServerChannel, Error> {
+        let channel = Channel::new(ServerConnection::new(Arc::clone(&self.config))?);
+        let sessions = Arc::clone(&self.sessions);
+        Ok(ServerChannel { channel, notes: Notes::default(), sessions })
     }
 }
 
@@ -96,21 +107,76 @@ pub struct PeerCertificate {
     pub(crate) chain: Vec<CertificateDer<'static>>,
 }
 
-/// The certificate of the peer, after the handshake.
-pub(crate) fn peer_certificate(channel: &Channel) -> Result<PeerCertificate, Error> {
-    let chain = channel.0.peer_certificates().unwrap_or_default();
-    let parsed = Parsed::new(chain.first().ok_or(Error::NoCertificatesPresented)?)?;
-    Ok(PeerCertificate {
-        role: parsed.role()?,
-        subject: parsed.subject_text(),
-        serial: parsed.serial_text(),
-        chain: chain.iter().cloned().map(CertificateDer::into_owned).collect(),
-    })
+/// The channel of an accepted connection.
+pub(crate) struct ServerChannel {
+    channel: Channel,
+    notes: Notes,
+    sessions: Arc<Sessions>,
+}
+
+impl ServerChannel {
+    /// Processes received bytes, see [`Channel::receive`].
+    ///
+    /// # Errors
+    /// TLS failed: send `out`, then close the connection. Its session cannot be resumed.
+    pub(crate) fn receive(
+        &mut self,
+        bytes: &[u8],
+        plain: &mut Vec<u8>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), TlsFailure> {
+        let channel = &mut self.channel;
+        let received = if channel.is_handshaking() {
+            let received = self.notes.lend(|| channel.receive(bytes, plain, out));
+            if !channel.is_handshaking() {
+                // Only the session is still of use.
+                self.notes.chain = None;
+            }
+            received
+        } else {
+            channel.receive(bytes, plain, out)
+        };
+        received.map_err(|error| {
+            if let Some(session) = &self.notes.session {
+                self.sessions.forget(session);
+            }
+            TlsFailure::from(error)
+        })
+    }
+
+    pub(crate) fn send(&mut self, plain: &[u8], out: &mut Vec<u8>) {
+        self.channel.send(plain, out);
+    }
+
+    pub(crate) fn end(&mut self, out: &mut Vec<u8>) {
+        self.channel.end(out);
+    }
+
+    pub(crate) fn is_handshaking(&self) -> bool {
+        self.channel.is_handshaking()
+    }
+
+    pub(crate) fn has_ended(&mut self) -> bool {
+        self.channel.has_ended()
+    }
+
+    /// The certificate of the peer, after the handshake.
+    pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, TlsFailure> {
+        let chain = self.channel.0.peer_certificates().unwrap_or_default();
+        let presented = chain.first().ok_or(TlsFailure::NoCertificate)?;
+        let parsed = Parsed::new(presented).map_err(Error::from)?;
+        Ok(PeerCertificate {
+            role: parsed.role().map_err(Error::from)?,
+            subject: parsed.subject_text(),
+            serial: parsed.serial_text(),
+            chain: chain.iter().cloned().map(CertificateDer::into_owned).collect(),
+        })
+    }
 }
 
 /// Verifies the certificates of clients.
 #[derive(Debug)]
-struct Clients {
+pub(super) struct Clients {
     trust: Trust,
     subjects: Vec<DistinguishedName>,
 }
@@ -130,14 +196,12 @@ impl Clients {
         Ok(Clients { trust: Trust::new(listed, revoked), subjects })
     }
 
-    fn judge(
-        &self,
-        presented: &CertificateDer<'_>,
-        intermediates: &[CertificateDer<'_>],
-        now: UnixTime,
-    ) -> Result<(), Error> {
-        Parsed::new(presented)?.role()?;
-        self.trust.judge(presented, intermediates, Purpose::Client, now)
+    /// Verifies the certificate of a client, its own first, and its role.
+    pub(super) fn judge(&self, chain: &[CertificateDer<'_>], now: UnixTime) -> Result<(), Error> {
+        let (own, intermediates) = chain.split_first().ok_or(Error::NoCertificatesPresented)?;
+        self.trust.judge(own, intermediates, Purpose::Client, now)?;
+        Parsed::new(own)?.role()?;
+        Ok(())
     }
 }
 
@@ -181,7 +245,13 @@ impl ClientCertVerifier for Clients {
         intermediates: &[CertificateDer<'_>],
         now: UnixTime,
     ) -> Result<ClientCertVerified, Error> {
-        self.judge(end_entity, intermediates, now)?;
+        let chain = std::iter::once(end_entity).chain(intermediates);
+        let chain: Chain = chain.map(|each| each.clone().into_owned()).collect();
+        noted(|notes| {
+            notes.chain = Some(Arc::clone(&chain));
+            notes.proved = Some(now);
+        });
+        self.judge(&chain, now)?;
         Ok(ClientCertVerified::assertion())
     }
 
@@ -205,5 +275,165 @@ impl ClientCertVerifier for Clients {
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
         ALGORITHMS.supported_schemes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU64, Ordering};
+    use std::time::Duration;
+
+    use rcgen::{CertificateRevocationListParams, KeyIdMethod, RevokedCertParams, date_time_ymd};
+    use rustls::HandshakeKind::{Full as FULL, Resumed as RESUMED};
+    use rustls::version::{TLS12, TLS13};
+    use rustls::{ClientConfig, HandshakeKind, SupportedProtocolVersion};
+
+    use super::*;
+    use crate::tls::test_party::{Party, connection};
+
+    const DAY: u64 = 24 * 60 * 60;
+    const VERSIONS: [&SupportedProtocolVersion; 2] = [&TLS12, &TLS13];
+
+    /// A clock that tests set, in seconds since 1970.
+    #[derive(Debug)]
+    struct Clock(AtomicU64);
+
+    impl Clock {
+        fn new() -> Arc<Clock> {
+            Arc::new(Clock(AtomicU64::new(UnixTime::now().as_secs())))
+        }
+
+        fn pass(&self, seconds: u64) {
+            self.0.fetch_add(seconds, Ordering::Relaxed);
+        }
+    }
+
+    impl TimeProvider for Clock {
+        fn current_time(&self) -> Option<UnixTime> {
+            Some(UnixTime::since_unix_epoch(Duration::from_secs(self.0.load(Ordering::Relaxed))))
+        }
+    }
+
+    /// How a handshake succeeds, or why it fails.
+    fn shake(tls: &ServerTls, client: &Arc<ClientConfig>) -> Result<HandshakeKind, &'static str> {
+        let mut server = tls.channel().unwrap();
+        talk(&mut server, client, b"").map_err(|failure| failure.reason())?;
+        assert_eq!(server.peer_certificate().unwrap().role, "operator");
+        Ok(server.channel.0.handshake_kind().unwrap())
+    }
+
+    /// Performs a handshake byte by byte, and then sends `then` as it is.
+    fn talk(
+        server: &mut ServerChannel,
+        client: &Arc<ClientConfig>,
+        then: &[u8],
+    ) -> Result<(), TlsFailure> {
+        let mut client = connection(client);
+        let (mut plain, mut to_server, mut to_client) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..6 {
+            while client.wants_write() {
+                client.write_tls(&mut to_server).unwrap();
+            }
+            for byte in std::mem::take(&mut to_server) {
+                server.receive(&[byte], &mut plain, &mut to_client)?;
+            }
+            let mut bytes = &std::mem::take(&mut to_client)[..];
+            while !bytes.is_empty() {
+                client.read_tls(&mut bytes).unwrap();
+                client.process_new_packets().unwrap();
+            }
+        }
+        assert!(!server.is_handshaking() && !client.is_handshaking());
+        server.receive(then, &mut plain, &mut to_client)
+    }
+
+    #[test]
+    fn a_session_is_resumed_with_its_role_for_one_day_after_the_full_handshake() {
+        let party = Party::new();
+        for version in VERSIONS {
+            let clock = Clock::new();
+            let tls = ServerTls::with_clock(&party.files(), Arc::clone(&clock) as _).unwrap();
+            let client = party.client(version);
+            assert_eq!(shake(&tls, &client), Ok(FULL));
+            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+            clock.pass(DAY / 2);
+            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+            clock.pass(DAY / 2 + 1);
+            assert_eq!(shake(&tls, &client), Ok(FULL), "{version:?}");
+            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+        }
+    }
+
+    #[test]
+    fn a_session_is_not_resumed_when_the_certificate_has_expired_since() {
+        let party = Party::with_client(|params| params.not_after = date_time_ymd(2040, 1, 1));
+        let last = 2_208_988_800;
+        for version in VERSIONS {
+            let clock = Arc::new(Clock(AtomicU64::new(last - 10)));
+            let tls = ServerTls::with_clock(&party.files(), Arc::clone(&clock) as _).unwrap();
+            let client = party.client(version);
+            assert_eq!(shake(&tls, &client), Ok(FULL));
+            assert_eq!(shake(&tls, &client), Ok(RESUMED));
+            clock.pass(11);
+            assert_eq!(shake(&tls, &client), Err("expired"), "{version:?}");
+        }
+    }
+
+    #[test]
+    fn a_session_is_not_resumed_when_the_certificate_was_revoked_since() {
+        let party = Party::new();
+        let revoked = RevokedCertParams {
+            serial_number: party.client.params.serial_number.clone().unwrap(),
+            revocation_time: date_time_ymd(2026, 1, 1),
+            reason_code: None,
+            invalidity_date: None,
+        };
+        let list = CertificateRevocationListParams {
+            this_update: date_time_ymd(2026, 1, 1),
+            next_update: date_time_ymd(2090, 1, 1),
+            crl_number: 1.into(),
+            issuing_distribution_point: None,
+            revoked_certs: vec![revoked],
+            key_identifier_method: KeyIdMethod::Sha256,
+        };
+        let list = list.signed_by(&party.authority.issuer()).unwrap().pem().unwrap();
+        let crl_file = Some(party.folder.write("crl.pem", &list));
+        for version in VERSIONS {
+            let client = party.client(version);
+            let before = ServerTls::load(&party.files()).unwrap();
+            let after =
+                ServerTls::load(&ServerFiles { crl_file: crl_file.clone(), ..party.files() });
+            assert_eq!(shake(&before, &client), Ok(FULL));
+            assert_eq!(shake(&before, &client), Ok(RESUMED));
+            assert_eq!(shake(&after.unwrap(), &client), Err("revoked"), "{version:?}");
+        }
+    }
+
+    #[test]
+    fn a_session_is_not_resumed_after_its_connection_has_failed() {
+        let party = Party::new();
+        for version in VERSIONS {
+            let tls = ServerTls::load(&party.files()).unwrap();
+            let client = party.client(version);
+            for expected in [FULL, FULL] {
+                assert_eq!(shake(&tls, &client), Ok(expected), "{version:?}");
+                assert_eq!(shake(&tls, &client), Ok(RESUMED));
+                let altered = [&[23, 3, 3, 0, 40][..], &[7; 40]].concat();
+                let failed = talk(&mut tls.channel().unwrap(), &client, &altered);
+                assert_eq!(failed, Err(TlsFailure::BadRecord));
+            }
+        }
+    }
+
+    #[test]
+    fn the_oldest_of_too_many_sessions_is_forgotten() {
+        let party = Party::new();
+        for version in VERSIONS {
+            let tls = ServerTls::load(&party.files()).unwrap();
+            let client = party.client(version);
+            assert_eq!(shake(&tls, &client), Ok(FULL));
+            tls.sessions.fill();
+            assert_eq!(shake(&tls, &client), Ok(FULL), "{version:?}");
+        }
     }
 }

@@ -104,6 +104,7 @@ impl Party {
         let server = Owner::new("localhost", Some(&authority), |_| {});
         let client = Owner::new("panel 7", Some(&authority), |params| {
             params.subject_alt_names.clear();
+            params.serial_number = Some(7.into());
             params.custom_extensions = vec![role("operator")];
             with(params);
         });
