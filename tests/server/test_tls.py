@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 from pymodbus.client import ModbusTlsClient
 
+from holdfast import logs
 from holdfast.appliance import Appliance
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError, load
@@ -207,7 +208,8 @@ def test_a_role_that_can_not_be_read_is_refused(
 
     trust = context(party.authority.ca, malformed, version)
     assert verdict(appliance, trust).endswith("ALERT_BAD_CERTIFICATE")
-    assert reasons(appliance, caplog) == ["bad_certificate"]
+    assert reasons(appliance, caplog) == ["role_type"]
+    assert logged_subjects(caplog) == ["CN=malformed"]
 
 
 def resumable(appliance: Appliance, trust: ssl.SSLContext) -> ssl.SSLSession:
@@ -224,7 +226,7 @@ def test_a_resumed_session_has_the_role_of_its_certificate(
     secure: Appliance, party: Party, version: str
 ) -> None:
     trust = context(party.authority.ca, party.operator, version)
-    session = resumable(secure, trust)
+    session: ssl.SSLSession | None = resumable(secure, trust)
     for _ in range(2):
         with peer(secure, trust, session=session) as again:
             assert again.shake().ask(WRITE) == FORBIDDEN
@@ -266,8 +268,15 @@ def test_a_session_from_before_a_revocation_is_not_resumed(
 def test_a_client_without_a_certificate_is_refused(
     secure: Appliance, party: Party, version: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert "ALERT" in verdict(secure, context(party.authority.ca, None, version))
+    alert = {"1.2": "HANDSHAKE_FAILURE", "1.3": "CERTIFICATE_REQUIRED"}[version]
+    assert verdict(secure, context(party.authority.ca, None, version)).endswith(f"ALERT_{alert}")
     assert reasons(secure, caplog) == ["no_certificate"]
+    assert logged_subjects(caplog) == [None]
+
+
+def logged_subjects(caplog: pytest.LogCaptureFixture) -> list[str | None]:
+    failures = [each for each in caplog.records if each.message == "tls_failed"]
+    return [each.fields.get("subject") for each in failures]  # type: ignore[attr-defined]
 
 
 @versions
@@ -280,20 +289,58 @@ def test_certificates_that_are_not_trusted(
 ) -> None:
     foreign, impostor = Certificates(tmp_path, "foreign"), Certificates(tmp_path)
     role = named("engineer")
-    issued = {
-        "unknown_authority": foreign.issue("engineer", "DNS:engineer", extensions=[role]),
-        "bad_signature": impostor.issue("engineer", "DNS:engineer", extensions=[role]),
-        "expired": party.client("old", role, dates=PAST),
-        "not_valid_yet": party.client("early", role, dates=FUTURE),
-        "wrong_purpose": party.client("server-only", role, "extendedKeyUsage=serverAuth"),
-        "unknown_extension": party.client("critical", role.replace("=", "=critical,")),
-    }
-    for each in issued.values():
-        assert "ALERT" in verdict(secure, context(party.authority.ca, each, version))
-    lonely = self_signed(tmp_path, "lonely", role)
-    assert "ALERT" in verdict(secure, context(party.authority.ca, lonely, version))
+    refused = [
+        ("unknown_issuer", "UNKNOWN_CA", foreign.issue("a", "DNS:a", extensions=[role])),
+        ("bad_signature", "BAD_CERTIFICATE", impostor.issue("b", "DNS:b", extensions=[role])),
+        ("expired", "CERTIFICATE_EXPIRED", party.client("c", role, dates=PAST)),
+        ("not_yet_valid", "CERTIFICATE_EXPIRED", party.client("d", role, dates=FUTURE)),
+        (
+            "wrong_purpose",
+            "UNSUPPORTED_CERTIFICATE",
+            party.client("e", role, "extendedKeyUsage=serverAuth"),
+        ),
+        (
+            "wrong_key_usage",
+            "UNSUPPORTED_CERTIFICATE",
+            party.client("f", role, "keyUsage=keyAgreement"),
+        ),
+        (
+            "unsupported_extension",
+            "BAD_CERTIFICATE",
+            party.client("g", role.replace("=", "=critical,")),
+        ),
+        ("unknown_issuer", "UNKNOWN_CA", self_signed(tmp_path, "h", role)),
+    ]
+    for _, alert, issued in refused:
+        trust = context(party.authority.ca, issued, version)
+        assert verdict(secure, trust).endswith(f"ALERT_{alert}")
 
-    assert reasons(secure, caplog, 7) == [*issued, "unknown_authority"]
+    assert reasons(secure, caplog, len(refused)) == [reason for reason, _, _ in refused]
+    assert logged_subjects(caplog) == [f"CN={name}" for name in "abcdefgh"]
+
+
+@versions
+def test_the_subject_of_a_refused_certificate_can_not_harm_the_log(
+    secure: Appliance,
+    party: Party,
+    version: str,
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+) -> None:
+    issued = Issued(tmp_path / "x.pem", tmp_path / "x.key")
+    subject = "/CN=\x1b[2J\nopened peer=1\u202e/O=" + "x" * 60 + ("/OU=" + "y" * 60) * 5
+    openssl(
+        *("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+        *("-keyout", issued.key, "-out", issued.certificate, "-days", "2", "-utf8"),
+        *("-subj", subject),
+    )
+    assert "ALERT" in verdict(secure, context(party.authority.ca, issued, version))
+    reasons(secure, caplog)
+    [told] = logged_subjects(caplog)
+    assert told is not None
+    assert len(told) == 256
+    [line] = [logs.message(each) for each in caplog.records if each.message == "tls_failed"]
+    assert line.isprintable()
 
 
 @versions
@@ -311,7 +358,7 @@ def test_a_self_signed_certificate_that_is_in_the_file_is_trusted_and_vouches_fo
     forged = forge(tmp_path, pinned)
     for issued in (other, forged):
         assert "ALERT" in verdict(appliance, context(party.authority.ca, issued, version))
-    assert reasons(appliance, caplog, 2) == ["unknown_authority"] * 2
+    assert reasons(appliance, caplog, 2) == ["unknown_issuer"] * 2
 
 
 def forge(folder: Path, by: Issued) -> Issued:
@@ -342,7 +389,7 @@ def test_self_signed_certificates_alone_and_their_dates(
     assert verdict(appliance, context(party.authority.ca, good)) == "served"
     assert "ALERT" in verdict(appliance, context(party.authority.ca, old))
     assert "ALERT" in verdict(appliance, context(party.authority.ca, party.engineer))
-    assert reasons(appliance, caplog, 2) == ["expired", "unknown_authority"]
+    assert reasons(appliance, caplog, 2) == ["expired", "unknown_issuer"]
 
 
 @versions
@@ -389,7 +436,7 @@ def test_a_server_that_the_client_does_not_trust_is_told_so(
         with pytest.raises(Refused):
             client.shake()
         client.flush()
-    assert reasons(secure, caplog) in (["refused_by_peer"], ["closed"])
+    assert reasons(secure, caplog) in (["peer_refused_certificate"], ["closed_during_handshake"])
 
 
 def test_a_peer_that_no_rule_names_is_closed_before_a_byte(run: Run, party: Party) -> None:
@@ -421,7 +468,7 @@ def test_old_versions_are_refused(secure: Appliance, caplog: pytest.LogCaptureFi
         old.minimum_version = old.maximum_version = ssl.TLSVersion.TLSv1_1
     old.set_ciphers("ALL:@SECLEVEL=0")
     assert "ALERT" in verdict(secure, old)
-    assert reasons(secure, caplog) == ["incompatible"]
+    assert reasons(secure, caplog) == ["no_common_version_or_cipher"]
 
 
 def test_a_client_that_hangs_in_the_handshake_is_closed_in_time_and_holds_up_nobody(
@@ -536,7 +583,7 @@ def test_a_record_that_was_changed_ends_the_connection(
         changed[-1] ^= 1
         client.wire.send(bytes(changed))
         assert client.end().endswith("ALERT_BAD_RECORD_MAC")
-    assert reasons(secure, caplog) == ["decrypt_error"]
+    assert reasons(secure, caplog) == ["bad_record"]
 
 
 # Deadlines, limits, stop
@@ -766,7 +813,7 @@ def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(
     finally:
         client.kill()
         client.communicate()
-    assert reasons(secure, caplog) == ["protocol_error"]
+    assert reasons(secure, caplog) == ["other"]
 
 
 # Memory

@@ -98,6 +98,9 @@ impl Engine {
         if let Some(peer) = &event.peer {
             peer::tell(&fields, peer)?;
         }
+        if let Some(subject) = event.subject {
+            fields.set_item("subject", subject.as_ref())?;
+        }
         if let Some(reason) = event.kind.reason() {
             fields.set_item("reason", reason)?;
         }

@@ -111,6 +111,8 @@ pub struct Event {
     pub listener: Arc<str>,
     pub kind: Kind,
     pub peer: Option<Peer>,
+    /// The subject of the certificate of a peer whose handshake failed, cut to 256 characters.
+    pub subject: Option<Box<str>>,
 }
 
 /// Which events are sent.
@@ -154,13 +156,20 @@ impl Reporter {
         self.verbosity.store(verbosity as u8, Ordering::Relaxed);
     }
 
-    pub(crate) fn report(&self, listener: &Arc<str>, kind: Kind, peer: Option<Peer>) {
+    pub(crate) fn report(
+        &self,
+        listener: &Arc<str>,
+        kind: Kind,
+        peer: Option<Peer>,
+        subject: Option<&str>,
+    ) {
         let verbosity = self.verbosity.load(Ordering::Relaxed);
         let least = if kind.is_ordinary() { Verbosity::All } else { Verbosity::Refusals };
         if verbosity < least as u8 {
             return;
         }
-        let event = Event { listener: Arc::clone(listener), kind, peer };
+        let subject = subject.map(Box::from);
+        let event = Event { listener: Arc::clone(listener), kind, peer, subject };
         if self.sender.try_send(event).is_err() {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }

@@ -67,11 +67,16 @@ impl ListenerContext {
     }
 
     pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {
-        self.reporter.report(&self.name, kind, peer);
+        self.reporter.report(&self.name, kind, peer, None);
     }
 
     /// Counts and reports the end of a connection.
     pub(crate) fn ended(&self, kind: Kind, peer: impl Into<Peer>) {
+        self.ended_with(kind, peer, None);
+    }
+
+    /// The same, for a peer that has presented a certificate.
+    pub(crate) fn ended_with(&self, kind: Kind, peer: impl Into<Peer>, subject: Option<&str>) {
         match kind {
             Kind::Idle => self.connections.idle.add(),
             Kind::RightsRevoked => self.connections.rights_revoked.add(),
@@ -81,7 +86,7 @@ impl ListenerContext {
             Kind::TlsFailed(_) => self.connections.tls_failed.add(),
             _ => {}
         }
-        self.report(kind, Some(peer.into()));
+        self.reporter.report(&self.name, kind, Some(peer.into()), subject);
     }
 
     /// Ends the connections that a service does not serve any more in the place of `before`.

@@ -163,7 +163,7 @@ impl ModbusStream {
         let certificate = match shaken {
             Ok(Ok(())) => stream.peer_certificate(),
             Ok(Err(Kind::Closed)) => {
-                let reason = TlsFailure::ClosedDuringHandshake.event_reason();
+                let reason = TlsFailure::ClosedDuringHandshake.reason();
                 return context.ended(Kind::TlsFailed(reason), peer);
             }
             Ok(Err(end)) => Err(end),
@@ -172,7 +172,7 @@ impl ModbusStream {
         let certificate = match certificate {
             Ok(certificate) => Arc::new(certificate),
             Err(end) => {
-                context.ended(end, peer);
+                context.ended_with(end, peer, stream.presented_subject().as_deref());
                 drain(&stream.into_socket(), usize::MAX, stop).await;
                 return;
             }
@@ -302,8 +302,8 @@ impl Service for ModbusStream {
             return Some(Kind::RightsRevoked);
         }
         let (tls, certificate) = (self.tls.as_ref()?, peer.certificate.as_ref()?);
-        if let Err(error) = tls.judge(certificate) {
-            return Some(Kind::TlsFailed(TlsFailure::from(&error).event_reason()));
+        if let Err(failure) = tls.judge(certificate) {
+            return Some(Kind::TlsFailed(failure.reason()));
         }
         // A session that never had rights keeps its exceptions.
         (self.terms(peer).is_none() && before.terms(peer).is_some()).then_some(Kind::RightsRevoked)

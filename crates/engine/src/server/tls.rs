@@ -83,6 +83,11 @@ impl ServerTlsStream {
         self.channel.peer_certificate().map_err(|failure| failed(&failure))
     }
 
+    /// The subject of the certificate of a peer whose handshake has failed.
+    pub(crate) fn presented_subject(&self) -> Option<String> {
+        self.channel.presented_subject()
+    }
+
     /// Announces the end, and closes the connection.
     pub(crate) async fn refuse(mut self, stop: watch::Receiver<bool>) {
         let mut unsent = Vec::new();
@@ -203,7 +208,7 @@ fn acknowledge(_socket: &TcpStream) {
 }
 
 fn failed(failure: &TlsFailure) -> Kind {
-    Kind::TlsFailed(failure.event_reason())
+    Kind::TlsFailed(failure.reason())
 }
 
 /// Finds the boundaries of records.

@@ -102,21 +102,21 @@ impl Parsed {
     /// The role in the certificate; empty, the null role, when there is none.
     ///
     /// # Errors
-    /// The role occurs twice, is not a UTF8String, or its extension is critical. Software that does
-    /// not know a critical extension must refuse the certificate, and the verifier does not know
-    /// roles.
-    pub(super) fn role(&self) -> Result<String, CertificateError> {
+    /// [`TlsFailure::TwoRoles`], [`TlsFailure::RoleType`], or [`TlsFailure::UnsupportedExtension`] if
+    /// the extension is critical. Software that does not know a critical extension must refuse the
+    /// certificate, and the verifier does not know roles.
+    pub(super) fn role(&self) -> Result<String, TlsFailure> {
         let extensions = self.0.tbs_certificate().extensions().map_or(&[][..], Vec::as_slice);
         let mut named = extensions.iter().filter(|extension| extension.extn_id == ROLE);
         let role = match (named.next(), named.next()) {
             (None, _) => return Ok(String::new()),
             (Some(extension), None) if extension.critical => {
-                return Err(CertificateError::UnhandledCriticalExtension);
+                return Err(TlsFailure::UnsupportedExtension);
             }
             (Some(extension), None) => Utf8StringRef::from_der(extension.extn_value.as_bytes()),
-            (Some(_), Some(_)) => return Err(CertificateError::BadEncoding),
+            (Some(_), Some(_)) => return Err(TlsFailure::TwoRoles),
         };
-        role.map(|role| role.to_string()).map_err(|_| CertificateError::BadEncoding)
+        role.map(|role| role.to_string()).map_err(|_| TlsFailure::RoleType)
     }
 
     /// Whether it is an authority: it has `CA:TRUE`, and its `keyUsage`, if any, has `keyCertSign`.
@@ -240,6 +240,12 @@ impl Parsed {
         number.take(MAX_SERIAL_LEN).map(|byte| format!("{byte:02x}")).collect()
     }
 
+    /// Whether its key may sign a handshake: `keyUsage`, if any, has `digitalSignature`.
+    pub(super) fn may_sign_handshakes(&self) -> bool {
+        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.digital_signature()))
+    }
+
     /// The subject, for the list of accepted issuers that a server sends to clients.
     pub(super) fn subject(&self) -> Option<DistinguishedName> {
         self.0.tbs_certificate().subject().to_der().ok().map(DistinguishedName::from)
@@ -276,7 +282,7 @@ mod tests {
         CustomExtension::from_oid_content(&ROLE_ARCS[..9], content.to_vec())
     }
 
-    fn role(extensions: &[CustomExtension]) -> Result<String, CertificateError> {
+    fn role(extensions: &[CustomExtension]) -> Result<String, TlsFailure> {
         parsed(|params| params.custom_extensions = extensions.to_vec()).role()
     }
 
@@ -307,13 +313,13 @@ mod tests {
             b"\x2c\x05\x0c\x03abc",
         ];
         for content in malformed {
-            assert_eq!(role(&[extension(content)]), Err(CertificateError::BadEncoding));
+            assert_eq!(role(&[extension(content)]), Err(TlsFailure::RoleType));
         }
         let twice = [extension(b"\x0c\x01a"), extension(b"\x0c\x01a")];
-        assert_eq!(role(&twice), Err(CertificateError::BadEncoding));
+        assert_eq!(role(&twice), Err(TlsFailure::TwoRoles));
         let mut critical = extension(b"\x0c\x01a");
         critical.set_criticality(true);
-        assert_eq!(role(&[critical]), Err(CertificateError::UnhandledCriticalExtension));
+        assert_eq!(role(&[critical]), Err(TlsFailure::UnsupportedExtension));
     }
 
     #[test]

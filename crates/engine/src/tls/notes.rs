@@ -7,6 +7,8 @@ use std::sync::Arc;
 
 use rustls::pki_types::{CertificateDer, UnixTime};
 
+use super::TlsFailure;
+
 /// A certificate and its intermediates.
 pub(super) type Chain = Arc<[CertificateDer<'static>]>;
 
@@ -17,6 +19,8 @@ pub(super) struct Notes {
     pub(super) chain: Option<Chain>,
     /// When the peer proved that it has the key of its certificate.
     pub(super) proved: Option<UnixTime>,
+    /// Why the chain was refused. The error of rustls decides about the alert, and has fewer words.
+    pub(super) failure: Option<TlsFailure>,
     /// The key of the stored session of the connection.
     pub(super) session: Option<Vec<u8>>,
 }

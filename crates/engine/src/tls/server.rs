@@ -14,8 +14,8 @@ use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::sign::SingleCertAndKey;
 use rustls::time_provider::{DefaultTimeProvider, TimeProvider};
 use rustls::{
-    DigitallySignedStruct, DistinguishedName, Error, ServerConfig, ServerConnection,
-    SignatureScheme,
+    AlertDescription, CertificateError, DigitallySignedStruct, DistinguishedName, Error,
+    OtherError, ProtocolVersion, ServerConfig, ServerConnection, SignatureScheme,
 };
 use webpki::{CertRevocationList, OwnedCertRevocationList};
 
@@ -76,7 +76,7 @@ impl ServerTls {
     }
 
     /// Judges the certificate of an open session again, as a handshake would now.
-    pub(crate) fn judge(&self, certificate: &PeerCertificate) -> Result<(), Error> {
+    pub(crate) fn judge(&self, certificate: &PeerCertificate) -> Result<(), TlsFailure> {
         self.clients.judge(&certificate.chain, UnixTime::now())
     }
 
@@ -128,7 +128,7 @@ impl ServerChannel {
         let channel = &mut self.channel;
         let received = if channel.is_handshaking() {
             let received = self.notes.lend(|| channel.receive(bytes, plain, out));
-            if !channel.is_handshaking() {
+            if received.is_ok() && !channel.is_handshaking() {
                 // Only the session is still of use.
                 self.notes.chain = None;
             }
@@ -140,7 +140,11 @@ impl ServerChannel {
             if let Some(session) = &self.notes.session {
                 self.sessions.forget(session);
             }
-            TlsFailure::from(error)
+            let failure = self.notes.failure.take().unwrap_or_else(|| TlsFailure::from(error));
+            if failure == TlsFailure::NoCertificate && self.is_tls12() {
+                replace_certificate_required(out);
+            }
+            failure
         })
     }
 
@@ -156,6 +160,17 @@ impl ServerChannel {
         self.channel.is_handshaking()
     }
 
+    fn is_tls12(&self) -> bool {
+        self.channel.0.protocol_version() == Some(ProtocolVersion::TLSv1_2)
+    }
+
+    /// The subject of the certificate that the peer has presented, during the handshake and after it
+    /// has failed.
+    pub(crate) fn presented_subject(&self) -> Option<String> {
+        let presented = self.notes.chain.as_ref()?.first()?;
+        Parsed::new(presented).ok().map(|parsed| parsed.subject_text())
+    }
+
     pub(crate) fn has_ended(&mut self) -> bool {
         self.channel.has_ended()
     }
@@ -166,12 +181,48 @@ impl ServerChannel {
         let presented = chain.first().ok_or(TlsFailure::NoCertificate)?;
         let parsed = Parsed::new(presented).map_err(Error::from)?;
         Ok(PeerCertificate {
-            role: parsed.role().map_err(Error::from)?,
+            role: parsed.role()?,
             subject: parsed.subject_text(),
             serial: parsed.serial_text(),
             chain: chain.iter().cloned().map(CertificateDer::into_owned).collect(),
         })
     }
+}
+
+/// Over TLS 1.2, replaces the alert `certificate_required` at the end of `out` by
+/// `handshake_failure`: the former exists in TLS 1.3 only (RFC 5246, 7.4.6). There is no encryption yet.
+fn replace_certificate_required(out: &mut [u8]) {
+    const ALERT: u8 = 21;
+    const FATAL: u8 = 2;
+    if let [.., ALERT, 3, 3, 0, 2, FATAL, alert] = out
+        && *alert == u8::from(AlertDescription::CertificateRequired)
+    {
+        *alert = u8::from(AlertDescription::HandshakeFailure);
+    }
+}
+
+/// The error with which rustls sends the alert for a failure (RFC 8446, 6.2).
+fn refused(failure: &TlsFailure) -> Error {
+    let error = match failure {
+        TlsFailure::Expired { .. }
+        | TlsFailure::NotYetValid { .. }
+        | TlsFailure::IssuerExpired { .. }
+        | TlsFailure::IssuerNotYetValid { .. } => CertificateError::Expired,
+        TlsFailure::Revoked => CertificateError::Revoked,
+        TlsFailure::UnknownIssuer | TlsFailure::UnknownRevocation => {
+            CertificateError::UnknownIssuer
+        }
+        TlsFailure::WrongPurpose { .. }
+        | TlsFailure::WrongKeyUsage
+        | TlsFailure::UnsupportedCertificate { .. } => CertificateError::InvalidPurpose,
+        TlsFailure::BadCertificate
+        | TlsFailure::BadSignature
+        | TlsFailure::TwoRoles
+        | TlsFailure::RoleType
+        | TlsFailure::UnsupportedExtension => CertificateError::BadEncoding,
+        other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
+    };
+    error.into()
 }
 
 /// Verifies the certificates of clients.
@@ -197,10 +248,14 @@ impl Clients {
     }
 
     /// Verifies the certificate of a client, its own first, and its role.
-    pub(super) fn judge(&self, chain: &[CertificateDer<'_>], now: UnixTime) -> Result<(), Error> {
-        let (own, intermediates) = chain.split_first().ok_or(Error::NoCertificatesPresented)?;
+    pub(super) fn judge(
+        &self,
+        chain: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<(), TlsFailure> {
+        let (own, intermediates) = chain.split_first().ok_or(TlsFailure::NoCertificate)?;
         self.trust.judge(own, intermediates, Purpose::Client, now)?;
-        Parsed::new(own)?.role()?;
+        Parsed::new(own).map_err(Error::from)?.role()?;
         Ok(())
     }
 }
@@ -251,7 +306,11 @@ impl ClientCertVerifier for Clients {
             notes.chain = Some(Arc::clone(&chain));
             notes.proved = Some(now);
         });
-        self.judge(&chain, now)?;
+        self.judge(&chain, now).map_err(|failure| {
+            let refused = refused(&failure);
+            noted(|notes| notes.failure = Some(failure));
+            refused
+        })?;
         Ok(ClientCertVerified::assertion())
     }
 
@@ -283,13 +342,16 @@ mod tests {
     use std::sync::atomic::{AtomicU64, Ordering};
     use std::time::Duration;
 
-    use rcgen::{CertificateRevocationListParams, KeyIdMethod, RevokedCertParams, date_time_ymd};
+    use rcgen::{
+        CertificateRevocationListParams, CustomExtension, KeyIdMethod, RevokedCertParams,
+        date_time_ymd,
+    };
     use rustls::HandshakeKind::{Full as FULL, Resumed as RESUMED};
     use rustls::version::{TLS12, TLS13};
     use rustls::{ClientConfig, HandshakeKind, SupportedProtocolVersion};
 
     use super::*;
-    use crate::tls::test_party::{Party, connection};
+    use crate::tls::test_party::{Party, ROLE_ARCS, connection, role};
 
     const DAY: u64 = 24 * 60 * 60;
     const VERSIONS: [&SupportedProtocolVersion; 2] = [&TLS12, &TLS13];
@@ -421,6 +483,22 @@ mod tests {
                 let altered = [&[23, 3, 3, 0, 40][..], &[7; 40]].concat();
                 let failed = talk(&mut tls.channel().unwrap(), &client, &altered);
                 assert_eq!(failed, Err(TlsFailure::BadRecord));
+            }
+        }
+    }
+
+    #[test]
+    fn a_client_without_exactly_one_role_is_refused() {
+        let wrong_type = CustomExtension::from_oid_content(&ROLE_ARCS, vec![19, 1, 65]);
+        let two = vec![role("operator"), role("engineer")];
+        for (roles, reason) in [(two, "two_roles"), (vec![wrong_type], "role_type")] {
+            let party = Party::with_client(|params| params.custom_extensions = roles.clone());
+            let tls = ServerTls::load(&party.files()).unwrap();
+            for version in VERSIONS {
+                let mut server = tls.channel().unwrap();
+                let refused = talk(&mut server, &party.client(version), b"").unwrap_err();
+                assert_eq!(refused.reason(), reason);
+                assert_eq!(server.presented_subject().as_deref(), Some("CN=panel 7"));
             }
         }
     }

@@ -54,10 +54,13 @@ impl Owner {
     }
 }
 
+/// The extension that holds the role.
+pub(crate) const ROLE_ARCS: [u64; 9] = [1, 3, 6, 1, 4, 1, 50316, 802, 1];
+
 /// The extension with a role.
 pub(crate) fn role(role: &str) -> CustomExtension {
     let content = [&[12, role.len() as u8], role.as_bytes()].concat();
-    CustomExtension::from_oid_content(&[1, 3, 6, 1, 4, 1, 50316, 802, 1], content)
+    CustomExtension::from_oid_content(&ROLE_ARCS, content)
 }
 
 /// A folder of files, removed on drop.

@@ -4,6 +4,7 @@
 //! * A listed authority ([`Parsed::is_authority`]) can issue certificates within its own dates.
 //! * A presented certificate with `CA:TRUE` is trusted only if it is listed itself.
 //! * Dates and purpose of the presented certificate are always checked.
+//! * The key of a client must be for signing. Devices with other `keyUsage` are common.
 //!
 //! webpki checks signatures, and the constraints along a path. Dates are checked when a certificate
 //! is used, not when its file is read: the clock of a machine may be wrong just after power-on.
@@ -125,6 +126,9 @@ impl Trust {
         }
         if parsed.has_ca_flag() {
             return Err(told(TlsFailure::CaAsEndEntity));
+        }
+        if purpose == Purpose::Client && !parsed.may_sign_handshakes() {
+            return Err(told(TlsFailure::WrongKeyUsage));
         }
         self.vouch(&Path { end_entity: &end_entity, intermediates, purpose, now })
     }
