@@ -230,8 +230,8 @@ class ServerTls:
     """Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 
     `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
-    `crl_file` has the revocation lists of these authorities. Raises `ValueError` for a file that
-    can't be used.
+    `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
+    their clients after `nextUpdate`. Raises `ValueError` for a file that can't be used.
     """
 
     def __new__(
@@ -241,7 +241,11 @@ class ServerTls:
         key_file: str | PathLike[str],
         ca_file: str | PathLike[str],
         crl_file: str | PathLike[str] | None = None,
+        expired_crl: Literal["refuse", "accept"] = "refuse",
     ) -> ServerTls: ...
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful about the files: dates, and revocation lists."""
 
 @final
 class Listener:

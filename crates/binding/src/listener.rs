@@ -14,7 +14,7 @@ use holdfast_engine::server::{
     PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
     StreamSettings, UdpSettings, WhenFull,
 };
-use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
+use holdfast_engine::tls::server::{ExpiredLists, ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
 use holdfast_protocol::raw_ingest::Format;
 use ipnet::IpNet;
@@ -122,17 +122,25 @@ pub struct ServerTls {
 #[pymethods]
 impl ServerTls {
     #[new]
-    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None))]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse"))]
     fn new(
         cert_file: PathBuf,
         key_file: PathBuf,
         ca_file: PathBuf,
         crl_file: Option<PathBuf>,
+        expired_crl: &str,
     ) -> PyResult<ServerTls> {
-        let files = ServerFiles { cert_file, key_file, ca_file, crl_file };
+        let allowed = [("refuse", ExpiredLists::Refuse), ("accept", ExpiredLists::Accept)];
+        let expired_lists = word("expired_crl", expired_crl, &allowed)?;
+        let files = ServerFiles { cert_file, key_file, ca_file, crl_file, expired_lists };
         let core = CoreServerTls::load(&files);
         let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
         Ok(ServerTls { core: Arc::new(core) })
+    }
+
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.core.warnings().to_vec()
     }
 }
 

@@ -227,6 +227,8 @@ class ServerTlsConfig(Model):
     """Authorities of client certificates, and self-signed certificates of clients."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client."""
+    expired_crl: Literal["refuse", "accept"] = "refuse"
+    """Clients of an authority whose list is past its nextUpdate."""
     review: DurationOrZero = 3600.0
     """At most so many seconds pass until the certificates of open connections are judged again; 0:
     only at a reload."""

@@ -60,6 +60,9 @@ pub enum TlsFailure {
     Revoked,
     #[error("an authority above the certificate has no valid revocation list")]
     UnknownRevocation,
+    /// The `nextUpdate` of a revocation list has passed.
+    #[error("a revocation list of an authority above the certificate expired {} ago", span(*.ago))]
+    ExpiredRevocationList { ago: Duration },
     /// The signature of a certificate is invalid; or that of the handshake, when the peer does not
     /// hold the key of its certificate.
     #[error("the signature of the certificate, or of the handshake, is invalid")]
@@ -139,6 +142,7 @@ impl TlsFailure {
             TlsFailure::WrongPurpose { .. } => "wrong_purpose",
             TlsFailure::Revoked => "revoked",
             TlsFailure::UnknownRevocation => "unknown_revocation",
+            TlsFailure::ExpiredRevocationList { .. } => "expired_revocation_list",
             TlsFailure::BadSignature => "bad_signature",
             TlsFailure::BadCertificate => "bad_certificate",
             TlsFailure::TwoRoles => "two_roles",
@@ -311,7 +315,7 @@ pub(super) fn between(from: UnixTime, to: UnixTime) -> Duration {
     Duration::from_secs(to.as_secs().saturating_sub(from.as_secs()))
 }
 
-fn span(time: Duration) -> String {
+pub(super) fn span(time: Duration) -> String {
     let seconds = time.as_secs();
     if seconds < DAY { format!("{seconds} s") } else { format!("{} days", seconds / DAY) }
 }
@@ -381,6 +385,7 @@ mod tests {
             TlsFailure::WrongPurpose { required: "serverAuth" },
             TlsFailure::Revoked,
             TlsFailure::UnknownRevocation,
+            TlsFailure::ExpiredRevocationList { ago },
             TlsFailure::BadSignature,
             TlsFailure::BadCertificate,
             TlsFailure::TwoRoles,

@@ -5,12 +5,14 @@
 
 mod certificate;
 pub mod client;
+mod doubts;
 mod failure;
 mod files;
 mod notes;
 mod own;
 mod p521;
 mod provider;
+mod revocation;
 mod rsa_pss;
 pub mod server;
 mod sessions;

@@ -8,8 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rustls::client::danger::HandshakeSignatureValid;
-use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, UnixTime};
+use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::sign::SingleCertAndKey;
 use rustls::time_provider::{DefaultTimeProvider, TimeProvider};
@@ -17,13 +16,14 @@ use rustls::{
     AlertDescription, CertificateError, DigitallySignedStruct, DistinguishedName, Error,
     OtherError, ProtocolVersion, ServerConfig, ServerConnection, SignatureScheme,
 };
-use webpki::{CertRevocationList, OwnedCertRevocationList};
 
 use super::certificate::{Parsed, Purpose};
+use super::doubts::Doubts;
 use super::files::FileError;
 use super::notes::{Chain, Notes, noted};
 use super::own::own;
 use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
+use super::revocation::List;
 use super::sessions::Sessions;
 use super::trust::{Listed, Trust};
 use super::{Channel, TlsFailure};
@@ -39,6 +39,16 @@ pub struct ServerFiles {
     pub ca_file: PathBuf,
     /// Revocation lists. If given, every authority above a client requires a list.
     pub crl_file: Option<PathBuf>,
+    pub expired_lists: ExpiredLists,
+}
+
+/// What happens to clients of an authority whose revocation list is past its `nextUpdate`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ExpiredLists {
+    /// They are refused.
+    Refuse,
+    /// The list counts as it is.
+    Accept,
 }
 
 /// The TLS configuration of a server.
@@ -46,6 +56,7 @@ pub struct ServerTls {
     config: Arc<ServerConfig>,
     clients: Arc<Clients>,
     sessions: Arc<Sessions>,
+    warnings: Vec<String>,
 }
 
 impl ServerTls {
@@ -62,7 +73,9 @@ impl ServerTls {
         clock: Arc<dyn TimeProvider>,
     ) -> Result<ServerTls, FileError> {
         let own = own(&files.cert_file, &files.key_file)?;
-        let clients = Arc::new(Clients::load(files)?);
+        let mut doubts = Doubts::new(files, clock.current_time().unwrap_or(UnixTime::now()));
+        doubts.of_own(&own.cert);
+        let clients = Arc::new(Clients::load(files, &mut doubts)?);
         let sessions = Arc::new(Sessions::new(Arc::clone(&clients), Arc::clone(&clock)));
         let config = ServerConfig::builder_with_details(provider(), clock)
             .with_safe_default_protocol_versions()
@@ -72,7 +85,8 @@ impl ServerTls {
             .with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
         config.session_storage = Arc::clone(&sessions) as _;
         config.send_tls13_tickets = 1;
-        Ok(ServerTls { config: Arc::new(config), clients, sessions })
+        let (config, warnings) = (Arc::new(config), doubts.found());
+        Ok(ServerTls { config, clients, sessions, warnings })
     }
 
     /// Judges the certificate of an open session again, as a handshake would now.
@@ -80,11 +94,16 @@ impl ServerTls {
         self.clients.judge(&certificate.chain, UnixTime::now())
     }
 
+    /// What is doubtful about the files: certificates outside their dates, revocation lists that are
+    /// missing, expired or of others.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
     /// Creates the channel of an accepted connection.
     pub(crate) fn channel(&self) -> Result<ServerChannel, Error> {
         let channel = Channel::new(ServerConnection::new(Arc::clone(&self.config))?);
-        let sessions = Arc::clone(&self.sessions);
-        Ok(ServerChannel { channel, notes: Notes::default(), sessions })
+        Ok(ServerChannel { channel, notes: Notes::default(), sessions: Arc::clone(&self.sessions) })
     }
 }
 
@@ -209,9 +228,9 @@ fn refused(failure: &TlsFailure) -> Error {
         | TlsFailure::IssuerExpired { .. }
         | TlsFailure::IssuerNotYetValid { .. } => CertificateError::Expired,
         TlsFailure::Revoked => CertificateError::Revoked,
-        TlsFailure::UnknownIssuer | TlsFailure::UnknownRevocation => {
-            CertificateError::UnknownIssuer
-        }
+        TlsFailure::UnknownIssuer
+        | TlsFailure::UnknownRevocation
+        | TlsFailure::ExpiredRevocationList { .. } => CertificateError::UnknownIssuer,
         TlsFailure::WrongPurpose { .. }
         | TlsFailure::WrongKeyUsage
         | TlsFailure::UnsupportedCertificate { .. } => CertificateError::InvalidPurpose,
@@ -233,18 +252,28 @@ pub(super) struct Clients {
 }
 
 impl Clients {
-    fn load(files: &ServerFiles) -> Result<Clients, FileError> {
+    fn load(files: &ServerFiles, doubts: &mut Doubts<'_>) -> Result<Clients, FileError> {
         let listed = listed(&files.ca_file)?;
         let subjects = listed.iter().filter_map(Listed::subject).collect();
+        doubts.of_listed(&listed);
         let revoked = match &files.crl_file {
             Some(file) if !listed.iter().any(Listed::is_authority) => {
                 let flaw = "crl_file requires an authority (CA:TRUE) in ca_file";
                 return Err(FileError::content(file, flaw));
             }
-            Some(file) => revocations(file)?,
+            Some(file) => {
+                let lists = List::of_file(file)?;
+                doubts.of_lists(file, &lists, &listed);
+                lists.into_iter().map(List::into_usable).collect()
+            }
             None => Vec::new(),
         };
-        Ok(Clients { trust: Trust::new(listed, revoked), subjects })
+        let trust = Trust::new(listed, revoked);
+        let trust = match files.expired_lists {
+            ExpiredLists::Refuse => trust,
+            ExpiredLists::Accept => trust.accepting_expired_lists(),
+        };
+        Ok(Clients { trust, subjects })
     }
 
     /// Verifies the certificate of a client, its own first, and its role.
@@ -270,23 +299,6 @@ fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
         return Err(FileError::content(file, flaw));
     }
     Ok(listed)
-}
-
-/// Reads all revocation lists of a file, at least one.
-fn revocations(file: &Path) -> Result<Vec<CertRevocationList<'static>>, FileError> {
-    let text = std::fs::read(file)
-        .map_err(|error| FileError::Unreadable { file: file.display().to_string(), error })?;
-    let found: Result<Vec<_>, _> = CertificateRevocationListDer::pem_slice_iter(&text).collect();
-    let found = found.map_err(|error| FileError::content(file, error.to_string()))?;
-    if found.is_empty() {
-        let flaw = "found no revocation list, allowed: X509 CRL in PEM";
-        return Err(FileError::content(file, flaw));
-    }
-    let read = found.iter().map(|list| OwnedCertRevocationList::from_der(list).map(Into::into));
-    let read: Result<Vec<_>, _> = read.collect();
-    read.map_err(|error| {
-        FileError::content(file, format!("a revocation list can't be read: {error}"))
-    })
 }
 
 impl ClientCertVerifier for Clients {

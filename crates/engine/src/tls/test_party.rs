@@ -13,7 +13,7 @@ use rustls::pki_types::{PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, ClientConnection, RootCertStore, SupportedProtocolVersion};
 
 use super::provider::provider;
-use super::server::ServerFiles;
+use super::server::{ExpiredLists, ServerFiles};
 
 /// A certificate and its key.
 pub(crate) struct Owner {
@@ -121,6 +121,7 @@ impl Party {
             key_file: write("server.key", self.server.key.serialize_pem()),
             ca_file: write("ca.pem", self.authority.certificate.pem()),
             crl_file: None,
+            expired_lists: ExpiredLists::Refuse,
         }
     }
 
