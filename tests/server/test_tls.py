@@ -776,6 +776,38 @@ def test_pymodbus(secure: Appliance, party: Party, version: str) -> None:
         client.close()  # type: ignore[no-untyped-call]
 
 
+@pytest.mark.parametrize("version", ["-tls1_2", "-tls1_3"])
+def test_openssl_asks_for_short_fragments_and_is_served(
+    secure: Appliance, party: Party, version: str
+) -> None:
+    host, port = address(secure)
+    shown = ("-cert", str(party.operator.certificate), "-key", str(party.operator.key))
+    client = subprocess.Popen(
+        [
+            *(tool("openssl"), "s_client", "-quiet", "-connect", f"{host}:{port}", version),
+            *("-maxfraglen", "512", *shown),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        bufsize=0,
+    )
+    try:
+        assert client.stdin is not None
+        assert client.stdout is not None
+        client.stdin.write(wire.frames([MAX_READ] * 10))
+        received, replies = b"", list[wire.Frame]()
+        while len(replies) < 10:
+            piece = client.stdout.read(65536)
+            assert piece
+            received += piece
+            replies = wire.split(received)[0]
+        assert [reply.pdu for reply in replies] == [b"\x03\xfa" + bytes(250)] * 10
+    finally:
+        client.kill()
+        client.communicate()
+
+
 def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(
     secure: Appliance, party: Party, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -8,7 +8,7 @@ use rustls::pki_types::{CertificateDer, UnixTime};
 use super::certificate::{Parsed, name_text};
 use super::failure::{between, span};
 use super::revocation::List;
-use super::server::{ExpiredLists, ServerFiles};
+use super::server_files::{ExpiredLists, ServerFiles};
 use super::trust::Listed;
 
 /// Finds what is doubtful.

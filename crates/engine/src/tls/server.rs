@@ -1,59 +1,33 @@
-//! The server side: its certificate, the clients that it trusts, and their roles.
+//! The server side: its certificate, and the channels of its connections.
 //!
 //! Mutual authentication is mandatory, as MB-TCP-Security requires. The certificate of a client and its
 //! dates are checked for every connection, also if it resumes a session.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use rustls::client::danger::HandshakeSignatureValid;
 use rustls::pki_types::{CertificateDer, UnixTime};
-use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::sign::SingleCertAndKey;
 use rustls::time_provider::{DefaultTimeProvider, TimeProvider};
-use rustls::{
-    AlertDescription, CertificateError, DigitallySignedStruct, DistinguishedName, Error,
-    OtherError, ProtocolVersion, ServerConfig, ServerConnection, SignatureScheme,
-};
+use rustls::{AlertDescription, Error, ProtocolVersion, ServerConfig, ServerConnection};
 
-use super::certificate::{Parsed, Purpose};
+use super::certificate::Parsed;
+use super::clients::Clients;
 use super::doubts::Doubts;
 use super::files::FileError;
-use super::notes::{Chain, Notes, noted};
+use super::fragment::{Asked, LENGTHS, RECORD_HEADER_LEN, asked};
+use super::notes::Notes;
 use super::own::own;
-use super::provider::{ALGORITHMS, provider, verify_tls12, verify_tls13};
-use super::revocation::List;
+use super::provider::provider;
+pub use super::server_files::{ExpiredLists, ServerFiles};
 use super::sessions::Sessions;
-use super::trust::{Listed, Trust};
 use super::{Channel, TlsFailure};
-
-/// The PEM files of a server.
-#[derive(Debug, Clone)]
-pub struct ServerFiles {
-    /// The certificate of the server, with its intermediates.
-    pub cert_file: PathBuf,
-    /// The key of the certificate, without a passphrase.
-    pub key_file: PathBuf,
-    /// Authorities of clients, and self-signed certificates of clients.
-    pub ca_file: PathBuf,
-    /// Revocation lists. If given, every authority above a client requires a list.
-    pub crl_file: Option<PathBuf>,
-    pub expired_lists: ExpiredLists,
-}
-
-/// What happens to clients of an authority whose revocation list is past its `nextUpdate`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ExpiredLists {
-    /// They are refused.
-    Refuse,
-    /// The list counts as it is.
-    Accept,
-}
 
 /// The TLS configuration of a server.
 pub struct ServerTls {
     config: Arc<ServerConfig>,
+    /// The same for clients that ask for shorter fragments.
+    short: Arc<[Arc<ServerConfig>; LENGTHS.len()]>,
     clients: Arc<Clients>,
     sessions: Arc<Sessions>,
     warnings: Vec<String>,
@@ -81,12 +55,17 @@ impl ServerTls {
             .with_safe_default_protocol_versions()
             .map_err(|error| FileError::content(&files.cert_file, error.to_string()))?;
         let mut config = config
-            .with_client_cert_verifier(Arc::clone(&clients) as Arc<dyn ClientCertVerifier>)
+            .with_client_cert_verifier(Arc::clone(&clients) as _)
             .with_cert_resolver(Arc::new(SingleCertAndKey::from(own)));
         config.session_storage = Arc::clone(&sessions) as _;
         config.send_tls13_tickets = 1;
-        let (config, warnings) = (Arc::new(config), doubts.found());
-        Ok(ServerTls { config, clients, sessions, warnings })
+        let short = LENGTHS.map(|len| {
+            let mut short = config.clone();
+            short.max_fragment_size = Some(len + RECORD_HEADER_LEN);
+            Arc::new(short)
+        });
+        let (config, short, warnings) = (Arc::new(config), Arc::new(short), doubts.found());
+        Ok(ServerTls { config, short, clients, sessions, warnings })
     }
 
     /// Judges the certificate of an open session again, as a handshake would now.
@@ -103,7 +82,13 @@ impl ServerTls {
     /// Creates the channel of an accepted connection.
     pub(crate) fn channel(&self) -> Result<ServerChannel, Error> {
         let channel = Channel::new(ServerConnection::new(Arc::clone(&self.config))?);
-        Ok(ServerChannel { channel, notes: Notes::default(), sessions: Arc::clone(&self.sessions) })
+        Ok(ServerChannel {
+            channel,
+            first: Some(Vec::new()),
+            short: Arc::clone(&self.short),
+            notes: Notes::default(),
+            sessions: Arc::clone(&self.sessions),
+        })
     }
 }
 
@@ -129,6 +114,9 @@ pub struct PeerCertificate {
 /// The channel of an accepted connection.
 pub(crate) struct ServerChannel {
     channel: Channel,
+    /// The first bytes of the client, until they tell how long fragments may be.
+    first: Option<Vec<u8>>,
+    short: Arc<[Arc<ServerConfig>; LENGTHS.len()]>,
     notes: Notes,
     sessions: Arc<Sessions>,
 }
@@ -139,6 +127,30 @@ impl ServerChannel {
     /// # Errors
     /// TLS failed: send `out`, then close the connection. Its session cannot be resumed.
     pub(crate) fn receive(
+        &mut self,
+        bytes: &[u8],
+        plain: &mut Vec<u8>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), TlsFailure> {
+        let Some(mut first) = self.first.take() else {
+            return self.process(bytes, plain, out);
+        };
+        first.extend_from_slice(bytes);
+        match asked(&first) {
+            Asked::Unknown => {
+                self.first = Some(first);
+                return Ok(());
+            }
+            Asked::Length(index) => {
+                let connection = ServerConnection::new(Arc::clone(&self.short[index]))?;
+                self.channel = Channel::new(connection);
+            }
+            Asked::Nothing => {}
+        }
+        self.process(&first, plain, out)
+    }
+
+    fn process(
         &mut self,
         bytes: &[u8],
         plain: &mut Vec<u8>,
@@ -217,135 +229,6 @@ fn replace_certificate_required(out: &mut [u8]) {
         && *alert == u8::from(AlertDescription::CertificateRequired)
     {
         *alert = u8::from(AlertDescription::HandshakeFailure);
-    }
-}
-
-/// The error with which rustls sends the alert for a failure (RFC 8446, 6.2).
-fn refused(failure: &TlsFailure) -> Error {
-    let error = match failure {
-        TlsFailure::Expired { .. }
-        | TlsFailure::NotYetValid { .. }
-        | TlsFailure::IssuerExpired { .. }
-        | TlsFailure::IssuerNotYetValid { .. } => CertificateError::Expired,
-        TlsFailure::Revoked => CertificateError::Revoked,
-        TlsFailure::UnknownIssuer
-        | TlsFailure::UnknownRevocation
-        | TlsFailure::ExpiredRevocationList { .. } => CertificateError::UnknownIssuer,
-        TlsFailure::WrongPurpose { .. }
-        | TlsFailure::WrongKeyUsage
-        | TlsFailure::UnsupportedCertificate { .. } => CertificateError::InvalidPurpose,
-        TlsFailure::BadCertificate
-        | TlsFailure::BadSignature
-        | TlsFailure::TwoRoles
-        | TlsFailure::RoleType
-        | TlsFailure::UnsupportedExtension => CertificateError::BadEncoding,
-        other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
-    };
-    error.into()
-}
-
-/// Verifies the certificates of clients.
-#[derive(Debug)]
-pub(super) struct Clients {
-    trust: Trust,
-    subjects: Vec<DistinguishedName>,
-}
-
-impl Clients {
-    fn load(files: &ServerFiles, doubts: &mut Doubts<'_>) -> Result<Clients, FileError> {
-        let listed = listed(&files.ca_file)?;
-        let subjects = listed.iter().filter_map(Listed::subject).collect();
-        doubts.of_listed(&listed);
-        let revoked = match &files.crl_file {
-            Some(file) if !listed.iter().any(Listed::is_authority) => {
-                let flaw = "crl_file requires an authority (CA:TRUE) in ca_file";
-                return Err(FileError::content(file, flaw));
-            }
-            Some(file) => {
-                let lists = List::of_file(file)?;
-                doubts.of_lists(file, &lists, &listed);
-                lists.into_iter().map(List::into_usable).collect()
-            }
-            None => Vec::new(),
-        };
-        let trust = Trust::new(listed, revoked);
-        let trust = match files.expired_lists {
-            ExpiredLists::Refuse => trust,
-            ExpiredLists::Accept => trust.accepting_expired_lists(),
-        };
-        Ok(Clients { trust, subjects })
-    }
-
-    /// Verifies the certificate of a client, its own first, and its role.
-    pub(super) fn judge(
-        &self,
-        chain: &[CertificateDer<'_>],
-        now: UnixTime,
-    ) -> Result<(), TlsFailure> {
-        let (own, intermediates) = chain.split_first().ok_or(TlsFailure::NoCertificate)?;
-        self.trust.judge(own, intermediates, Purpose::Client, now)?;
-        Parsed::new(own).map_err(Error::from)?.role()?;
-        Ok(())
-    }
-}
-
-/// Reads authorities and self-signed certificates. Any other certificate is a mistake.
-fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
-    let listed = Listed::of_file(file)?;
-    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.is_self_signed();
-    if let Some(index) = listed.iter().position(is_mistake) {
-        let flaw =
-            format!("certificate {}: neither an authority (CA:TRUE) nor self-signed", index + 1);
-        return Err(FileError::content(file, flaw));
-    }
-    Ok(listed)
-}
-
-impl ClientCertVerifier for Clients {
-    fn root_hint_subjects(&self) -> &[DistinguishedName] {
-        &self.subjects
-    }
-
-    fn verify_client_cert(
-        &self,
-        end_entity: &CertificateDer<'_>,
-        intermediates: &[CertificateDer<'_>],
-        now: UnixTime,
-    ) -> Result<ClientCertVerified, Error> {
-        let chain = std::iter::once(end_entity).chain(intermediates);
-        let chain: Chain = chain.map(|each| each.clone().into_owned()).collect();
-        noted(|notes| {
-            notes.chain = Some(Arc::clone(&chain));
-            notes.proved = Some(now);
-        });
-        self.judge(&chain, now).map_err(|failure| {
-            let refused = refused(&failure);
-            noted(|notes| notes.failure = Some(failure));
-            refused
-        })?;
-        Ok(ClientCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls12(message, certificate, signed)
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls13(message, certificate, signed)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        ALGORITHMS.supported_schemes()
     }
 }
 
@@ -497,6 +380,56 @@ mod tests {
                 assert_eq!(failed, Err(TlsFailure::BadRecord));
             }
         }
+    }
+
+    #[test]
+    fn a_client_gets_no_longer_fragments_than_it_asks_for() {
+        let party = Party::new();
+        let tls = ServerTls::load(&party.files()).unwrap();
+        for version in VERSIONS {
+            for (code, len) in LENGTHS.iter().zip(1..).map(|(len, code)| (code, *len)) {
+                let mut server = tls.channel().unwrap();
+                let (mut hello, mut sent) = (Vec::new(), Vec::new());
+                connection(&party.client(version)).write_tls(&mut hello).unwrap();
+                with_extension(&mut hello, &[0, 1, 0, 1, code]);
+                let cut = hello.len() - 1;
+                for part in [&hello[..cut], &hello[cut..]] {
+                    assert!(sent.is_empty());
+                    server.receive(part, &mut Vec::new(), &mut sent).unwrap();
+                }
+                server.send(&[7; 10_000], &mut sent);
+                let longest = lengths(&sent).into_iter().max().unwrap();
+                // The certificate of the server is longer than the shortest fragment.
+                let overhead = if version == &TLS13 { 1 + 16 } else { 0 };
+                assert!(longest <= len + overhead, "{longest} of {len} over {version:?}");
+                assert!(len > 512 || longest == len + overhead, "{longest}");
+            }
+        }
+    }
+
+    /// Inserts an extension as the first of a ClientHello in one record.
+    fn with_extension(hello: &mut Vec<u8>, extension: &[u8]) {
+        let session_id = 5 + 4 + 2 + 32;
+        let suites = session_id + 1 + usize::from(hello[session_id]);
+        let suites_len = usize::from(u16::from_be_bytes([hello[suites], hello[suites + 1]]));
+        let compressions = suites + 2 + suites_len;
+        let extensions = compressions + 1 + usize::from(hello[compressions]);
+        for at in [3, 7, extensions] {
+            let len = u16::from_be_bytes([hello[at], hello[at + 1]]) + extension.len() as u16;
+            hello[at..at + 2].copy_from_slice(&len.to_be_bytes());
+        }
+        hello.splice(extensions + 2..extensions + 2, extension.iter().copied());
+    }
+
+    /// The lengths of records.
+    fn lengths(mut records: &[u8]) -> Vec<usize> {
+        let mut found = Vec::new();
+        while let [_, _, _, high, low, rest @ ..] = records {
+            let len = usize::from(u16::from_be_bytes([*high, *low]));
+            found.push(len);
+            records = &rest[len..];
+        }
+        found
     }
 
     #[test]

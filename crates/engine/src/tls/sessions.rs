@@ -15,8 +15,8 @@ use rustls::pki_types::UnixTime;
 use rustls::server::StoresServerSessions;
 use rustls::time_provider::TimeProvider;
 
+use super::clients::Clients;
 use super::notes::{Chain, noted};
-use super::server::Clients;
 
 /// The most sessions. The oldest gives way.
 const MAX_SESSIONS: usize = 1024;

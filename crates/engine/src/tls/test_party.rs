@@ -13,7 +13,7 @@ use rustls::pki_types::{PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, ClientConnection, RootCertStore, SupportedProtocolVersion};
 
 use super::provider::provider;
-use super::server::{ExpiredLists, ServerFiles};
+use super::server_files::{ExpiredLists, ServerFiles};
 
 /// A certificate and its key.
 pub(crate) struct Owner {
