@@ -50,6 +50,18 @@ def ipv6() -> None:
 
 
 @pytest.fixture
+def many_files() -> Iterator[None]:
+    """As many open files as the system allows."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    if hard < 2500:
+        missing("a limit of 2500 open files")
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.fixture
 def memory() -> holdfast.Memory:
     """A memory with the addresses 0 to 999 in every area, all zero."""
     return holdfast.Memory(

@@ -234,8 +234,9 @@ class ServerTls:
     """Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 
     `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
-    `crl_file` has the revocation lists of these authorities. `key` is the content of `key_file`
-    without its passphrase, if it has one. Raises `ValueError` for a file that can't be used.
+    `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
+    their clients after `nextUpdate`. `key` is the content of `key_file` without its passphrase, if
+    it has one. Raises `ValueError` for a file that can't be used.
     """
 
     def __new__(
@@ -245,18 +246,23 @@ class ServerTls:
         key_file: str | PathLike[str],
         ca_file: str | PathLike[str],
         crl_file: str | PathLike[str] | None = None,
+        expired_crl: Literal["refuse", "accept"] = "refuse",
         key: bytes | None = None,
     ) -> ServerTls: ...
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful about the files: dates, and revocation lists."""
 
 @final
 class Listener:
     """The settings of a listener. The constructor makes a listener for Modbus over TCP connections.
 
     `framing` is `mbap` for Modbus TCP, `rtu` for RTU over TCP, `ascii` for ASCII over TCP; `tls`
-    enables TLS. Times are in seconds; `idle_timeout` 0 is unlimited. With `listen_only`, function 8
-    may set a unit to listen only mode, for all peers. `raw_ingest`, only with `mbap`
-    and without TLS, is a listener for packets whose connections come to the same port: its own bind
-    and limits are ignored. Raises `ValueError` for an invalid address, limit or time.
+    enables TLS, with at most `max_handshakes` connections that are not authenticated yet, beside
+    `max_connections`. Times are in seconds; `idle_timeout` 0 is unlimited. With `listen_only`,
+    function 8 may set a unit to listen only mode, for all peers. `raw_ingest`, only with `mbap` and
+    without TLS, is a listener for packets whose connections come to the same port: its own bind and
+    limits are ignored. Raises `ValueError` for an invalid address, limit or time.
     """
 
     def __new__(
@@ -274,6 +280,7 @@ class Listener:
         frame_timeout: float | None = None,
         listen_only: bool = False,
         tls: ServerTls | None = None,
+        max_handshakes: int = 256,
         raw_ingest: Listener | None = None,
     ) -> Listener: ...
     @staticmethod

@@ -73,6 +73,7 @@ class ConnectionCounters(TypedDict):
     refused_full: int
     refused_listen_only: int
     evicted: int
+    evicted_handshakes: int
     rights_revoked: int
     ended: int
     idle: int

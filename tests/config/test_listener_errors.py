@@ -399,7 +399,7 @@ def test_tcp_and_udp_share_a_port_number(folder: Folder) -> None:
     ("old", "new", "problem"),
     [
         ("tls: {", "tlsx: {", "5: tls: missing, allowed: a mapping with the keys cert_file, "
-         "key_file, key_passphrase_file, ca_file, crl_file, review"),
+         "key_file, key_passphrase_file, ca_file, crl_file, expired_crl, review"),
         ("key_file: k.pem, ", "", "8: tls.key_file: missing, allowed: text"),
         ("k.pem", "5", "8: tls.key_file: found 5, allowed: text"),
         ("k.pem", "''", "8: tls.key_file: found '', allowed: the path of a file"),
@@ -409,7 +409,7 @@ def test_tcp_and_udp_share_a_port_number(folder: Folder) -> None:
          "directory"),
         ("a.pem", "a.pem, crl_file: ", "8: tls.crl_file: found nothing, allowed: text"),
         ("a.pem", "a.pem, ca: a.pem", "8: tls.ca: unknown key, allowed: cert_file, key_file, "
-         "key_passphrase_file, ca_file, crl_file, review"),
+         "key_passphrase_file, ca_file, crl_file, expired_crl, review"),
         ("[engineer]", "engineer", f"10: rules[0].roles: found 'engineer', allowed: {SOME}"),
         ("[engineer]", "[]", f"10: rules[0].roles: found an empty list, allowed: {SOME}"),
         ("[engineer]", "", f"10: rules[0].roles: found nothing, allowed: {SOME}"),

@@ -11,11 +11,9 @@ import pytest
 
 import holdfast
 from support import wire
-from support.machine import missing, needs_127_0_0_2, needs_proc
+from support.machine import needs_127_0_0_2, needs_proc
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from support.running import Connect, Process, Serve
 
 READ = bytes.fromhex("0300000001")
@@ -41,18 +39,6 @@ def held() -> tuple[int, int]:
 
 
 # Many
-
-
-@pytest.fixture
-def many_files() -> Iterator[None]:
-    """As many open files as the system allows."""
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    if hard < 2500:
-        missing("a limit of 2500 open files")
-    yield
-    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 @pytest.mark.usefixtures("many_files")
@@ -126,6 +112,20 @@ def test_a_full_server_closes_the_connection_that_is_idle_longest(
     assert is_open(first)
     assert is_open(third)
     assert server.counters()["connections"]["evicted"] == 1
+
+
+def test_silent_connections_displace_each_other_and_hardly_anyone_else(
+    memory: holdfast.Memory, serve: Serve, connect: Connect
+) -> None:
+    server = serve({1: memory}, max_connections=10, when_full="evict")
+    clients = [connect(server) for _ in range(9)]
+    assert all(is_open(client) for client in clients)
+
+    silent = [connect(server) for _ in range(25)]
+
+    assert [each.rest() for each in silent[:-1]] == [b""] * 24
+    assert all(is_open(client) for client in clients)
+    assert is_open(silent[-1])
 
 
 def test_one_newcomer_after_another_takes_the_place_of_the_idle(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 from pymodbus.client import ModbusTlsClient
 
+from holdfast import logs
 from holdfast.appliance import Appliance
 from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError, load
@@ -207,21 +208,57 @@ def test_a_role_that_can_not_be_read_is_refused(
 
     trust = context(party.authority.ca, malformed, version)
     assert verdict(appliance, trust).endswith("ALERT_BAD_CERTIFICATE")
-    assert reasons(appliance, caplog) == ["bad_certificate"]
+    assert reasons(appliance, caplog) == ["role_type"]
+    assert logged_subjects(caplog) == ["CN=malformed"]
 
 
-def test_a_role_is_that_of_the_certificate_at_every_connection(
-    secure: Appliance, party: Party
+def resumable(appliance: Appliance, trust: ssl.SSLContext) -> ssl.SSLSession:
+    """A session of a connection that was served."""
+    with peer(appliance, trust) as first:
+        assert first.shake().ask(READ) == ZERO
+        assert not first.tls.session_reused
+        assert first.tls.session is not None
+        return first.tls.session
+
+
+@versions
+def test_a_resumed_session_has_the_role_of_its_certificate(
+    secure: Appliance, party: Party, version: str
 ) -> None:
-    """A session that is offered again is not resumed: the certificate is shown again."""
-    for version in ("1.2", "1.3"):
-        trust = context(party.authority.ca, party.operator, version)
-        with peer(secure, trust) as first:
-            assert first.shake().ask(READ) == ZERO
-            session = first.tls.session
-        with peer(secure, trust, session=session) as second:
-            assert second.shake().ask(WRITE) == FORBIDDEN
-            assert not second.tls.session_reused
+    trust = context(party.authority.ca, party.operator, version)
+    session: ssl.SSLSession | None = resumable(secure, trust)
+    for _ in range(2):
+        with peer(secure, trust, session=session) as again:
+            assert again.shake().ask(WRITE) == FORBIDDEN
+            assert again.ask(READ) == ZERO
+            assert again.tls.session_reused
+            session = again.tls.session
+    assert connections(secure)["tls_failed"] == 0
+
+
+@versions
+def test_a_session_from_before_a_revocation_is_not_resumed(
+    run: Run, version: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority = Certificates(tmp_path)
+    server, client = authority.issue("server", "DNS:localhost"), authority.issue("lost", "DNS:lost")
+    files = {
+        "cert_file": server.certificate,
+        "key_file": server.key,
+        "ca_file": authority.ca,
+        "crl_file": authority.revoke(),
+    }
+    trust = context(authority.ca, client, version)
+    before = run(configuration(files, ANYONE))
+    session = resumable(before, trust)
+    before.stop()
+    authority.revoke(client)
+    after = run(configuration(files, ANYONE))
+
+    refusal = pytest.raises(Refused, match="ALERT_CERTIFICATE_REVOKED")
+    with peer(after, trust, session=session) as again, refusal:
+        again.shake().ask(READ)
+    assert reasons(after, caplog) == ["revoked"]
 
 
 # Trust
@@ -231,8 +268,15 @@ def test_a_role_is_that_of_the_certificate_at_every_connection(
 def test_a_client_without_a_certificate_is_refused(
     secure: Appliance, party: Party, version: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert "ALERT" in verdict(secure, context(party.authority.ca, None, version))
+    alert = {"1.2": "HANDSHAKE_FAILURE", "1.3": "CERTIFICATE_REQUIRED"}[version]
+    assert verdict(secure, context(party.authority.ca, None, version)).endswith(f"ALERT_{alert}")
     assert reasons(secure, caplog) == ["no_certificate"]
+    assert logged_subjects(caplog) == [None]
+
+
+def logged_subjects(caplog: pytest.LogCaptureFixture) -> list[str | None]:
+    failures = [each for each in caplog.records if each.message == "tls_failed"]
+    return [each.fields.get("subject") for each in failures]  # type: ignore[attr-defined]
 
 
 @versions
@@ -245,20 +289,58 @@ def test_certificates_that_are_not_trusted(
 ) -> None:
     foreign, impostor = Certificates(tmp_path, "foreign"), Certificates(tmp_path)
     role = named("engineer")
-    issued = {
-        "unknown_authority": foreign.issue("engineer", "DNS:engineer", extensions=[role]),
-        "bad_signature": impostor.issue("engineer", "DNS:engineer", extensions=[role]),
-        "expired": party.client("old", role, dates=PAST),
-        "not_valid_yet": party.client("early", role, dates=FUTURE),
-        "wrong_purpose": party.client("server-only", role, "extendedKeyUsage=serverAuth"),
-        "unknown_extension": party.client("critical", role.replace("=", "=critical,")),
-    }
-    for each in issued.values():
-        assert "ALERT" in verdict(secure, context(party.authority.ca, each, version))
-    lonely = self_signed(tmp_path, "lonely", role)
-    assert "ALERT" in verdict(secure, context(party.authority.ca, lonely, version))
+    refused = [
+        ("unknown_issuer", "UNKNOWN_CA", foreign.issue("a", "DNS:a", extensions=[role])),
+        ("bad_signature", "BAD_CERTIFICATE", impostor.issue("b", "DNS:b", extensions=[role])),
+        ("expired", "CERTIFICATE_EXPIRED", party.client("c", role, dates=PAST)),
+        ("not_yet_valid", "CERTIFICATE_EXPIRED", party.client("d", role, dates=FUTURE)),
+        (
+            "wrong_purpose",
+            "UNSUPPORTED_CERTIFICATE",
+            party.client("e", role, "extendedKeyUsage=serverAuth"),
+        ),
+        (
+            "wrong_key_usage",
+            "UNSUPPORTED_CERTIFICATE",
+            party.client("f", role, "keyUsage=keyAgreement"),
+        ),
+        (
+            "unsupported_extension",
+            "BAD_CERTIFICATE",
+            party.client("g", role.replace("=", "=critical,")),
+        ),
+        ("unknown_issuer", "UNKNOWN_CA", self_signed(tmp_path, "h", role)),
+    ]
+    for _, alert, issued in refused:
+        trust = context(party.authority.ca, issued, version)
+        assert verdict(secure, trust).endswith(f"ALERT_{alert}")
 
-    assert reasons(secure, caplog, 7) == [*issued, "unknown_authority"]
+    assert reasons(secure, caplog, len(refused)) == [reason for reason, _, _ in refused]
+    assert logged_subjects(caplog) == [f"CN={name}" for name in "abcdefgh"]
+
+
+@versions
+def test_the_subject_of_a_refused_certificate_can_not_harm_the_log(
+    secure: Appliance,
+    party: Party,
+    version: str,
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+) -> None:
+    issued = Issued(tmp_path / "x.pem", tmp_path / "x.key")
+    subject = "/CN=\x1b[2J\nopened peer=1\u202e/O=" + "x" * 60 + ("/OU=" + "y" * 60) * 5
+    openssl(
+        *("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+        *("-keyout", issued.key, "-out", issued.certificate, "-days", "2", "-utf8"),
+        *("-subj", subject),
+    )
+    assert "ALERT" in verdict(secure, context(party.authority.ca, issued, version))
+    reasons(secure, caplog)
+    [told] = logged_subjects(caplog)
+    assert told is not None
+    assert len(told) == 256
+    [line] = [logs.message(each) for each in caplog.records if each.message == "tls_failed"]
+    assert line.isprintable()
 
 
 @versions
@@ -276,7 +358,7 @@ def test_a_self_signed_certificate_that_is_in_the_file_is_trusted_and_vouches_fo
     forged = forge(tmp_path, pinned)
     for issued in (other, forged):
         assert "ALERT" in verdict(appliance, context(party.authority.ca, issued, version))
-    assert reasons(appliance, caplog, 2) == ["unknown_authority"] * 2
+    assert reasons(appliance, caplog, 2) == ["unknown_issuer"] * 2
 
 
 def forge(folder: Path, by: Issued) -> Issued:
@@ -307,7 +389,7 @@ def test_self_signed_certificates_alone_and_their_dates(
     assert verdict(appliance, context(party.authority.ca, good)) == "served"
     assert "ALERT" in verdict(appliance, context(party.authority.ca, old))
     assert "ALERT" in verdict(appliance, context(party.authority.ca, party.engineer))
-    assert reasons(appliance, caplog, 2) == ["expired", "unknown_authority"]
+    assert reasons(appliance, caplog, 2) == ["expired", "unknown_issuer"]
 
 
 @versions
@@ -354,7 +436,7 @@ def test_a_server_that_the_client_does_not_trust_is_told_so(
         with pytest.raises(Refused):
             client.shake()
         client.flush()
-    assert reasons(secure, caplog) in (["refused_by_peer"], ["closed"])
+    assert reasons(secure, caplog) in (["peer_refused_certificate"], ["closed_during_handshake"])
 
 
 def test_a_peer_that_no_rule_names_is_closed_before_a_byte(run: Run, party: Party) -> None:
@@ -386,7 +468,7 @@ def test_old_versions_are_refused(secure: Appliance, caplog: pytest.LogCaptureFi
         old.minimum_version = old.maximum_version = ssl.TLSVersion.TLSv1_1
     old.set_ciphers("ALL:@SECLEVEL=0")
     assert "ALERT" in verdict(secure, old)
-    assert reasons(secure, caplog) == ["incompatible"]
+    assert reasons(secure, caplog) == ["no_common_version_or_cipher"]
 
 
 def test_a_client_that_hangs_in_the_handshake_is_closed_in_time_and_holds_up_nobody(
@@ -501,7 +583,7 @@ def test_a_record_that_was_changed_ends_the_connection(
         changed[-1] ^= 1
         client.wire.send(bytes(changed))
         assert client.end().endswith("ALERT_BAD_RECORD_MAC")
-    assert reasons(secure, caplog) == ["decrypt_error"]
+    assert reasons(secure, caplog) == ["bad_record"]
 
 
 # Deadlines, limits, stop
@@ -530,15 +612,90 @@ def test_a_connection_without_a_request_ends_after_the_idle_timeout(run: Run, pa
     assert connections(appliance)["idle"] == 1
 
 
-def test_the_idlest_gives_way_also_amid_its_handshake(run: Run, party: Party) -> None:
-    more = {"max_connections": 1, "when_full": "evict"}
-    appliance = run(configuration(party.files(), BY_ROLE, **more))
+def shaken(appliance: Appliance, party: Party, number: int, opened: contextlib.ExitStack) -> Any:
+    """Returns clients with an open session that was used."""
     trust = context(party.authority.ca, party.engineer)
-    with wire.Connection(address(appliance)) as silent:
-        wire.until(lambda: connections(appliance)["open"] == 1, "it is admitted")
-        assert verdict(appliance, trust) == "served"
-        assert silent.rest() == b""
-    wire.until(lambda: connections(appliance)["evicted"] == 1, "it is counted")
+    clients = [opened.enter_context(peer(appliance, trust)) for _ in range(number)]
+    for client in clients:
+        assert client.shake().ask(READ) == ZERO
+    return clients
+
+
+@pytest.mark.parametrize("when_full", ["evict", "refuse"])
+def test_silent_connections_displace_each_other_and_no_session(
+    run: Run, party: Party, when_full: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    limits = {"max_connections": 4, "max_handshakes": 10, "when_full": when_full}
+    appliance = run(configuration(party.files(), BY_ROLE, **limits))
+    with contextlib.ExitStack() as opened:
+        clients = shaken(appliance, party, 3, opened)
+        silent = [opened.enter_context(wire.Connection(address(appliance))) for _ in range(25)]
+        assert [each.rest() for each in silent[:15]] == [b""] * 15
+        assert all(client.ask(READ) == ZERO for client in clients)
+        # The handshake of this one displaces another silent connection, and succeeds.
+        clients += shaken(appliance, party, 1, opened)
+        assert silent[15].rest() == b""
+        assert all(client.ask(WRITE) == WRITE for client in clients)
+
+        counted = connections(appliance)
+        assert (counted["evicted"], counted["evicted_handshakes"]) == (0, 16)
+        assert (counted["open"], counted["tls_failed"], counted["refused_full"]) == (13, 0, 0)
+        appliance.log_events(wire.DEADLINE)
+        logged = [each for each in caplog.records if each.message == "evicted"]
+        assert {each.fields["reason"] for each in logged} == {"handshake"}  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("many_files")
+def test_1500_half_open_handshakes_beside_sessions_that_notice_nothing(
+    run: Run, party: Party
+) -> None:
+    limits = {"max_connections": 20, "max_handshakes": 100, "when_full": "evict"}
+    appliance = run(configuration(party.files(), BY_ROLE, **limits))
+    with contextlib.ExitStack() as opened:
+        clients = shaken(appliance, party, 19, opened)
+        hello = Peer(address(appliance), context(party.authority.ca), source=None)
+        begun = opened.enter_context(hello).hello()
+        for number in range(1500):
+            half_open = opened.enter_context(wire.Connection(address(appliance)))
+            with contextlib.suppress(ConnectionError):
+                half_open.send(begun[: 1 + number % len(begun)])
+            if number % 50 == 0:
+                assert clients[number % len(clients)].ask(READ) == ZERO
+        assert all(client.ask(WRITE) == WRITE for client in clients)
+        assert shaken(appliance, party, 1, opened)
+        counted = connections(appliance)
+        assert (counted["evicted"], counted["refused_full"]) == (0, 0)
+        assert counted["evicted_handshakes"] > 1000
+
+
+def test_a_new_session_displaces_the_one_that_is_idle_longest(run: Run, party: Party) -> None:
+    limits = {"max_connections": 2, "when_full": "evict"}
+    appliance = run(configuration(party.files(), BY_ROLE, **limits))
+    with contextlib.ExitStack() as opened:
+        first, second = shaken(appliance, party, 2, opened)
+        assert first.ask(READ) == ZERO
+        [third] = shaken(appliance, party, 1, opened)
+        assert second.end() == "cut"
+        assert first.ask(READ) == third.ask(READ) == ZERO
+    assert connections(appliance)["evicted"] == 1
+
+
+def test_a_full_listener_refuses_a_new_session(run: Run, party: Party) -> None:
+    appliance = run(configuration(party.files(), BY_ROLE, max_connections=1))
+    trust = context(party.authority.ca, party.engineer)
+    with contextlib.ExitStack() as opened:
+        early = opened.enter_context(peer(appliance, trust))
+        hello = early.hello()
+        early.wire.send(hello[:20])
+        wire.until(lambda: connections(appliance)["open"] == 1, "its handshake has begun")
+        [first] = shaken(appliance, party, 1, opened)
+        late = opened.enter_context(wire.Connection(address(appliance)))
+        assert late.rest() == b""
+        early.wire.send(hello[20:])
+        early.shake()
+        assert early.end() == "close_notify"
+        assert first.ask(READ) == ZERO
+    assert connections(appliance)["refused_full"] == 2
 
 
 def slow(client: Peer, number: int) -> None:
@@ -619,6 +776,38 @@ def test_pymodbus(secure: Appliance, party: Party, version: str) -> None:
         client.close()  # type: ignore[no-untyped-call]
 
 
+@pytest.mark.parametrize("version", ["-tls1_2", "-tls1_3"])
+def test_openssl_asks_for_short_fragments_and_is_served(
+    secure: Appliance, party: Party, version: str
+) -> None:
+    host, port = address(secure)
+    shown = ("-cert", str(party.operator.certificate), "-key", str(party.operator.key))
+    client = subprocess.Popen(
+        [
+            *(tool("openssl"), "s_client", "-quiet", "-connect", f"{host}:{port}", version),
+            *("-maxfraglen", "512", *shown),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        bufsize=0,
+    )
+    try:
+        assert client.stdin is not None
+        assert client.stdout is not None
+        client.stdin.write(wire.frames([MAX_READ] * 10))
+        received, replies = b"", list[wire.Frame]()
+        while len(replies) < 10:
+            piece = client.stdout.read(65536)
+            assert piece
+            received += piece
+            replies = wire.split(received)[0]
+        assert [reply.pdu for reply in replies] == [b"\x03\xfa" + bytes(250)] * 10
+    finally:
+        client.kill()
+        client.communicate()
+
+
 def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(
     secure: Appliance, party: Party, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -656,7 +845,7 @@ def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(
     finally:
         client.kill()
         client.communicate()
-    assert reasons(secure, caplog) == ["protocol_error"]
+    assert reasons(secure, caplog) == ["other"]
 
 
 # Memory

@@ -251,12 +251,13 @@ def _wrong_order(mint: Mint) -> Shown:
     return mint.signed(by=second, above=[first, second], trusts=[mint.authority])
 
 
-UNSUPPORTED = ("unsupported_certificate", "untrusted_certificate")
-UNKNOWN = ("unknown_issuer", "unknown_authority")
-IS_CA = ("ca_as_end_entity", "untrusted_certificate")
-NO_AUTHORITY = ("issuer_not_authority", "untrusted_certificate")
-CONSTRAINED = ("constraint_violated", "untrusted_certificate")
+UNSUPPORTED = ("unsupported_certificate",) * 2
+UNKNOWN = ("unknown_issuer",) * 2
+IS_CA = ("ca_as_end_entity",) * 2
+NO_AUTHORITY = ("issuer_not_authority",) * 2
+CONSTRAINED = ("constraint_violated",) * 2
 UNNAMED = ("wrong_name", SERVED)
+NOT_TO_SIGN = {"client": "wrong_key_usage"}
 
 
 def _below_stranger(mint: Mint) -> Shown:
@@ -329,9 +330,15 @@ CASES = [
     Case("of an unknown authority", _below_stranger, *UNKNOWN),
     Case("of an unknown authority, listed", _listed_of_stranger, client=None),
     Case("of an impostor", _impostor, "bad_signature", "bad_signature"),
-    Case("keyUsage nonRepudiation", signed("keyUsage=critical,nonRepudiation")),
-    Case("keyUsage keyEncipherment", signed("keyUsage=critical,keyEncipherment", key="RSA")),
-    Case("keyUsage keyCertSign", signed("keyUsage=critical,keyCertSign")),
+    Case("keyUsage digitalSignature", signed("keyUsage=critical,digitalSignature")),
+    Case("keyUsage nonRepudiation", signed("keyUsage=critical,nonRepudiation"), **NOT_TO_SIGN),
+    Case(
+        "keyUsage keyEncipherment",
+        signed("keyUsage=critical,keyEncipherment", key="RSA"),
+        **NOT_TO_SIGN,
+    ),
+    Case("keyUsage keyCertSign", signed("keyUsage=critical,keyCertSign"), **NOT_TO_SIGN),
+    Case("keyUsage keyEncipherment, listed", own("keyUsage=critical,keyEncipherment", key="RSA")),
     Case("for servers", signed("extendedKeyUsage=serverAuth"), client="wrong_purpose"),
     Case("for clients", signed("extendedKeyUsage=clientAuth"), device="wrong_purpose"),
     Case("for both", signed("extendedKeyUsage=critical,serverAuth,clientAuth")),
@@ -340,14 +347,14 @@ CASES = [
         "for signing code", signed("extendedKeyUsage=codeSigning"), "wrong_purpose", "wrong_purpose"
     ),
     Case("expired", signed(dates=PAST), "expired", "expired"),
-    Case("not yet valid", signed(dates=FUTURE), "not_yet_valid", "not_valid_yet"),
+    Case("not yet valid", signed(dates=FUTURE), "not_yet_valid", "not_yet_valid"),
     Case("for another name", signed("subjectAltName=DNS:other,IP:127.0.0.2"), *UNNAMED),
     Case("with a common name alone", signed("subjectAltName=", name="127.0.0.1"), *UNNAMED),
     Case(
         "with an unknown critical extension",
         signed("1.3.6.1.4.1.50316.802.9=critical,DER:0500"),
         "unsupported_extension",
-        "unknown_extension",
+        "unsupported_extension",
     ),
     Case("of X.509 version 1", _version_1, *UNSUPPORTED),
     # Chains
@@ -361,8 +368,8 @@ CASES = [
         below(extensions=[CA, "keyUsage=critical,digitalSignature"]),
         *NO_AUTHORITY,
     ),
-    Case("below an expired intermediate", below(dates=PAST), "issuer_expired", "expired"),
-    Case("below an expired authority", signed_by(dates=PAST), "issuer_expired", "expired"),
+    Case("below an expired intermediate", below(dates=PAST), "issuer_expired", "issuer_expired"),
+    Case("below an expired authority", signed_by(dates=PAST), "issuer_expired", "issuer_expired"),
     Case("below too many", _short_path, *CONSTRAINED),
     Case("outside the names of its authority", _other_names, *CONSTRAINED),
     Case("signed by a listed device", _signed_by_device, *UNKNOWN),

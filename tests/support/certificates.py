@@ -93,12 +93,13 @@ class Certificates:
         )
         return Issued(certificate, key)
 
-    def revoke(self, *issued: Issued) -> Path:
+    def revoke(self, *issued: Issued, dates: tuple[str, str] | None = None) -> Path:
         """Revokes these certificates. Returns the list of all revoked certificates."""
         revoked = self._folder / f"{self._name}.crl"
         for each in issued:
             self._ca("-revoke", each.certificate)
-        self._ca("-gencrl", "-out", revoked)
+        of = () if dates is None else ("-crl_lastupdate", dates[0], "-crl_nextupdate", dates[1])
+        self._ca("-gencrl", "-out", revoked, *of)
         return revoked
 
     def _ca(self, *arguments: str | Path) -> None:

@@ -209,7 +209,7 @@ def test_tls_1_1_is_refused(start: Start, files: Files, log: web.Records) -> Non
         warnings.simplefilter("ignore", DeprecationWarning)
         trust.minimum_version = ssl.TLSVersion.TLSv1
         trust.maximum_version = ssl.TLSVersion.TLSv1_1
-    assert refusal(start(files.https()), trust, log) == "incompatible"
+    assert refusal(start(files.https()), trust, log) == "no_common_version_or_cipher"
 
 
 def test_a_peer_from_elsewhere_gets_no_byte(start: Start, files: Files) -> None:
@@ -269,7 +269,7 @@ def test_a_client_that_does_not_trust_the_server_is_counted(
             peer.shake()
         peer.flush()
         service.until_counted("tls_failed")
-    assert log.of("tls_failed")[0]["reason"] == "refused_by_peer"
+    assert log.of("tls_failed")[0]["reason"] == "peer_ended"
 
 
 def test_an_altered_record_ends_the_connection(
@@ -284,7 +284,7 @@ def test_an_altered_record_ends_the_connection(
         with pytest.raises(Refused):
             peer.rest()
     service.until_counted("tls_failed")
-    assert log.of("tls_failed")[0]["reason"] == "decrypt_error"
+    assert log.of("tls_failed")[0]["reason"] == "bad_record"
 
 
 # Certificates of clients.
@@ -313,7 +313,7 @@ def test_other_certificates_are_refused_with_their_reason(
     told = [
         refusal(service, files.trust(each), log) for each in (stranger, late, server_only, gone)
     ]
-    assert told == ["unknown_authority", "expired", "wrong_purpose", "revoked"]
+    assert told == ["unknown_issuer", "expired", "wrong_purpose", "revoked"]
     assert is_served(service, files.trust(files.client))
 
 
@@ -377,7 +377,7 @@ def test_an_authority_that_is_removed_is_not_trusted_any_more(
     assert is_served(service, files.trust(files.client))
     own = files.server
     https.adopt(Https(HttpsFiles(own.certificate, own.key, client_ca_file=other.ca)))
-    assert refusal(service, files.trust(files.client), log) == "unknown_authority"
+    assert refusal(service, files.trust(files.client), log) == "unknown_issuer"
     assert is_served(service, files.trust(other.issue("panel", CLIENT)))
 
 

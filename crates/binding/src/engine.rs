@@ -101,6 +101,9 @@ impl Engine {
         if let Some(peer) = &event.peer {
             peer::tell(&fields, peer)?;
         }
+        if let Some(subject) = event.subject {
+            fields.set_item("subject", subject.as_ref())?;
+        }
         if let Some(reason) = event.kind.reason() {
             fields.set_item("reason", reason)?;
         }
@@ -223,6 +226,7 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
         ("refused_full", &counters.refused_full),
         ("refused_listen_only", &counters.refused_listen_only),
         ("evicted", &counters.evicted),
+        ("evicted_handshakes", &counters.evicted_handshakes),
         ("rights_revoked", &counters.rights_revoked),
         ("ended", &counters.ended),
         ("idle", &counters.idle),

@@ -14,7 +14,7 @@ use holdfast_engine::server::{
     PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
     StreamSettings, UdpSettings, WhenFull,
 };
-use holdfast_engine::tls::server::{ServerFiles, ServerTls as CoreServerTls};
+use holdfast_engine::tls::server::{ExpiredLists, ServerFiles, ServerTls as CoreServerTls};
 use holdfast_memory::Memory as CoreMemory;
 use holdfast_protocol::raw_ingest::Format;
 use ipnet::IpNet;
@@ -122,18 +122,26 @@ pub struct ServerTls {
 #[pymethods]
 impl ServerTls {
     #[new]
-    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, key=None))]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", key=None))]
     fn new(
         cert_file: PathBuf,
         key_file: PathBuf,
         ca_file: PathBuf,
         crl_file: Option<PathBuf>,
+        expired_crl: &str,
         key: Option<&[u8]>,
     ) -> PyResult<ServerTls> {
-        let files = ServerFiles { cert_file, key_file, ca_file, crl_file };
+        let allowed = [("refuse", ExpiredLists::Refuse), ("accept", ExpiredLists::Accept)];
+        let expired_lists = word("expired_crl", expired_crl, &allowed)?;
+        let files = ServerFiles { cert_file, key_file, ca_file, crl_file, expired_lists };
         let core = CoreServerTls::load(&files, key);
         let core = core.map_err(|error| PyValueError::new_err(error.to_string()))?;
         Ok(ServerTls { core: Arc::new(core) })
+    }
+
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.core.warnings().to_vec()
     }
 }
 
@@ -146,7 +154,7 @@ pub struct Listener {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Listener {
     #[new]
-    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, raw_ingest=None))]
+    #[pyo3(signature = (name, bind, rules, *, framing="mbap", max_connections=256, max_connections_per_source=None, when_full="refuse", idle_timeout=300.0, request_timeout=10.0, frame_timeout=None, listen_only=false, tls=None, max_handshakes=256, raw_ingest=None))]
     fn new(
         name: String,
         bind: &str,
@@ -160,6 +168,7 @@ impl Listener {
         frame_timeout: Option<f64>,
         listen_only: bool,
         tls: Option<PyRef<'_, ServerTls>>,
+        max_handshakes: i128,
         raw_ingest: Option<PyRef<'_, Listener>>,
     ) -> PyResult<Listener> {
         let raw_ingest = match raw_ingest.map(|listener| listener.core.kind.clone()) {
@@ -174,6 +183,8 @@ impl Listener {
             }
         };
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
+        let max_handshakes = within("max_handshakes", max_handshakes, 1..=65_535)?;
+        let limits = limits(max_connections, max_connections_per_source, when_full)?;
         let framings = [
             ("mbap", StreamFraming::Mbap),
             ("rtu", StreamFraming::Rtu),
@@ -183,7 +194,10 @@ impl Listener {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
             rules: cores(&rules),
-            limits: limits(max_connections, max_connections_per_source, when_full)?,
+            limits: ConnectionLimits {
+                max_handshakes: tls.is_some().then_some(max_handshakes),
+                ..limits
+            },
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             frame_timeout: frame_timeout
@@ -329,6 +343,7 @@ fn limits(
         max_connections: within("max_connections", max_connections, 1..=65_535)?,
         max_connections_per_source: of_source,
         when_full: word("when_full", when_full, &allowed)?,
+        max_handshakes: None,
     })
 }
 

@@ -123,6 +123,7 @@ impl Front {
                 max_connections: 100,
                 max_connections_per_source: None,
                 when_full: WhenFull::Refuse,
+                max_handshakes: None,
             },
             idle_timeout: None,
             request_timeout: PATIENCE,

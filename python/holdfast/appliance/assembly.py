@@ -167,6 +167,7 @@ def listener(
             | ModbusAsciiOverTcpListener()
         ):
             rtu = settings if isinstance(settings, ModbusRtuOverTcpListener) else None
+            secure = settings if isinstance(settings, ModbusTlsListener) else None
             return _core.Listener(
                 name,
                 str(settings.bind),
@@ -179,7 +180,8 @@ def listener(
                 request_timeout=settings.request_timeout,
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
                 listen_only=settings.listen_only,
-                tls=server_tls(settings.tls) if settings.type == "modbus-tls" else None,
+                tls=None if secure is None else server_tls(secure.tls),
+                max_handshakes=256 if secure is None else secure.max_handshakes,
                 raw_ingest=_shared_port(name, settings, config, memories),
             )
         case ModbusUdpListener() | ModbusRtuOverUdpListener():
@@ -255,6 +257,7 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
         key_file=settings.key_file,
         ca_file=settings.ca_file,
         crl_file=settings.crl_file,
+        expired_crl=settings.expired_crl,
         key=unlocked(settings.key_file, settings.key_passphrase_file),
     )
 

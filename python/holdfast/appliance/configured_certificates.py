@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from holdfast.client.url import NetworkTarget
@@ -37,6 +37,8 @@ class _Named:
     place: KeyPath
     file: str
     kind: Kind
+    by_core: bool = False
+    """Whether the core also reads it, and warns when it is not valid."""
 
 
 def expiries(config: Config) -> Expiries:
@@ -62,7 +64,8 @@ def doubts(config: Config) -> list[tuple[KeyPath, str]]:
 
         lists = each.kind == "revocation lists"
         dates = (expiry.of_revocation_lists if lists else expiry.of_certificates)(each.file)
-        texts = [one.doubt(expiry.now()) for one in dates]
+        now = expiry.now()
+        texts = [one.doubt(now) for one in dates if one.is_valid(now) or not each.by_core]
         if each.kind == "server":
             texts.append(nameless(each.file))
         for text in texts:
@@ -77,7 +80,8 @@ def _named(config: Config) -> Iterator[_Named]:
         if isinstance(listener, ModbusTlsListener):
             tls = listener.tls
             place: KeyPath = ("listeners", name, "tls")
-            yield from _of_server(place, tls.cert_file, tls.crl_file, "ca_file", tls.ca_file)
+            found = _of_server(place, tls.cert_file, tls.crl_file, "ca_file", tls.ca_file)
+            yield from (replace(each, by_core=True) for each in found)
     for name in HTTP_SERVICES:
         service = getattr(config, name)
         if service is not None and service.tls is not None:

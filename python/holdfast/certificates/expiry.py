@@ -28,6 +28,10 @@ class Expiry:
     begins: datetime
     ends: datetime
 
+    def is_valid(self, now: datetime) -> bool:
+        """Whether it is valid now."""
+        return self.begins <= now < self.ends
+
     def doubt(self, now: datetime) -> str | None:
         """Returns why it is not valid, or soon will not be; `None` if there is no doubt."""
         if self.ends <= now:

@@ -25,26 +25,30 @@ WRONG = 2
 def load_whole(path: Path | str) -> Config:
     """Loads a configuration and checks the contents of its certificates and keys.
 
-    Raises `ConfigError` with every problem.
+    Doubtful certificates are among its warnings. Raises `ConfigError` with every problem.
     """
     config = load(path)
     file = str(path)
     problems: dict[KeyPath, str] = {}
+    doubts: list[tuple[KeyPath, str]] = []
     for name, listener in config.listeners.items():
         if isinstance(listener, ModbusTlsListener):
+            place: KeyPath = ("listeners", name, "tls")
             try:
-                assembly.server_tls(listener.tls)
+                loaded = assembly.server_tls(listener.tls)
             except ValueError as error:
-                problems["listeners", name, "tls"] = str(error)
+                problems[place] = str(error)
+            else:
+                doubts += [(place, warning) for warning in loaded.warnings]
     targets: list[tuple[KeyPath, Target]] = [
         (("devices", name), device.target) for name, device in config.devices.items()
     ]
     targets += [(("links", name), link.target) for name, link in config.links.items()]
-    for place, target in targets:
+    for where, target in targets:
         try:
             endpoint(target)
         except (OSError, ValueError) as error:
-            problems[*place, "url"] = str(error)
+            problems[*where, "url"] = str(error)
     if config.nats is not None and config.nats.device_tls is not None:
         from holdfast.scanner import device_tls
 
@@ -57,24 +61,25 @@ def load_whole(path: Path | str) -> Config:
             check_files(assembly.gateway_tls(config.gateway))
         except (OSError, ValueError) as error:
             problems["gateway", "device_tls"] = str(error)
-    for name in HTTP_SERVICES:
-        service = getattr(config, name)
-        if service is not None and service.tls is not None:
+    for service in HTTP_SERVICES:
+        settings = getattr(config, service)
+        if settings is not None and settings.tls is not None:
             try:
-                assembly.https(service.tls)
+                assembly.https(settings.tls)
             except ValueError as error:
-                problems[name, "tls"] = str(error)
-    doubts = [] if problems else configured_certificates.doubts(config)
-    if problems or doubts:
-        report = Report(source.parse(source.read_text(Path(path), file), file)[0])
-        for where, message in problems.items():
-            report.add(where, message)
-        if problems:
-            raise ConfigError(file, report.problems)
-        for where, message in doubts:
-            report.doubt(where, message)
-        config.with_warnings([*config.warnings, *report.doubts])
-    return config
+                problems[service, "tls"] = str(error)
+    if not problems:
+        doubts += configured_certificates.doubts(config)
+    if not problems and not doubts:
+        return config
+    report = Report(source.parse(source.read_text(Path(path), file), file)[0])
+    for where, message in problems.items():
+        report.add(where, message)
+    if problems:
+        raise ConfigError(file, report.problems)
+    for where, message in doubts:
+        report.doubt(where, message)
+    return config.with_warnings([*config.warnings, *report.doubts])
 
 
 def load_or_exit(path: Path | str) -> Config:

@@ -180,6 +180,11 @@ def _flags(data: dict[str, Any]) -> Literal["strict"] | None:
     return "strict" if data["format"] == "crc" else None
 
 
+def _handshakes(data: dict[str, Any]) -> int:
+    most: int = data["max_connections"]
+    return max(256, most)
+
+
 class RawIngestConfig(Model):
     """Raw ingest packets on the port of a Modbus TCP server: the first bytes decide."""
 
@@ -224,6 +229,8 @@ class ServerTlsConfig(Model):
     """Authorities of client certificates, and self-signed certificates of clients."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client."""
+    expired_crl: Literal["refuse", "accept"] = "refuse"
+    """Clients of an authority whose list is past its nextUpdate."""
     review: DurationOrZero = 3600.0
     """At most so many seconds pass until the certificates of open connections are judged again; 0:
     only at a reload."""
@@ -236,6 +243,9 @@ class ModbusTlsListener(_ConnectionListener):
     """The protocol."""
     tls: ServerTlsConfig
     """The server's certificate, and the clients it trusts."""
+    max_handshakes: Connections = Field(default_factory=_handshakes)
+    """Maximum number of open connections that are not authenticated yet, beside max_connections; at
+    the limit, the oldest is closed. Default: as many as max_connections, at least 256."""
     request_timeout: Duration = 10.0
     """Seconds from the first byte of a request to its last, and for the handshake."""
     rules: Annotated[tuple[TlsRuleConfig, ...], Strict(False), Field(min_length=1)]

@@ -41,7 +41,7 @@ class Report:
         return any(path[: len(settled)] == settled for settled in self.settled)
 
     def doubt(self, path: KeyPath, message: str) -> None:
-        """Adds a warning: a valid setting at `path` that has no effect."""
+        """Adds a warning: a valid setting at `path` that has no effect, or probably a wrong one."""
         self.doubts.append(self._at(path, message, of_key=False))
 
     def _at(self, path: KeyPath, message: str, of_key: bool) -> Problem:

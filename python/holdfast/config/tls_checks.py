@@ -39,6 +39,8 @@ def check_server_tls(path: KeyPath, tls: dict[Any, Any], folder: Path, report: R
     """Reports files of a TLS or HTTPS server that can't be read. The model reports missing keys."""
     for key in SERVER_FILES:
         check_readable((*path, key), tls.get(key), folder, report)
+    if "expired_crl" in tls and tls.get("crl_file") is None:
+        report.doubt((*path, "expired_crl"), "has no effect without crl_file")
 
 
 def check_https(path: KeyPath, tls: dict[Any, Any], folder: Path, report: Report) -> None:

@@ -19,33 +19,33 @@ HANDSHAKE = b"\x16"
 CHUNK = 65536
 
 _VERIFICATION = {
-    2: "unknown_authority",
+    2: "unknown_issuer",
     3: "unknown_revocation",
-    9: "not_valid_yet",
+    9: "not_yet_valid",
     10: "expired",
     12: "expired_revocation_list",
-    18: "unknown_authority",
-    19: "unknown_authority",
-    20: "unknown_authority",
-    21: "unknown_authority",
+    18: "unknown_issuer",
+    19: "unknown_issuer",
+    20: "unknown_issuer",
+    21: "unknown_issuer",
     23: "revoked",
     26: "wrong_purpose",
-    34: "unknown_extension",
+    34: "unsupported_extension",
 }
 """Reasons by the error codes of OpenSSL's verification (X509_V_ERR_…)."""
 
 _REASONS = {
     "PEER_DID_NOT_RETURN_A_CERTIFICATE": "no_certificate",
-    "UNSUPPORTED_PROTOCOL": "incompatible",
-    "VERSION_TOO_LOW": "incompatible",
-    "NO_SHARED_CIPHER": "incompatible",
-    "NO_SUITABLE_KEY_SHARE": "incompatible",
-    "NO_SUITABLE_GROUPS_KEY_SHARE": "incompatible",
-    "NO_SUITABLE_SIGNATURE_ALGORITHM": "incompatible",
-    "NO_SHARED_SIGNATURE_ALGORITHMS": "incompatible",
+    "UNSUPPORTED_PROTOCOL": "no_common_version_or_cipher",
+    "VERSION_TOO_LOW": "no_common_version_or_cipher",
+    "NO_SHARED_CIPHER": "no_common_version_or_cipher",
+    "NO_SUITABLE_KEY_SHARE": "no_common_version_or_cipher",
+    "NO_SUITABLE_GROUPS_KEY_SHARE": "no_common_version_or_cipher",
+    "NO_SUITABLE_SIGNATURE_ALGORITHM": "no_common_version_or_cipher",
+    "NO_SHARED_SIGNATURE_ALGORITHMS": "no_common_version_or_cipher",
     "WRONG_VERSION_NUMBER": "not_tls",
     "HTTP_REQUEST": "not_tls",
-    "DECRYPTION_FAILED_OR_BAD_RECORD_MAC": "decrypt_error",
+    "DECRYPTION_FAILED_OR_BAD_RECORD_MAC": "bad_record",
     "BAD_SIGNATURE": "bad_signature",
 }
 """Reasons by OpenSSL's names of errors."""
@@ -88,8 +88,8 @@ def reason(error: ssl.SSLError) -> str:
         return _VERIFICATION.get(error.verify_code, "untrusted_certificate")
     name = str(error.reason)
     if "_ALERT_" in name:
-        return "refused_by_peer"
-    return _REASONS.get(name, "protocol_error")
+        return "peer_ended"
+    return _REASONS.get(name, "other")
 
 
 class TlsTransport(asyncio.Transport, asyncio.Protocol):

@@ -1,6 +1,9 @@
 //! The open connections of a listener, and their limits.
+//!
+//! With TLS, a connection takes a place among the sessions only once its handshake has authenticated
+//! the peer. Until then it has a place among the handshakes, and only handshakes give way to it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,6 +13,10 @@ use tokio::task::AbortHandle;
 
 use super::peer::Peer;
 use crate::tls::server::PeerCertificate;
+
+/// A connection without any request so far counts as idle for this much longer, so that connections
+/// that never send anything do not displace those that do.
+const SILENCE: Duration = Duration::from_secs(60);
 
 /// What happens to a new connection when a limit is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,6 +34,9 @@ pub struct ConnectionLimits {
     pub max_connections: usize,
     pub max_connections_per_source: Option<usize>,
     pub when_full: WhenFull,
+    /// The most connections whose handshake is not complete. They are not among
+    /// `max_connections`. `None`: connections begin without a handshake.
+    pub max_handshakes: Option<usize>,
 }
 
 impl ConnectionLimits {
@@ -35,6 +45,7 @@ impl ConnectionLimits {
         max_connections: 0,
         max_connections_per_source: None,
         when_full: WhenFull::Refuse,
+        max_handshakes: None,
     };
 }
 
@@ -48,14 +59,25 @@ pub(crate) struct Admission {
 struct Table {
     limits: ConnectionLimits,
     next_id: u64,
-    held: HashMap<u64, Held>,
-    per_source: HashMap<IpAddr, usize>,
+    sessions: HashMap<u64, Held>,
+    /// In order of age.
+    handshakes: BTreeMap<u64, Held>,
+    per_source: HashMap<IpAddr, Places>,
+}
+
+/// The places that a source has taken.
+#[derive(Debug, Clone, Copy, Default)]
+struct Places {
+    sessions: usize,
+    handshakes: usize,
 }
 
 #[derive(Debug)]
 struct Held {
     peer: Peer,
     opened: SystemTime,
+    /// When it was admitted, as [`Activity::last_request`].
+    admitted: u64,
     activity: Arc<Activity>,
     /// Set once the task of the connection runs.
     task: Option<AbortHandle>,
@@ -64,7 +86,7 @@ struct Held {
 /// What a connection and the table of connections tell each other without waiting.
 #[derive(Debug)]
 struct Activity {
-    /// In microseconds since the epoch of the admission.
+    /// In microseconds since the epoch of the admission. Before any request, when it was admitted.
     last_request: AtomicU64,
     is_amid_packet: AtomicBool,
     /// Whether the connection must look up its rights again.
@@ -86,6 +108,13 @@ pub struct Session {
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Full;
 
+/// A connection that was closed in favour of another.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Evicted {
+    Session(Peer),
+    Handshake(Peer),
+}
+
 /// The place of one connection. Dropping it frees the place.
 #[derive(Debug)]
 pub(crate) struct Ticket {
@@ -96,7 +125,13 @@ pub(crate) struct Ticket {
 
 impl Admission {
     pub(crate) fn new(limits: ConnectionLimits) -> Admission {
-        let table = Table { limits, next_id: 0, held: HashMap::new(), per_source: HashMap::new() };
+        let table = Table {
+            limits,
+            next_id: 0,
+            sessions: HashMap::new(),
+            handshakes: BTreeMap::new(),
+            per_source: HashMap::new(),
+        };
         Admission { epoch: Instant::now(), table: Mutex::new(table) }
     }
 
@@ -105,52 +140,32 @@ impl Admission {
         self.table().limits = limits;
     }
 
-    /// Admits a connection from `peer`. Also returns the peer that was evicted for it.
+    /// Admits a connection from `peer`. Also returns the connection that was evicted for it.
     pub(crate) fn admit(
         self: &Arc<Self>,
         peer: SocketAddr,
-    ) -> Result<(Ticket, Option<Peer>), Full> {
-        let source = peer.ip().to_canonical();
+    ) -> Result<(Ticket, Option<Evicted>), Full> {
         let mut table = self.table();
-        let from_source = table.per_source.get(&source).copied().unwrap_or_default();
-        let ConnectionLimits { max_connections, max_connections_per_source, .. } = table.limits;
-        let evicted = if max_connections_per_source.is_some_and(|most| from_source >= most) {
-            Some(self.evict(&mut table, Some(source))?)
-        } else if table.held.len() >= max_connections {
-            Some(self.evict(&mut table, None)?)
-        } else {
-            None
+        let max_handshakes = table.limits.max_handshakes;
+        let evicted = match max_handshakes {
+            None => table.clear_session(peer.ip())?,
+            Some(most) => table.clear_handshake(peer.ip(), most)?,
         };
         let id = table.next_id;
         table.next_id += 1;
-        let last_request = AtomicU64::new(self.now());
-        let (is_amid_packet, is_outdated) = (AtomicBool::new(false), AtomicBool::new(false));
-        let activity = Arc::new(Activity { last_request, is_amid_packet, is_outdated });
+        let admitted = self.since(Instant::now());
+        let activity = Arc::new(Activity {
+            last_request: AtomicU64::new(admitted),
+            is_amid_packet: AtomicBool::new(false),
+            is_outdated: AtomicBool::new(false),
+        });
         let (peer, opened) = (peer.into(), SystemTime::now());
-        let held = Held { peer, opened, activity: Arc::clone(&activity), task: None };
-        table.held.insert(id, held);
-        *table.per_source.entry(source).or_default() += 1;
-        Ok((Ticket { id, activity, admission: Arc::clone(self) }, evicted))
-    }
-
-    /// Closes the connection that has been idle longest, of one source or of all; first those that are
-    /// not in the middle of a packet.
-    fn evict(&self, table: &mut Table, source: Option<IpAddr>) -> Result<Peer, Full> {
-        if table.limits.when_full == WhenFull::Refuse {
-            return Err(Full);
+        let held = Held { peer, opened, admitted, activity: Arc::clone(&activity), task: None };
+        match max_handshakes {
+            None => table.insert_session(id, held),
+            Some(_) => table.insert_handshake(id, held),
         }
-        let of_source = |held: &Held| source.is_none_or(|ip| held.peer.ip().to_canonical() == ip);
-        let candidates =
-            table.held.iter().filter(|(_, held)| held.task.is_some() && of_source(held));
-        let id = candidates
-            .min_by_key(|(id, held)| {
-                let Activity { last_request, is_amid_packet, .. } = &*held.activity;
-                let is_amid_packet = is_amid_packet.load(Ordering::Relaxed);
-                (is_amid_packet, last_request.load(Ordering::Relaxed), **id)
-            })
-            .map(|(id, _)| *id)
-            .ok_or(Full)?;
-        Ok(table.end(id).ok_or(Full)?.peer)
+        Ok((Ticket { id, activity, admission: Arc::clone(self) }, evicted))
     }
 
     /// Ends the connections for which `ends` has a reason. The others look up their rights again,
@@ -158,7 +173,7 @@ impl Admission {
     pub(crate) fn review<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
         let mut table = self.table();
         let mut ending = Vec::new();
-        for (id, held) in &table.held {
+        for (id, held) in table.held() {
             match ends(&held.peer) {
                 Some(reason) => ending.push((*id, reason)),
                 None => held.activity.is_outdated.store(true, Ordering::Release),
@@ -175,7 +190,7 @@ impl Admission {
 
     /// The open connections, in the order in which they were opened.
     pub(crate) fn sessions(&self) -> Vec<Session> {
-        let now = self.now();
+        let now = self.since(Instant::now());
         let session = |(id, held): (&u64, &Held)| Session {
             id: *id,
             peer: held.peer.clone(),
@@ -184,25 +199,115 @@ impl Admission {
                 now.saturating_sub(held.activity.last_request.load(Ordering::Relaxed)),
             ),
         };
-        let mut sessions: Vec<Session> = self.table().held.iter().map(session).collect();
+        let mut sessions: Vec<Session> = self.table().held().map(session).collect();
         sessions.sort_unstable_by_key(|session| session.id);
         sessions
     }
 
     pub(crate) fn open(&self) -> usize {
-        self.table().held.len()
+        let table = self.table();
+        table.sessions.len() + table.handshakes.len()
     }
 
     fn table(&self) -> MutexGuard<'_, Table> {
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn now(&self) -> u64 {
-        self.epoch.elapsed().as_micros() as u64
+    fn since(&self, now: Instant) -> u64 {
+        now.saturating_duration_since(self.epoch).as_micros() as u64
     }
 }
 
 impl Table {
+    /// Makes sure that there is a place for a session.
+    fn clear_session(&mut self, source: IpAddr) -> Result<Option<Evicted>, Full> {
+        let source = source.to_canonical();
+        if self.is_most(self.places(source).sessions) {
+            self.evict(Some(source)).map(Some)
+        } else if self.sessions.len() >= self.limits.max_connections {
+            self.evict(None).map(Some)
+        } else {
+            Ok(None)
+        }
+    }
+
+    /// Makes sure that there is a place for a handshake. The oldest handshake gives way: one that
+    /// takes its time is more likely a peer that never completes it.
+    fn clear_handshake(&mut self, source: IpAddr, most: usize) -> Result<Option<Evicted>, Full> {
+        let source = source.to_canonical();
+        let places = self.places(source);
+        let is_full =
+            self.is_most(places.sessions) || self.sessions.len() >= self.limits.max_connections;
+        if is_full && self.limits.when_full == WhenFull::Refuse {
+            return Err(Full);
+        }
+        let of = self.is_most(places.handshakes).then_some(source);
+        if of.is_none() && self.handshakes.len() < most {
+            return Ok(None);
+        }
+        let is_evictable = |held: &Held| held.task.is_some() && held.is_of(of);
+        let oldest = self.handshakes.iter().find(|(_, held)| is_evictable(held));
+        let id = *oldest.ok_or(Full)?.0;
+        Ok(self.end(id).map(|held| Evicted::Handshake(held.peer)))
+    }
+
+    /// Closes the session that has been idle longest, of one source or of all; first those that are
+    /// not in the middle of a packet.
+    fn evict(&mut self, source: Option<IpAddr>) -> Result<Evicted, Full> {
+        if self.limits.when_full == WhenFull::Refuse {
+            return Err(Full);
+        }
+        let candidates =
+            self.sessions.iter().filter(|(_, held)| held.task.is_some() && held.is_of(source));
+        let id = candidates.min_by_key(|(id, held)| held.rank(**id)).map(|(id, _)| *id);
+        let held = self.end(id.ok_or(Full)?).ok_or(Full)?;
+        Ok(Evicted::Session(held.peer))
+    }
+
+    /// Whether a source may not have more than this many places of a kind.
+    fn is_most(&self, count: usize) -> bool {
+        self.limits.max_connections_per_source.is_some_and(|most| count >= most)
+    }
+
+    /// All connections.
+    fn held(&self) -> impl Iterator<Item = (&u64, &Held)> {
+        self.sessions.iter().chain(&self.handshakes)
+    }
+
+    fn held_mut(&mut self, id: u64) -> Option<&mut Held> {
+        self.sessions.get_mut(&id).or_else(|| self.handshakes.get_mut(&id))
+    }
+
+    fn places(&self, source: IpAddr) -> Places {
+        self.per_source.get(&source).copied().unwrap_or_default()
+    }
+
+    fn insert_session(&mut self, id: u64, held: Held) {
+        self.per_source.entry(held.source()).or_default().sessions += 1;
+        self.sessions.insert(id, held);
+    }
+
+    fn insert_handshake(&mut self, id: u64, held: Held) {
+        self.per_source.entry(held.source()).or_default().handshakes += 1;
+        self.handshakes.insert(id, held);
+    }
+
+    fn remove(&mut self, id: u64) -> Option<Held> {
+        let session = self.sessions.remove(&id);
+        let was_session = session.is_some();
+        let held = session.or_else(|| self.handshakes.remove(&id))?;
+        let mut places = self.places(held.source());
+        match was_session {
+            true => places.sessions -= 1,
+            false => places.handshakes -= 1,
+        }
+        match places.sessions + places.handshakes {
+            0 => self.per_source.remove(&held.source()),
+            _ => self.per_source.insert(held.source(), places),
+        };
+        Some(held)
+    }
+
     /// Removes a connection and aborts its task, which drops the socket.
     fn end(&mut self, id: u64) -> Option<Held> {
         let held = self.remove(id)?;
@@ -211,17 +316,23 @@ impl Table {
         }
         Some(held)
     }
+}
 
-    fn remove(&mut self, id: u64) -> Option<Held> {
-        let held = self.held.remove(&id)?;
-        let source = held.peer.ip().to_canonical();
-        if let Some(count) = self.per_source.get_mut(&source) {
-            *count -= 1;
-            if *count == 0 {
-                self.per_source.remove(&source);
-            }
-        }
-        Some(held)
+impl Held {
+    /// The order in which sessions give way.
+    fn rank(&self, id: u64) -> (bool, i128, u64) {
+        let last_request = self.activity.last_request.load(Ordering::Relaxed);
+        let silence = if last_request == self.admitted { SILENCE.as_micros() } else { 0 };
+        let is_amid_packet = self.activity.is_amid_packet.load(Ordering::Relaxed);
+        (is_amid_packet, i128::from(last_request) - silence as i128, id)
+    }
+
+    fn source(&self) -> IpAddr {
+        self.peer.ip().to_canonical()
+    }
+
+    fn is_of(&self, source: Option<IpAddr>) -> bool {
+        source.is_none_or(|source| self.source() == source)
     }
 }
 
@@ -230,16 +341,35 @@ impl Ticket {
         self.id
     }
 
+    /// Moves the connection to the sessions: its peer is authenticated. Also returns the session
+    /// that was evicted for it.
+    ///
+    /// # Errors
+    /// There is no place.
+    pub(crate) fn establish(&self) -> Result<Option<Evicted>, Full> {
+        let mut table = self.admission.table();
+        let Some(source) = table.handshakes.get(&self.id).map(Held::source) else {
+            // It has just been evicted, and ends at the next await.
+            return Ok(None);
+        };
+        let evicted = table.clear_session(source)?;
+        if let Some(held) = table.remove(self.id) {
+            let now = self.admission.since(Instant::now());
+            self.activity.last_request.store(now.max(held.admitted + 1), Ordering::Relaxed);
+            table.insert_session(self.id, held);
+        }
+        Ok(evicted)
+    }
+
     /// Records the time of a request.
     #[inline]
     pub(crate) fn touch(&self, now: Instant) {
-        let since = now.saturating_duration_since(self.admission.epoch);
-        self.activity.last_request.store(since.as_micros() as u64, Ordering::Relaxed);
+        self.activity.last_request.store(self.admission.since(now), Ordering::Relaxed);
     }
 
     /// Records the certificate that the peer has proved to own.
     pub(crate) fn identify(&self, certificate: Arc<PeerCertificate>) {
-        if let Some(held) = self.admission.table().held.get_mut(&self.id) {
+        if let Some(held) = self.admission.table().held_mut(self.id) {
             held.peer.certificate = Some(certificate);
         }
     }
@@ -259,7 +389,7 @@ impl Ticket {
 
 /// Sets the task of a connection, so that it can be evicted.
 pub(crate) fn attach(admission: &Admission, id: u64, task: AbortHandle) {
-    match admission.table().held.get_mut(&id) {
+    match admission.table().held_mut(id) {
         Some(held) => held.task = Some(task),
         // It was ended before its task ran, or its task has ended.
         None => task.abort(),
@@ -282,6 +412,10 @@ mod tests {
         SocketAddr::from(([127, 0, 0, last], port))
     }
 
+    fn session(last: u8, port: u16) -> Evicted {
+        Evicted::Session(peer(last, port).into())
+    }
+
     fn admission(
         max_connections: usize,
         max_connections_per_source: Option<usize>,
@@ -291,7 +425,34 @@ mod tests {
             max_connections,
             max_connections_per_source,
             when_full,
+            max_handshakes: None,
         }))
+    }
+
+    /// A listener with TLS.
+    fn with_handshakes(
+        max_handshakes: usize,
+        max_connections: usize,
+        max_connections_per_source: Option<usize>,
+        when_full: WhenFull,
+    ) -> Arc<Admission> {
+        Arc::new(Admission::new(ConnectionLimits {
+            max_connections,
+            max_connections_per_source,
+            when_full,
+            max_handshakes: Some(max_handshakes),
+        }))
+    }
+
+    /// Begins a handshake.
+    fn begin(
+        admission: &Arc<Admission>,
+        runtime: &tokio::runtime::Runtime,
+        peer: SocketAddr,
+    ) -> (Ticket, Option<Evicted>) {
+        let (ticket, evicted) = admission.admit(peer).unwrap();
+        attach(admission, ticket.id(), task(runtime));
+        (ticket, evicted)
     }
 
     fn task(runtime: &tokio::runtime::Runtime) -> AbortHandle {
@@ -333,7 +494,7 @@ mod tests {
             tickets[index].touch(later + Duration::from_secs(seconds));
         }
         let (_fourth, evicted) = admission.admit(peer(1, 4)).unwrap();
-        assert_eq!(evicted, Some(peer(1, 2).into()));
+        assert_eq!(evicted, Some(session(1, 2)));
         assert_eq!(admission.open(), 3);
     }
 
@@ -350,15 +511,15 @@ mod tests {
         tickets[0].set_amid_packet(true);
         tickets[2].set_amid_packet(true);
         let (_fourth, evicted) = admit(4);
-        assert_eq!(evicted, Some(peer(1, 2).into()));
+        assert_eq!(evicted, Some(session(1, 2)));
         let (fifth, evicted) = admit(5);
-        assert_eq!(evicted, Some(peer(1, 4).into()), "the silent one, although it is the newest");
+        assert_eq!(evicted, Some(session(1, 4)), "the silent one, although it is the newest");
         fifth.set_amid_packet(true);
         let (sixth, evicted) = admit(6);
-        assert_eq!(evicted, Some(peer(1, 1).into()), "all are in the middle of a packet");
+        assert_eq!(evicted, Some(session(1, 1)), "all are in the middle of a packet");
         sixth.set_amid_packet(true);
         fifth.set_amid_packet(false);
-        assert_eq!(admit(7).1, Some(peer(1, 5).into()), "its packet is complete");
+        assert_eq!(admit(7).1, Some(session(1, 5)), "its packet is complete");
     }
 
     #[test]
@@ -371,6 +532,102 @@ mod tests {
             ticket
         });
         let (_third, evicted) = admission.admit(peer(2, 3)).unwrap();
-        assert_eq!(evicted, Some(peer(2, 2).into()));
+        assert_eq!(evicted, Some(session(2, 2)));
+    }
+
+    #[test]
+    fn a_connection_without_a_request_gives_way_to_those_with_requests() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = admission(3, None, WhenFull::Evict);
+        let busy = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+        busy.iter().for_each(|ticket| ticket.touch(Instant::now()));
+        let mut silent = vec![begin(&admission, &runtime, peer(1, 3)).0];
+        for port in 4..20 {
+            let (ticket, evicted) = begin(&admission, &runtime, peer(1, port));
+            assert_eq!(evicted, Some(session(1, port - 1)));
+            silent.push(ticket);
+        }
+    }
+
+    #[test]
+    fn connections_that_were_idle_for_long_give_way_to_new_ones_without_a_request() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let mut admission = admission(3, None, WhenFull::Evict);
+        // The others sent their last requests before the silence that a new connection has ahead.
+        Arc::get_mut(&mut admission).unwrap().epoch -= SILENCE + Duration::from_secs(10);
+        let _dead = [1, 2, 3].map(|port| {
+            let ticket = begin(&admission, &runtime, peer(1, port)).0;
+            ticket.touch(admission.epoch + Duration::from_secs(u64::from(port)));
+            ticket
+        });
+        let evicted = [4, 5, 6].map(|port| begin(&admission, &runtime, peer(1, port)));
+        let evicted = evicted.each_ref().map(|(_, evicted)| evicted.clone());
+        assert_eq!(evicted, [1, 2, 3].map(|port| Some(session(1, port))));
+    }
+
+    #[test]
+    fn handshakes_displace_each_other_and_no_session() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        for when_full in [WhenFull::Evict, WhenFull::Refuse] {
+            let admission = with_handshakes(2, 3, None, when_full);
+            let sessions = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+            sessions.iter().for_each(|ticket| assert_eq!(ticket.establish(), Ok(None)));
+            let silent: Vec<_> =
+                (10..40).map(|port| begin(&admission, &runtime, peer(1, port))).collect();
+            let evicted: Vec<_> =
+                silent.iter().filter_map(|(_, evicted)| evicted.clone()).collect();
+            let oldest: Vec<_> =
+                (10..38).map(|port| Evicted::Handshake(peer(1, port).into())).collect();
+            assert_eq!(evicted, oldest);
+            assert_eq!(admission.open(), 4, "{when_full:?}");
+        }
+    }
+
+    #[test]
+    fn an_authenticated_peer_takes_the_place_of_the_session_that_is_idle_longest() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(9, 2, None, WhenFull::Evict);
+        let tickets = [1, 2, 3].map(|port| {
+            let (ticket, evicted) = begin(&admission, &runtime, peer(1, port));
+            assert_eq!(evicted, None);
+            ticket
+        });
+        assert_eq!(tickets[1].establish(), Ok(None));
+        assert_eq!(tickets[0].establish(), Ok(None));
+        assert_eq!(tickets[2].establish(), Ok(Some(session(1, 2))));
+        assert_eq!(admission.open(), 2);
+    }
+
+    #[test]
+    fn without_eviction_a_full_listener_refuses_a_peer_before_and_after_its_handshake() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(9, 1, None, WhenFull::Refuse);
+        let tickets = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)).0);
+        assert_eq!(tickets[1].establish(), Ok(None));
+        assert_eq!(tickets[0].establish(), Err(Full));
+        assert_eq!(admission.admit(peer(2, 3)).unwrap_err(), Full);
+        drop(tickets);
+        assert_eq!((admission.open(), admission.table().per_source.len()), (0, 0));
+    }
+
+    #[test]
+    fn handshakes_of_a_source_at_its_limit_displace_only_each_other() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(9, 9, Some(2), WhenFull::Evict);
+        let _other = begin(&admission, &runtime, peer(2, 1));
+        let _held = [1, 2].map(|port| begin(&admission, &runtime, peer(1, port)));
+        let (third, evicted) = begin(&admission, &runtime, peer(1, 3));
+        assert_eq!(evicted, Some(Evicted::Handshake(peer(1, 1).into())));
+        assert_eq!(third.establish(), Ok(None));
+    }
+
+    #[test]
+    fn a_handshake_that_was_just_evicted_takes_no_place() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let admission = with_handshakes(1, 1, None, WhenFull::Evict);
+        let first = begin(&admission, &runtime, peer(1, 1)).0;
+        let _second = begin(&admission, &runtime, peer(1, 2));
+        assert_eq!(first.establish(), Ok(None));
+        assert_eq!(admission.open(), 1);
     }
 }

@@ -73,6 +73,8 @@ pub struct ConnectionCounters {
     pub tls_failed: Counter,
     /// Closed in favour of a new connection.
     pub evicted: Counter,
+    /// Closed during the handshake in favour of a new connection.
+    pub evicted_handshakes: Counter,
     /// Ended by a reload: no rule names the peer any more.
     pub rights_revoked: Counter,
     /// Ended by an operator.

@@ -30,6 +30,8 @@ pub enum Kind {
     BrokenFrame,
     /// Closed in favour of a new connection.
     Evicted,
+    /// Closed during the handshake in favour of a new connection.
+    EvictedHandshake,
     /// Ended by a reload: no rule names the peer any more.
     RightsRevoked,
     /// Ended by an operator.
@@ -68,7 +70,7 @@ impl Kind {
             Kind::RequestTimeout => "request_timeout",
             Kind::SlowReader => "slow_reader",
             Kind::BrokenFrame => "broken_frame",
-            Kind::Evicted => "evicted",
+            Kind::Evicted | Kind::EvictedHandshake => "evicted",
             Kind::RightsRevoked => "rights_revoked",
             Kind::Ended => "ended",
             Kind::RefusedSource => "refused_source",
@@ -89,6 +91,7 @@ impl Kind {
         match self {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
             Kind::TlsFailed(reason) => Some(reason),
+            Kind::EvictedHandshake => Some("handshake"),
             _ => None,
         }
     }
@@ -108,6 +111,8 @@ pub struct Event {
     pub listener: Arc<str>,
     pub kind: Kind,
     pub peer: Option<Peer>,
+    /// The subject of the certificate of a peer whose handshake failed, cut to 256 characters.
+    pub subject: Option<Box<str>>,
 }
 
 /// Which events are sent.
@@ -151,13 +156,20 @@ impl Reporter {
         self.verbosity.store(verbosity as u8, Ordering::Relaxed);
     }
 
-    pub(crate) fn report(&self, listener: &Arc<str>, kind: Kind, peer: Option<Peer>) {
+    pub(crate) fn report(
+        &self,
+        listener: &Arc<str>,
+        kind: Kind,
+        peer: Option<Peer>,
+        subject: Option<&str>,
+    ) {
         let verbosity = self.verbosity.load(Ordering::Relaxed);
         let least = if kind.is_ordinary() { Verbosity::All } else { Verbosity::Refusals };
         if verbosity < least as u8 {
             return;
         }
-        let event = Event { listener: Arc::clone(listener), kind, peer };
+        let subject = subject.map(Box::from);
+        let event = Event { listener: Arc::clone(listener), kind, peer, subject };
         if self.sender.try_send(event).is_err() {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }

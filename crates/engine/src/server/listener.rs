@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
-use super::admission::{Admission, ConnectionLimits, Full, Ticket, attach};
+use super::admission::{Admission, ConnectionLimits, Evicted, Full, Ticket, attach};
 use super::audit::{Auditor, Permit};
 use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
@@ -88,11 +88,16 @@ impl ListenerContext {
     }
 
     pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {
-        self.reporter.report(&self.name, kind, peer);
+        self.reporter.report(&self.name, kind, peer, None);
     }
 
     /// Counts and reports the end of a connection.
     pub(crate) fn ended(&self, kind: Kind, peer: impl Into<Peer>) {
+        self.ended_with(kind, peer, None);
+    }
+
+    /// The same, for a peer that has presented a certificate.
+    pub(crate) fn ended_with(&self, kind: Kind, peer: impl Into<Peer>, subject: Option<&str>) {
         match kind {
             Kind::Idle => self.connections.idle.add(),
             Kind::RightsRevoked => self.connections.rights_revoked.add(),
@@ -102,7 +107,7 @@ impl ListenerContext {
             Kind::TlsFailed(_) => self.connections.tls_failed.add(),
             _ => {}
         }
-        self.report(kind, Some(peer.into()));
+        self.reporter.report(&self.name, kind, Some(peer.into()), subject);
     }
 
     /// Ends the connections that a service does not serve any more in the place of `before`.
@@ -110,6 +115,26 @@ impl ListenerContext {
         for (peer, kind) in self.admission.review(|peer| service.ends(before, peer)) {
             self.ended(kind, peer);
         }
+    }
+
+    /// Counts and reports a connection that was closed for another.
+    pub(crate) fn evicted(&self, evicted: Option<Evicted>) {
+        match evicted {
+            None => {}
+            Some(Evicted::Session(peer)) => {
+                self.connections.evicted.add();
+                self.report(Kind::Evicted, Some(peer));
+            }
+            Some(Evicted::Handshake(peer)) => {
+                self.connections.evicted_handshakes.add();
+                self.report(Kind::EvictedHandshake, Some(peer));
+            }
+        }
+    }
+
+    pub(crate) fn refuse_full(&self, peer: impl Into<Peer>) {
+        self.connections.refused_full.add();
+        self.report(Kind::RefusedFull, Some(peer.into()));
     }
 
     pub(crate) fn refuse_source(&self, peer: SocketAddr) {
@@ -210,15 +235,9 @@ fn admit<S: Service>(
     }
     let (ticket, evicted) = match context.admission.admit(peer) {
         Ok(admitted) => admitted,
-        Err(Full) => {
-            context.connections.refused_full.add();
-            return context.report(Kind::RefusedFull, Some(peer.into()));
-        }
+        Err(Full) => return context.refuse_full(peer),
     };
-    if evicted.is_some() {
-        context.connections.evicted.add();
-        context.report(Kind::Evicted, evicted);
-    }
+    context.evicted(evicted);
     context.connections.accepted.add();
     context.report(Kind::Opened, Some(peer.into()));
     // A reload reviews the admitted connections. This one looks up its rights only now.

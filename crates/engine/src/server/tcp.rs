@@ -8,8 +8,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout, timeout_at};
 
-use super::admission::ConnectionLimits;
-use super::admission::Ticket;
+use super::admission::{ConnectionLimits, Full, Ticket};
 use super::connection::{Connection, Renewal, Terms, Timeouts};
 use super::counters::PacketCounters;
 use super::event::Kind;
@@ -164,7 +163,7 @@ impl ModbusStream {
         let certificate = match shaken {
             Ok(Ok(())) => stream.peer_certificate(),
             Ok(Err(Kind::Closed)) => {
-                let reason = TlsFailure::ClosedDuringHandshake.event_reason();
+                let reason = TlsFailure::ClosedDuringHandshake.reason();
                 return context.ended(Kind::TlsFailed(reason), peer);
             }
             Ok(Err(end)) => Err(end),
@@ -173,13 +172,20 @@ impl ModbusStream {
         let certificate = match certificate {
             Ok(certificate) => Arc::new(certificate),
             Err(end) => {
-                context.ended(end, peer);
+                context.ended_with(end, peer, stream.presented_subject().as_deref());
                 drain(&stream.into_socket(), usize::MAX, stop).await;
                 return;
             }
         };
         ticket.identify(Arc::clone(&certificate));
         let peer = Peer { address: peer, certificate: Some(certificate) };
+        match ticket.establish() {
+            Ok(evicted) => context.evicted(evicted),
+            Err(Full) => {
+                context.refuse_full(peer);
+                return stream.refuse(stop).await;
+            }
+        }
         context.report(Kind::Secured, Some(peer.clone()));
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
@@ -296,8 +302,8 @@ impl Service for ModbusStream {
             return Some(Kind::RightsRevoked);
         }
         let (tls, certificate) = (self.tls.as_ref()?, peer.certificate.as_ref()?);
-        if let Err(error) = tls.judge(certificate) {
-            return Some(Kind::TlsFailed(TlsFailure::from(&error).event_reason()));
+        if let Err(failure) = tls.judge(certificate) {
+            return Some(Kind::TlsFailed(failure.reason()));
         }
         // A session that never had rights keeps its exceptions.
         (self.terms(peer).is_none() && before.terms(peer).is_some()).then_some(Kind::RightsRevoked)

@@ -10,13 +10,17 @@ use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+#[cfg(target_os = "linux")]
+use socket2::SockRef;
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
+use tokio::sync::watch;
 
 use super::event::Kind;
+use super::listener::drain;
 use super::stream::{self, Stream};
-use crate::tls::server::{self, PeerCertificate, ServerTls};
-use crate::tls::{Channel, TlsFailure};
+use crate::tls::TlsFailure;
+use crate::tls::server::{PeerCertificate, ServerChannel, ServerTls};
 
 /// Bytes per read of a socket.
 const INPUT: usize = 4096;
@@ -41,7 +45,7 @@ thread_local! {
 
 pub(crate) struct ServerTlsStream {
     socket: TcpStream,
-    channel: Channel,
+    channel: ServerChannel,
     records: Records,
     /// Plain text that did not fit into the input of the connection, and how much of it was read.
     plain: Vec<u8>,
@@ -52,7 +56,7 @@ pub(crate) struct ServerTlsStream {
 
 impl ServerTlsStream {
     pub(crate) fn new(socket: TcpStream, tls: &ServerTls) -> Result<ServerTlsStream, Kind> {
-        let channel = tls.channel().map_err(|error| failed(&error))?;
+        let channel = tls.channel().map_err(|error| failed(&TlsFailure::from(error)))?;
         let records = Records::default();
         Ok(ServerTlsStream { socket, channel, records, plain: Vec::new(), taken: 0, ended: None })
     }
@@ -70,12 +74,26 @@ impl ServerTlsStream {
                 poll_fn(|context| self.poll_read(context, &mut [], &mut unsent)).await?;
             }
         }
+        acknowledge(&self.socket);
         Ok(())
     }
 
     /// The certificate of the peer, after the handshake.
     pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, Kind> {
-        server::peer_certificate(&self.channel).map_err(|error| failed(&error))
+        self.channel.peer_certificate().map_err(|failure| failed(&failure))
+    }
+
+    /// The subject of the certificate of a peer whose handshake has failed.
+    pub(crate) fn presented_subject(&self) -> Option<String> {
+        self.channel.presented_subject()
+    }
+
+    /// Announces the end, and closes the connection.
+    pub(crate) async fn refuse(mut self, stop: watch::Receiver<bool>) {
+        let mut unsent = Vec::new();
+        self.channel.end(&mut unsent);
+        let _ = stream::write(&self.socket, &mut unsent);
+        drain(&self.socket, usize::MAX, stop).await;
     }
 
     pub(crate) fn into_socket(self) -> TcpStream {
@@ -181,8 +199,16 @@ impl Stream for ServerTlsStream {
     }
 }
 
-fn failed(error: &rustls::Error) -> Kind {
-    Kind::TlsFailed(TlsFailure::from(error).event_reason())
+/// Acknowledges what has been received, instead of waiting for a reply that carries the
+/// acknowledgement. Often the last message of a handshake comes from the client. A client without
+/// TCP_NODELAY sends its first request only once that message is acknowledged: 40 ms later.
+fn acknowledge(_socket: &TcpStream) {
+    #[cfg(target_os = "linux")]
+    let _ = SockRef::from(_socket).set_tcp_quickack(true);
+}
+
+fn failed(failure: &TlsFailure) -> Kind {
+    Kind::TlsFailed(failure.reason())
 }
 
 /// Finds the boundaries of records.
@@ -224,7 +250,43 @@ impl Records {
 
 #[cfg(test)]
 mod tests {
+    #[cfg(target_os = "linux")]
+    use {
+        crate::tls::test_party::{self, Party},
+        rustls::version::{TLS12, TLS13},
+        std::net::TcpStream as Blocking,
+        tokio::net::TcpListener,
+    };
+
     use super::*;
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn after_the_handshake_nothing_waits_for_an_acknowledgement() {
+        let party = Party::new();
+        let tls = ServerTls::load(&party.files(), None).unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        for version in [&TLS12, &TLS13] {
+            let config = party.client(version);
+            let is_prompt = runtime.block_on(async {
+                let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+                let mut client = Blocking::connect(listener.local_addr().unwrap()).unwrap();
+                let (socket, _) = listener.accept().await.unwrap();
+                // As on a socket that has just replied: acknowledgements wait for the next reply.
+                SockRef::from(&socket).set_tcp_quickack(false).unwrap();
+                let mut stream = ServerTlsStream::new(socket, &tls).unwrap();
+                let shaking = std::thread::spawn(move || {
+                    test_party::connection(&config).complete_io(&mut client).unwrap();
+                    client
+                });
+                stream.handshake(Duration::from_secs(60)).await.unwrap();
+                let is_prompt = SockRef::from(&stream.socket).tcp_quickack().unwrap();
+                shaking.join().unwrap();
+                is_prompt
+            });
+            assert!(is_prompt, "{version:?}");
+        }
+    }
 
     #[test]
     fn record_boundaries_are_found_for_every_split() {

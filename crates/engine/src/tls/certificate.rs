@@ -7,8 +7,9 @@ use x509_cert::certificate::{CertificateInner, Profile};
 use x509_cert::der::asn1::{AnyRef, ObjectIdentifier, UintRef, Utf8StringRef};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader};
 use x509_cert::ext::pkix::{BasicConstraints, ExtendedKeyUsage, KeyUsage};
+use x509_cert::name::Name;
 use x509_cert::serial_number::SerialNumber;
-use x509_cert::spki::SubjectPublicKeyInfoOwned;
+use x509_cert::spki::{AlgorithmIdentifierOwned, SubjectPublicKeyInfoOwned};
 
 use super::failure::TlsFailure;
 use super::provider::KEYS;
@@ -35,7 +36,7 @@ const CURVES: [ObjectIdentifier; 3] = [
 const MIN_RSA_BITS: usize = 2048;
 const MAX_RSA_BITS: usize = 8192;
 
-/// The most characters of a subject and bytes of a serial number in a log.
+/// The most characters of a name and bytes of a serial number in a log.
 const MAX_SUBJECT_LEN: usize = 256;
 const MAX_SERIAL_LEN: usize = 32;
 
@@ -78,7 +79,7 @@ fn purpose_id(oid: &ObjectIdentifier) -> KeyPurposeId<'_> {
 
 /// Accepts serial numbers of any length: nothing depends on them, and some devices use long ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
-struct AnySerial;
+pub(super) struct AnySerial;
 
 impl Profile for AnySerial {
     fn check_serial_number(_: &SerialNumber<AnySerial>) -> der::Result<()> {
@@ -102,21 +103,21 @@ impl Parsed {
     /// The role in the certificate; empty, the null role, when there is none.
     ///
     /// # Errors
-    /// The role occurs twice, is not a UTF8String, or its extension is critical. Software that does
-    /// not know a critical extension must refuse the certificate, and the verifier does not know
-    /// roles.
-    pub(super) fn role(&self) -> Result<String, CertificateError> {
+    /// [`TlsFailure::TwoRoles`], [`TlsFailure::RoleType`], or [`TlsFailure::UnsupportedExtension`] if
+    /// the extension is critical. Software that does not know a critical extension must refuse the
+    /// certificate, and the verifier does not know roles.
+    pub(super) fn role(&self) -> Result<String, TlsFailure> {
         let extensions = self.0.tbs_certificate().extensions().map_or(&[][..], Vec::as_slice);
         let mut named = extensions.iter().filter(|extension| extension.extn_id == ROLE);
         let role = match (named.next(), named.next()) {
             (None, _) => return Ok(String::new()),
             (Some(extension), None) if extension.critical => {
-                return Err(CertificateError::UnhandledCriticalExtension);
+                return Err(TlsFailure::UnsupportedExtension);
             }
             (Some(extension), None) => Utf8StringRef::from_der(extension.extn_value.as_bytes()),
-            (Some(_), Some(_)) => return Err(CertificateError::BadEncoding),
+            (Some(_), Some(_)) => return Err(TlsFailure::TwoRoles),
         };
-        role.map(|role| role.to_string()).map_err(|_| CertificateError::BadEncoding)
+        role.map(|role| role.to_string()).map_err(|_| TlsFailure::RoleType)
     }
 
     /// Whether it is an authority: it has `CA:TRUE`, and its `keyUsage`, if any, has `keyCertSign`.
@@ -146,12 +147,18 @@ impl Parsed {
         self.0.tbs_certificate().issuer() == self.0.tbs_certificate().subject()
     }
 
+    /// Its first and last second.
+    pub(super) fn validity(&self) -> (UnixTime, UnixTime) {
+        let validity = self.0.tbs_certificate().validity();
+        let [first, last] = [&validity.not_before, &validity.not_after]
+            .map(|time| UnixTime::since_unix_epoch(time.to_unix_duration()));
+        (first, last)
+    }
+
     /// # Errors
     /// `now` is outside its dates.
     pub(super) fn is_valid_at(&self, now: UnixTime) -> Result<(), CertificateError> {
-        let validity = self.0.tbs_certificate().validity();
-        let not_before = UnixTime::since_unix_epoch(validity.not_before.to_unix_duration());
-        let not_after = UnixTime::since_unix_epoch(validity.not_after.to_unix_duration());
+        let (not_before, not_after) = self.validity();
         if now < not_before {
             return Err(CertificateError::NotValidYetContext { time: now, not_before });
         }
@@ -217,21 +224,31 @@ impl Parsed {
         self.key_algorithm().filter(|_| is_pss)
     }
 
-    fn key(&self) -> &SubjectPublicKeyInfoOwned {
+    pub(super) fn key(&self) -> &SubjectPublicKeyInfoOwned {
         self.0.tbs_certificate().subject_public_key_info()
     }
 
     fn key_algorithm(&self) -> Option<Vec<u8>> {
-        let der = self.key().algorithm.to_der().ok()?;
-        AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
+        algorithm_content(&self.key().algorithm)
+    }
+
+    /// Whether its issuer is the subject of another certificate.
+    pub(super) fn is_issued_by(&self, other: &Parsed) -> bool {
+        other.has_subject(self.0.tbs_certificate().issuer())
+    }
+
+    pub(super) fn has_subject(&self, name: &Name) -> bool {
+        self.0.tbs_certificate().subject() == name
     }
 
     /// The subject for a log, as RFC 4514 writes it. Control characters are replaced.
     pub(super) fn subject_text(&self) -> String {
-        let text = self.0.tbs_certificate().subject().to_string();
-        let shown =
-            |found: char| if found.is_control() { char::REPLACEMENT_CHARACTER } else { found };
-        text.chars().take(MAX_SUBJECT_LEN).map(shown).collect()
+        name_text(self.0.tbs_certificate().subject())
+    }
+
+    /// The issuer, as [`Parsed::subject_text`].
+    pub(super) fn issuer_text(&self) -> String {
+        name_text(self.0.tbs_certificate().issuer())
     }
 
     /// The serial number for a log, in hexadecimal digits.
@@ -240,10 +257,28 @@ impl Parsed {
         number.take(MAX_SERIAL_LEN).map(|byte| format!("{byte:02x}")).collect()
     }
 
+    /// Whether its key may sign a handshake: `keyUsage`, if any, has `digitalSignature`.
+    pub(super) fn may_sign_handshakes(&self) -> bool {
+        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.digital_signature()))
+    }
+
     /// The subject, for the list of accepted issuers that a server sends to clients.
     pub(super) fn subject(&self) -> Option<DistinguishedName> {
         self.0.tbs_certificate().subject().to_der().ok().map(DistinguishedName::from)
     }
+}
+
+/// A name for a log, as RFC 4514 writes it. Control characters are replaced.
+pub(super) fn name_text(name: &Name) -> String {
+    let shown = |found: char| if found.is_control() { char::REPLACEMENT_CHARACTER } else { found };
+    name.to_string().chars().take(MAX_SUBJECT_LEN).map(shown).collect()
+}
+
+/// The content of an algorithm identifier.
+pub(super) fn algorithm_content(algorithm: &AlgorithmIdentifierOwned) -> Option<Vec<u8>> {
+    let der = algorithm.to_der().ok()?;
+    AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
 }
 
 /// The size of the modulus of an RSA key in PKCS#1, in bits.
@@ -276,7 +311,7 @@ mod tests {
         CustomExtension::from_oid_content(&ROLE_ARCS[..9], content.to_vec())
     }
 
-    fn role(extensions: &[CustomExtension]) -> Result<String, CertificateError> {
+    fn role(extensions: &[CustomExtension]) -> Result<String, TlsFailure> {
         parsed(|params| params.custom_extensions = extensions.to_vec()).role()
     }
 
@@ -307,13 +342,13 @@ mod tests {
             b"\x2c\x05\x0c\x03abc",
         ];
         for content in malformed {
-            assert_eq!(role(&[extension(content)]), Err(CertificateError::BadEncoding));
+            assert_eq!(role(&[extension(content)]), Err(TlsFailure::RoleType));
         }
         let twice = [extension(b"\x0c\x01a"), extension(b"\x0c\x01a")];
-        assert_eq!(role(&twice), Err(CertificateError::BadEncoding));
+        assert_eq!(role(&twice), Err(TlsFailure::TwoRoles));
         let mut critical = extension(b"\x0c\x01a");
         critical.set_criticality(true);
-        assert_eq!(role(&[critical]), Err(CertificateError::UnhandledCriticalExtension));
+        assert_eq!(role(&[critical]), Err(TlsFailure::UnsupportedExtension));
     }
 
     #[test]

@@ -60,13 +60,23 @@ pub enum TlsFailure {
     Revoked,
     #[error("an authority above the certificate has no valid revocation list")]
     UnknownRevocation,
+    /// The `nextUpdate` of a revocation list has passed.
+    #[error("a revocation list of an authority above the certificate expired {} ago", span(*.ago))]
+    ExpiredRevocationList { ago: Duration },
     /// The signature of a certificate is invalid; or that of the handshake, when the peer does not
     /// hold the key of its certificate.
     #[error("the signature of the certificate, or of the handshake, is invalid")]
     BadSignature,
-    /// It is not an X.509 certificate, or its role is malformed.
+    /// It is not an X.509 certificate.
     #[error("the certificate can't be read")]
     BadCertificate,
+    #[error("the certificate has more than one role")]
+    TwoRoles,
+    #[error("the role of the certificate is not a UTF8String")]
+    RoleType,
+    /// The key of the certificate is for other purposes than signing handshakes.
+    #[error("the keyUsage of the certificate lacks digitalSignature")]
+    WrongKeyUsage,
     #[error("the certificate has a critical extension that is not supported")]
     UnsupportedExtension,
     /// Its version, key or signature is not supported.
@@ -119,7 +129,8 @@ pub enum TlsFailure {
 }
 
 impl TlsFailure {
-    /// The cause as a word for programs. It does not change when messages change.
+    /// The cause as a word for programs, for errors and log events. It does not change when messages
+    /// change.
     pub const fn reason(&self) -> &'static str {
         match self {
             TlsFailure::UnknownIssuer => "unknown_issuer",
@@ -131,8 +142,12 @@ impl TlsFailure {
             TlsFailure::WrongPurpose { .. } => "wrong_purpose",
             TlsFailure::Revoked => "revoked",
             TlsFailure::UnknownRevocation => "unknown_revocation",
+            TlsFailure::ExpiredRevocationList { .. } => "expired_revocation_list",
             TlsFailure::BadSignature => "bad_signature",
             TlsFailure::BadCertificate => "bad_certificate",
+            TlsFailure::TwoRoles => "two_roles",
+            TlsFailure::RoleType => "role_type",
+            TlsFailure::WrongKeyUsage => "wrong_key_usage",
             TlsFailure::UnsupportedExtension => "unsupported_extension",
             TlsFailure::UnsupportedCertificate { .. } => "unsupported_certificate",
             TlsFailure::CaAsEndEntity => "ca_as_end_entity",
@@ -151,41 +166,6 @@ impl TlsFailure {
             TlsFailure::ClosedBeforeReply => "closed_before_reply",
             TlsFailure::BadRecord => "bad_record",
             TlsFailure::Other { .. } => "other",
-        }
-    }
-
-    /// The `reason` of the event `tls_failed` of a listener. It is older than
-    /// [`TlsFailure::reason`] and has fewer words.
-    pub const fn event_reason(&self) -> &'static str {
-        match self {
-            TlsFailure::UnknownIssuer => "unknown_authority",
-            TlsFailure::Expired { .. } | TlsFailure::IssuerExpired { .. } => "expired",
-            TlsFailure::NotYetValid { .. } | TlsFailure::IssuerNotYetValid { .. } => {
-                "not_valid_yet"
-            }
-            TlsFailure::WrongPurpose { .. } => "wrong_purpose",
-            TlsFailure::Revoked => "revoked",
-            TlsFailure::UnknownRevocation => "unknown_revocation",
-            TlsFailure::BadSignature => "bad_signature",
-            TlsFailure::BadCertificate => "bad_certificate",
-            TlsFailure::UnsupportedExtension => "unknown_extension",
-            TlsFailure::WrongName { .. }
-            | TlsFailure::UnsupportedCertificate { .. }
-            | TlsFailure::CaAsEndEntity
-            | TlsFailure::IssuerNotAuthority
-            | TlsFailure::ConstraintViolated { .. }
-            | TlsFailure::UntrustedCertificate { .. } => "untrusted_certificate",
-            TlsFailure::NoCertificate => "no_certificate",
-            TlsFailure::PeerRequiresCertificate
-            | TlsFailure::PeerRefusedCertificate { .. }
-            | TlsFailure::PeerRefusedHandshake
-            | TlsFailure::PeerEnded { .. }
-            | TlsFailure::NoCommonVersionOrCipher { by_peer: true } => "refused_by_peer",
-            TlsFailure::NoCommonVersionOrCipher { by_peer: false } => "incompatible",
-            TlsFailure::NotTls | TlsFailure::MalformedMessage { .. } => "not_tls",
-            TlsFailure::ClosedDuringHandshake | TlsFailure::ClosedBeforeReply => "closed",
-            TlsFailure::BadRecord => "decrypt_error",
-            TlsFailure::Other { .. } => "protocol_error",
         }
     }
 }
@@ -335,7 +315,7 @@ pub(super) fn between(from: UnixTime, to: UnixTime) -> Duration {
     Duration::from_secs(to.as_secs().saturating_sub(from.as_secs()))
 }
 
-fn span(time: Duration) -> String {
+pub(super) fn span(time: Duration) -> String {
     let seconds = time.as_secs();
     if seconds < DAY { format!("{seconds} s") } else { format!("{} days", seconds / DAY) }
 }
@@ -405,8 +385,12 @@ mod tests {
             TlsFailure::WrongPurpose { required: "serverAuth" },
             TlsFailure::Revoked,
             TlsFailure::UnknownRevocation,
+            TlsFailure::ExpiredRevocationList { ago },
             TlsFailure::BadSignature,
             TlsFailure::BadCertificate,
+            TlsFailure::TwoRoles,
+            TlsFailure::RoleType,
+            TlsFailure::WrongKeyUsage,
             TlsFailure::UnsupportedExtension,
             TlsFailure::UnsupportedCertificate { flaw: flaw.clone() },
             TlsFailure::CaAsEndEntity,
@@ -433,29 +417,20 @@ mod tests {
     }
 
     #[test]
-    fn an_alert_of_the_peer_differs_from_a_failure_found_here() {
-        let told = |error: Error| {
-            let failure = TlsFailure::from(error);
-            (failure.reason(), failure.event_reason())
-        };
-        assert_eq!(
-            told(Error::AlertReceived(AlertDescription::ProtocolVersion)),
-            ("no_common_version_or_cipher", "refused_by_peer")
-        );
-        assert_eq!(
-            told(rustls::PeerIncompatible::NoCipherSuitesInCommon.into()),
-            ("no_common_version_or_cipher", "incompatible")
-        );
-        assert_eq!(
-            told(Error::AlertReceived(AlertDescription::CertificateRequired)),
-            ("peer_requires_certificate", "refused_by_peer")
-        );
-        assert_eq!(told(InvalidMessage::InvalidContentType.into()), ("not_tls", "not_tls"));
-        assert_eq!(
-            told(InvalidMessage::UnexpectedMessage("hello").into()),
-            ("malformed_message", "not_tls")
-        );
-        assert_eq!(told(Error::DecryptError), ("bad_record", "decrypt_error"));
-        assert_eq!(told(Error::HandshakeNotComplete), ("other", "protocol_error"));
+    fn alerts_of_the_peer_and_failures_found_here_have_reasons() {
+        let told = |error: Error| TlsFailure::from(error).reason();
+        let required = Error::AlertReceived(AlertDescription::CertificateRequired);
+        assert_eq!(told(required), "peer_requires_certificate");
+        assert_eq!(told(InvalidMessage::InvalidContentType.into()), "not_tls");
+        assert_eq!(told(InvalidMessage::UnexpectedMessage("hello").into()), "malformed_message");
+        assert_eq!(told(Error::DecryptError), "bad_record");
+        assert_eq!(told(Error::HandshakeNotComplete), "other");
+        let [here, there] = [
+            TlsFailure::from(Error::from(rustls::PeerIncompatible::NoCipherSuitesInCommon)),
+            TlsFailure::from(Error::AlertReceived(AlertDescription::ProtocolVersion)),
+        ];
+        assert_eq!(here, TlsFailure::NoCommonVersionOrCipher { by_peer: false });
+        assert_eq!(there, TlsFailure::NoCommonVersionOrCipher { by_peer: true });
+        assert_eq!(here.reason(), there.reason());
     }
 }

@@ -5,13 +5,22 @@
 
 mod certificate;
 pub mod client;
+mod clients;
+mod doubts;
 mod failure;
 mod files;
+mod fragment;
+mod notes;
 mod own;
 mod p521;
 mod provider;
+mod revocation;
 mod rsa_pss;
 pub mod server;
+mod server_files;
+mod sessions;
+#[cfg(test)]
+pub(crate) mod test_party;
 mod trust;
 
 use std::io::{Read, Write};

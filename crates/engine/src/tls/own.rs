@@ -31,6 +31,7 @@ pub(super) fn own(
     let [end_entity, ..] = chain.as_slice() else {
         return Err(FileError::content(cert_file, "found no certificate"));
     };
+    is_in_order(&chain).map_err(|flaw| FileError::content(cert_file, flaw))?;
     let key = signing_key(key, end_entity)
         .ok_or_else(|| wrong(format!("found a key of another kind, allowed: {KEYS}")))?;
     let own = CertifiedKey::new(chain, key);
@@ -41,6 +42,25 @@ pub(super) fn own(
         }
         Err(error) => Err(wrong(error.to_string())),
     }
+}
+
+/// # Errors
+/// A certificate is not the issuer of the one before it.
+fn is_in_order(chain: &[CertificateDer<'_>]) -> Result<(), String> {
+    for (pair, number) in chain.windows(2).zip(2..) {
+        let [below, above] = [&pair[0], &pair[1]].map(|der| Parsed::new(der));
+        if let (Ok(below), Ok(above)) = (below, above)
+            && !below.is_issued_by(&above)
+        {
+            return Err(format!(
+                "certificate {number}: found {}, allowed: {}, the issuer of certificate {}",
+                above.subject_text(),
+                below.issuer_text(),
+                number - 1
+            ));
+        }
+    }
+    Ok(())
 }
 
 /// `None` for an unsupported kind of key.

@@ -4,6 +4,7 @@
 //! * A listed authority ([`Parsed::is_authority`]) can issue certificates within its own dates.
 //! * A presented certificate with `CA:TRUE` is trusted only if it is listed itself.
 //! * Dates and purpose of the presented certificate are always checked.
+//! * The key of a client must be for signing. Devices with other `keyUsage` are common.
 //!
 //! webpki checks signatures, and the constraints along a path. Dates are checked when a certificate
 //! is used, not when its file is read: the clock of a machine may be wrong just after power-on.
@@ -72,6 +73,10 @@ impl Listed {
         self.parsed.is_self_signed()
     }
 
+    pub(super) fn parsed(&self) -> &Parsed {
+        &self.parsed
+    }
+
     pub(super) fn subject(&self) -> Option<DistinguishedName> {
         self.parsed.subject()
     }
@@ -97,11 +102,18 @@ pub(super) struct Trust {
     listed: Arc<[Listed]>,
     /// Revocation lists. If there are any, every authority requires one.
     revoked: Vec<CertRevocationList<'static>>,
+    /// Whether lists past their `nextUpdate` count.
+    accepts_expired_lists: bool,
 }
 
 impl Trust {
     pub(super) fn new(listed: Arc<[Listed]>, revoked: Vec<CertRevocationList<'static>>) -> Trust {
-        Trust { listed, revoked }
+        Trust { listed, revoked, accepts_expired_lists: false }
+    }
+
+    /// Uses revocation lists also after their `nextUpdate`.
+    pub(super) fn accepting_expired_lists(self) -> Trust {
+        Trust { accepts_expired_lists: true, ..self }
     }
 
     /// Verifies the certificate of a peer, for its purpose. Does not check the name.
@@ -125,6 +137,9 @@ impl Trust {
         }
         if parsed.has_ca_flag() {
             return Err(told(TlsFailure::CaAsEndEntity));
+        }
+        if purpose == Purpose::Client && !parsed.may_sign_handshakes() {
+            return Err(told(TlsFailure::WrongKeyUsage));
         }
         self.vouch(&Path { end_entity: &end_entity, intermediates, purpose, now })
     }
@@ -157,10 +172,27 @@ impl Trust {
             path.intermediates,
             path.now,
             path.purpose,
-            revocation(&lists),
+            self.revocation(&lists),
             Some(&check),
         )?;
         Ok(())
+    }
+
+    /// Every authority of a path requires a list.
+    fn revocation<'l>(
+        &self,
+        lists: &'l [&'l CertRevocationList<'l>],
+    ) -> Option<RevocationOptions<'l>> {
+        let options = RevocationOptionsBuilder::new(lists).ok()?;
+        let expiration = match self.accepts_expired_lists {
+            true => ExpirationPolicy::Ignore,
+            false => ExpirationPolicy::Enforce,
+        };
+        let options = options
+            .with_depth(webpki::RevocationCheckDepth::Chain)
+            .with_status_policy(UnknownStatusPolicy::Deny)
+            .with_expiration_policy(expiration);
+        Some(options.build())
     }
 }
 
@@ -216,16 +248,6 @@ fn is_allowed(path: &VerifiedPath<'_>, authorities: &[&Listed]) -> Result<(), we
     }
 }
 
-/// Every authority of a path requires a list. The age of a list does not matter.
-fn revocation<'l>(lists: &'l [&'l CertRevocationList<'l>]) -> Option<RevocationOptions<'l>> {
-    let options = RevocationOptionsBuilder::new(lists).ok()?;
-    let options = options
-        .with_depth(webpki::RevocationCheckDepth::Chain)
-        .with_status_policy(UnknownStatusPolicy::Deny)
-        .with_expiration_policy(ExpirationPolicy::Ignore);
-    Some(options.build())
-}
-
 /// Converts an error of webpki. The presented certificate has already passed the checks of its
 /// dates and purpose, so these errors concern a certificate above it.
 fn refused(error: webpki::Error) -> Error {
@@ -233,6 +255,9 @@ fn refused(error: webpki::Error) -> Error {
     match error {
         Found::UnknownIssuer => CertificateError::UnknownIssuer.into(),
         Found::CertRevoked => CertificateError::Revoked.into(),
+        Found::CrlExpired { time, next_update } => {
+            told(TlsFailure::ExpiredRevocationList { ago: between(next_update, time) })
+        }
         Found::UnknownRevocationStatus
         | Found::InvalidCrlSignatureForPublicKey
         | Found::IssuerNotCrlSigner

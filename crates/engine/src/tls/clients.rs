@@ -1,0 +1,150 @@
+//! Verifies the certificates of clients, for a server.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use rustls::client::danger::HandshakeSignatureValid;
+use rustls::pki_types::{CertificateDer, UnixTime};
+use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
+use rustls::{
+    CertificateError, DigitallySignedStruct, DistinguishedName, Error, OtherError, SignatureScheme,
+};
+
+use super::TlsFailure;
+use super::certificate::{Parsed, Purpose};
+use super::doubts::Doubts;
+use super::files::FileError;
+use super::notes::{Chain, noted};
+use super::provider::{ALGORITHMS, verify_tls12, verify_tls13};
+use super::revocation::List;
+use super::server_files::{ExpiredLists, ServerFiles};
+use super::trust::{Listed, Trust};
+
+/// Verifies the certificates of clients.
+#[derive(Debug)]
+pub(super) struct Clients {
+    trust: Trust,
+    subjects: Vec<DistinguishedName>,
+}
+
+impl Clients {
+    pub(super) fn load(files: &ServerFiles, doubts: &mut Doubts<'_>) -> Result<Clients, FileError> {
+        let listed = listed(&files.ca_file)?;
+        let subjects = listed.iter().filter_map(Listed::subject).collect();
+        doubts.of_listed(&listed);
+        let revoked = match &files.crl_file {
+            Some(file) if !listed.iter().any(Listed::is_authority) => {
+                let flaw = "crl_file requires an authority (CA:TRUE) in ca_file";
+                return Err(FileError::content(file, flaw));
+            }
+            Some(file) => {
+                let lists = List::of_file(file)?;
+                doubts.of_lists(file, &lists, &listed);
+                lists.into_iter().map(List::into_usable).collect()
+            }
+            None => Vec::new(),
+        };
+        let trust = Trust::new(listed, revoked);
+        let trust = match files.expired_lists {
+            ExpiredLists::Refuse => trust,
+            ExpiredLists::Accept => trust.accepting_expired_lists(),
+        };
+        Ok(Clients { trust, subjects })
+    }
+
+    /// Verifies the certificate of a client, its own first, and its role.
+    pub(super) fn judge(
+        &self,
+        chain: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<(), TlsFailure> {
+        let (own, intermediates) = chain.split_first().ok_or(TlsFailure::NoCertificate)?;
+        self.trust.judge(own, intermediates, Purpose::Client, now)?;
+        Parsed::new(own).map_err(Error::from)?.role()?;
+        Ok(())
+    }
+}
+
+/// Reads authorities and self-signed certificates. Any other certificate is a mistake.
+fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
+    let listed = Listed::of_file(file)?;
+    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.is_self_signed();
+    if let Some(index) = listed.iter().position(is_mistake) {
+        let flaw =
+            format!("certificate {}: neither an authority (CA:TRUE) nor self-signed", index + 1);
+        return Err(FileError::content(file, flaw));
+    }
+    Ok(listed)
+}
+
+impl ClientCertVerifier for Clients {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        &self.subjects
+    }
+
+    fn verify_client_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<ClientCertVerified, Error> {
+        let chain = std::iter::once(end_entity).chain(intermediates);
+        let chain: Chain = chain.map(|each| each.clone().into_owned()).collect();
+        noted(|notes| {
+            notes.chain = Some(Arc::clone(&chain));
+            notes.proved = Some(now);
+        });
+        self.judge(&chain, now).map_err(|failure| {
+            let refused = refused(&failure);
+            noted(|notes| notes.failure = Some(failure));
+            refused
+        })?;
+        Ok(ClientCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls12(message, certificate, signed)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13(message, certificate, signed)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        ALGORITHMS.supported_schemes()
+    }
+}
+
+/// The error with which rustls sends the alert for a failure (RFC 8446, 6.2).
+fn refused(failure: &TlsFailure) -> Error {
+    let error = match failure {
+        TlsFailure::Expired { .. }
+        | TlsFailure::NotYetValid { .. }
+        | TlsFailure::IssuerExpired { .. }
+        | TlsFailure::IssuerNotYetValid { .. } => CertificateError::Expired,
+        TlsFailure::Revoked => CertificateError::Revoked,
+        TlsFailure::UnknownIssuer
+        | TlsFailure::UnknownRevocation
+        | TlsFailure::ExpiredRevocationList { .. } => CertificateError::UnknownIssuer,
+        TlsFailure::WrongPurpose { .. }
+        | TlsFailure::WrongKeyUsage
+        | TlsFailure::UnsupportedCertificate { .. } => CertificateError::InvalidPurpose,
+        TlsFailure::BadCertificate
+        | TlsFailure::BadSignature
+        | TlsFailure::TwoRoles
+        | TlsFailure::RoleType
+        | TlsFailure::UnsupportedExtension => CertificateError::BadEncoding,
+        other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
+    };
+    error.into()
+}

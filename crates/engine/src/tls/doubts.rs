@@ -1,0 +1,121 @@
+//! What is doubtful about the files of a server. None of it is an error: the clock of a machine may
+//! be wrong just after power-on, and dates are checked when a certificate is used.
+
+use std::path::Path;
+
+use rustls::pki_types::{CertificateDer, UnixTime};
+
+use super::certificate::{Parsed, name_text};
+use super::failure::{between, span};
+use super::revocation::List;
+use super::server_files::{ExpiredLists, ServerFiles};
+use super::trust::Listed;
+
+/// Finds what is doubtful.
+pub(super) struct Doubts<'f> {
+    files: &'f ServerFiles,
+    now: UnixTime,
+    found: Vec<String>,
+}
+
+impl<'f> Doubts<'f> {
+    pub(super) fn new(files: &'f ServerFiles, now: UnixTime) -> Doubts<'f> {
+        Doubts { files, now, found: Vec::new() }
+    }
+
+    pub(super) fn found(self) -> Vec<String> {
+        self.found
+    }
+
+    pub(super) fn of_own(&mut self, chain: &[CertificateDer<'_>]) {
+        for (der, number) in chain.iter().zip(1..) {
+            if let Ok(parsed) = Parsed::new(der) {
+                let file = &self.files.cert_file;
+                self.of_dates(file, &parsed, number, "clients refuse this server");
+            }
+        }
+    }
+
+    pub(super) fn of_listed(&mut self, listed: &[Listed]) {
+        for (each, number) in listed.iter().zip(1..) {
+            let parsed = each.parsed();
+            let outcome = match each.is_authority() {
+                true => "its clients are refused",
+                false => "this client is refused",
+            };
+            self.of_dates(&self.files.ca_file, parsed, number, outcome);
+        }
+    }
+
+    fn of_dates(&mut self, file: &Path, parsed: &Parsed, number: usize, outcome: &str) {
+        let (begins, ends) = parsed.validity();
+        let name = format!("certificate {number} ({})", parsed.subject_text());
+        if self.now > ends {
+            let ago = span(between(ends, self.now));
+            self.add(file, &format!("{name} expired {ago} ago: {outcome}"));
+        }
+        if self.now < begins {
+            let wait = span(between(self.now, begins));
+            self.add(
+                file,
+                &format!(
+                    "{name} is not valid yet, its validity begins in {wait}: {outcome} until then"
+                ),
+            );
+        }
+    }
+
+    pub(super) fn of_lists(&mut self, file: &Path, lists: &[List], listed: &[Listed]) {
+        let authorities: Vec<_> =
+            listed.iter().zip(1..).filter(|(each, _)| each.is_authority()).collect();
+        for list in lists {
+            let name = format!("revocation list {} ({})", list.number, name_text(list.issuer()));
+            let named = || {
+                let issued = |each: &&(&Listed, usize)| each.0.parsed().has_subject(list.issuer());
+                authorities.iter().filter(issued)
+            };
+            if named().next().is_none() {
+                self.add(file, &format!(
+                    "{name} is not of an authority in ca_file: it applies only to clients that send \
+                     its authority"
+                ));
+            } else if !named().any(|(each, _)| list.is_signed_by(each.parsed())) {
+                self.add(file, &format!(
+                    "{name} is not signed by the authority of that name in ca_file: clients of that \
+                     authority are refused"
+                ));
+            }
+            self.of_age(file, list, &name);
+        }
+        for (each, number) in authorities {
+            if !lists.iter().any(|list| each.parsed().has_subject(list.issuer())) {
+                let subject = each.parsed().subject_text();
+                self.add(file, &format!(
+                    "found no list of certificate {number} of ca_file ({subject}): its clients are \
+                     refused"
+                ));
+            }
+        }
+    }
+
+    fn of_age(&mut self, file: &Path, list: &List, name: &str) {
+        if let Some(ends) = list.ends()
+            && self.now > ends
+        {
+            let ago = span(between(ends, self.now));
+            let outcome = match self.files.expired_lists {
+                ExpiredLists::Refuse => "clients of that authority are refused",
+                ExpiredLists::Accept => "certificates revoked since are accepted",
+            };
+            self.add(file, &format!("{name} expired {ago} ago: {outcome}"));
+        }
+        if self.now < list.begins() {
+            let wait = span(between(self.now, list.begins()));
+            self.add(file, &format!("{name} was issued {wait} in the future: check the clock"));
+        }
+    }
+
+    fn add(&mut self, file: &Path, doubt: &str) {
+        self.found.push(format!("{}: {doubt}", file.display()));
+    }
+}

@@ -1,0 +1,138 @@
+//! Sessions that clients may resume: they have the secrets and the certificate of an earlier
+//! handshake (MB-TCP-Security, R-42).
+//!
+//! The certificate is judged again each time, by the same rules and today's date. If it is not
+//! trusted any more, the session is forgotten, and the client gets a full handshake, which refuses
+//! it. Sessions are stored here and not in tickets: there is no key that could decrypt all of them, and
+//! whoever changes the trusted certificates starts without sessions.
+
+use std::collections::{HashMap, VecDeque};
+use std::fmt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use rustls::pki_types::UnixTime;
+use rustls::server::StoresServerSessions;
+use rustls::time_provider::TimeProvider;
+
+use super::clients::Clients;
+use super::notes::{Chain, noted};
+
+/// The most sessions. The oldest gives way.
+const MAX_SESSIONS: usize = 1024;
+
+/// The most bytes of a session and of its certificates, so that the memory for all is limited.
+const MAX_LEN: usize = 8 * 1024;
+
+/// The longest time between a full handshake and the last one that resumes its session.
+const LIFETIME: Duration = Duration::from_secs(24 * 60 * 60);
+
+pub(super) struct Sessions {
+    clients: Arc<Clients>,
+    clock: Arc<dyn TimeProvider>,
+    stored: Mutex<Stored>,
+}
+
+#[derive(Default)]
+struct Stored {
+    sessions: HashMap<Vec<u8>, Session>,
+    /// The keys, oldest first. Sessions may have been forgotten since.
+    in_order: VecDeque<Vec<u8>>,
+}
+
+#[derive(Clone)]
+struct Session {
+    secrets: Vec<u8>,
+    chain: Chain,
+    /// When the client proved that it has the key of its certificate.
+    proved: UnixTime,
+}
+
+impl Sessions {
+    pub(super) fn new(clients: Arc<Clients>, clock: Arc<dyn TimeProvider>) -> Sessions {
+        Sessions { clients, clock, stored: Mutex::default() }
+    }
+
+    /// Forgets a session: its connection has failed.
+    pub(super) fn forget(&self, key: &[u8]) {
+        self.stored().sessions.remove(key);
+    }
+
+    /// The secrets of a session whose client is still trusted.
+    fn resumed(&self, key: &[u8], session: Session) -> Option<Vec<u8>> {
+        let now = self.clock.current_time()?;
+        let age = now.as_secs().checked_sub(session.proved.as_secs());
+        let is_fresh = age.is_some_and(|age| age <= LIFETIME.as_secs());
+        if !is_fresh || self.clients.judge(&session.chain, now).is_err() {
+            self.forget(key);
+            return None;
+        }
+        noted(|notes| {
+            notes.chain = Some(session.chain);
+            notes.proved = Some(session.proved);
+            notes.session = Some(key.to_vec());
+        });
+        Some(session.secrets)
+    }
+
+    fn stored(&self) -> MutexGuard<'_, Stored> {
+        self.stored.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl StoresServerSessions for Sessions {
+    fn put(&self, key: Vec<u8>, secrets: Vec<u8>) -> bool {
+        let (chain, proved) = noted(|notes| (notes.chain.clone(), notes.proved));
+        let (Some(chain), Some(proved)) = (chain, proved) else { return false };
+        let len = secrets.len() + chain.iter().map(|certificate| certificate.len()).sum::<usize>();
+        if len > MAX_LEN {
+            return false;
+        }
+        noted(|notes| notes.session = Some(key.clone()));
+        let mut stored = self.stored();
+        stored.in_order.push_back(key.clone());
+        stored.sessions.insert(key, Session { secrets, chain, proved });
+        if stored.in_order.len() > MAX_SESSIONS
+            && let Some(oldest) = stored.in_order.pop_front()
+        {
+            stored.sessions.remove(&oldest);
+        }
+        true
+    }
+
+    /// For TLS 1.2, which resumes a session any number of times.
+    fn get(&self, key: &[u8]) -> Option<Vec<u8>> {
+        let session = self.stored().sessions.get(key).cloned()?;
+        self.resumed(key, session)
+    }
+
+    /// For TLS 1.3, which resumes a session once, and then stores it with another key.
+    fn take(&self, key: &[u8]) -> Option<Vec<u8>> {
+        let session = self.stored().sessions.remove(key)?;
+        self.resumed(key, session)
+    }
+
+    fn can_cache(&self) -> bool {
+        true
+    }
+}
+
+impl fmt::Debug for Sessions {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("Sessions").finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+impl Sessions {
+    /// Stores as many sessions as there is room for.
+    pub(super) fn fill(&self) {
+        let now = self.clock.current_time();
+        noted(|notes| (notes.chain, notes.proved) = (Some(Chain::default()), now));
+        for number in 0..MAX_SESSIONS as u64 {
+            assert!(self.put(number.to_be_bytes().to_vec(), Vec::new()));
+        }
+        assert_eq!(self.stored().sessions.len(), MAX_SESSIONS);
+        noted(std::mem::take);
+    }
+}

@@ -1,0 +1,146 @@
+//! An authority, a server and a client, for tests.
+
+use std::fs;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use rcgen::{
+    BasicConstraints, Certificate, CertificateParams, CustomExtension, DnType, IsCa, Issuer,
+    KeyPair, KeyUsagePurpose, date_time_ymd,
+};
+use rustls::pki_types::{PrivateKeyDer, ServerName};
+use rustls::{ClientConfig, ClientConnection, RootCertStore, SupportedProtocolVersion};
+
+use super::provider::provider;
+use super::server_files::{ExpiredLists, ServerFiles};
+
+/// A certificate and its key.
+pub(crate) struct Owner {
+    pub(crate) certificate: Certificate,
+    pub(crate) params: CertificateParams,
+    pub(crate) key: KeyPair,
+}
+
+impl Owner {
+    /// Valid from 2000 to 2100, unless `with` says otherwise.
+    pub(crate) fn new(
+        name: &str,
+        by: Option<&Owner>,
+        with: impl Fn(&mut CertificateParams),
+    ) -> Owner {
+        let mut params = CertificateParams::new([name.to_owned()]).unwrap();
+        params.distinguished_name.push(DnType::CommonName, name);
+        (params.not_before, params.not_after) =
+            (date_time_ymd(2000, 1, 1), date_time_ymd(2100, 1, 1));
+        with(&mut params);
+        let key = KeyPair::generate().unwrap();
+        let certificate = match by {
+            None => params.self_signed(&key),
+            Some(by) => params.signed_by(&key, &by.issuer()),
+        };
+        Owner { certificate: certificate.unwrap(), params, key }
+    }
+
+    pub(crate) fn authority(name: &str, by: Option<&Owner>) -> Owner {
+        Owner::new(name, by, |params| {
+            params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+            params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        })
+    }
+
+    pub(crate) fn issuer(&self) -> Issuer<'_, &KeyPair> {
+        Issuer::from_params(&self.params, &self.key)
+    }
+}
+
+/// The extension that holds the role.
+pub(crate) const ROLE_ARCS: [u64; 9] = [1, 3, 6, 1, 4, 1, 50316, 802, 1];
+
+/// The extension with a role.
+pub(crate) fn role(role: &str) -> CustomExtension {
+    let content = [&[12, role.len() as u8], role.as_bytes()].concat();
+    CustomExtension::from_oid_content(&ROLE_ARCS, content)
+}
+
+/// A folder of files, removed on drop.
+pub(crate) struct Folder(PathBuf);
+
+impl Folder {
+    pub(crate) fn new() -> Folder {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        let name = format!("holdfast-party-{}-{number}", std::process::id());
+        let path = std::env::temp_dir().join(name);
+        fs::create_dir(&path).unwrap();
+        Folder(path)
+    }
+
+    pub(crate) fn write(&self, name: &str, content: &str) -> PathBuf {
+        let path = self.0.join(name);
+        fs::write(&path, content).unwrap();
+        path
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// An authority, and the certificates of a server and of a client with the role `operator`.
+pub(crate) struct Party {
+    pub(crate) folder: Folder,
+    pub(crate) authority: Owner,
+    pub(crate) server: Owner,
+    pub(crate) client: Owner,
+}
+
+impl Party {
+    pub(crate) fn new() -> Party {
+        Party::with_client(|_| {})
+    }
+
+    pub(crate) fn with_client(with: impl Fn(&mut CertificateParams)) -> Party {
+        let authority = Owner::authority("authority", None);
+        let server = Owner::new("localhost", Some(&authority), |_| {});
+        let client = Owner::new("panel 7", Some(&authority), |params| {
+            params.subject_alt_names.clear();
+            params.serial_number = Some(7.into());
+            params.custom_extensions = vec![role("operator")];
+            with(params);
+        });
+        Party { folder: Folder::new(), authority, server, client }
+    }
+
+    pub(crate) fn files(&self) -> ServerFiles {
+        let write = |name, content: String| self.folder.write(name, &content);
+        ServerFiles {
+            cert_file: write("server.pem", self.server.certificate.pem()),
+            key_file: write("server.key", self.server.key.serialize_pem()),
+            ca_file: write("ca.pem", self.authority.certificate.pem()),
+            crl_file: None,
+            expired_lists: ExpiredLists::Refuse,
+        }
+    }
+
+    /// The settings of the client. They keep sessions, so that the next connection resumes one.
+    pub(crate) fn client(&self, version: &'static SupportedProtocolVersion) -> Arc<ClientConfig> {
+        let mut roots = RootCertStore::empty();
+        roots.add(self.authority.certificate.der().clone()).unwrap();
+        let key = PrivateKeyDer::try_from(self.client.key.serialize_der()).unwrap();
+        let chain = vec![self.client.certificate.der().clone()];
+        let config = ClientConfig::builder_with_provider(provider())
+            .with_protocol_versions(&[version])
+            .unwrap()
+            .with_root_certificates(roots)
+            .with_client_auth_cert(chain, key);
+        Arc::new(config.unwrap())
+    }
+}
+
+pub(crate) fn connection(config: &Arc<ClientConfig>) -> ClientConnection {
+    let name = ServerName::try_from("localhost").unwrap();
+    ClientConnection::new(Arc::clone(config), name).unwrap()
+}

@@ -1,0 +1,197 @@
+"""The files of a listener: which are refused, which are doubtful, and what clients get then."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from click.testing import CliRunner
+
+from holdfast.cli import main
+from holdfast.cli.configuration import load_whole
+from holdfast.config import ConfigError
+from support.certificate_cases import CA, NAME, SIGNS, Mint
+from support.certificates import FUTURE, PAST, Certificates, named
+from support.tls_peer import configuration, context, reasons, verdict
+
+if TYPE_CHECKING:
+    import ssl
+    from pathlib import Path
+
+    from support.running import Run
+
+ANYONE: list[dict[str, Any]] = [{"sources": ["127.0.0.1"], "access": "read-only"}]
+
+
+class Plant:
+    """A listener's certificate, a client, and the authority of both."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.authority = Certificates(folder, "plant")
+        self.server = self.authority.issue("server", "DNS:localhost,IP:127.0.0.1")
+        self.client = self.authority.issue("client", "DNS:client", extensions=[named("a")])
+
+    def files(self, **more: Any) -> dict[str, Any]:
+        files = {"cert_file": self.server.certificate, "key_file": self.server.key}
+        return {**files, "ca_file": self.authority.ca, **more}
+
+    def joined(self, name: str, *files: Path) -> Path:
+        joined = self.folder / name
+        joined.write_bytes(b"".join(file.read_bytes() for file in files))
+        return joined
+
+    def config(self, **more: Any) -> Path:
+        file = self.folder / "plant.yaml"
+        file.write_text(configuration(self.files(**more), ANYONE))
+        return file
+
+    def warnings(self, **more: Any) -> list[str]:
+        """What `load_whole` warns about, without the names of files."""
+        told = [warning.message for warning in load_whole(self.config(**more)).warnings]
+        assert all(str(self.folder) in message for message in told)
+        return [message.split(": ", 1)[1] for message in told]
+
+    def trust(self) -> ssl.SSLContext:
+        """The client's."""
+        return context(self.authority.ca, self.client)
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Plant:
+    return Plant(tmp_path)
+
+
+@pytest.fixture
+def mint(tmp_path: Path) -> Mint:
+    return Mint(tmp_path)
+
+
+def test_files_as_intended_have_no_warning(plant: Plant) -> None:
+    assert plant.warnings() == []
+    assert plant.warnings(crl_file=plant.authority.revoke()) == []
+
+
+@pytest.mark.parametrize(
+    ("dates", "told"),
+    [
+        (PAST, r"certificate 2 \(CN=old\) expired \d+ days ago: its clients are refused"),
+        (
+            FUTURE,
+            r"certificate 2 \(CN=old\) is not valid yet, its validity begins in \d+ days: its ",
+        ),
+    ],
+)
+def test_an_authority_outside_its_dates_is_doubtful_and_refuses_its_clients(
+    plant: Plant,
+    mint: Mint,
+    dates: tuple[str, str],
+    told: str,
+    run: Run,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    old = mint.root(name="old", dates=dates)
+    client = mint.make(by=old, name="leaf", extensions=[named("a")])
+    both = plant.joined("both.pem", plant.authority.ca, old.certificate)
+    [warning] = plant.warnings(ca_file=both)
+    assert re.match(told, warning)
+
+    appliance = run(plant.config(ca_file=both).read_text())
+    assert verdict(appliance, plant.trust()) == "served"
+    assert "ALERT" in verdict(appliance, context(plant.authority.ca, client))
+    expected = "issuer_expired" if dates == PAST else "issuer_not_yet_valid"
+    assert reasons(appliance, caplog) == [expected]
+
+
+def test_a_certificate_of_the_server_outside_its_dates_is_doubtful(plant: Plant) -> None:
+    old = plant.authority.issue("old", "DNS:localhost", dates=PAST)
+    [warning] = plant.warnings(cert_file=old.certificate, key_file=old.key)
+    assert warning.startswith("certificate 1 (CN=old) expired ")
+    assert warning.endswith(" days ago: clients refuse this server")
+
+
+def test_a_list_that_has_expired_is_doubtful_and_refuses_clients(
+    plant: Plant, run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    crl = plant.authority.revoke(dates=PAST)
+    [warning] = plant.warnings(crl_file=crl)
+    assert warning.startswith("revocation list 1 (CN=plant) expired ")
+    assert warning.endswith(" days ago: clients of that authority are refused")
+    appliance = run(plant.config(crl_file=crl).read_text())
+    assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")
+    assert reasons(appliance, caplog) == ["expired_revocation_list"]
+
+
+def test_a_list_that_has_expired_may_be_accepted(plant: Plant, run: Run) -> None:
+    lost = plant.authority.issue("lost", "DNS:lost")
+    files = {"crl_file": plant.authority.revoke(lost, dates=PAST), "expired_crl": "accept"}
+    [warning] = plant.warnings(**files)
+    assert warning.endswith(" days ago: certificates revoked since are accepted")
+    appliance = run(plant.config(**files).read_text())
+    assert verdict(appliance, plant.trust()) == "served"
+    assert "REVOKED" in verdict(appliance, context(plant.authority.ca, lost))
+
+
+def test_the_newest_list_of_an_authority_counts(plant: Plant, run: Run) -> None:
+    old = plant.joined("old.crl", plant.authority.revoke(dates=PAST))
+    both = plant.joined("both.crl", old, plant.authority.revoke())
+    appliance = run(plant.config(crl_file=both).read_text())
+    assert verdict(appliance, plant.trust()) == "served"
+
+
+def test_lists_of_others_and_authorities_without_a_list_are_doubtful(
+    plant: Plant, tmp_path: Path, run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = Certificates(tmp_path, "other").revoke()
+    assert plant.warnings(crl_file=other) == [
+        "revocation list 1 (CN=other) is not of an authority in ca_file: it applies only to "
+        "clients that send its authority",
+        "found no list of certificate 1 of ca_file (CN=plant): its clients are refused",
+    ]
+    appliance = run(plant.config(crl_file=other).read_text())
+    assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")
+    assert reasons(appliance, caplog) == ["unknown_revocation"]
+
+
+def test_a_list_of_an_authority_of_the_same_name_is_doubtful(
+    plant: Plant, tmp_path: Path, run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "twin"
+    folder.mkdir()
+    twin = plant.joined("twin.crl", Certificates(folder, "plant").revoke())
+    assert plant.warnings(crl_file=twin) == [
+        "revocation list 1 (CN=plant) is not signed by the authority of that name in ca_file: "
+        "clients of that authority are refused"
+    ]
+    appliance = run(plant.config(crl_file=twin).read_text())
+    assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")
+    assert reasons(appliance, caplog) == ["unknown_revocation"]
+
+
+def test_certificates_in_the_wrong_order_are_an_error(plant: Plant, mint: Mint) -> None:
+    root = mint.root()
+    between = mint.make(by=root, name="between", extensions=(CA, SIGNS))
+    leaf = mint.make(by=between, name="leaf", extensions=[NAME])
+    chain = (leaf.certificate, between.certificate, root.certificate)
+    assert plant.warnings(cert_file=plant.joined("c.pem", *chain), key_file=leaf.key) == []
+    wrong = plant.joined("wrong.pem", chain[0], chain[2], chain[1])
+    with pytest.raises(ConfigError) as refused:
+        load_whole(plant.config(cert_file=wrong, key_file=leaf.key))
+    [problem] = refused.value.problems
+    told = "certificate 2: found CN=authority, allowed: CN=between, the issuer of certificate 1"
+    assert problem.message == f"{wrong}: {told}"
+
+
+def test_check_prints_warnings_and_succeeds(plant: Plant) -> None:
+    file = plant.config(crl_file=plant.authority.revoke(dates=PAST))
+    result = CliRunner().invoke(main, ["check", str(file)])
+    assert result.exit_code == 0
+    [line] = [line for line in result.stderr.splitlines() if "warning" in line]
+    assert line.startswith(f"warning: {file}:")
+    assert "listeners.secure.tls: " in line
+
+
+def test_a_policy_without_lists_has_no_effect(plant: Plant) -> None:
+    [warning] = load_whole(plant.config(expired_crl="accept")).warnings
+    assert warning.message == "has no effect without crl_file"
