@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import ssl
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
@@ -150,10 +151,16 @@ def test_a_key_of_another_certificate_is_an_error(
     assert checked(file) == (2, [f"{file}:1: {service}.tls: {told}", "1 problem"])
 
 
+def tomorrow() -> tuple[str, str]:
+    """Dates that end in more than one day."""
+    ends = datetime.now(UTC) + timedelta(hours=36)
+    return "20200101000000Z", ends.strftime("%Y%m%d%H%M%SZ")
+
+
 def test_dates_and_missing_names_are_warnings(files: Files, tmp_path: Path) -> None:
     late = files.authority.issue("late", NAMES, dates=PAST)
     early = files.authority.issue("early", NAMES, dates=FUTURE)
-    soon = files.authority.issue("soon", NAMES)
+    soon = files.authority.issue("soon", NAMES, dates=tomorrow())
     nameless = files.authority.issue(
         "nameless", "email:a@b.example", dates=("20200101000000Z", "20900101000000Z")
     )
@@ -173,8 +180,9 @@ def test_dates_and_missing_names_are_warnings(files: Files, tmp_path: Path) -> N
 def test_expired_revocation_lists_and_authorities_are_warnings(
     files: Files, tmp_path: Path
 ) -> None:
-    tls = files.tls(client_ca_file=files.authority.ca, crl_file=files.authority.revoke())
-    code, lines = checked(configured(tmp_path, tls))
+    revoked = files.authority.revoke(dates=tomorrow())
+    late = files.authority.issue("late", NAMES, dates=PAST).certificate
+    code, lines = checked(configured(tmp_path, files.tls(client_ca_file=late, crl_file=revoked)))
     assert code == 0
     assert ["client_ca_file" in lines[0], "crl_file" in lines[1]] == [True, True]
     assert "the revocation list of CN=authority expires in 1 day" in lines[1]

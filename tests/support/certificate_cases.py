@@ -132,7 +132,7 @@ class Mint:
             signer = ("-CA", by.certificate, "-CAkey", by.key, "-set_serial", str(self._made))  # type: ignore[assignment]
         written = ("-in", request, "-out", issued.certificate, *self._extended(extensions))
         if dates is None:
-            openssl("x509", "-req", *signer, "-days", "2", f"-{digest}", *options, *written)
+            openssl("x509", "-req", *signer, "-days", "90", f"-{digest}", *options, *written)
         else:
             self._dated(issued, by, dates, written)
         return issued

@@ -27,8 +27,8 @@ new_certs_dir = {folder}
 rand_serial = yes
 unique_subject = no
 default_md = sha256
-default_days = 2
-default_crl_days = 2
+default_days = 90
+default_crl_days = 90
 policy = names
 crl_extensions = list
 [names]
@@ -63,7 +63,7 @@ class Certificates:
         self._configuration.write_text(CONFIGURATION.format(folder=folder, name=name))
         openssl(
             *("req", "-x509", *_new_key("P-256"), "-nodes"),
-            *("-keyout", self._key, "-out", self.ca, "-days", "2", "-subj", f"/CN={name}"),
+            *("-keyout", self._key, "-out", self.ca, "-days", "90", "-subj", f"/CN={name}"),
             *("-addext", "keyUsage=critical,keyCertSign,cRLSign"),
         )
 
