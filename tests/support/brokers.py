@@ -5,11 +5,15 @@ They listen only on the loopback interface, on free ports.
 
 from __future__ import annotations
 
+import contextlib
+import json
+import re
 import signal
 import socket
 import subprocess
 import sys
 from abc import ABC, abstractmethod
+from http.client import HTTPConnection
 from pathlib import Path
 
 from support import wire
@@ -134,6 +138,18 @@ class NatsServer(Broker):
     @property
     def url(self) -> str:
         return f"nats://{self.host}:{self.port}"
+
+    def clients(self) -> list[str]:
+        """The names of the connected clients, of a server with the option `-m`."""
+        monitor = re.findall(r"Starting http monitor on (\S+)", self.log)[-1]
+        host, _, port = monitor.rpartition(":")
+        # Without a resolver, which a test may have replaced.
+        with socket.socket() as made, contextlib.closing(HTTPConnection(host)) as http:
+            made.settimeout(wire.DEADLINE)
+            made.connect((host, int(port)))
+            http.sock = made
+            http.request("GET", "/connz")
+            return [each.get("name", "") for each in json.load(http.getresponse())["connections"]]
 
     def command(self) -> list[str]:
         self._before = self.log.count(READY)

@@ -271,7 +271,7 @@ class Run(Protocol):
 
 @pytest.fixture(scope="session")
 def shared_nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
-    server = NatsServer(tmp_path_factory.mktemp("nats"))
+    server = NatsServer(tmp_path_factory.mktemp("nats"), "-m", "-1")
     yield server
     server.kill()
 
@@ -321,6 +321,8 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
             return scanner
 
         yield start
+    # What a scanner sent last could otherwise be stored after the bucket was deleted.
+    wire.until(lambda: "holdfast scan" not in nats.clients(), "scanners have left")
 
 
 @pytest.fixture
