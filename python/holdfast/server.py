@@ -6,6 +6,7 @@ The server is one listener of the native engine, whose threads serve it outside 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self, cast
@@ -128,20 +129,22 @@ class Server:
         self._identity = identity or Identity()
         self._workers = workers
         self._engine: _core.Engine | None = None
+        self._starting = threading.Lock()
 
     def start(self) -> Self:
         """Listens and serves until `stop`.
 
         Raises `OSError` if the address can't be bound, `RuntimeError` if the server is running.
         """
-        if self._engine is not None:
-            raise RuntimeError("the server is already running")
-        self._engine = _core.Engine(
-            [self._listener],
-            identity=self._identity.objects(),
-            unit_names=self._identity.names(),
-            workers=self._workers,
-        )
+        with self._starting:
+            if self._engine is not None:
+                raise RuntimeError("the server is already running")
+            self._engine = _core.Engine(
+                [self._listener],
+                identity=self._identity.objects(),
+                unit_names=self._identity.names(),
+                workers=self._workers,
+            )
         return self
 
     def stop(self) -> None:

@@ -19,6 +19,7 @@ pub mod client;
 mod counter;
 pub mod items;
 pub mod link;
+mod own_threads;
 pub mod packet_area;
 pub mod poller;
 mod serial_line;

@@ -6,7 +6,7 @@ use std::net::IpAddr;
 use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
-use std::thread::{self, JoinHandle};
+use std::thread;
 use std::time::Duration;
 
 use holdfast_memory::Memory;
@@ -26,6 +26,7 @@ use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, serve};
+use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
 
 #[derive(Debug, Error)]
@@ -88,7 +89,7 @@ pub struct Poller {
     passed: mpsc::UnboundedSender<PassedWrite>,
     /// The links that listeners use.
     shared: Mutex<Vec<(Address, Weak<SharedLink>)>>,
-    thread: Mutex<Option<JoinHandle<()>>>,
+    thread: OwnThreads,
 }
 
 /// Orders to the thread of the poller. The thread ends when all senders are dropped.
@@ -138,6 +139,8 @@ impl Poller {
             .name("holdfast-poller".into())
             .spawn(work)
             .map_err(PollerError::Thread)?;
+        let threads = OwnThreads::default();
+        threads.push(thread);
         let poller = Poller {
             polled: Mutex::default(),
             orders,
@@ -145,7 +148,7 @@ impl Poller {
             tickets: AtomicU64::default(),
             passed,
             shared: Mutex::default(),
-            thread: Mutex::new(Some(thread)),
+            thread: threads,
         };
         for device in devices {
             poller.begin(device)?;
@@ -308,12 +311,12 @@ impl Poller {
 
     /// Stops polling. Complete reads have been passed on. A read in progress is abandoned.
     pub fn stop(&self) {
+        if self.thread.are_of_another_process() {
+            return;
+        }
         // The poller may already be stopped.
         let _ = self.order(Order::Stop);
-        if let Some(thread) = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            let ended = thread.join();
-            debug_assert!(ended.is_ok() || thread::panicking(), "the poller's thread panicked");
-        }
+        self.thread.join();
     }
 }
 

@@ -5,7 +5,7 @@ use std::mem;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::thread;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::identification::ObjectError;
@@ -27,6 +27,7 @@ use super::serial::{ModbusSerial, SerialSettings};
 use super::tcp::{ModbusStream, StreamSettings};
 use super::udp::{DatagramFraming, ModbusUdp, UdpSettings};
 use super::unit_server::UnitServer;
+use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 
 /// The time that connections have to end when the engine stops.
@@ -75,7 +76,7 @@ pub struct Engine {
     listeners: Mutex<Vec<Arc<Listener>>>,
     handles: Vec<Handle>,
     stop: Arc<watch::Sender<bool>>,
-    workers: Mutex<Vec<JoinHandle<()>>>,
+    workers: OwnThreads,
     reporter: Reporter,
     auditor: Option<Auditor>,
     events: Events,
@@ -162,7 +163,7 @@ impl Engine {
             listeners: Mutex::default(),
             handles: runtimes.iter().map(|runtime| runtime.handle().clone()).collect(),
             stop: Arc::new(stop),
-            workers: Mutex::default(),
+            workers: OwnThreads::default(),
             reporter,
             auditor,
             events,
@@ -337,7 +338,7 @@ impl Engine {
         };
         let name = format!("holdfast-io-{index}");
         let thread = thread::Builder::new().name(name).spawn(body).map_err(StartError::Worker)?;
-        self.workers.lock().unwrap_or_else(PoisonError::into_inner).push(thread);
+        self.workers.push(thread);
         Ok(())
     }
 
@@ -385,13 +386,14 @@ impl Engine {
     }
 
     /// Stops listening, answers what has been received, and closes every connection. Returns within
-    /// a second. A second call waits for the first. Ends a wait for writes.
+    /// a second. A second call waits for the first. Ends a wait for writes. Does nothing in a forked
+    /// child.
     pub fn stop(&self) {
-        let _ = self.stop.send(true);
-        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
-        for worker in workers.drain(..) {
-            let _ = worker.join();
+        if self.workers.are_of_another_process() {
+            return;
         }
+        let _ = self.stop.send(true);
+        self.workers.join();
         if let Some(records) = &self.records {
             records.wake();
         }

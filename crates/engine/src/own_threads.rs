@@ -1,0 +1,39 @@
+//! Threads that a value owns, which are joined at its end.
+
+use std::process;
+use std::sync::{Mutex, PoisonError};
+use std::thread::JoinHandle;
+
+/// Threads of this process. In a child process that was forked, they do not exist.
+#[derive(Debug)]
+pub(crate) struct OwnThreads {
+    process: u32,
+    threads: Mutex<Vec<JoinHandle<()>>>,
+}
+
+impl Default for OwnThreads {
+    fn default() -> OwnThreads {
+        OwnThreads { process: process::id(), threads: Mutex::default() }
+    }
+}
+
+impl OwnThreads {
+    pub(crate) fn push(&self, thread: JoinHandle<()>) {
+        self.threads.lock().unwrap_or_else(PoisonError::into_inner).push(thread);
+    }
+
+    /// Whether this is a forked child, which has no copies of the threads. It must not stop those of its
+    /// parent, with which it shares sockets.
+    pub(crate) fn are_of_another_process(&self) -> bool {
+        self.process != process::id()
+    }
+
+    /// Waits for the end of all threads. A second call waits for the first.
+    pub(crate) fn join(&self) {
+        let mut threads = self.threads.lock().unwrap_or_else(PoisonError::into_inner);
+        for thread in threads.drain(..) {
+            let ended = thread.join();
+            debug_assert!(ended.is_ok() || std::thread::panicking(), "a thread panicked");
+        }
+    }
+}
