@@ -14,6 +14,7 @@ use pyo3::types::PyDict;
 
 use crate::arguments::{seconds, within, word};
 use crate::audit;
+use crate::heartbeat;
 use crate::listener::Listener;
 use crate::peer;
 
@@ -74,6 +75,10 @@ impl Engine {
 
     fn end_session(&self, py: Python<'_>, listener: &str, id: u64) -> bool {
         py.detach(|| self.core.end_session(listener, id))
+    }
+
+    fn heartbeats(&self) -> Vec<(String, f64, Option<u32>)> {
+        self.core.heartbeats().iter().map(|beats| heartbeat::shown(beats)).collect()
     }
 
     #[getter]

@@ -25,6 +25,7 @@ use super::state::DeviceState;
 use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
+use crate::heartbeat::Heartbeat;
 use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, serve};
 use crate::tls::client::Identity;
 
@@ -89,6 +90,7 @@ pub struct Poller {
     /// The links that listeners use.
     shared: Mutex<Vec<(Address, Weak<SharedLink>)>>,
     thread: Mutex<Option<JoinHandle<()>>>,
+    heartbeat: Arc<Heartbeat>,
 }
 
 /// Orders to the thread of the poller. The thread ends when all senders are dropped.
@@ -127,15 +129,17 @@ impl Poller {
             .enable_time()
             .build()
             .map_err(PollerError::Thread)?;
-        let to = Arc::clone(&results);
+        let heartbeat = Arc::new(Heartbeat::new("holdfast-poller"));
+        let (to, own) = (Arc::clone(&results), Arc::clone(&heartbeat));
         let work = move || {
-            LocalSet::new().block_on(&runtime, obey(told, writes, Arc::clone(&to)));
+            let work = own.during(obey(told, writes, Arc::clone(&to)));
+            LocalSet::new().block_on(&runtime, work);
             to.end();
             // Does not wait for name resolution in progress.
             runtime.shutdown_background();
         };
         let thread = thread::Builder::new()
-            .name("holdfast-poller".into())
+            .name(heartbeat.thread().to_owned())
             .spawn(work)
             .map_err(PollerError::Thread)?;
         let poller = Poller {
@@ -146,11 +150,17 @@ impl Poller {
             passed,
             shared: Mutex::default(),
             thread: Mutex::new(Some(thread)),
+            heartbeat,
         };
         for device in devices {
             poller.begin(device)?;
         }
         Ok(poller)
+    }
+
+    /// The heartbeat of the thread.
+    pub fn heartbeat(&self) -> &Heartbeat {
+        &self.heartbeat
     }
 
     /// Polls one more device.
