@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import sys
+import threading
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -93,6 +95,7 @@ def memory_access(memories: dict[str, holdfast.Memory]) -> MemoryAccess:
 @pytest.fixture
 def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAccess) -> Diagnostics:
     engine = web.StandIn({"scada": LISTENER, "replication": RAW}, lost_events=11)
+    engine.threads = [("holdfast-io-0", 0.25, threading.get_native_id()), ("gone", 7.5, None)]
     made = web.diagnostics_of(memories, engine)
     status = {
         "state": "failed",
@@ -226,6 +229,16 @@ def test_every_counter_is_there(
     scraped: dict[tuple[str, ...], float], sample: tuple[str, ...], value: float
 ) -> None:
     assert scraped[sample] == value
+
+
+def test_threads_have_a_heartbeat_and_the_processor_time_that_the_system_knows(
+    scraped: dict[tuple[str, ...], float],
+) -> None:
+    assert scraped["holdfast_thread_heartbeat_age_seconds", "holdfast-io-0"] == 0.25
+    assert scraped["holdfast_thread_heartbeat_age_seconds", "gone"] == 7.5
+    assert ("holdfast_thread_cpu_seconds_total", "gone") not in scraped
+    if sys.platform == "linux":
+        assert scraped["holdfast_thread_cpu_seconds_total", "holdfast-io-0"] > 0
 
 
 def test_what_the_process_does_is_there(scraped: dict[tuple[str, ...], float]) -> None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from holdfast.adapters import MemoryAccess, Stop
 from holdfast.adapters.rest import Rest
 from holdfast.appliance.diagnostics import Diagnostics
+from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import RestConfig
 from holdfast.web.port import listen
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import holdfast
     from holdfast._core import Engine
     from holdfast.audit import Audit
+    from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
@@ -122,6 +124,10 @@ class StandIn:
 
     listeners: dict[str, Any] = field(default_factory=dict)
     lost_events: int = 0
+    threads: list[ThreadHeartbeat] = field(default_factory=list)
+
+    def heartbeats(self) -> list[ThreadHeartbeat]:
+        return self.threads
 
     def counters(self) -> dict[str, Any]:
         return self.listeners
@@ -131,7 +137,7 @@ def diagnostics_of(
     memories: Mapping[str, holdfast.Memory], engine: object | None = None
 ) -> Diagnostics:
     chosen: Engine = engine or StandIn()  # type: ignore[assignment]
-    return Diagnostics(memories, chosen)
+    return Diagnostics(memories, chosen, Liveness(chosen.heartbeats))
 
 
 class Service:

@@ -86,6 +86,7 @@ class Metrics:
             request_timeout=REQUEST_TIMEOUT,
             https=https,
         )
+        self.heartbeat = self._host.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""
@@ -167,6 +168,7 @@ class Figures(Collector):
         yield from _of_devices(stats["devices"])
         yield from _of_links(stats["links"])
         yield from _of_adapters(stats["adapters"])
+        yield from _of_threads(stats["threads"])
         yield from _of_memories(self._diagnostics.memories())
 
 
@@ -292,6 +294,16 @@ def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             else:
                 _add(status, name, dict(_flat(key, value)))
     yield from (accepted, values, reads, refused, restarts, states, connections, opened, status)
+
+
+def _of_threads(threads: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    ages = _gauge("thread_heartbeat_age_seconds", "Time since the last heartbeat.", "thread")
+    cpu = _counter("thread_cpu_seconds", "Processor time of a thread.", "thread")
+    for name, told in threads.items():
+        ages.add_metric([name], told["heartbeat_age"])
+        if told["cpu"] is not None:
+            cpu.add_metric([name], told["cpu"])
+    yield from (ages, cpu)
 
 
 def _of_memories(memories: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:

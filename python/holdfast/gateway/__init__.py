@@ -58,6 +58,7 @@ class Gateway:
             rejection=rejection,
             https=https,
         )
+        self.heartbeat = self._host.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set."""

@@ -24,6 +24,7 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from holdfast import logs
+from holdfast.heartbeat import PERIOD, Heartbeat
 from holdfast.net.addresses import holds, joined, parse_address
 from holdfast.web.admission import Admission, Full, Waiting
 from holdfast.web.port import BACKLOG
@@ -135,6 +136,8 @@ class Host:
         self.request_timeout = request_timeout
         self.sources = tuple(sources)
         self.counted = Counts()
+        self.heartbeat = Heartbeat()
+        """The heartbeat of the event loop of `run`."""
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
         self._limits = limits
@@ -206,9 +209,10 @@ class Host:
         with self._listener.dup() as listener:
             server = await loop.create_server(connection, sock=listener, backlog=BACKLOG)
             while not stopped.is_set():
+                self.heartbeat.beat()
                 state.default_headers = [(b"date", formatdate(usegmt=True).encode())]
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stopped.wait(), 1.0)
+                    await asyncio.wait_for(stopped.wait(), PERIOD)
             server.close()
             await _end(cast("set[_Connection]", state.connections))
 

@@ -46,6 +46,7 @@ class Rest:
             request_timeout=settings.request_timeout,
             https=https,
         )
+        self.heartbeat = self._host.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""

@@ -158,7 +158,7 @@ ROUTES = (
         "stats",
         "Get all counters since the start",
         json_answer(
-            "Counters of listeners, devices, adapters, log and audit log",
+            "Counters of listeners, devices, adapters, log and audit log; threads",
             ref("Stats"),
             {
                 "uptime": 3600.25,
@@ -208,6 +208,7 @@ ROUTES = (
                 "events_lost": 0,
                 "log_dropped": 0,
                 "audit": None,
+                "threads": {"holdfast-io-0": {"heartbeat_age": 0.4, "cpu": 12.5}},
                 "certificates": {"/etc/holdfast/server.pem": 1893456000.0},
                 "revocation_lists": {},
             },

@@ -159,6 +159,22 @@ DIAGNOSTICS: dict[str, Schema] = {
                     },
                 },
             },
+            "threads": {
+                "type": "object",
+                "description": "By name of the thread",
+                "additionalProperties": object_of(
+                    {
+                        "heartbeat_age": {
+                            "type": "number",
+                            "description": "Seconds since the last heartbeat",
+                        },
+                        "cpu": {
+                            "type": ["number", "null"],
+                            "description": "Processor time in seconds, if the system provides it",
+                        },
+                    }
+                ),
+            },
             "certificates": {
                 "type": "object",
                 "description": "For each configured file, when its first certificate expires, in "
