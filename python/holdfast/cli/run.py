@@ -17,6 +17,7 @@ from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import Appliance, assembly
 from holdfast.appliance.control import Control
+from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
@@ -90,6 +91,7 @@ def serve(
     give_way()
     allow_open_files(_connections(config))
     signals = Signals(reloads=file is not None)
+    manager = ServiceManager()
     appliance = Appliance(config)
     try:
         appliance.start()
@@ -100,14 +102,19 @@ def serve(
         click.echo(f"{named}: {error}", err=True)
         sys.exit(WRONG)
     with ExitStack() as parts:
+        parts.callback(manager.close)
         parts.callback(appliance.stop)
+        parts.callback(manager.stopping)
         reloading = None
         if file is not None:
-            reloading = Reloading(appliance, file)
+            reloading = Reloading(appliance, file, manager)
             parts.callback(_control(appliance, reloading, file))
         click.echo(greeting(appliance))
+        manager.ready()
         while not signals.received:
             appliance.log_events(timeout=JOIN_TIMEOUT)
+            if appliance.is_live:
+                manager.feed_watchdog()
             if reloading is not None:
                 reloading.step(requested=signals.take_reload())
 
