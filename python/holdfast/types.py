@@ -119,6 +119,7 @@ class ModbusCounters(TypedDict):
     exceptions: dict[int, int]
     unanswered: int
     connections: ConnectionCounters
+    tls_failures: dict[str, int]
     frames: FrameCounters
 
 
@@ -127,6 +128,7 @@ class RawCounters(TypedDict):
 
     packets: PacketCounters
     connections: ConnectionCounters
+    tls_failures: dict[str, int]
 
 
 ListenerCounters: TypeAlias = ModbusCounters | RawCounters

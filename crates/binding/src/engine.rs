@@ -227,7 +227,6 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
         ("accepted", &counters.accepted),
         ("refused_source", &counters.refused_source),
         ("refused_role", &counters.refused_role),
-        ("tls_failed", &counters.tls_failed),
         ("refused_full", &counters.refused_full),
         ("refused_listen_only", &counters.refused_listen_only),
         ("evicted", &counters.evicted),
@@ -241,8 +240,10 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
     ] {
         connections.set_item(key, counter.get())?;
     }
+    connections.set_item("tls_failed", counters.tls_failed.total())?;
     connections.set_item("open", listener.open_connections)?;
     all.set_item("connections", connections)?;
+    all.set_item("tls_failures", counters.tls_failed.by_reason())?;
     Ok(all)
 }
 

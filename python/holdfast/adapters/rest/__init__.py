@@ -54,4 +54,8 @@ class Rest:
 
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections."""
-        return {"address": self._host.address, "connections": self._host.counts()}
+        return {
+            "address": self._host.address,
+            "connections": self._host.counts(),
+            "tls_failures": self._host.tls_failures(),
+        }
