@@ -49,6 +49,7 @@ def token(
     memories: tuple[str, ...] = ("plant_a",),
     areas: tuple[str, ...] = AREAS,
     access: str = "read-write",
+    manage: bool = False,
 ) -> dict[str, object]:
     """Builds the configuration of a token."""
     digest = hashlib.sha256(secret.encode()).hexdigest()
@@ -57,6 +58,7 @@ def token(
         "sha256": digest,
         "memories": list(memories),
         "areas": list(areas),
+        "manage": manage,
         "access": access,
     }
 
@@ -140,6 +142,16 @@ def diagnostics_of(
     return Diagnostics(memories, chosen, Liveness(chosen.heartbeats))
 
 
+class NoSessions:
+    """Replaces the listeners of an appliance: there are no connections."""
+
+    def sessions(self) -> list[dict[str, Any]]:
+        return []
+
+    def end_session(self, *_: object) -> bool:
+        return False
+
+
 class Service:
     """A REST adapter with its supervisor."""
 
@@ -163,8 +175,8 @@ class Service:
         self.diagnostics.adapters["rest"] = (self.supervisor, self.memory_access)
 
     def made(self) -> Rest:
-        parts = (self.settings, self.memory_access, self.diagnostics, self.listener)
-        return Rest(*parts, https=self.https)
+        parts = (self.settings, self.memory_access, self.diagnostics)
+        return Rest(*parts, NoSessions(), self.listener, https=self.https)
 
     @property
     def address(self) -> tuple[str, int]:

@@ -57,6 +57,9 @@ LEVELS = {
     "ended": logging.INFO,
 }
 
+# What the audit log has of a connection that was ended.
+_SHOWN = ("peer", "role", "subject", "serial")
+
 # Seconds between checks of the health of devices.
 HEALTH_CHECK_INTERVAL = 1.0
 
@@ -147,9 +150,12 @@ class Appliance:
         """The open connections of all listeners. Thread-safe."""
         return self._parts().sessions()
 
-    def end_session(self, listener: str, number: int) -> bool:
-        """Ends a connection. Returns whether there was one. Thread-safe."""
-        return self._parts().end_session(listener, number)
+    def end_session(self, listener: str, number: int, by: Mapping[str, str]) -> bool:
+        """Ends a connection. Returns whether there was one. Thread-safe.
+
+        `by` is who has requested it, as fields of the audit log.
+        """
+        return self._parts().end_session(listener, number, by)
 
     def _parts(self) -> _Running:
         if self._running is None:
@@ -371,8 +377,17 @@ class _Running:
     def sessions(self) -> list[dict[str, Any]]:
         return self._engine.sessions()
 
-    def end_session(self, listener: str, number: int) -> bool:
-        return self._engine.end_session(listener, number)
+    def end_session(self, listener: str, number: int, by: Mapping[str, str]) -> bool:
+        place = {"listener": listener, "id": number}
+        known = [each for each in self.sessions() if place.items() <= each.items()]
+        if not self._engine.end_session(listener, number):
+            return False
+        session = {"session": f"{listener}/{number}"}
+        session |= {f"session_{key}": each[key] for each in known for key in _SHOWN if key in each}
+        logs.write(logging.INFO, "session_ended", **session, **by)
+        if self._audit is not None:
+            self._audit.write(event="session_ended", **session, **by)
+        return True
 
     def reload(self, config: Config) -> list[str]:
         """Takes over a configuration, see `Appliance.reload`."""
@@ -537,7 +552,7 @@ class _Running:
             part = add(
                 "rest",
                 lambda: Rest(
-                    rest, access, self.diagnostics, at.listener, https=self._https["rest"]
+                    rest, access, self.diagnostics, self, at.listener, https=self._https["rest"]
                 ),
                 *_apart_from_files(rest),
                 sorted(self._memories),

@@ -51,6 +51,9 @@ if TYPE_CHECKING:
 # Maximum delay of the reaction to a signal, in seconds.
 JOIN_TIMEOUT = 0.2
 
+# Who ends a connection at a request of `holdfast sessions`, in the audit log.
+SOURCE = {"source": "holdfast sessions"}
+
 # Maximum number of devices in the greeting.
 MAX_DEVICES = 10
 
@@ -124,7 +127,7 @@ def _control(appliance: Appliance, reloading: Reloading, file: Path) -> Callable
     handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
         "reload": reloading.ask,
         "sessions": lambda: {"sessions": appliance.sessions()},
-        "end": lambda listener, id: {"ended": appliance.end_session(listener, id)},
+        "end": lambda listener, id: {"ended": appliance.end_session(listener, id, SOURCE)},
     }
     try:
         return Control(file, handlers).close
