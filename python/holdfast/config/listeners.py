@@ -149,6 +149,12 @@ class RawRuleConfig(Model):
     """The areas that may be written."""
 
 
+def _per_source(data: dict[str, Any]) -> int:
+    """Leaves room for others: silent connections from one address can't fill the listener."""
+    most: int = data["max_connections"]
+    return (most + 1) // 2
+
+
 class _ConnectionListener(Model):
     """Settings of all Modbus servers over TCP connections."""
 
@@ -158,8 +164,9 @@ class _ConnectionListener(Model):
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256
     """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = None
-    """Maximum number of open connections from one address; null: unlimited."""
+    max_connections_per_source: Connections | None = Field(default_factory=_per_source)
+    """Maximum number of open connections from one address; null: unlimited. Default: half of
+    max_connections, rounded up."""
     when_full: Literal["refuse", "evict"] = "refuse"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
     idle_timeout: DurationOrZero = 300.0
@@ -384,8 +391,9 @@ class RawIngestListener(Model):
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256
     """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = None
-    """Maximum number of open connections from one address; null: unlimited."""
+    max_connections_per_source: Connections | None = Field(default_factory=_per_source)
+    """Maximum number of open connections from one address; null: unlimited. Default: half of
+    max_connections, rounded up."""
     when_full: Literal["refuse", "evict"] = "refuse"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
     request_timeout: Duration = 10.0
