@@ -17,6 +17,7 @@ from holdfast.types import (
     PolledBlock,
     Seal,
     StatusBlock,
+    ThreadHeartbeat,
     WhenFull,
 )
 
@@ -399,6 +400,9 @@ class Engine:
     def end_session(self, listener: str, id: int) -> bool:
         """Ends a connection. Returns whether there was one."""
 
+    def heartbeats(self) -> list[ThreadHeartbeat]:
+        """The heartbeat of each worker thread."""
+
     def next_event(self, timeout: float) -> tuple[str, str, dict[str, object]] | None:
         """Listener, kind and fields of the next event; `None` after `timeout` seconds.
 
@@ -749,6 +753,10 @@ class Poller:
     """
 
     def __new__(cls, devices: Sequence[PolledDevice]) -> Poller: ...
+    @property
+    def heartbeat(self) -> ThreadHeartbeat:
+        """The heartbeat of the thread."""
+
     def add(self, device: PolledDevice) -> None:
         """Adds a device.
 

@@ -63,6 +63,10 @@ PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
 result in seconds since 1970."""
 
 
+ThreadHeartbeat: TypeAlias = tuple[str, float, int | None]
+"""A thread's name, seconds since its last heartbeat, and its number in the system, if known."""
+
+
 class ConnectionCounters(TypedDict):
     """Connections of one listener: `open` is the current number, the others count outcomes."""
 
@@ -115,6 +119,7 @@ class ModbusCounters(TypedDict):
     exceptions: dict[int, int]
     unanswered: int
     connections: ConnectionCounters
+    tls_failures: dict[str, int]
     frames: FrameCounters
 
 
@@ -123,6 +128,7 @@ class RawCounters(TypedDict):
 
     packets: PacketCounters
     connections: ConnectionCounters
+    tls_failures: dict[str, int]
 
 
 ListenerCounters: TypeAlias = ModbusCounters | RawCounters

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import sys
+import threading
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +32,21 @@ LISTENER: dict[str, Any] = {
     "requests": {3: 7, 16: 2},
     "exceptions": {2: 1},
     "unanswered": 4,
-    "connections": {"accepted": 5, "refused_source": 1, "idle": 3, "open": 2},
+    "connections": {
+        "accepted": 5,
+        "refused_source": 1,
+        "refused_role": 12,
+        "refused_full": 13,
+        "refused_listen_only": 14,
+        "tls_failed": 9,
+        "evicted": 15,
+        "rights_revoked": 16,
+        "ended": 17,
+        "idle": 3,
+        "accept_errors": 18,
+        "open": 2,
+    },
+    "tls_failures": {"expired": 4, "not_tls": 5},
     "frames": {"foreign": 6, "broken": 0},
 }
 RAW: dict[str, Any] = {
@@ -93,6 +109,7 @@ def memory_access(memories: dict[str, holdfast.Memory]) -> MemoryAccess:
 @pytest.fixture
 def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAccess) -> Diagnostics:
     engine = web.StandIn({"scada": LISTENER, "replication": RAW}, lost_events=11)
+    engine.threads = [("holdfast-io-0", 0.25, threading.get_native_id()), ("gone", 7.5, None)]
     made = web.diagnostics_of(memories, engine)
     status = {
         "state": "failed",
@@ -103,7 +120,12 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
         "topics": ["a"],
     }
     rest: Any = SimpleNamespace(
-        status=lambda: {"state": "running", "restarts": 0, "connections": {"idle": 1, "open": 2}}
+        status=lambda: {
+            "state": "running",
+            "restarts": 0,
+            "connections": {"refused_full": 3, "idle": 1, "broken_request": 4, "open": 2},
+            "tls_failures": {"not_tls": 6},
+        }
     )
     mqtt: Any = SimpleNamespace(status=lambda: status)
     made.adapters = {"rest": (rest, memory_access), "mqtt": (mqtt, None)}
@@ -165,14 +187,25 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_requests_total", "16", "scada"), 2),
         (("holdfast_exceptions_total", "2", "scada"), 1),
         (("holdfast_connections_open", "scada"), 2),
-        (("holdfast_connections_total", "scada", "accepted"), 5),
-        (("holdfast_connections_total", "scada", "refused_source"), 1),
+        (("holdfast_connections_accepted_total", "scada"), 5),
+        (("holdfast_connections_refused_total", "scada", "source"), 1),
+        (("holdfast_connections_refused_total", "scada", "role"), 12),
+        (("holdfast_connections_refused_total", "scada", "full"), 13),
+        (("holdfast_requests_refused_total", "scada", "listen_only"), 14),
+        (("holdfast_connections_closed_total", "scada", "evicted"), 15),
+        (("holdfast_connections_closed_total", "scada", "rights_revoked"), 16),
+        (("holdfast_connections_closed_total", "scada", "ended"), 17),
+        (("holdfast_connections_closed_total", "scada", "idle"), 3),
+        (("holdfast_tls_failed_total", "scada", "expired"), 4),
+        (("holdfast_tls_failed_total", "scada", "not_tls"), 5),
+        (("holdfast_listener_total", "connections_accept_errors", "scada"), 18),
         (("holdfast_listener_total", "unanswered", "scada"), 4),
         (("holdfast_listener_total", "frames_foreign", "scada"), 6),
         (("holdfast_listener_total", "frames_broken", "scada"), 0),
         (("holdfast_listener_total", "fresh", "replication"), 8),
         (("holdfast_listener_total", "packets_accepted", "replication"), 9),
-        (("holdfast_listener_total", "packets_refused_crc", "replication"), 1),
+        (("holdfast_packets_refused_total", "replication", "crc"), 1),
+        (("holdfast_packets_refused_total", "replication", "range"), 2),
         (("holdfast_device_health", "meter", "error"), 1),
         (("holdfast_device_health", "meter", "ok"), 0),
         (("holdfast_device_health", "fresh", "unknown"), 1),
@@ -210,7 +243,10 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_adapter_state", "mqtt", "failed"), 1),
         (("holdfast_adapter_restarts_total", "mqtt"), 3),
         (("holdfast_adapter_connections_open", "rest"), 2),
-        (("holdfast_adapter_connections_total", "rest", "idle"), 1),
+        (("holdfast_adapter_connections_refused_total", "rest", "full"), 3),
+        (("holdfast_adapter_connections_closed_total", "rest", "idle"), 1),
+        (("holdfast_adapter_connections_closed_total", "rest", "broken_request"), 4),
+        (("holdfast_adapter_tls_failed_total", "rest", "not_tls"), 6),
         (("holdfast_adapter_status", "mqtt", "connected"), 1),
         (("holdfast_adapter_status", "mqtt", "messages_in"), 12),
         (("holdfast_adapter_state", "metrics", "running"), 1),
@@ -228,8 +264,22 @@ def test_every_counter_is_there(
     assert scraped[sample] == value
 
 
+def test_threads_have_a_heartbeat_and_the_processor_time_that_the_system_knows(
+    scraped: dict[tuple[str, ...], float],
+) -> None:
+    assert scraped["holdfast_thread_heartbeat_age_seconds", "holdfast-io-0"] == 0.25
+    assert scraped["holdfast_thread_heartbeat_age_seconds", "gone"] == 7.5
+    assert ("holdfast_thread_cpu_seconds_total", "gone") not in scraped
+    if sys.platform == "linux":
+        assert scraped["holdfast_thread_cpu_seconds_total", "holdfast-io-0"] > 0
+
+
 def test_what_the_process_does_is_there(scraped: dict[tuple[str, ...], float]) -> None:
-    assert ("holdfast_connections_total", "scada", "open") not in scraped
+    names = {name for name, *_ in scraped}
+    assert "holdfast_connections_total" not in names
+    assert not [
+        key for key in scraped if key[0] == "holdfast_listener_total" and "refuse" in key[1]
+    ]
     assert ("holdfast_device_age_seconds", "fresh") not in scraped
     assert ("holdfast_device_polls_total", "spare") not in scraped
     assert scraped["holdfast_uptime_seconds",] >= 0
@@ -297,6 +347,19 @@ def test_a_real_server_is_shown(
     assert seen["holdfast_requests_total", "3", "real"] == 2
     assert seen["holdfast_exceptions_total", "2", "real"] == 1
     assert seen["holdfast_connections_open", "real"] == 1
+
+
+def test_no_counter_of_a_real_listener_is_forgotten(
+    client: web.Client, diagnostics: Diagnostics, server: holdfast.Server
+) -> None:
+    """What a listener newly counts as refused or closed belongs to a metric with its reason."""
+    counters = server.counters()
+    diagnostics._engine.listeners = {"real": counters}  # type: ignore[attr-defined]
+    seen = samples(client.get("/metrics").body.decode())
+    others = {key[1] for key in seen if key[0] == "holdfast_listener_total"}
+    assert {name for name in others if name.startswith("connections")} == {
+        "connections_accept_errors"
+    }
 
 
 def test_names_follow_the_conventions(client: web.Client) -> None:

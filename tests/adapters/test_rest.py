@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 ADMIN, READER, NARROW, OTHER = "secret-admin", "secret-reader", "secret-narrow", "secret-other"
 TOKENS = [
-    web.token("admin", ADMIN, memories=("plant_a", "plant_b")),
+    web.token("admin", ADMIN, memories=("plant_a", "plant_b"), manage=True),
     web.token("reader", READER, access="read-only"),
     web.token("narrow", NARROW, areas=("input_registers",)),
     web.token("other", OTHER, memories=("plant_b",)),
@@ -466,6 +466,8 @@ ROUTES = {
     "/api/v1/diagnostics/memory": "GET",
     "/api/v1/diagnostics/stats": "GET",
     "/api/v1/diagnostics/mqtt": "GET",
+    "/api/v1/sessions": "GET",
+    "/api/v1/sessions/end": "POST",
     "/openapi.json": "GET",
     "/docs": "GET",
 }
@@ -929,6 +931,10 @@ def test_every_example_command_is_accepted(document: dict[str, Any]) -> None:
         ("GET", "/api/v1/diagnostics/memory", None),
         ("GET", "/api/v1/diagnostics/stats", None),
         ("GET", "/api/v1/diagnostics/mqtt", None),
+        ("GET", "/api/v1/sessions", None),
+        ("POST", "/api/v1/sessions/end", b'{"id":"scada/17"}'),
+        ("POST", "/api/v1/sessions/end", b'{"id":"scada"}'),
+        ("POST", "/api/v1/sessions/end", b"[" * 2000),
         ("GET", "/openapi.json", None),
     ],
 )

@@ -404,6 +404,9 @@ def test_renewed_certificates_serve_the_next_connection(
             assert after.tls.getpeercert(binary_form=True) != before
 
 
+BY = {"source": "test"}
+
+
 def test_sessions_are_listed_with_their_certificates_and_ended(
     rig: Rig, party: Party, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -416,9 +419,9 @@ def test_sessions_are_listed_with_their_certificates_and_ended(
         session = found["laptop"]
         assert session["subject"] == "CN=laptop"
         assert int(session["serial"], 16) > 0
-        assert not rig.appliance.end_session("scada", 999)
-        assert not rig.appliance.end_session("other", session["id"])
-        assert rig.appliance.end_session("scada", session["id"])
+        assert not rig.appliance.end_session("scada", 999, BY)
+        assert not rig.appliance.end_session("other", session["id"], BY)
+        assert rig.appliance.end_session("scada", session["id"], BY)
         with pytest.raises((Refused, ConnectionError)):
             goes.ask(READ)
         assert stays.ask(READ) == READ_42

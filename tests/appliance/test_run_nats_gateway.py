@@ -173,7 +173,7 @@ def test_the_gateway_tells_its_figures(run: Run, server: holdfast.Server) -> Non
     metrics = scraped(appliance)
     assert 'holdfast_adapter_status{adapter="gateway",field="requests"} 5.0' in metrics
     assert 'holdfast_ingest_refused_total{adapter="gateway",reason="malformed"} 1.0' in metrics
-    assert 'holdfast_adapter_connections_total{adapter="gateway",outcome="accepted"} 5.0' in metrics
+    assert 'holdfast_adapter_connections_accepted_total{adapter="gateway"} 5.0' in metrics
 
 
 def scraped(appliance: Appliance) -> str:

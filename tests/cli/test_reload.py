@@ -133,7 +133,11 @@ def test_sessions_are_listed_and_ended(running: Running) -> None:
         assert (left["listener"], left["id"], left["peer"]) == ("scada", 0, peers[0])
         gone = failure("sessions", str(running.file), "--end", ids[1])
         assert gone == ["holdfast: scada/1: no such connection"]
-    assert invoke("sessions", str(running.file), "--end", "scada").exit_code == 2
+    for wrong in ("scada", "17", "/17", "scada/x", f"scada/{2**64}"):
+        assert invoke("sessions", str(running.file), "--end", wrong).exit_code == 2
+    log = running.end()
+    assert f"session_ended session=scada/1 session_peer={peers[1]}" in log
+    assert 'source="holdfast sessions"' in log
 
 
 def test_without_an_appliance_both_say_so(tmp_path: Path) -> None:

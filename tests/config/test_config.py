@@ -97,8 +97,30 @@ def test_an_area_that_is_left_out_does_not_exist(loaded: Callable[..., Config]) 
 
 def test_a_listener_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
     scada = scada_of(loaded())
-    assert (scada.max_connections, scada.max_connections_per_source) == (256, None)
+    assert (scada.max_connections, scada.max_connections_per_source) == (256, 128)
     assert (scada.when_full, scada.idle_timeout, scada.request_timeout) == ("refuse", 300, 10)
+
+
+@pytest.mark.parametrize(
+    ("written", "most"),
+    [
+        ("max_connections: 1", 1),
+        ("max_connections: 2", 2),
+        ("max_connections: 17", 16),
+        ("max_connections: 33", 17),
+        ("max_connections: 65535", 32768),
+        ("max_connections_per_source: null", None),
+        ("max_connections_per_source: 256", 256),
+    ],
+)
+def test_one_source_has_half_of_the_places_unless_the_file_says_otherwise(
+    loaded: Callable[..., Config], written: str, most: int | None
+) -> None:
+    for kind, units in (("modbus-tcp", "access: read-only"), ("raw-ingest", "areas: [coils]")):
+        rule = f"{{sources: [10.0.0.7], units: {{1: plant}}, {units}}}"
+        text = f"type: {kind}, bind: '127.0.0.1:1', {written}, rules: [{rule}]"
+        listener: Any = loaded(f"{SERVED}listeners:\n  a: {{{text}}}\n").listeners["a"]
+        assert listener.max_connections_per_source == most
 
 
 def test_the_appliance_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
@@ -245,7 +267,7 @@ def test_raw_ingest_speaks_v1_unless_it_says_otherwise(loaded: Callable[..., Con
     text = f"type: raw-ingest, bind: '127.0.0.1:1', rules: [{rule}]"
     listener = listener_of(loaded, text, RawIngestListener)
     assert (listener.format, listener.crc) == ("v1", None)
-    assert (listener.max_connections, listener.max_connections_per_source) == (256, None)
+    assert (listener.max_connections, listener.max_connections_per_source) == (256, 128)
     assert (listener.flags, listener.when_full, listener.after_refusal) == (None, "refuse", "close")
     assert (listener.rules[0].units, listener.rules[0].memories) == ({65535: "plant"}, ())
 
@@ -520,7 +542,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "    type: modbus-tcp\n"
         "    bind: 127.0.0.1:5020\n"
         "    max_connections: 256\n"
-        "    max_connections_per_source: null\n"
+        "    max_connections_per_source: 128\n"
         "    when_full: refuse\n"
         "    idle_timeout: 300\n"
         "    request_timeout: 10\n"

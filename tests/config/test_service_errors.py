@@ -159,7 +159,7 @@ def test_tokens_are_a_list_or_none(folder: Folder, tokens: str, problem: str) ->
 
 def test_a_secret_in_the_place_of_a_token_is_not_repeated(folder: Folder) -> None:
     text = MEMORIES + REST[: REST.index("tokens:")] + "tokens: [my-secret-token, 12345]\n"
-    keys = "name, sha256, memories, areas, access"
+    keys = "name, sha256, memories, areas, access, manage"
     assert folder.problems(text) == [
         f"p.yaml:7: rest.tokens[0]: found text of 15 characters, allowed: a mapping with the keys "
         f"{keys}",

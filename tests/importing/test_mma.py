@@ -310,6 +310,7 @@ def test_ipv4_addresses_are_ipv4_only_if_that_was_meant(imported: Import) -> Non
 
 def test_a_full_port_closes_the_connection_that_is_idle_longest(imported: Import) -> None:
     assert port(imported(FIRST))["when_full"] == "evict"
+    assert port(imported(FIRST))["max_connections_per_source"] is None
     assert port(imported(FIRST))["idle_timeout"] == 0
     assert port(imported(SECOND % (RULE, "")), "main")["when_full"] == "evict"
 
@@ -435,6 +436,7 @@ def test_a_listener_keeps_its_name_and_names_its_memory(imported: Import) -> Non
     assert port(found, "main") == {
         "type": "modbus-tcp",
         "bind": "127.0.0.1:502",
+        "max_connections_per_source": None,
         "when_full": "evict",
         "idle_timeout": 0,
         "rules": [{"sources": ["10.0.0.0/8"], "units": {1: "main-1"}, "access": "read-write"}],
@@ -570,6 +572,7 @@ def test_a_listener_without_policies_takes_only_raw_ingest(imported: Import) -> 
     assert port(found, "main") == {
         "type": "raw-ingest",
         "bind": "127.0.0.1:502",
+        "max_connections_per_source": None,
         "when_full": "evict",
         "idle_timeout": 0,
         **raw_ingest({1: "main-1"}, ["coils", "holding_registers"]),
@@ -723,6 +726,7 @@ def test_raw_ingest_becomes_a_listener_without_crc(imported: Import) -> None:
         "crc": "none",
         "flags": "ignore",
         "packets": "many",
+        "max_connections_per_source": None,
         "when_full": "evict",
         "request_timeout": 1.5,
         "idle_timeout": 1.5,

@@ -204,3 +204,12 @@ def test_a_value_that_json_does_not_have_is_refused_in_words(memory_access: Memo
     found = refused(memory_access, command(20, [7, object()]))
     assert (found.where["index"], found.reason) == (1, "invalid_value")
     assert found.detail.startswith('commands[0]: values[1] is "<object object at ')
+
+
+def test_reasons_beyond_a_limit_are_counted_together(memory_access: MemoryAccess) -> None:
+    """An adapter of another package may make its reasons from what it receives."""
+    for number in [*range(100), 0, 99]:
+        memory_access.note(Refused(f"reason {number}", "-"), "edge", "-")
+    counted: Any = memory_access.counts()["refused"]
+    assert (len(counted), sum(counted.values())) == (65, 102)
+    assert (counted["reason 0"], counted["reason 63"], counted["other"]) == (2, 1, 37)

@@ -713,7 +713,7 @@ def test_a_packet_over_a_whole_area_is_never_seen_in_part(
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_200_connections_at_once_all_get_their_byte(start: Start, workers: int) -> None:
-    plant = Plant(start(listener("v1"), workers=workers))
+    plant = Plant(start(listener("v1", max_connections_per_source=None), workers=workers))
     with contextlib.ExitStack() as opened:
         clients = [opened.enter_context(plant.connect()) for _ in range(200)]
         for number, client in enumerate(clients):
@@ -729,7 +729,7 @@ def test_200_connections_at_once_all_get_their_byte(start: Start, workers: int) 
 
 
 def test_connections_too_many_get_no_byte(start: Start) -> None:
-    plant = Plant(start(listener("v1", max_connections=2)))
+    plant = Plant(start(listener("v1", max_connections=2, max_connections_per_source=None)))
     packet = good("v1", "coils", 0, [1])
     with plant.connect() as first, plant.connect() as second:
         wire.until(lambda: plant.counted("connections")["open"] == 2, "both are accepted")

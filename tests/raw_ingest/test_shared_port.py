@@ -295,6 +295,7 @@ def test_silent_connections_are_evicted_before_those_amid_a_packet(
     run: Run, dial: Any, kind: str, packets: str
 ) -> None:
     limits: dict[str, Any] = {"max_connections": 3, "when_full": "evict"}
+    limits["max_connections_per_source"] = None
     appliance = run(configuration({"packets": packets}, kind=kind, **limits))
     begun = dial(appliance)
     begun.sendall(packet(0, 1)[:-1])

@@ -12,9 +12,10 @@ import pytest
 import holdfast
 from support import wire
 from support.machine import needs_127_0_0_2, needs_proc
+from support.running import endpoint
 
 if TYPE_CHECKING:
-    from support.running import Connect, Process, Serve
+    from support.running import Connect, Process, Run, Serve
 
 READ = bytes.fromhex("0300000001")
 ZERO = bytes.fromhex("03020000")
@@ -500,3 +501,26 @@ def test_a_server_that_could_not_start_leaves_no_thread_and_no_file(
             holdfast.Server({1: memory}, bind=taken, access="read-only").start()
 
     assert held() == before
+
+
+LIMITED = """
+memories:
+  plant: {holding_registers: 1000}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    max_connections: 20
+    rules: [{sources: [127.0.0.0/8], units: {1: plant}, access: read-only}]
+"""
+
+
+@needs_127_0_0_2
+def test_silent_connections_of_one_source_leave_room_for_others_by_default(
+    run: Run, connect: Connect
+) -> None:
+    address = endpoint(run(LIMITED), "scada")
+    for _ in range(16):
+        assert is_open(connect(address, source="127.0.0.1"))
+    assert is_refused(address, source="127.0.0.1")
+    assert is_open(connect(address, source="127.0.0.2"))

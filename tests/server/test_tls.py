@@ -106,6 +106,10 @@ BY_ROLE: list[dict[str, Any]] = [
 ANYONE: list[dict[str, Any]] = [{"sources": ["127.0.0.1"], "access": "read-write"}]
 
 
+PLACES: dict[str, Any] = {"max_connections_per_source": None}
+"""All peers of these tests have one address, which may take all places."""
+
+
 @pytest.fixture
 def secure(run: Run, party: Party) -> Appliance:
     """The engineer writes, the operator reads, nobody else comes in."""
@@ -625,7 +629,7 @@ def shaken(appliance: Appliance, party: Party, number: int, opened: contextlib.E
 def test_silent_connections_displace_each_other_and_no_session(
     run: Run, party: Party, when_full: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    limits = {"max_connections": 4, "max_handshakes": 10, "when_full": when_full}
+    limits = {**PLACES, "max_connections": 4, "max_handshakes": 10, "when_full": when_full}
     appliance = run(configuration(party.files(), BY_ROLE, **limits))
     with contextlib.ExitStack() as opened:
         clients = shaken(appliance, party, 3, opened)
@@ -649,7 +653,7 @@ def test_silent_connections_displace_each_other_and_no_session(
 def test_1500_half_open_handshakes_beside_sessions_that_notice_nothing(
     run: Run, party: Party
 ) -> None:
-    limits = {"max_connections": 20, "max_handshakes": 100, "when_full": "evict"}
+    limits = {**PLACES, "max_connections": 20, "max_handshakes": 100, "when_full": "evict"}
     appliance = run(configuration(party.files(), BY_ROLE, **limits))
     with contextlib.ExitStack() as opened:
         clients = shaken(appliance, party, 19, opened)
@@ -669,7 +673,7 @@ def test_1500_half_open_handshakes_beside_sessions_that_notice_nothing(
 
 
 def test_a_new_session_displaces_the_one_that_is_idle_longest(run: Run, party: Party) -> None:
-    limits = {"max_connections": 2, "when_full": "evict"}
+    limits = {**PLACES, "max_connections": 2, "when_full": "evict"}
     appliance = run(configuration(party.files(), BY_ROLE, **limits))
     with contextlib.ExitStack() as opened:
         first, second = shaken(appliance, party, 2, opened)
@@ -681,7 +685,7 @@ def test_a_new_session_displaces_the_one_that_is_idle_longest(run: Run, party: P
 
 
 def test_a_full_listener_refuses_a_new_session(run: Run, party: Party) -> None:
-    appliance = run(configuration(party.files(), BY_ROLE, max_connections=1))
+    appliance = run(configuration(party.files(), BY_ROLE, **PLACES, max_connections=1))
     trust = context(party.authority.ca, party.engineer)
     with contextlib.ExitStack() as opened:
         early = opened.enter_context(peer(appliance, trust))
@@ -854,7 +858,7 @@ def test_openssl_changes_its_keys_and_a_flood_of_new_keys_ends_the_connection(
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 def test_idle_connections_cost_little_memory(party: Party, tmp_path: Path) -> None:
     file = tmp_path / "plant.yaml"
-    limits = {"max_connections": 1000, "idle_timeout": 0}
+    limits = {**PLACES, "max_connections": 1000, "idle_timeout": 0}
     file.write_text(configuration(party.files(), BY_ROLE, **limits))
     trust = context(party.authority.ca, party.engineer)
     with serving(file) as (pid, at), contextlib.ExitStack() as opened:

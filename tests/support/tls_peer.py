@@ -225,6 +225,14 @@ def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
             return str(refused)
 
 
+def failures(appliance: Appliance) -> dict[str, int]:
+    """Returns the counted TLS failures by reason. Their sum is that of the connections."""
+    [listener] = appliance.diagnostics.stats()["listeners"].values()
+    counted: dict[str, int] = listener["tls_failures"]
+    assert sum(counted.values()) == listener["connections"]["tls_failed"]
+    return counted
+
+
 def reasons(appliance: Appliance, caplog: pytest.LogCaptureFixture, count: int = 1) -> list[str]:
     """Returns the logged reasons of TLS failures, once there are `count`."""
     wire.until(lambda: connections(appliance)["tls_failed"] >= count, "failures are counted")
@@ -238,4 +246,6 @@ def reasons(appliance: Appliance, caplog: pytest.LogCaptureFixture, count: int =
         ]
 
     wire.until(lambda: len(told()) >= count, "failures are logged")
-    return told()
+    found = told()
+    assert set(found) <= set(failures(appliance)), "each is counted by its reason"
+    return found

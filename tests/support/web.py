@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from holdfast.adapters import MemoryAccess, Stop
 from holdfast.adapters.rest import Rest
 from holdfast.appliance.diagnostics import Diagnostics
+from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import RestConfig
 from holdfast.web.port import listen
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import holdfast
     from holdfast._core import Engine
     from holdfast.audit import Audit
+    from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
 
 AREAS = ("coils", "discrete_inputs", "holding_registers", "input_registers")
@@ -47,6 +49,7 @@ def token(
     memories: tuple[str, ...] = ("plant_a",),
     areas: tuple[str, ...] = AREAS,
     access: str = "read-write",
+    manage: bool = False,
 ) -> dict[str, object]:
     """Builds the configuration of a token."""
     digest = hashlib.sha256(secret.encode()).hexdigest()
@@ -55,6 +58,7 @@ def token(
         "sha256": digest,
         "memories": list(memories),
         "areas": list(areas),
+        "manage": manage,
         "access": access,
     }
 
@@ -122,6 +126,10 @@ class StandIn:
 
     listeners: dict[str, Any] = field(default_factory=dict)
     lost_events: int = 0
+    threads: list[ThreadHeartbeat] = field(default_factory=list)
+
+    def heartbeats(self) -> list[ThreadHeartbeat]:
+        return self.threads
 
     def counters(self) -> dict[str, Any]:
         return self.listeners
@@ -131,7 +139,17 @@ def diagnostics_of(
     memories: Mapping[str, holdfast.Memory], engine: object | None = None
 ) -> Diagnostics:
     chosen: Engine = engine or StandIn()  # type: ignore[assignment]
-    return Diagnostics(memories, chosen)
+    return Diagnostics(memories, chosen, Liveness(chosen.heartbeats))
+
+
+class NoSessions:
+    """Replaces the listeners of an appliance: there are no connections."""
+
+    def sessions(self) -> list[dict[str, Any]]:
+        return []
+
+    def end_session(self, *_: object) -> bool:
+        return False
 
 
 class Service:
@@ -157,8 +175,8 @@ class Service:
         self.diagnostics.adapters["rest"] = (self.supervisor, self.memory_access)
 
     def made(self) -> Rest:
-        parts = (self.settings, self.memory_access, self.diagnostics, self.listener)
-        return Rest(*parts, https=self.https)
+        parts = (self.settings, self.memory_access, self.diagnostics)
+        return Rest(*parts, NoSessions(), self.listener, https=self.https)
 
     @property
     def address(self) -> tuple[str, int]:

@@ -101,7 +101,9 @@ def refusal(service: web.Service, trust: ssl.SSLContext, log: web.Records) -> st
         peer.send(HEALTH)
         assert peer.rest() == b""
     service.until_counted("tls_failed", before + 1)
-    return str(log.of("tls_failed")[-1]["reason"])
+    reason = str(log.of("tls_failed")[-1]["reason"])
+    assert service.diagnostics.stats()["adapters"]["rest"]["tls_failures"][reason] >= 1
+    return reason
 
 
 # What is served.

@@ -14,6 +14,7 @@ use pyo3::types::PyDict;
 
 use crate::arguments::{seconds, within, word};
 use crate::audit;
+use crate::heartbeat;
 use crate::listener::Listener;
 use crate::peer;
 
@@ -74,6 +75,10 @@ impl Engine {
 
     fn end_session(&self, py: Python<'_>, listener: &str, id: u64) -> bool {
         py.detach(|| self.core.end_session(listener, id))
+    }
+
+    fn heartbeats(&self) -> Vec<(String, f64, Option<u32>)> {
+        self.core.heartbeats().iter().map(|beats| heartbeat::shown(beats)).collect()
     }
 
     #[getter]
@@ -222,7 +227,6 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
         ("accepted", &counters.accepted),
         ("refused_source", &counters.refused_source),
         ("refused_role", &counters.refused_role),
-        ("tls_failed", &counters.tls_failed),
         ("refused_full", &counters.refused_full),
         ("refused_listen_only", &counters.refused_listen_only),
         ("evicted", &counters.evicted),
@@ -236,8 +240,10 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
     ] {
         connections.set_item(key, counter.get())?;
     }
+    connections.set_item("tls_failed", counters.tls_failed.total())?;
     connections.set_item("open", listener.open_connections)?;
     all.set_item("connections", connections)?;
+    all.set_item("tls_failures", counters.tls_failed.by_reason())?;
     Ok(all)
 }
 

@@ -9,6 +9,7 @@ mod batch;
 mod client;
 mod connection;
 mod engine;
+mod heartbeat;
 mod limits;
 mod link;
 mod listener;

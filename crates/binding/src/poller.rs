@@ -16,6 +16,7 @@ use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, seconds, within, word};
 use crate::client::{Endpoint, Request};
+use crate::heartbeat;
 use crate::link::{self, Link, Passage};
 use crate::memory::{Memory, named};
 
@@ -116,6 +117,11 @@ impl Poller {
             devices.iter().map(|device| device.core.clone()).collect();
         let core = py.detach(|| Core::start(devices)).map_err(raised)?;
         Ok(Poller { core })
+    }
+
+    #[getter]
+    fn heartbeat(&self) -> (String, f64, Option<u32>) {
+        heartbeat::shown(self.core.heartbeat())
     }
 
     fn add(&self, device: PyRef<'_, PolledDevice>) -> PyResult<()> {

@@ -1,6 +1,8 @@
-//! A counter that only increases.
+//! Counters that only increase.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 /// A counter that only increases.
 #[derive(Debug, Default)]
@@ -23,5 +25,24 @@ impl Counter {
 
     pub fn get(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// A counter for each reason. The reasons are words of the program, so there are few.
+#[derive(Debug, Default)]
+pub struct ReasonCounters(Mutex<BTreeMap<&'static str, u64>>);
+
+impl ReasonCounters {
+    pub fn add(&self, reason: &'static str) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner).entry(reason).or_default() += 1;
+    }
+
+    /// The counts by reason. Reasons that did not occur are left out.
+    pub fn by_reason(&self) -> BTreeMap<&'static str, u64> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    pub fn total(&self) -> u64 {
+        self.by_reason().values().sum()
     }
 }

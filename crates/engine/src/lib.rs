@@ -17,6 +17,7 @@
 
 pub mod client;
 mod counter;
+mod heartbeat;
 pub mod items;
 pub mod link;
 mod own_threads;
@@ -26,4 +27,5 @@ mod serial_line;
 pub mod server;
 pub mod tls;
 
+pub use heartbeat::Heartbeat;
 pub use serial_line::{LineDirection, LineMode, LineParity, SerialLine};

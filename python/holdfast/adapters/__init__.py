@@ -15,19 +15,35 @@ import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
+from holdfast.heartbeat import Heartbeat
 from holdfast.ingest import Counts, Grant, MemoryAccess, Refused, Written
 from holdfast.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Adapter", "Context", "Counts", "Grant", "MemoryAccess", "Refused", "Stop", "Written"]
+__all__ = [
+    "Adapter",
+    "Context",
+    "Counts",
+    "Grant",
+    "Heartbeat",
+    "MemoryAccess",
+    "Refused",
+    "Stop",
+    "Written",
+]
 
 ENTRY_POINTS = "holdfast.adapters"
 
 
 class Adapter(Protocol):
-    """The interface of an adapter."""
+    """The interface of an adapter.
+
+    An adapter with an event loop, or another loop of its own, can have an attribute `heartbeat`, a
+    `Heartbeat` on which the loop calls `beat` once a second. If it does not for 10 seconds, the
+    adapter is logged as stalled, and the watchdog of the service manager is not fed any more.
+    """
 
     def run(self, stop: Stop) -> None:
         """Runs until `stop` is set. Called once, in a thread of its own."""

@@ -48,6 +48,21 @@ EXPIRIES = (
     ),
 )
 """Statistics that are times: their key, metric and description."""
+REFUSED = {"refused_source": "source", "refused_role": "role", "refused_full": "full"}
+"""The reasons of refused connections, by their keys in the counters."""
+REFUSED_REQUESTS = {"refused_listen_only": "listen_only"}
+"""The reasons of refused requests, by their keys in the counters of connections."""
+CLOSED = {
+    "evicted": "evicted",
+    "evicted_handshakes": "evicted_handshake",
+    "rights_revoked": "rights_revoked",
+    "ended": "ended",
+    "idle": "idle",
+    "request_timeout": "request_timeout",
+    "slow_reader": "slow_reader",
+    "broken_request": "broken_request",
+}
+"""The reasons of connections that were closed by this side, by their keys in the counters."""
 LINK_OUTCOMES = (
     "replies",
     "timeouts",
@@ -86,6 +101,7 @@ class Metrics:
             request_timeout=REQUEST_TIMEOUT,
             https=https,
         )
+        self.heartbeat = self._host.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""
@@ -93,7 +109,11 @@ class Metrics:
 
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections."""
-        return {"address": self._host.address, "connections": self._host.counts()}
+        return {
+            "address": self._host.address,
+            "connections": self._host.counts(),
+            "tls_failures": self._host.tls_failures(),
+        }
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["path"] != PATH:
@@ -167,6 +187,7 @@ class Figures(Collector):
         yield from _of_devices(stats["devices"])
         yield from _of_links(stats["links"])
         yield from _of_adapters(stats["adapters"])
+        yield from _of_threads(stats["threads"])
         yield from _of_memories(self._diagnostics.memories())
 
 
@@ -187,8 +208,11 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
     requests = _counter("requests", "Modbus requests, by function code.", "listener", "function")
     exceptions = _counter("exceptions", "Modbus exceptions, by exception code.", "listener", "code")
     more = _counter("listener", "Other counters of a listener.", "listener", "counter")
-    opened = _gauge("connections_open", "Open connections.", "listener")
-    connections = _counter("connections", "Connections, by outcome.", "listener", "outcome")
+    connections = _Connections("", "listener")
+    packets = _counter(
+        "packets_refused", "Raw Ingest packets refused, by reason.", "listener", "reason"
+    )
+    refused = _counter("requests_refused", "Requests refused, by reason.", "listener", "reason")
     for name, counters in listeners.items():
         for key, counted in counters.items():
             if key == "requests":
@@ -196,10 +220,18 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
             elif key == "exceptions":
                 _add(exceptions, name, counted)
             elif key == "connections":
-                _add_connections(opened, connections, name, counted)
+                rest = connections.add(name, counted)
+                _add(refused, name, _taken(rest, REFUSED_REQUESTS))
+                _add(more, name, dict(_flat(key, rest)))
+            elif key == "tls_failures":
+                _add(connections.tls_failed, name, counted)
+            elif key == "packets":
+                _add(packets, name, counted["refused"])
+                rest = {key: value for key, value in counted.items() if key != "refused"}
+                _add(more, name, dict(_flat(key, rest)))
             else:
                 _add(more, name, dict(_flat(key, counted)))
-    yield from (requests, exceptions, connections, opened, more)
+    yield from (requests, exceptions, refused, packets, *connections.families(), more)
 
 
 def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
@@ -275,8 +307,7 @@ def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     refused = _counter("ingest_refused", "Refused messages, by reason.", "adapter", "reason")
     restarts = _counter("adapter_restarts", "Restarts of the adapter.", "adapter")
     states = _gauge("adapter_state", "1 for the current state.", "adapter", "state")
-    opened = _gauge("adapter_connections_open", "Open connections.", "adapter")
-    connections = _counter("adapter_connections", "Connections, by outcome.", "adapter", "outcome")
+    connections = _Connections("adapter_", "adapter")
     status = _gauge("adapter_status", "Other figures of an adapter.", "adapter", "field")
     plain = {"accepted": accepted, "values": values, "reads": reads, "restarts": restarts}
     for name, fields in adapters.items():
@@ -288,10 +319,23 @@ def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             elif key == "refused":
                 _add(refused, name, value)
             elif key == "connections" and isinstance(value, dict):
-                _add_connections(opened, connections, name, value)
+                connections.add(name, value)
+            elif key == "tls_failures":
+                _add(connections.tls_failed, name, value)
             else:
                 _add(status, name, dict(_flat(key, value)))
-    yield from (accepted, values, reads, refused, restarts, states, connections, opened, status)
+    yield from (accepted, values, reads, refused, restarts, states, status)
+    yield from connections.families()
+
+
+def _of_threads(threads: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    ages = _gauge("thread_heartbeat_age_seconds", "Time since the last heartbeat.", "thread")
+    cpu = _counter("thread_cpu_seconds", "Processor time of a thread.", "thread")
+    for name, told in threads.items():
+        ages.add_metric([name], told["heartbeat_age"])
+        if told["cpu"] is not None:
+            cpu.add_metric([name], told["cpu"])
+    yield from (ages, cpu)
 
 
 def _of_memories(memories: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
@@ -322,14 +366,43 @@ def _add(
         family.add_metric([name, str(key)], value)
 
 
-def _add_connections(
-    opened: GaugeMetricFamily,
-    connections: CounterMetricFamily,
-    name: str,
-    counted: Mapping[str, int],
-) -> None:
-    opened.add_metric([name], counted.get("open", 0))
-    _add(connections, name, {key: value for key, value in counted.items() if key != "open"})
+def _taken(counted: dict[str, int], reasons: Mapping[str, str]) -> dict[str, int]:
+    """Removes the counters of these keys. Returns them by reason."""
+    return {reason: counted.pop(key) for key, reason in reasons.items() if key in counted}
+
+
+class _Connections:
+    """The metrics of connections: of listeners, or of the HTTP services among the adapters."""
+
+    def __init__(self, prefix: str, label: str) -> None:
+        self.opened = _gauge(f"{prefix}connections_open", "Open connections.", label)
+        self.accepted = _counter(f"{prefix}connections_accepted", "Accepted connections.", label)
+        self.refused = _counter(
+            f"{prefix}connections_refused", "Refused connections, by reason.", label, "reason"
+        )
+        self.closed = _counter(
+            f"{prefix}connections_closed",
+            "Connections closed by this side, by reason.",
+            label,
+            "reason",
+        )
+        self.tls_failed = _counter(
+            f"{prefix}tls_failed", "Failures of TLS, by reason.", label, "reason"
+        )
+
+    def add(self, name: str, counted: Mapping[str, int]) -> dict[str, int]:
+        """Adds the counters of one listener. Returns those that belong to other metrics."""
+        rest = dict(counted)
+        rest.pop("tls_failed", None)  # The sum of all reasons.
+        self.opened.add_metric([name], rest.pop("open", 0))
+        self.accepted.add_metric([name], rest.pop("accepted", 0))
+        _add(self.refused, name, _taken(rest, REFUSED))
+        _add(self.closed, name, _taken(rest, CLOSED))
+        return rest
+
+    def families(self) -> Iterator[Metric]:
+        """Yields the metrics."""
+        yield from (self.opened, self.accepted, self.refused, self.closed, self.tls_failed)
 
 
 def _flat(key: str, value: object) -> Iterator[tuple[str, float]]:

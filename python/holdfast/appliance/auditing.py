@@ -10,16 +10,18 @@ from holdfast import logs
 from holdfast._core import __version__
 from holdfast.audit import Audit, Copies, Journal, Syslog
 from holdfast.config.syslog import parse_syslog
+from holdfast.heartbeat import PERIOD, Heartbeat
 
 if TYPE_CHECKING:
     from holdfast._core import Engine
     from holdfast.config import AuditConfig, Config
+    from holdfast.types import ThreadHeartbeat
 
 # The most writes that are moved to the audit log at once.
 BATCH = 1000
 
 # Seconds that the thread waits for a write. The engine wakes it for each write, and when it stops.
-PATIENCE = 3600.0
+PATIENCE = PERIOD
 
 # Seconds between attempts to write a log that fails.
 RETRY = 1.0
@@ -59,12 +61,17 @@ class WriteRecorder:
         self._engine = engine
         self._lost = 0
         self._stopped = threading.Event()
+        self._heartbeat = Heartbeat()
         self._thread = threading.Thread(target=self._run, name="holdfast-audit")
         audit.on_failing(engine.set_audit_failing)
 
     def start(self) -> None:
         """Starts the thread."""
         self._thread.start()
+
+    def heartbeat(self) -> ThreadHeartbeat:
+        """Returns the heartbeat of the thread. Thread-safe."""
+        return self._thread.name, self._heartbeat.age, self._thread.native_id
 
     def finish(self) -> None:
         """Waits until all writes are moved. Call it after the engine has stopped."""
@@ -74,6 +81,7 @@ class WriteRecorder:
 
     def _run(self) -> None:
         while True:
+            self._heartbeat.beat()
             ended = self._stopped.is_set()
             if self._audit.closed and self._audit.failing and not ended:
                 # Writes wait in the queue of the engine, whose room is limited.

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from holdfast._core import Engine, Link, Memory, Poller
+    from holdfast.appliance.liveness import Liveness
     from holdfast.appliance.supervision import Supervisor
     from holdfast.audit import Audit
     from holdfast.ingest import MemoryAccess
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
 class Diagnostics:
     """Reads counters and states of a running appliance. Thread-safe; changes nothing."""
 
-    def __init__(self, memories: Mapping[str, Memory], engine: Engine) -> None:
+    def __init__(self, memories: Mapping[str, Memory], engine: Engine, liveness: Liveness) -> None:
         self._memories = memories
         self._engine = engine
+        self._liveness = liveness
         self._began = time.monotonic()
         self.adapters: dict[str, tuple[Supervisor, MemoryAccess | None]] = {}
         self.audit: Audit | None = None
@@ -51,7 +53,7 @@ class Diagnostics:
         }
 
     def stats(self) -> dict[str, Any]:
-        """Returns all counters of listeners, devices, links, adapters, log and audit log."""
+        """Returns all counters of listeners, devices, links, adapters, log, audit log, threads."""
         return {
             "uptime": round(time.monotonic() - self._began, 3),
             "listeners": self._engine.counters(),
@@ -61,6 +63,7 @@ class Diagnostics:
             "events_lost": self._engine.lost_events,
             "log_dropped": logs.dropped(),
             "audit": None if self.audit is None else self.audit.counts(),
+            "threads": self._liveness.threads(),
             "certificates": self.expiries.certificates,
             "revocation_lists": self.expiries.revocation_lists,
         }

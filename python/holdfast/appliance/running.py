@@ -15,6 +15,7 @@ from holdfast import _core, logs
 from holdfast.adapters import foreign
 from holdfast.appliance import assembly, auditing, changes, configured_certificates
 from holdfast.appliance.diagnostics import Diagnostics
+from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
 from holdfast.config import (
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
         MetricsConfig,
         RestConfig,
     )
+    from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
 
 # All other events of a listener are refusals or faults.
@@ -54,6 +56,9 @@ LEVELS = {
     "rights_revoked": logging.INFO,
     "ended": logging.INFO,
 }
+
+# What the audit log has of a connection that was ended.
+_SHOWN = ("peer", "role", "subject", "serial")
 
 # Seconds between checks of the health of devices.
 HEALTH_CHECK_INTERVAL = 1.0
@@ -121,6 +126,11 @@ class Appliance:
         return changed
 
     @property
+    def is_live(self) -> bool:
+        """Whether no thread was stalled when `log_events` looked last. False if not running."""
+        return self._running is not None and self._running.liveness.all_live
+
+    @property
     def diagnostics(self) -> Diagnostics:
         """The diagnostics. Raises `RuntimeError` if not running."""
         return self._parts().diagnostics
@@ -132,7 +142,7 @@ class Appliance:
     def log_events(self, timeout: float) -> None:
         """Waits up to `timeout` seconds for a listener event and logs it.
 
-        Also logs changes of seals and of the health of devices.
+        Also logs changes of seals and of the health of devices, and threads that are stalled.
         """
         self._parts().log_events(timeout)
 
@@ -140,9 +150,12 @@ class Appliance:
         """The open connections of all listeners. Thread-safe."""
         return self._parts().sessions()
 
-    def end_session(self, listener: str, number: int) -> bool:
-        """Ends a connection. Returns whether there was one. Thread-safe."""
-        return self._parts().end_session(listener, number)
+    def end_session(self, listener: str, number: int, by: Mapping[str, str]) -> bool:
+        """Ends a connection. Returns whether there was one. Thread-safe.
+
+        `by` is who has requested it, as fields of the audit log.
+        """
+        return self._parts().end_session(listener, number, by)
 
     def _parts(self) -> _Running:
         if self._running is None:
@@ -187,6 +200,7 @@ class _Running:
         self._forwarded: dict[tuple[str, int], Mapping[str, int]] = {}
         self._unreachable: set[tuple[str, int]] = set()
         self._looked = self._reviewed = time.monotonic()
+        self._recorder: auditing.WriteRecorder | None = None
         # Missing adapters and unusable TLS files are reported before any socket is opened.
         _check_parts(config)
         self._https = _loaded_https(config)
@@ -215,7 +229,8 @@ class _Running:
             if self._poller is not None:
                 for device in devices:
                     self._poller.add(device)
-            self.diagnostics = Diagnostics(memories, self._engine)
+            self.liveness = Liveness(self._heartbeats)
+            self.diagnostics = Diagnostics(memories, self._engine, self.liveness)
             self.diagnostics.audit = self._audit
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
@@ -224,7 +239,6 @@ class _Running:
             for name, part in self._adapters(config, self._ports).items():
                 self._add(name, part)
             undo.pop_all()
-        self._recorder: auditing.WriteRecorder | None = None
         if self._audit is not None:
             self._recorder = auditing.WriteRecorder(self._audit, self._engine)
             self._recorder.start()
@@ -273,6 +287,7 @@ class _Running:
             return
         self._looked = now
         logs.tell_held_back()
+        self.liveness.check()
         interval = _review_interval(self._config)
         if interval is not None and now - self._reviewed >= interval:
             self._reviewed = now
@@ -280,6 +295,16 @@ class _Running:
         if self._poller is not None:
             for name, told in self._poller.counters(report=False).items():
                 self._log_device(name, told)
+
+    def _heartbeats(self) -> list[ThreadHeartbeat]:
+        """The heartbeats of all threads that the appliance depends on. Thread-safe."""
+        heartbeats = self._engine.heartbeats()
+        if self._poller is not None:
+            heartbeats.append(self._poller.heartbeat)
+        if self._recorder is not None:
+            heartbeats.append(self._recorder.heartbeat())
+        own = [supervisor.heartbeat() for supervisor in list(self._supervisors.values())]
+        return [*heartbeats, *(each for each in own if each is not None)]
 
     def _log_device(self, name: str, told: Mapping[str, Any]) -> None:
         """Logs changes of a device since the last check."""
@@ -352,8 +377,17 @@ class _Running:
     def sessions(self) -> list[dict[str, Any]]:
         return self._engine.sessions()
 
-    def end_session(self, listener: str, number: int) -> bool:
-        return self._engine.end_session(listener, number)
+    def end_session(self, listener: str, number: int, by: Mapping[str, str]) -> bool:
+        place = {"listener": listener, "id": number}
+        known = [each for each in self.sessions() if place.items() <= each.items()]
+        if not self._engine.end_session(listener, number):
+            return False
+        session = {"session": f"{listener}/{number}"}
+        session |= {f"session_{key}": each[key] for each in known for key in _SHOWN if key in each}
+        logs.write(logging.INFO, "session_ended", **session, **by)
+        if self._audit is not None:
+            self._audit.write(event="session_ended", **session, **by)
+        return True
 
     def reload(self, config: Config) -> list[str]:
         """Takes over a configuration, see `Appliance.reload`."""
@@ -518,7 +552,7 @@ class _Running:
             part = add(
                 "rest",
                 lambda: Rest(
-                    rest, access, self.diagnostics, at.listener, https=self._https["rest"]
+                    rest, access, self.diagnostics, self, at.listener, https=self._https["rest"]
                 ),
                 *_apart_from_files(rest),
                 sorted(self._memories),

@@ -15,12 +15,14 @@ import time
 from typing import TYPE_CHECKING
 
 from holdfast import logs
+from holdfast.heartbeat import Heartbeat
 from holdfast.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast.adapters import Adapter
+    from holdfast.types import ThreadHeartbeat
     from holdfast.web.port import Port
 
 FIRST_PAUSE = 1.0
@@ -70,6 +72,8 @@ class Supervisor:
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
         self._adapter: Adapter | None = None
         self._state = "stopped"
+        self._began = Heartbeat()
+        self._has_ended = False
         self._restarts = 0
         self._last_error: str | None = None
 
@@ -88,6 +92,21 @@ class Supervisor:
         self._thread.join(STOP_TIMEOUT)
         if self._thread.is_alive():
             logs.write(logging.ERROR, "adapter_does_not_stop", adapter=self.name)
+
+    def heartbeat(self) -> ThreadHeartbeat | None:
+        """Returns the heartbeat of the adapter's loop, if it has one; otherwise of the thread.
+
+        `None` before the start, and once the adapter was stopped. Thread-safe.
+        """
+        if self._thread.ident is None or self._has_ended:
+            return None
+        age = 0.0
+        if not self._thread.is_alive():
+            age = self._began.age
+        elif self._state == "running":
+            own = getattr(self._adapter, "heartbeat", None)
+            age = own.age if isinstance(own, Heartbeat) else 0.0
+        return self._thread.name, age, self._thread.native_id
 
     def status(self) -> dict[str, object]:
         """Returns the state of the supervision and the adapter's own status."""
@@ -131,6 +150,7 @@ class Supervisor:
             self._stop.wait(pause)
             pause = min(2 * pause, MAX_PAUSE)
         self._state = "stopped"
+        self._has_ended = True
 
     def _once(self) -> bool:
         """Creates and runs the adapter. Returns whether it ended without an exception."""

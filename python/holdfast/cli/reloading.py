@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.appliance import Appliance
+    from holdfast.appliance.service_manager import ServiceManager
 
 WATCH_INTERVAL = 1.0
 """Seconds between two looks at the files. A change counts when it is still the same at the next."""
@@ -29,8 +30,9 @@ WATCH_INTERVAL = 1.0
 class Reloading:
     """Reloads one appliance. `due` and `reload` are for the thread that runs it."""
 
-    def __init__(self, appliance: Appliance, file: Path) -> None:
+    def __init__(self, appliance: Appliance, file: Path, manager: ServiceManager) -> None:
         self._appliance = appliance
+        self._manager = manager
         self._file = file
         self._waiting: list[Future[Mapping[str, Any]]] = []
         self._lock = threading.Lock()
@@ -50,7 +52,8 @@ class Reloading:
             waiting, self._waiting = self._waiting, []
         if not (waiting or requested or self._has_changed()):
             return
-        result = self._reload()
+        with self._manager.reloading():
+            result = self._reload()
         for future in waiting:
             future.set_result(result)
 

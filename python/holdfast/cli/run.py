@@ -17,6 +17,7 @@ from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import Appliance, assembly
 from holdfast.appliance.control import Control
+from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.open_files import allow_open_files
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
 
 # Maximum delay of the reaction to a signal, in seconds.
 JOIN_TIMEOUT = 0.2
+
+# Who ends a connection at a request of `holdfast sessions`, in the audit log.
+SOURCE = {"source": "holdfast sessions"}
 
 # Maximum number of devices in the greeting.
 MAX_DEVICES = 10
@@ -90,6 +94,7 @@ def serve(
     give_way()
     allow_open_files(_connections(config))
     signals = Signals(reloads=file is not None)
+    manager = ServiceManager()
     appliance = Appliance(config)
     try:
         appliance.start()
@@ -100,14 +105,19 @@ def serve(
         click.echo(f"{named}: {error}", err=True)
         sys.exit(WRONG)
     with ExitStack() as parts:
+        parts.callback(manager.close)
         parts.callback(appliance.stop)
+        parts.callback(manager.stopping)
         reloading = None
         if file is not None:
-            reloading = Reloading(appliance, file)
+            reloading = Reloading(appliance, file, manager)
             parts.callback(_control(appliance, reloading, file))
         click.echo(greeting(appliance))
+        manager.ready()
         while not signals.received:
             appliance.log_events(timeout=JOIN_TIMEOUT)
+            if appliance.is_live:
+                manager.feed_watchdog()
             if reloading is not None:
                 reloading.step(requested=signals.take_reload())
 
@@ -117,7 +127,7 @@ def _control(appliance: Appliance, reloading: Reloading, file: Path) -> Callable
     handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
         "reload": reloading.ask,
         "sessions": lambda: {"sessions": appliance.sessions()},
-        "end": lambda listener, id: {"ended": appliance.end_session(listener, id)},
+        "end": lambda listener, id: {"ended": appliance.end_session(listener, id, SOURCE)},
     }
     try:
         return Control(file, handlers).close

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from holdfast import logs
+from holdfast.adapters.sessions import parse_session_id
 from holdfast.appliance.control import NotRunning, ask
 from holdfast.cli.showing import plain, table
 
@@ -43,11 +44,11 @@ def sessions(file: Path, as_json: bool, ending: str | None) -> None:
 
 
 def _end(file: Path, ending: str) -> None:
-    listener, _, number = ending.rpartition("/")
-    if not number.isdecimal():
-        message = f"found {ending!r}, allowed: LISTENER/NUMBER, as in the list of connections"
-        raise click.BadParameter(message, param_hint="'--end'")
-    if not ask(file, "end", listener=listener, id=int(number)).get("ended"):
+    try:
+        listener, number = parse_session_id(ending)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="'--end'") from None
+    if not ask(file, "end", listener=listener, id=number).get("ended"):
         click.echo(f"holdfast: {ending}: no such connection", err=True)
         sys.exit(1)
     click.echo(f"ended {ending}")

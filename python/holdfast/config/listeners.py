@@ -149,6 +149,19 @@ class RawRuleConfig(Model):
     """The areas that may be written."""
 
 
+FEW = 16
+"""So many connections from one address are not limited by default."""
+
+
+def _per_source(data: dict[str, Any]) -> int:
+    """Leaves room for others: silent connections from one address can't fill the listener.
+
+    A listener for few connections often has a single client, or a gateway in front of all.
+    """
+    most: int = data["max_connections"]
+    return max((most + 1) // 2, min(most, FEW))
+
+
 class _ConnectionListener(Model):
     """Settings of all Modbus servers over TCP connections."""
 
@@ -158,8 +171,9 @@ class _ConnectionListener(Model):
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256
     """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = None
-    """Maximum number of open connections from one address; null: unlimited."""
+    max_connections_per_source: Connections | None = Field(default_factory=_per_source)
+    """Maximum number of open connections from one address; null: unlimited. Default: half of
+    max_connections, but at least 16."""
     when_full: Literal["refuse", "evict"] = "refuse"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
     idle_timeout: DurationOrZero = 300.0
@@ -384,8 +398,9 @@ class RawIngestListener(Model):
     """Where to listen: an IP address and a port."""
     max_connections: Connections = 256
     """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = None
-    """Maximum number of open connections from one address; null: unlimited."""
+    max_connections_per_source: Connections | None = Field(default_factory=_per_source)
+    """Maximum number of open connections from one address; null: unlimited. Default: half of
+    max_connections, but at least 16."""
     when_full: Literal["refuse", "evict"] = "refuse"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
     request_timeout: Duration = 10.0

@@ -76,6 +76,8 @@ class TokenConfig(GatewayTokenConfig):
     """The areas it can access."""
     access: Access
     """Whether it may write."""
+    manage: bool = False
+    """Whether it may list and end the connections of listeners."""
 
 
 def _form(tokens: object) -> str:

@@ -58,6 +58,7 @@ class Gateway:
             rejection=rejection,
             https=https,
         )
+        self.heartbeat = self._host.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set."""
@@ -70,4 +71,9 @@ class Gateway:
 
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections and requests. Thread-safe."""
-        return {"address": self.address, "connections": self.counts(), **self._app.counts()}
+        return {
+            "address": self.address,
+            "connections": self.counts(),
+            "tls_failures": self._host.tls_failures(),
+            **self._app.counts(),
+        }

@@ -10,6 +10,9 @@ from holdfast.types import AREAS
 _INGEST = {"discrete_inputs", "input_registers"}
 """The areas that REST and MQTT could write in the source."""
 
+ADMISSION = {"max_connections_per_source": None, "when_full": "evict"}
+"""How the source admitted connections: none was refused, and an address could take all places."""
+
 
 @dataclass
 class Draft:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.config.broker import parse_broker, parse_topic_filter
 from holdfast.config.words import listing, show
+from holdfast.importing.draft import ADMISSION
 from holdfast.importing.filters import ALL
 from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.peers import Peers, written
@@ -288,7 +289,7 @@ class Adapters:
             return
         listener: dict[str, Any] = {"type": "raw-ingest", "bind": str(bind)}
         listener |= {"format": "crc", "crc": "none", "flags": "ignore", "packets": "many"}
-        listener["when_full"] = "evict"
+        listener |= ADMISSION
         if timeout is not None:
             listener |= {"request_timeout": seconds(timeout), "idle_timeout": seconds(timeout)}
         listener["rules"] = [{"sources": sources, **self.draft.grant(memories)}]

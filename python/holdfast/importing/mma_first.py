@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.scalars import MAX_CONNECTIONS
 from holdfast.config.words import guess, listing, show
 from holdfast.importing import functions
+from holdfast.importing.draft import ADMISSION
 from holdfast.importing.filters import ALL, read_filter
 from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
@@ -173,7 +174,7 @@ class FirstGeneration:
         if sources is None or not units or rights is None:
             return None
         rule = {"sources": sources, "units": units, **rights}
-        limits = {"max_connections": most, "when_full": "evict", "idle_timeout": 0}
+        limits = {"max_connections": most, **ADMISSION, "idle_timeout": 0}
         return {"type": "modbus-tcp", "bind": bind, **limits, "rules": [rule]}
 
     def _sources(self, policy: Section) -> list[str] | None:

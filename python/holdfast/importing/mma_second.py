@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.importing import functions
+from holdfast.importing.draft import ADMISSION
 from holdfast.importing.filters import ALL, read_networks
 from holdfast.importing.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
@@ -125,7 +126,7 @@ class SecondGeneration:
         admitted = ALL if self.admitted is None else self.admitted
         rules = merged(known, admitted)
         raw = self._raw_ingest(listener, memories, admitted)
-        common = {"bind": str(bind), "when_full": "evict", "idle_timeout": 0}
+        common = {"bind": str(bind), **ADMISSION, "idle_timeout": 0}
         if not raw:
             message = "the listener is left out: nobody may read or write its memories"
             self.desk.note("left out", listener.path, message)

@@ -83,6 +83,13 @@ class Written:
         return {"status": "accepted", "commands": self.commands, "written": self.values}
 
 
+MAX_REASONS = 64
+"""The most reasons that are counted apart: adapters of other packages have their own."""
+
+OTHER = "other"
+"""The reason under which all others are counted."""
+
+
 @dataclass
 class Counts:
     """Counters of one memory access: accepted messages, values written, reads, refusals."""
@@ -91,6 +98,11 @@ class Counts:
     values: int = 0
     reads: int = 0
     refused: Counter[str] = field(default_factory=Counter)
+
+    def refuse(self, reason: str) -> None:
+        """Counts a refusal. Reasons beyond `MAX_REASONS` are counted together."""
+        known = reason in self.refused or len(self.refused) < MAX_REASONS
+        self.refused[reason if known else OTHER] += 1
 
     def snapshot(self) -> dict[str, object]:
         """Returns a copy of the counters."""
@@ -177,7 +189,7 @@ class MemoryAccess:
     def note(self, refused: Refused, who: str, peer: str) -> None:
         """Counts and logs a refusal without auditing it, such as the refusal of a read."""
         with self._lock:
-            self._counts.refused[refused.reason] += 1
+            self._counts.refuse(refused.reason)
         logs.refused(
             "ingest_refused",
             kind=(self.name, refused.reason),

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
+from holdfast.heartbeat import Heartbeat
 from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ class ScannerAdapter:
     def __init__(self, settings: Settings, poller: Poller | None = None) -> None:
         self._settings = settings
         self._scanner = Scanner(settings, poller)
+        self.heartbeat = Heartbeat()
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set, or until a shutdown message.
@@ -41,7 +43,8 @@ class ScannerAdapter:
                 loop.call_soon_threadsafe(self._scanner.end)
 
         stop.then(end)
-        await self._scanner.run()
+        async with self.heartbeat.kept():
+            await self._scanner.run()
 
     def status(self) -> dict[str, object]:
         """Returns the state of the connection, the number of devices, and counts of messages."""

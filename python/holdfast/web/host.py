@@ -24,6 +24,7 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from holdfast import logs
+from holdfast.heartbeat import PERIOD, Heartbeat
 from holdfast.net.addresses import holds, joined, parse_address
 from holdfast.web.admission import Admission, Full, Waiting
 from holdfast.web.port import BACKLOG
@@ -135,6 +136,9 @@ class Host:
         self.request_timeout = request_timeout
         self.sources = tuple(sources)
         self.counted = Counts()
+        self._tls_failures: dict[str, int] = {}
+        self.heartbeat = Heartbeat()
+        """The heartbeat of the event loop of `run`."""
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
         self._limits = limits
@@ -145,6 +149,10 @@ class Host:
     def counts(self) -> dict[str, int]:
         """Returns the counts of connections. Thread-safe."""
         return asdict(self.counted)
+
+    def tls_failures(self) -> dict[str, int]:
+        """Returns the counts of failures of TLS, by reason. Thread-safe."""
+        return dict(self._tls_failures)
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set. Can be called again: the socket stays open."""
@@ -168,6 +176,11 @@ class Host:
     def release(self, connection: _Connection) -> None:
         """Frees the place of a connection that was closed."""
         self._admission.release(connection)
+
+    def note_tls_failure(self, peer: str, reason: str) -> None:
+        """Counts and logs a failure of TLS. Called in the thread of `run`."""
+        self._tls_failures[reason] = self._tls_failures.get(reason, 0) + 1
+        self.note("tls_failed", peer, reason=reason)
 
     def note(self, event: str, peer: str, **fields: str) -> None:
         """Counts and logs an event of a connection. Called in the thread of `run`."""
@@ -206,9 +219,10 @@ class Host:
         with self._listener.dup() as listener:
             server = await loop.create_server(connection, sock=listener, backlog=BACKLOG)
             while not stopped.is_set():
+                self.heartbeat.beat()
                 state.default_headers = [(b"date", formatdate(usegmt=True).encode())]
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stopped.wait(), 1.0)
+                    await asyncio.wait_for(stopped.wait(), PERIOD)
             server.close()
             await _end(cast("set[_Connection]", state.connections))
 
@@ -402,7 +416,7 @@ class _Connection(HttpToolsProtocol):
 
     def tls_failed(self, reason: str) -> None:
         """Called when TLS failed, before the connection is closed."""
-        self.host.note("tls_failed", self.app_state["peer"], reason=reason)
+        self.host.note_tls_failure(self.app_state["peer"], reason)
 
     def plain_answer(self) -> bytes:
         """Returns the response to a request without TLS."""

@@ -25,6 +25,7 @@ use super::state::DeviceState;
 use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
+use crate::heartbeat::Heartbeat;
 use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, serve};
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
@@ -90,6 +91,7 @@ pub struct Poller {
     /// The links that listeners use.
     shared: Mutex<Vec<(Address, Weak<SharedLink>)>>,
     thread: OwnThreads,
+    heartbeat: Arc<Heartbeat>,
 }
 
 /// Orders to the thread of the poller. The thread ends when all senders are dropped.
@@ -128,15 +130,17 @@ impl Poller {
             .enable_time()
             .build()
             .map_err(PollerError::Thread)?;
-        let to = Arc::clone(&results);
+        let heartbeat = Arc::new(Heartbeat::new("holdfast-poller"));
+        let (to, own) = (Arc::clone(&results), Arc::clone(&heartbeat));
         let work = move || {
-            LocalSet::new().block_on(&runtime, obey(told, writes, Arc::clone(&to)));
+            let work = own.during(obey(told, writes, Arc::clone(&to)));
+            LocalSet::new().block_on(&runtime, work);
             to.end();
             // Does not wait for name resolution in progress.
             runtime.shutdown_background();
         };
         let thread = thread::Builder::new()
-            .name("holdfast-poller".into())
+            .name(heartbeat.thread().to_owned())
             .spawn(work)
             .map_err(PollerError::Thread)?;
         let threads = OwnThreads::default();
@@ -149,11 +153,17 @@ impl Poller {
             passed,
             shared: Mutex::default(),
             thread: threads,
+            heartbeat,
         };
         for device in devices {
             poller.begin(device)?;
         }
         Ok(poller)
+    }
+
+    /// The heartbeat of the thread.
+    pub fn heartbeat(&self) -> &Heartbeat {
+        &self.heartbeat
     }
 
     /// Polls one more device.

@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 use holdfast_protocol::pdu::ExceptionCode;
 use holdfast_protocol::raw_ingest::Refusal;
 
-use crate::counter::Counter;
+use crate::counter::{Counter, ReasonCounters};
 
 /// The counters of one listener since its start.
 #[derive(Debug)]
@@ -70,7 +70,7 @@ pub struct ConnectionCounters {
     /// A request asked for listen only mode, which the listener does not allow.
     pub refused_listen_only: Counter,
     /// TLS failed, usually in the handshake.
-    pub tls_failed: Counter,
+    pub tls_failed: ReasonCounters,
     /// Closed in favour of a new connection.
     pub evicted: Counter,
     /// Closed during the handshake in favour of a new connection.

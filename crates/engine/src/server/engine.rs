@@ -27,6 +27,7 @@ use super::serial::{ModbusSerial, SerialSettings};
 use super::tcp::{ModbusStream, StreamSettings};
 use super::udp::{DatagramFraming, ModbusUdp, UdpSettings};
 use super::unit_server::UnitServer;
+use crate::heartbeat::Heartbeat;
 use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 
@@ -77,6 +78,8 @@ pub struct Engine {
     handles: Vec<Handle>,
     stop: Arc<watch::Sender<bool>>,
     workers: OwnThreads,
+    /// One for each worker.
+    heartbeats: Vec<Arc<Heartbeat>>,
     reporter: Reporter,
     auditor: Option<Auditor>,
     events: Events,
@@ -164,14 +167,15 @@ impl Engine {
             handles: runtimes.iter().map(|runtime| runtime.handle().clone()).collect(),
             stop: Arc::new(stop),
             workers: OwnThreads::default(),
+            heartbeats: (0..runtimes.len()).map(heartbeat).collect(),
             reporter,
             auditor,
             events,
             records,
         };
         engine.reload(settings.listening)?;
-        for (index, runtime) in runtimes.into_iter().enumerate() {
-            engine.work(index, runtime, stopping.clone())?;
+        for (runtime, heartbeat) in runtimes.into_iter().zip(&engine.heartbeats) {
+            engine.work(runtime, Arc::clone(heartbeat), stopping.clone())?;
         }
         Ok(engine)
     }
@@ -323,23 +327,28 @@ impl Engine {
     /// Runs one worker until the engine stops and its connections have ended.
     fn work(
         &self,
-        index: usize,
         runtime: Runtime,
+        heartbeat: Arc<Heartbeat>,
         mut stopping: watch::Receiver<bool>,
     ) -> Result<(), StartError> {
         let stop = Arc::clone(&self.stop);
+        let name = heartbeat.thread().to_owned();
         let body = move || {
-            runtime.block_on(async move {
+            runtime.block_on(heartbeat.during(async move {
                 let _ = stopping.wait_for(|stop| *stop).await;
                 drop(stopping);
                 // Each connection and listener holds a receiver.
                 let _ = tokio::time::timeout(GRACE, stop.closed()).await;
-            });
+            }));
         };
-        let name = format!("holdfast-io-{index}");
         let thread = thread::Builder::new().name(name).spawn(body).map_err(StartError::Worker)?;
         self.workers.push(thread);
         Ok(())
+    }
+
+    /// The heartbeat of each worker.
+    pub fn heartbeats(&self) -> &[Arc<Heartbeat>] {
+        &self.heartbeats
     }
 
     /// The address of each listener, in the order of the settings; `None` for serial lines.
@@ -398,6 +407,11 @@ impl Engine {
             records.wake();
         }
     }
+}
+
+/// The heartbeat of the worker with this number.
+fn heartbeat(index: usize) -> Arc<Heartbeat> {
+    Arc::new(Heartbeat::new(format!("holdfast-io-{index}")))
 }
 
 impl Listener {

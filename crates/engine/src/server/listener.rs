@@ -104,7 +104,7 @@ impl ListenerContext {
             Kind::Ended => self.connections.ended.add(),
             Kind::RequestTimeout => self.connections.request_timeout.add(),
             Kind::SlowReader => self.connections.slow_reader.add(),
-            Kind::TlsFailed(_) => self.connections.tls_failed.add(),
+            Kind::TlsFailed(reason) => self.connections.tls_failed.add(reason),
             _ => {}
         }
         self.reporter.report(&self.name, kind, Some(peer.into()), subject);

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import socket
 
     from holdfast.adapters.diagnostics import DiagnosticsSource
+    from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.stop import Stop
@@ -28,6 +29,7 @@ class Rest:
         settings: RestConfig,
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
+        sessions: SessionControl,
         listener: socket.socket,
         *,
         https: Https | None = None,
@@ -35,7 +37,7 @@ class Rest:
         scheme = "http" if https is None else "https"
         self._host = Host(
             "rest",
-            App(settings, memory_access, diagnostics, listener, scheme),
+            App(settings, memory_access, diagnostics, sessions, listener, scheme),
             listener,
             sources=settings.sources,
             limits=ConnectionLimits(
@@ -46,6 +48,7 @@ class Rest:
             request_timeout=settings.request_timeout,
             https=https,
         )
+        self.heartbeat = self._host.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""
@@ -53,4 +56,8 @@ class Rest:
 
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections."""
-        return {"address": self._host.address, "connections": self._host.counts()}
+        return {
+            "address": self._host.address,
+            "connections": self._host.counts(),
+            "tls_failures": self._host.tls_failures(),
+        }

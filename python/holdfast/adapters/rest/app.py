@@ -16,6 +16,7 @@ from holdfast import __version__
 from holdfast.adapters.rest import openapi
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.adapters.rest.routes import INGEST, READ, ROUTES
+from holdfast.adapters.sessions import parse_session_id
 from holdfast.ingest import Grant, Refused
 from holdfast.types import AREAS
 from holdfast.web import openapi_page as page
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.rest.routes import Parameter
+    from holdfast.adapters.sessions import SessionControl
     from holdfast.config import RestConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.web.host import Receive, Scope, Send
@@ -46,6 +48,12 @@ class Declined(Refused):
     """A refusal before the memory access was called, which has not counted it yet."""
 
 
+class EndSession(msgspec.Struct, forbid_unknown_fields=True):
+    """The body of a request that ends a session."""
+
+    id: str
+
+
 class App:
     """The ASGI application."""
 
@@ -54,11 +62,13 @@ class App:
         settings: RestConfig,
         memory_access: MemoryAccess,
         diagnostics: DiagnosticsSource,
+        sessions: SessionControl,
         listener: socket.socket,
         scheme: str,
     ) -> None:
         self._memory_access = memory_access
         self._diagnostics = diagnostics
+        self._sessions = sessions
         self._max_body = settings.max_body
         tokens = () if settings.tokens == "none" else settings.tokens
         self._tokens = [(token.name, bytes.fromhex(token.sha256)) for token in tokens]
@@ -71,6 +81,7 @@ class App:
             )
             for token in tokens
         }
+        self._managers = {token.name for token in tokens if token.manage}
         self._anyone = (
             Grant(ANYONE, frozenset(memory_access.memories), frozenset(AREAS))
             if settings.tokens == "none"
@@ -87,6 +98,8 @@ class App:
             "memories": self._memories,
             "stats": self._stats,
             "mqtt": self._mqtt,
+            "sessions": self._list_sessions,
+            "end_session": self._end_session,
             "openapi": self._openapi,
             "docs": self._docs,
         }
@@ -172,6 +185,24 @@ class App:
         least: dict[str, object] = {"connected": False, "broker": None, "topics": []}
         return JSON, _encoded(least | status)
 
+    def _list_sessions(self, request: Request) -> Answer:
+        self._authorize_manager(request)
+        return JSON, msgspec.json.encode({"sessions": self._sessions.sessions()})
+
+    async def _end_session(self, request: Request) -> Answer:
+        grant = self._authorize_manager(request)
+        request.check_json()
+        body = await request.body(self._max_body)
+        try:
+            asked = msgspec.json.decode(body, type=EndSession)
+            listener, number = parse_session_id(asked.id)
+        except ValueError as error:
+            raise _malformed(str(error)) from None
+        by = {"listener": "rest", "peer": request.peer, "source": grant.name}
+        if not await asyncio.to_thread(self._sessions.end_session, listener, number, by):
+            raise Declined("unknown_session", f"no session {shown(asked.id)}")
+        return JSON, msgspec.json.encode({"status": "ended", "id": asked.id})
+
     def _openapi(self, _: Request) -> Answer:
         return JSON, self._document
 
@@ -192,6 +223,14 @@ class App:
             return self._anyone
         grant = self._grants[request.owner(self._tokens)]
         request.who = grant.name
+        return grant
+
+    def _authorize_manager(self, request: Request) -> Grant:
+        """As `_authorize`, for a client that may manage the appliance."""
+        grant = self._authorize(request)
+        if grant.name not in self._managers:
+            detail = f"{grant.name} may not manage sessions, allowed: tokens with manage: true"
+            raise Declined("not_granted", detail)
         return grant
 
 

@@ -20,13 +20,13 @@ REFUSALS = Refusals(
     Refusal(
         403,
         ("not_granted",),
-        "The token does not grant this memory or area, or does not grant writes",
+        "The token does not grant this memory or area, writes, or the management of sessions",
         "area coils is not granted to edge-gateway",
     ),
     Refusal(
         404,
-        ("unknown_memory", "not_found", "not_configured"),
-        "The resource or the memory does not exist",
+        ("unknown_memory", "unknown_session", "not_found", "not_configured"),
+        "The resource, the memory or the session does not exist",
         'no memory "plant_z"',
     ),
     Refusal(

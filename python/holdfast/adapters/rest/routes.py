@@ -158,7 +158,7 @@ ROUTES = (
         "stats",
         "Get all counters since the start",
         json_answer(
-            "Counters of listeners, devices, adapters, log and audit log",
+            "Counters of listeners, devices, adapters, log and audit log; threads",
             ref("Stats"),
             {
                 "uptime": 3600.25,
@@ -208,6 +208,7 @@ ROUTES = (
                 "events_lost": 0,
                 "log_dropped": 0,
                 "audit": None,
+                "threads": {"holdfast-io-0": {"heartbeat_age": 0.4, "cpu": 12.5}},
                 "certificates": {"/etc/holdfast/server.pem": 1893456000.0},
                 "revocation_lists": {},
             },
@@ -229,6 +230,44 @@ ROUTES = (
             },
         ),
         ("not_configured",),
+    ),
+    Route(
+        "/api/v1/sessions",
+        "GET",
+        "sessions",
+        "List the open connections of listeners",
+        json_answer(
+            "The open connections, with the certificate of TLS peers",
+            ref("Sessions"),
+            {
+                "sessions": [
+                    {
+                        "listener": "scada",
+                        "id": 17,
+                        "peer": "10.0.0.7:51200",
+                        "opened": 1893456000.0,
+                        "idle": 0.4,
+                    }
+                ]
+            },
+        ),
+        ("not_granted",),
+        description="Requires a token with `manage: true`.",
+    ),
+    Route(
+        "/api/v1/sessions/end",
+        "POST",
+        "end_session",
+        "End an open connection",
+        json_answer(
+            "The connection was ended",
+            ref("EndedSession"),
+            {"status": "ended", "id": "scada/17"},
+        ),
+        (*BODY, "not_granted", "unknown_session"),
+        description="Requires a token with `manage: true`. The peer can connect again, unless a "
+        "rule forbids it.",
+        body=Body(ref("EndSession"), {"session": ("One session", {"id": "scada/17"})}),
     ),
     Route(
         DOCUMENT,

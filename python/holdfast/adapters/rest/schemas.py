@@ -5,7 +5,7 @@ from __future__ import annotations
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.protocol import LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS, REGISTER_AREAS
-from holdfast.web.openapi import Schema, integer, object_of, ref
+from holdfast.web.openapi import Schema, array_of, integer, object_of, ref
 
 COUNTER: Schema = {"type": "integer", "minimum": 0}
 AT_LEAST_ONE: Schema = {"type": "integer", "minimum": 1}
@@ -13,6 +13,11 @@ TEXT: Schema = {"type": "string"}
 TEXT_OR_NULL: Schema = {"type": ["string", "null"]}
 REGISTER = integer(0, MAX_WORD)
 ADDRESS = integer(0, LAST_ADDRESS)
+
+SESSION_ID: Schema = {
+    "type": "string",
+    "description": "The listener and the id of a session, as in `scada/17`",
+}
 
 
 def _values(items: Schema) -> Schema:
@@ -33,6 +38,7 @@ COMMANDS: dict[str, Schema] = {
     "BitCommand": _command(BIT_AREAS, "values", ref("Bit")),
     "BoolsCommand": _command(BIT_AREAS, "bools", ref("Bit")),
     "Bit": {"enum": [0, 1, False, True]},
+    "EndSession": object_of({"id": SESSION_ID}),
 }
 
 ANSWERS: dict[str, Schema] = {
@@ -43,6 +49,7 @@ ANSWERS: dict[str, Schema] = {
         {"status": {"const": "accepted"}, "commands": AT_LEAST_ONE, "written": AT_LEAST_ONE}
     ),
     "Values": object_of({"values": _values(REGISTER)}),
+    "EndedSession": object_of({"status": {"const": "ended"}, "id": SESSION_ID}),
     "Health": object_of({"status": {"const": "ok"}}),
     "Refusal": {
         "type": "object",
@@ -59,6 +66,20 @@ ANSWERS: dict[str, Schema] = {
 }
 
 DIAGNOSTICS: dict[str, Schema] = {
+    "Sessions": object_of({"sessions": array_of(ref("Session"))}),
+    "Session": object_of(
+        {
+            "listener": TEXT,
+            "id": COUNTER,
+            "peer": TEXT,
+            "opened": {"type": "number", "description": "Unix time"},
+            "idle": {"type": "number", "description": "Seconds since the last request"},
+            "role": TEXT | {"description": "The role in the certificate of a TLS peer"},
+            "subject": TEXT | {"description": "The subject of that certificate"},
+            "serial": TEXT | {"description": "The serial number of that certificate"},
+        },
+        optional=("role", "subject", "serial"),
+    ),
     "Memories": object_of({"memories": {"type": "object", "additionalProperties": ref("Memory")}}),
     "Memory": object_of(
         {
@@ -158,6 +179,22 @@ DIAGNOSTICS: dict[str, Schema] = {
                         },
                     },
                 },
+            },
+            "threads": {
+                "type": "object",
+                "description": "By name of the thread",
+                "additionalProperties": object_of(
+                    {
+                        "heartbeat_age": {
+                            "type": "number",
+                            "description": "Seconds since the last heartbeat",
+                        },
+                        "cpu": {
+                            "type": ["number", "null"],
+                            "description": "Processor time in seconds, if the system provides it",
+                        },
+                    }
+                ),
             },
             "certificates": {
                 "type": "object",

@@ -1,0 +1,70 @@
+"""Whether the threads of a running appliance still get to their work, and their processor time."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from holdfast import logs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from holdfast.types import ThreadHeartbeat
+
+STALLED = 10.0
+"""Seconds without a heartbeat after which a thread is stalled."""
+
+
+class Liveness:
+    """Watches heartbeats. `check` is for one thread; all else is thread-safe."""
+
+    def __init__(self, heartbeats: Callable[[], Sequence[ThreadHeartbeat]]) -> None:
+        self._heartbeats = heartbeats
+        self._checked = time.monotonic()
+        self._stalled: set[str] = set()
+
+    @property
+    def all_live(self) -> bool:
+        """Whether no thread was stalled at the last check."""
+        return not self._stalled
+
+    def check(self) -> None:
+        """Logs threads that have stalled or are back. Call it about once a second."""
+        now = time.monotonic()
+        # A suspended process holds up this thread too. Only what exceeds that is a stall.
+        limit = STALLED + now - self._checked
+        self._checked = now
+        ages = {thread: age for thread, age, _ in self._heartbeats()}
+        stalled = {
+            thread
+            for thread, age in ages.items()
+            if age > (STALLED if thread in self._stalled else limit)
+        }
+        for thread in sorted(stalled - self._stalled):
+            age = round(ages[thread], 1)
+            logs.write(logging.ERROR, "thread_stalled", thread=thread, heartbeat_age=age)
+        for thread in sorted(self._stalled - stalled):
+            logs.write(logging.INFO, "thread_back", thread=thread)
+        self._stalled = stalled
+
+    def threads(self) -> dict[str, dict[str, Any]]:
+        """Returns the age of the heartbeat and the processor time of each thread, in seconds."""
+        return {
+            thread: {"heartbeat_age": round(age, 3), "cpu": cpu_time(number)}
+            for thread, age, number in self._heartbeats()
+        }
+
+
+def cpu_time(number: int | None) -> float | None:
+    """Returns the processor time of a thread of this process; `None` where it is not known."""
+    try:
+        stat = Path(f"/proc/self/task/{number}/stat").read_text()
+    except OSError:  # Not Linux, or the thread has ended.
+        return None
+    # Behind the name in parentheses: the state, and 10 fields before utime and stime.
+    user, system = stat.rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
