@@ -1040,6 +1040,10 @@ class Altered:
         told: dict[str, dict[str, Any]] = self._poller.counters(report=report)
         return {name: {**counted, **self.counters_instead} for name, counted in told.items()}
 
+    @property
+    def heartbeat(self) -> Any:
+        return self._poller.heartbeat
+
     def stop(self) -> None:
         self._poller.stop()
 
