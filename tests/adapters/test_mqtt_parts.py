@@ -141,9 +141,9 @@ def test_of_two_subscriptions_to_the_same_filter_the_first_gives_the_grant() -> 
 # Pauses
 
 
-def test_pauses_double_up_to_a_minute_and_begin_anew_after_a_connection_that_held() -> None:
+def test_pauses_double_up_to_ten_seconds_and_begin_anew_after_a_connection_that_held() -> None:
     backoff = Backoff()
-    expected = [1, 2, 4, 8, 16, 32, 60, 60]
+    expected = [1, 2, 4, 8, 10, 10]
 
     for _ in range(2):
         for number, seconds in enumerate(expected):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import random
 
 FIRST_PAUSE = 1.0
-MAX_PAUSE = 60.0
-"""Seconds. Each failure doubles the pause, up to the maximum."""
+MAX_PAUSE = 10.0
+"""Seconds. Each failure doubles the pause. After an outage, the longest pause is added to it."""
 
 JITTER = 0.25
 """A pause varies randomly by this fraction, so that clients do not all reconnect at once."""
