@@ -16,8 +16,8 @@ import pytest
 
 import holdfast
 from holdfast import raw_ingest
-from holdfast.appliance import Appliance
-from holdfast.appliance.changes import ReloadRefused
+from holdfast.appliance import Appliance, assembly
+from holdfast.appliance.changes import ReloadIncomplete, ReloadRefused
 from holdfast.config import load
 from support import wire
 from support.certificates import Certificates, Issued, named
@@ -470,6 +470,9 @@ def test_devices_come_change_and_go(rig: Rig, serve: Serve, connect: Connect) ->
     assert rig.appliance.diagnostics.devices()["pump"]["polls"] >= polls
     rig.appliance.log_events(0)
 
+    with pytest.raises(ReloadRefused, match=r"devices\.pump: in_flight, retry or tolerance of"):
+        rig.reload(plant(devices={"pump": polled(second, in_flight=2)}))
+
     rig.reload(plant(devices={"pump": polled(second, enabled=False)}))
     assert rig.appliance.diagnostics.devices() == {"pump": {"health": "disabled"}}
     rig.reload(plant())
@@ -609,3 +612,18 @@ def test_a_reload_is_recorded_and_reopens_a_renamed_audit_log(rig: Rig, connect:
     assert connect(rig.address()).ask(WRITE) == WRITE
     with pytest.raises(ReloadRefused, match="audit: changed; requires a restart"):
         rig.reload(plant(audit={"file": "audit.log", "fail": "closed"}))
+
+
+def test_an_internal_error_is_not_told_as_a_refusal(
+    rig: Rig, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.start(plant())
+
+    def broken(*_: object) -> None:
+        raise KeyError("pump")
+
+    monkeypatch.setattr(assembly, "mirror", broken)
+    less = listener(rule("127.0.0.0/8", access="read-only"))
+    with pytest.raises(ReloadIncomplete, match="KeyError: 'pump'"):
+        rig.reload(plant(listeners={"scada": less}))
+    assert connect(rig.address()).ask(WRITE) == FORBIDDEN

@@ -9,7 +9,7 @@ from holdfast.config.fingerprint import fingerprint
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast.config import Config, MemoryConfig
+    from holdfast.config import Config, DeviceConfig, MemoryConfig
     from holdfast.config.links import LinkConfig
 
 
@@ -19,6 +19,10 @@ class ReloadRefused(Exception):
     def __init__(self, reasons: list[str]) -> None:
         super().__init__("; ".join(reasons))
         self.reasons = reasons
+
+
+class ReloadIncomplete(Exception):
+    """An internal error after a part of the configuration has changed. Requires a restart."""
 
 
 SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log")
@@ -47,11 +51,15 @@ def restarts(before: Config, now: Config) -> list[str]:
             reasons.append(f"memories.{name}: removed; its values would be lost")
         elif _layout(memory) != _layout(now.memories[name]):
             reasons.append(f"memories.{name}: areas or seal changed")
-    known = {_connection(link): link for link in before.links.values()}
+    known = {link.url: link for link in before.links.values()}
     for name, link in now.links.items():
-        running = known.get(_connection(link))
-        if running is not None and _waiting(running) != _waiting(link):
+        if link.url in known and _waiting(known[link.url]) != _waiting(link):
             reasons.append(f"links.{name}: settings of a connection in use changed")
+    used = {device.url: device for device in before.devices.values()}
+    for name, device in now.devices.items():
+        if device.url in used and _pace(used[device.url]) != _pace(device):
+            message = "in_flight, retry or tolerance of a connection in use changed"
+            reasons.append(f"devices.{name}: {message}")
     if before.workers != now.workers:
         reasons.append("workers: changed")
     if fingerprint(before.audit) != fingerprint(now.audit):
@@ -63,10 +71,11 @@ def _layout(memory: MemoryConfig) -> object:
     return {area: (span.start, span.size) for area, span in memory.areas().items()}, memory.seal
 
 
-def _connection(link: LinkConfig) -> str:
-    return link.url
-
-
 def _waiting(link: LinkConfig) -> dict[str, Any]:
     """The settings that a connection keeps as long as it is in use."""
     return link.model_dump(exclude={"url", "timeout"})
+
+
+def _pace(device: DeviceConfig) -> dict[str, Any]:
+    """The settings that a connection of devices keeps as long as it is in use."""
+    return device.model_dump(include={"in_flight", "retry", "tolerance"})

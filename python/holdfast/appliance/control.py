@@ -146,7 +146,20 @@ def _addresses(file: Path) -> list[str]:
     """The addresses where the appliance of a configuration can be."""
     if sys.platform == "win32":
         return [_name(file)]
-    return [str(folder / _name(file)) for folder in _folders()]
+    return [str(folder / _name(file)) for folder in _folders() if not _is_forged(folder)]
+
+
+def _is_forged(folder: Path) -> bool:
+    """Whether somebody else has made the folder that this user has for temporary files."""
+    if folder != _temporary():
+        return False
+    with contextlib.suppress(OSError):
+        return folder.lstat().st_uid != os.getuid()
+    return False
+
+
+def _temporary() -> Path:
+    return Path(tempfile.gettempdir()) / f"holdfast-{os.getuid()}"
 
 
 def _folders() -> Iterator[Path]:
@@ -157,7 +170,7 @@ def _folders() -> Iterator[Path]:
     if runtime:
         yield Path(runtime) / "holdfast"
     yield Path("/run/holdfast")
-    yield Path(tempfile.gettempdir()) / f"holdfast-{os.getuid()}"
+    yield _temporary()
 
 
 def _name(file: Path) -> str:

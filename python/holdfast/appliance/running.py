@@ -119,7 +119,8 @@ class Appliance:
 
         Returns the keys of what has changed. Raises `ReloadRefused` for changes that require a
         restart, `OSError` for an address that can't be bound or a file that can't be opened, and
-        `UnknownAdapter`; nothing has changed then. Call it in the thread that calls `log_events`.
+        `UnknownAdapter`; nothing has changed then. Raises `ReloadIncomplete` for an internal error
+        after the listeners have changed. Call it in the thread that calls `log_events`.
         """
         changed = self._parts().reload(config)
         self.config = config
@@ -426,12 +427,28 @@ class _Running:
                 events=_events(config),
             )
             undo.pop_all()
-        # From here on, nothing can be refused any more.
         before, self._config, self._fingerprints = self._config, config, fingerprints
         self._poller = self.diagnostics.poller = poller
         known.update(added)
+        try:
+            self._take_over(before, added, links, devices, https, ports)
+        except Exception as error:
+            raise changes.ReloadIncomplete(f"{type(error).__name__}: {error}") from error
+        return changed
+
+    def _take_over(
+        self,
+        before: Config,
+        added: Mapping[str, _core.Memory],
+        links: assembly.Links,
+        devices: Mapping[str, _core.PolledDevice],
+        https: Mapping[str, Https | None],
+        ports: dict[str, Port],
+    ) -> None:
+        """The part of a reload that follows the change of the listeners, and refuses nothing."""
+        config = self._config
         self._seals |= {name: memory.seal_changes for name, memory in added.items()}
-        assembly.mirror(config, memories)
+        assembly.mirror(config, self._memories)
         self._passages.update(links.passages)
         for name in [name for name in self._passages if name not in links.passages]:
             del self._passages[name]
@@ -450,7 +467,6 @@ class _Running:
         if self._audit is not None:
             self._audit.reopen()
             auditing.record(self._audit, "reload", config)
-        return changed
 
     def _taken_over_ports(self, config: Config, undo: ExitStack) -> dict[str, Port]:
         """The ports of the HTTP services: those at the same address stay, new ones are bound."""

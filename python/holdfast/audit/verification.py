@@ -140,8 +140,8 @@ def _error(
 def _foreign(before: Line | None, line: Line, after: Line | None) -> str | None:
     """What is wrong with a line that names no place in the chain.
 
-    It may be the last one, incomplete, or stand before a line that says so, or be one of those that
-    were written before there was a chain.
+    Allowed are an incomplete last line, an incomplete line before one that reports it, and lines
+    from before the chain began.
     """
     begins = before is None or before.place is None
     if after is None:

@@ -10,6 +10,7 @@ import click
 from holdfast.appliance.control import NotRunning, ask
 
 REFUSED = 2
+INCOMPLETE = 3
 
 
 @click.command(epilog="Example: holdfast reload plant.yaml")
@@ -19,13 +20,17 @@ def reload(file: Path) -> None:
 
     The whole configuration and all files that it names are checked first. If anything is wrong, the
     appliance goes on as before, and every problem is printed. Exit codes: 0 reloaded, 1 no
-    appliance of this user runs FILE, 2 refused.
+    appliance of this user runs FILE, 2 refused, 3 an internal error: restart the appliance.
     """
     try:
         answer = ask(file, "reload")
     except NotRunning as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(1)
+    if "incomplete" in answer:
+        click.echo(answer["incomplete"], err=True)
+        click.echo("A part of the configuration has changed. Restart the appliance.", err=True)
+        sys.exit(INCOMPLETE)
     problems = answer.get("problems") or [answer[key] for key in ("error",) if key in answer]
     if problems:
         for problem in problems:

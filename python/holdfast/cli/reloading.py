@@ -28,7 +28,7 @@ WATCH_INTERVAL = 1.0
 
 
 class Reloading:
-    """Reloads one appliance. `due` and `reload` are for the thread that runs it."""
+    """Reloads one appliance. `step` is for the thread that runs it."""
 
     def __init__(self, appliance: Appliance, file: Path, manager: ServiceManager) -> None:
         self._appliance = appliance
@@ -81,7 +81,11 @@ class Reloading:
             problems = [f"{self._file}: {explained(error)}"]
         except (UnknownAdapter, ValueError) as error:
             problems = [f"{self._file}: {error}"]
-        self._known = self._seen = signature(self._file, self._appliance.config)
+        except changes.ReloadIncomplete as error:
+            logs.problem("reload_incomplete")
+            return {"incomplete": f"{self._file}: internal error: {error}"}
+        finally:
+            self._known = self._seen = signature(self._file, self._appliance.config)
         for problem in problems:
             logs.write(logging.ERROR, "reload_refused", problem=problem)
         if problems:
