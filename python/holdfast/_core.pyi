@@ -637,7 +637,8 @@ class PolledDevice:
     `max_gap` (default: 0) or `cost` (of a request, of a register or 16 bits) selects the gaps that
     are read; `readable` and `forbidden` are areas with start and end, exclusive. `status` is the
     memory of the status block, and the block. `start_within` is the maximum delay of the first poll
-    (default: the interval). `report` queues polls for `Poller.results`. `release` closes the
+    (default: the interval). `report` takes the polls; `fields` are areas, addresses and counts that
+    are read only for it, and not forwarded. `release` closes the
     connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
     are the first and the longest pause after failures (default: 1 and 60). Times are in seconds;
     interval 0 polls without a pause.
@@ -662,7 +663,8 @@ class PolledDevice:
         status: tuple[Memory, StatusBlock] | None = None,
         start_within: float | None = None,
         in_flight: int | None = 1,
-        report: bool = False,
+        report: Results | None = None,
+        fields: Sequence[tuple[Area, int, int]] | None = None,
         release: bool = False,
         measured: bool = False,
         retry: tuple[float, float] | None = None,
@@ -746,6 +748,35 @@ class Route:
     """Where a listener passes on the requests to a unit."""
 
 @final
+class Results:
+    """A receiver of polls, and of the results of writes. Its queue is bounded."""
+
+    def take(
+        self, timeout: float
+    ) -> (
+        tuple[
+            list[tuple[str, float, list[PolledBlock]]],
+            list[tuple[int, int]],
+        ]
+        | None
+    ):
+        """All polls and results of writes since the last call.
+
+        Waits up to `timeout` seconds for the first. A poll is a device, its scheduled time in
+        seconds since the poller's start (its actual start, if outside the schedule), and its blocks
+        in the order of their requests: area, address, count, the bytes (`None` without a valid
+        reply), the fault as in a status block, and the time of the result in seconds since 1970. A
+        write is its number and its fault, 0 if the device confirmed it. Returns `None` when the
+        poller has stopped and no results are left.
+        """
+
+    def wake(self) -> None:
+        """Ends the current or the next wait of `take`."""
+
+    @property
+    def dropped(self) -> int:
+        """Polls that are missing because the queue was full; the oldest are dropped."""
+
 class Poller:
     """Polls devices on a native thread, from construction to `stop`.
 
@@ -772,11 +803,11 @@ class Poller:
         changes nothing.
         """
 
-    def write(self, name: str, request: Request) -> int:
+    def write(self, name: str, request: Request, to: Results) -> int:
         """Sends a write to a device over its own connection, between two reads.
 
-        Returns the number of the write in `results`. Raises `ValueError` for an unknown device or a
-        request that does not write, `RuntimeError` after `stop`.
+        Returns the number under which `to` has the result. Raises `ValueError` for an unknown
+        device or a request that does not write, `RuntimeError` after `stop`.
         """
 
     def link(
@@ -822,36 +853,13 @@ class Poller:
     def remove(self, name: str) -> bool:
         """Removes a device. Returns whether it existed."""
 
-    def results(
-        self, timeout: float
-    ) -> (
-        tuple[
-            list[tuple[str, float, list[PolledBlock]]],
-            list[tuple[int, int]],
-        ]
-        | None
-    ):
-        """All polls of devices with `report`, and all writes, since the last call.
+    def receiver(self) -> Results:
+        """A new receiver of polls and of the results of writes. It ends with the poller."""
 
-        Waits up to `timeout` seconds for the first. A poll is a device, its scheduled time in
-        seconds since the poller's start (its actual start, if outside the schedule), and its blocks
-        in the order of their requests: area, address, count, the bytes (`None` without a valid
-        reply), the fault as in a status block, and the time of the result in seconds since 1970. A
-        write is its number and its fault, 0 if the device confirmed it. Returns `None` when the
-        poller has stopped and no results are left.
-        """
-
-    def wake(self) -> None:
-        """Ends the current or the next wait of `results`."""
-
-    @property
-    def dropped(self) -> int:
-        """Polls missing from `results` because the queue was full."""
-
-    def counters(self, *, report: bool | None = None) -> dict[str, dict[str, Any]]:
+    def counters(self, *, of: Results | None = None) -> dict[str, dict[str, Any]]:
         """The health and counters of each device and of its forwards, by device name.
 
-        `report` selects the devices with this value of `report`; `None` selects all.
+        `of` selects the devices whose polls this receiver takes; `None` selects all.
 
         `age` is the age of the last valid reply, `None` before the first. `plan_error` is the
         reason why the device has no plan, `None` if it has one. `unplanned` counts polls skipped

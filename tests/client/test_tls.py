@@ -131,12 +131,14 @@ class Reader:
 def _polled(url: str, timeout: float) -> Sequence[int]:
     reads: Any = [("holding_registers", 0, 3, None)]
     options: dict[str, Any] = {"interval": 60, "timeout": timeout, "start_within": 0}
+    poller = _core.Poller([])
+    results = poller.receiver()
     device = _core.PolledDevice(
-        "plc", endpoint(parse(url)), unit=1, reads=reads, report=True, **options
+        "plc", endpoint(parse(url)), unit=1, reads=reads, report=results, **options
     )
-    poller = _core.Poller([device])
     try:
-        taken = poller.results(2 * wire.DEADLINE)
+        poller.add(device)
+        taken = results.take(2 * wire.DEADLINE)
         assert taken is not None
         [(_, _, [(_, _, _, data, fault, _)])], _ = taken
     finally:

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast._core import Poller
+from support.native_poller import ReportingPoller
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
 @pytest.fixture
-def poller() -> Iterator[Poller]:
-    made = Poller([])
+def poller() -> Iterator[ReportingPoller]:
+    made = ReportingPoller()
     yield made
     made.stop()

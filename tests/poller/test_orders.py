@@ -10,7 +10,16 @@ import pytest
 from holdfast._core import Poller, Request
 from support import wire
 from support.fake_device import HANG_UP
-from support.native_poller import INVALID, REFUSED, RESET, TIMEOUT, device, taken, written
+from support.native_poller import (
+    INVALID,
+    REFUSED,
+    RESET,
+    TIMEOUT,
+    ReportingPoller,
+    device,
+    taken,
+    written,
+)
 from support.polled import Fake, asked, data, exception, reply
 
 if TYPE_CHECKING:
@@ -23,7 +32,7 @@ def writable(request: wire.Frame) -> bytes:
     return data(request) if request.pdu[0] <= 4 else reply(request, request.pdu)
 
 
-def test_a_write_is_confirmed_under_its_number(poller: Poller) -> None:
+def test_a_write_is_confirmed_under_its_number(poller: ReportingPoller) -> None:
     with Fake(lambda each: data(each) if each.pdu[0] <= 4 else reply(each, each.pdu[:5])) as fake:
         poller.add(device(fake))
         requests = [
@@ -53,7 +62,7 @@ def test_a_write_is_confirmed_under_its_number(poller: Poller) -> None:
     ],
 )
 def test_a_write_that_is_not_confirmed_has_a_fault(
-    poller: Poller, answer: Callable[[wire.Frame], bytes | None], fault: int
+    poller: ReportingPoller, answer: Callable[[wire.Frame], bytes | None], fault: int
 ) -> None:
     with Fake(lambda each: data(each) if each.pdu[0] <= 4 else answer(each)) as fake:
         poller.add(device(fake, timeout=0.2 if fault == TIMEOUT else 10.0))
@@ -61,7 +70,7 @@ def test_a_write_that_is_not_confirmed_has_a_fault(
         assert written(poller, poller.write("a", Request.write_register(0, 1))) == fault
 
 
-def test_a_write_to_nobody_is_refused_at_once(poller: Poller) -> None:
+def test_a_write_to_nobody_is_refused_at_once(poller: ReportingPoller) -> None:
     fake = Fake(data)
     with pytest.raises(ValueError, match="device a: there is no device of that name"):
         poller.write("a", Request.write_register(0, 1))
@@ -71,7 +80,9 @@ def test_a_write_to_nobody_is_refused_at_once(poller: Poller) -> None:
     assert written(poller, poller.write("a", Request.write_register(0, 1))) == REFUSED
 
 
-def test_a_write_waits_for_the_read_under_way_and_goes_before_the_next(poller: Poller) -> None:
+def test_a_write_waits_for_the_read_under_way_and_goes_before_the_next(
+    poller: ReportingPoller,
+) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
     def answer(request: wire.Frame) -> bytes:
@@ -92,7 +103,7 @@ def test_a_write_waits_for_the_read_under_way_and_goes_before_the_next(poller: P
         assert [each.pdu[0] for each in fake.requests] == [3, 6, 3, 3]
 
 
-def test_the_end_of_a_device_does_not_break_a_write_off(poller: Poller) -> None:
+def test_the_end_of_a_device_does_not_break_a_write_off(poller: ReportingPoller) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
     def answer(request: wire.Frame) -> bytes:
@@ -113,16 +124,18 @@ def test_the_end_of_a_device_does_not_break_a_write_off(poller: Poller) -> None:
 def test_the_end_of_a_poller_ends_the_wait_for_results() -> None:
     poller = Poller([])
     found: list[Any] = []
-    waiting = threading.Thread(target=lambda: found.append(poller.results(3600)))
+    results = poller.receiver()
+    waiting = threading.Thread(target=lambda: found.append(results.take(3600)))
     waiting.start()
     poller.stop()
     waiting.join()
     assert found == [None]
-    assert poller.results(3600) is None
+    assert results.take(3600) is None
+    assert poller.receiver().take(3600) is None
 
 
 def test_a_device_takes_the_place_of_another_with_its_connection_and_counters(
-    poller: Poller,
+    poller: ReportingPoller,
 ) -> None:
     with Fake(data) as fake:
         poller.add(device(fake))
@@ -139,7 +152,7 @@ def test_a_device_takes_the_place_of_another_with_its_connection_and_counters(
         assert not poller.remove("a")
 
 
-def test_a_poller_that_has_been_stopped_refuses_orders(poller: Poller) -> None:
+def test_a_poller_that_has_been_stopped_refuses_orders(poller: ReportingPoller) -> None:
     fake = Fake(data)
     poller.add(device(fake))
     poller.stop()
@@ -155,7 +168,7 @@ def test_a_poller_that_has_been_stopped_refuses_orders(poller: Poller) -> None:
     poller.stop()
 
 
-def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: Poller) -> None:
+def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: ReportingPoller) -> None:
     fake = Fake(data)
     receiver: Forward = ("127.0.0.1", 9, "v1", "required", 1, 1.0, [], None)
     for count, forward in ((65535, [receiver]), (65536, None)):
@@ -166,7 +179,9 @@ def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: Poller) -> Non
     assert sorted(poller.counters()) == ["65535", "65536"]
 
 
-def test_a_poll_under_way_is_completed_before_the_device_is_replaced(poller: Poller) -> None:
+def test_a_poll_under_way_is_completed_before_the_device_is_replaced(
+    poller: ReportingPoller,
+) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
     def answer(request: wire.Frame) -> bytes:
@@ -185,7 +200,7 @@ def test_a_poll_under_way_is_completed_before_the_device_is_replaced(poller: Pol
 
 
 def test_a_unit_that_is_given_a_rest_keeps_it_when_its_device_is_replaced(
-    poller: Poller,
+    poller: ReportingPoller,
 ) -> None:
     with Fake(lambda _: None) as fake:
         poller.add(device(fake, interval=0.05, timeout=0.05, retry=(60, 60)))
@@ -198,7 +213,7 @@ def test_a_unit_that_is_given_a_rest_keeps_it_when_its_device_is_replaced(
         assert fake.requests[reads].pdu[0] == 6
 
 
-def test_what_can_not_be_replaced_stays(poller: Poller) -> None:
+def test_what_can_not_be_replaced_stays(poller: ReportingPoller) -> None:
     with Fake(data) as fake:
         poller.add(device(fake))
         poller.add(device(fake, "b"))

@@ -1036,8 +1036,8 @@ class Altered:
         self._poller = poller
         self.counters_instead: dict[str, Any] = {}
 
-    def counters(self, *, report: bool | None = None) -> dict[str, dict[str, Any]]:
-        told: dict[str, dict[str, Any]] = self._poller.counters(report=report)
+    def counters(self, *, of: Any = None) -> dict[str, dict[str, Any]]:
+        told: dict[str, dict[str, Any]] = self._poller.counters(of=of)
         return {name: {**counted, **self.counters_instead} for name, counted in told.items()}
 
     @property

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast._core import Endpoint, PolledDevice, Poller
 from support import wire
@@ -10,30 +11,62 @@ from support import wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from holdfast._core import Request
     from support.polled import Fake
+
+Made: TypeAlias = "partial[PolledDevice]"
+"""A device, but for the receiver of its polls."""
 
 TIMEOUT, REFUSED, RESET, INVALID = 0x8001, 0x8002, 0x8003, 0x8004
 
 
-def device(fake: Fake, name: str = "a", **more: Any) -> PolledDevice:
+class ReportingPoller:
+    """A poller with one receiver, which takes the polls of all devices."""
+
+    def __init__(self) -> None:
+        self._poller = Poller([])
+        self.results = self._poller.receiver()
+
+    def add(self, device: Made) -> None:
+        self._poller.add(device(report=self.results))
+
+    def replace(self, name: str, device: Made, *, at_once: bool = True) -> None:
+        self._poller.replace(name, device(report=self.results), at_once=at_once)
+
+    def write(self, name: str, request: Request) -> int:
+        return self._poller.write(name, request, self.results)
+
+    def remove(self, name: str) -> bool:
+        return self._poller.remove(name)
+
+    def counters(self) -> dict[str, dict[str, Any]]:
+        return self._poller.counters()
+
+    def stop(self) -> None:
+        self._poller.stop()
+
+
+def device(fake: Fake, name: str = "a", **more: Any) -> Made:
     settings: dict[str, Any] = {
         "unit": 1,
         "interval": 3600.0,
         "timeout": 10.0,
         "reads": [("holding_registers", 0, 1, None)],
         "start_within": 0.0,
-        "report": True,
     }
-    return PolledDevice(name, Endpoint.network("tcp", "127.0.0.1", fake.port), **(settings | more))
+    endpoint = Endpoint.network("tcp", "127.0.0.1", fake.port)
+    return partial(PolledDevice, name, endpoint, **(settings | more))
 
 
-def taken(poller: Poller, wanted: Callable[[list[Any], list[Any]], object]) -> tuple[Any, Any]:
+def taken(
+    poller: ReportingPoller, wanted: Callable[[list[Any], list[Any]], object]
+) -> tuple[Any, Any]:
     """Collects polls and writes until `wanted` accepts them. Returns all of them."""
     polls: list[Any] = []
     writes: list[Any] = []
 
     def come() -> bool:
-        found = poller.results(0.05)
+        found = poller.results.take(0.05)
         assert found is not None
         polls.extend(found[0])
         writes.extend(found[1])
@@ -43,7 +76,7 @@ def taken(poller: Poller, wanted: Callable[[list[Any], list[Any]], object]) -> t
     return polls, writes
 
 
-def written(poller: Poller, number: int) -> int:
+def written(poller: ReportingPoller, number: int) -> int:
     """Returns the fault of a write."""
     _, writes = taken(poller, lambda _, writes: number in dict(writes))
     fault: int = dict(writes)[number]

@@ -39,7 +39,7 @@ mod _core {
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange};
     #[pymodule_export]
-    use super::poller::{PolledDevice, Poller, plan_blocks, tell_disabled};
+    use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
     #[pymodule_export]
     use super::raw_ingest::{encode_raw_ingest, pack_raw_ingest};
 

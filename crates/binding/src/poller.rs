@@ -6,8 +6,8 @@ use std::time::SystemTime;
 use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
-    Poller as Core, PollerError, ReadSettings, StatusSettings,
+    self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
+    Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_protocol::raw_ingest::Format;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
@@ -49,7 +49,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=false, release=false, measured=false, retry=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -67,18 +67,24 @@ impl PolledDevice {
         status: Option<(PyRef<'_, Memory>, StatusBlock)>,
         start_within: Option<f64>,
         in_flight: Option<i128>,
-        report: bool,
+        report: Option<PyRef<'_, Results>>,
+        fields: Option<Vec<Range>>,
         release: bool,
         measured: bool,
         retry: Option<(f64, f64)>,
     ) -> PyResult<PolledDevice> {
+        let place = |area: String, address, count| -> PyResult<_> {
+            let address = within("address", address, 0..=65_535)? as u16;
+            Ok((named(&area)?, address, within("count", count, 1..=65_536)? as u32))
+        };
         let reads = reads.into_iter().map(|(area, address, count, into)| {
-            Ok(ReadSettings {
-                area: named(&area)?,
-                address: within("address", address, 0..=65_535)? as u16,
-                count: within("count", count, 1..=65_536)? as u32,
-                into: into.map(destination).transpose()?,
-            })
+            let (area, address, count) = place(area, address, count)?;
+            let into = into.map(destination).transpose()?;
+            Ok(ReadSettings { area, address, count, into, forward: true })
+        });
+        let fields = fields.unwrap_or_default().into_iter().map(|(area, address, count)| {
+            let (area, address, count) = place(area, address.into(), count.into())?;
+            Ok(ReadSettings { area, address, count, into: None, forward: false })
         });
         let forward = forward.unwrap_or_default().into_iter().map(target);
         let status = status.map(|(memory, of)| self::status(&memory, of));
@@ -90,13 +96,13 @@ impl PolledDevice {
             unit_id: byte("unit", unit)?,
             interval: seconds("interval", interval)?,
             timeout: seconds("timeout", timeout)?,
-            reads: reads.collect::<PyResult<_>>()?,
+            reads: reads.chain(fields).collect::<PyResult<_>>()?,
             limits: limits(max_registers, max_bits, readable, forbidden)?,
             strategy: strategy(max_gap, cost)?,
             forward: forward.collect::<PyResult<_>>()?,
             status: status.transpose()?,
             start_within: seconds("start_within", start_within.unwrap_or(interval))?,
-            report,
+            report: report.map(|receiver| Arc::clone(&receiver.core)),
             release,
             measured,
         };
@@ -133,8 +139,17 @@ impl Poller {
         self.core.replace(name, device.core.clone(), at_once).map_err(raised)
     }
 
-    fn write(&self, name: &str, request: PyRef<'_, Request>) -> PyResult<u64> {
-        self.core.write(name, Box::new(request.encoded.clone())).map_err(raised)
+    fn write(
+        &self,
+        name: &str,
+        request: PyRef<'_, Request>,
+        to: PyRef<'_, Results>,
+    ) -> PyResult<u64> {
+        self.core.write(name, Box::new(request.encoded.clone()), &to.core).map_err(raised)
+    }
+
+    fn receiver(&self) -> Results {
+        Results { core: self.core.receiver() }
     }
 
     #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=256, coalesce=true, cache=0.0, preferred=None, retry=None))]
@@ -176,32 +191,18 @@ impl Poller {
         self.core.remove(name)
     }
 
-    fn results<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Taken<'py>>> {
-        let timeout = seconds("timeout", timeout)?;
-        let Batch { polls, writes, ended, .. } = py.detach(|| self.core.results().take(timeout));
-        if ended && polls.is_empty() && writes.is_empty() {
-            return Ok(None);
-        }
-        let polls = polls.iter().map(|poll| reported(py, poll)).collect::<PyResult<_>>()?;
-        let writes = writes.iter();
-        let writes = writes.map(|done| (done.ticket, done.outcome.err().map_or(0, Fault::code)));
-        Ok(Some((polls, writes.collect())))
-    }
-
-    fn wake(&self) {
-        self.core.results().wake();
-    }
-
-    #[getter]
-    fn dropped(&self) -> u64 {
-        self.core.results().dropped()
-    }
-
-    #[pyo3(signature = (*, report=None))]
-    fn counters<'py>(&self, py: Python<'py>, report: Option<bool>) -> PyResult<Bound<'py, PyDict>> {
+    #[pyo3(signature = (*, of=None))]
+    fn counters<'py>(
+        &self,
+        py: Python<'py>,
+        of: Option<PyRef<'_, Results>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
-        let devices = self.core.devices().into_iter();
-        for device in devices.filter(|device| report.is_none_or(|only| device.report == only)) {
+        let is_of = |device: &Polled| match &of {
+            Some(of) => device.report.as_ref().is_some_and(|to| Arc::ptr_eq(to, &of.core)),
+            None => true,
+        };
+        for device in self.core.devices().into_iter().filter(is_of) {
             let counted = state(py, &device.state)?;
             let mut forwards = Vec::new();
             for forward in &device.forwards {
@@ -220,6 +221,35 @@ impl Poller {
 
     fn stop(&self, py: Python<'_>) {
         py.detach(|| self.core.stop());
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Results {
+    core: Arc<poller::Results>,
+}
+
+#[pymethods]
+impl Results {
+    fn take<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Taken<'py>>> {
+        let timeout = seconds("timeout", timeout)?;
+        let Batch { polls, writes, ended, .. } = py.detach(|| self.core.take(timeout));
+        if ended && polls.is_empty() && writes.is_empty() {
+            return Ok(None);
+        }
+        let polls = polls.iter().map(|poll| reported(py, poll)).collect::<PyResult<_>>()?;
+        let writes = writes.iter();
+        let writes = writes.map(|done| (done.ticket, done.outcome.err().map_or(0, Fault::code)));
+        Ok(Some((polls, writes.collect())))
+    }
+
+    fn wake(&self) {
+        self.core.wake();
+    }
+
+    #[getter]
+    fn dropped(&self) -> u64 {
+        self.core.dropped()
     }
 }
 

@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from holdfast.ingest import MemoryAccess
 
 
+def configured(poller: Poller) -> dict[str, dict[str, Any]]:
+    """The counters of the devices in the configuration. Those of the scanner have a slash."""
+    return {name: told for name, told in poller.counters().items() if "/" not in name}
+
+
 class Diagnostics:
     """Reads counters and states of a running appliance. Thread-safe; changes nothing."""
 
@@ -70,7 +75,7 @@ class Diagnostics:
 
     def devices(self) -> dict[str, dict[str, Any]]:
         """Returns the health and the counters of each device."""
-        polled = {} if self.poller is None else self.poller.counters(report=False)
+        polled = {} if self.poller is None else configured(self.poller)
         return {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
 
     def adapter(self, name: str) -> dict[str, Any] | None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from holdfast import _core, logs
 from holdfast.adapters import foreign
 from holdfast.appliance import assembly, auditing, changes, configured_certificates
-from holdfast.appliance.diagnostics import Diagnostics
+from holdfast.appliance.diagnostics import Diagnostics, configured
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.supervision import Supervisor
 from holdfast.client.endpoint import check_files
@@ -294,7 +294,7 @@ class _Running:
             self._reviewed = now
             self._engine.review()
         if self._poller is not None:
-            for name, told in self._poller.counters(report=False).items():
+            for name, told in configured(self._poller).items():
                 self._log_device(name, told)
 
     def _heartbeats(self) -> list[ThreadHeartbeat]:

@@ -51,8 +51,7 @@ poll, and a caller may subscribe to a thousand tags one by one."""
 class Polling:
     """Polls devices. Calls `take` in the event loop for each poll.
 
-    Its arguments are the device, the scheduled time in seconds, and the blocks. Of a `poller` that
-    is given, the devices with reports and the results must belong to this object.
+    Its arguments are the device, the scheduled time in seconds, and the blocks.
     """
 
     def __init__(
@@ -74,7 +73,7 @@ class Polling:
         self._loop = asyncio.get_running_loop()
         self._is_own = poller is None
         self._poller = _core.Poller([]) if poller is None else poller
-        self._dropped_before = self._poller.dropped
+        self._results = self._poller.receiver()
         self._stopping = threading.Event()
         self._taken = threading.Semaphore(1)
         self._thread = threading.Thread(target=self._run, name="holdfast-scan", daemon=True)
@@ -111,10 +110,10 @@ class Polling:
         self._urgent.discard(device)
         old, name = device.polled_as, f"{PREFIX}{next(NUMBERS)}"
         if old:
-            self._poller.replace(old, _made(device, name), at_once=at_once)
+            self._poller.replace(old, self._made(device, name), at_once=at_once)
             del self._devices[old]
         else:
-            self._poller.add(_made(device, name))
+            self._poller.add(self._made(device, name))
         device.polled_as = name
         self._devices[name] = device
         self._renewed[device] = self._loop.time()
@@ -156,7 +155,7 @@ class Polling:
             raise Refused("the scanner is stopping")
         if self._paused is not None:
             raise Refused("not written: the scanner is disabled")
-        number = self._poller.write(device.polled_as, request)
+        number = self._poller.write(device.polled_as, request, self._results)
         done: asyncio.Future[int] = self._loop.create_future()
         self._writes[number] = done
         try:
@@ -164,14 +163,38 @@ class Polling:
         finally:
             del self._writes[number]
 
+    def _made(self, device: ScannedDevice, name: str) -> _core.PolledDevice:
+        source, plan = device.source, device.source.plan
+        assert device.endpoint is not None
+        interval = device.rate / 1000
+        reads = dict.fromkeys(
+            (tag.area, tag.address, tag.count, None) for tag in device.tags.values()
+        )
+        return _core.PolledDevice(
+            name,
+            device.endpoint,
+            unit=source.unit,
+            interval=interval,
+            timeout=source.timeout / 1000,
+            reads=list(reads),
+            max_gap=plan.max_gap,
+            max_registers=plan.max_registers,
+            max_bits=plan.max_bits,
+            readable=plan.readable,
+            forbidden=plan.forbidden,
+            start_within=min(interval, FIRST_WITHIN),
+            report=self._results,
+            release=source.release,
+        )
+
     def counters(self) -> dict[str, dict[str, Any]]:
         """Returns the poller's counters of each device, by its name in the poller."""
-        return self._poller.counters(report=True)
+        return self._poller.counters(of=self._results)
 
     @property
     def dropped(self) -> int:
         """Polls lost because the event loop did not keep up."""
-        return self._poller.dropped - self._dropped_before
+        return self._results.dropped
 
     async def stop(self) -> None:
         """Stops polling its devices, and closes the connections that nobody else uses."""
@@ -188,11 +211,11 @@ class Polling:
             self._poller.stop()
         while self._thread.is_alive():
             # A wake-up that comes before the wait may have ended another one.
-            self._poller.wake()
+            self._results.wake()
             self._thread.join(WAKE_INTERVAL)
 
     def _run(self) -> None:
-        while (taken := self._poller.results(RESULTS_TIMEOUT)) is not None:
+        while (taken := self._results.take(RESULTS_TIMEOUT)) is not None:
             if not any(taken):
                 if self._stopping.is_set():
                     return
@@ -215,26 +238,3 @@ class Polling:
                     self._take(device, due, blocks)
         finally:
             self._taken.release()
-
-
-def _made(device: ScannedDevice, name: str) -> _core.PolledDevice:
-    source, plan = device.source, device.source.plan
-    assert device.endpoint is not None
-    interval = device.rate / 1000
-    reads = dict.fromkeys((tag.area, tag.address, tag.count, None) for tag in device.tags.values())
-    return _core.PolledDevice(
-        name,
-        device.endpoint,
-        unit=source.unit,
-        interval=interval,
-        timeout=source.timeout / 1000,
-        reads=list(reads),
-        max_gap=plan.max_gap,
-        max_registers=plan.max_registers,
-        max_bits=plan.max_bits,
-        readable=plan.readable,
-        forbidden=plan.forbidden,
-        start_within=min(interval, FIRST_WITHIN),
-        report=True,
-        release=source.release,
-    )

@@ -72,8 +72,8 @@ pub struct DeviceSettings {
     pub status: Option<StatusSettings>,
     /// The first poll begins within this time. Devices are spread over it.
     pub start_within: Duration,
-    /// Whether reads are also sent to [`super::Results`].
-    pub report: bool,
+    /// Who takes the polls too.
+    pub report: Option<Arc<Results>>,
     /// Whether the connection is closed after each poll, for devices that accept only one.
     pub release: bool,
 }
@@ -86,6 +86,8 @@ pub struct ReadSettings {
     /// atomically.
     pub count: u32,
     pub into: Option<Destination>,
+    /// Whether the receivers of the device get it.
+    pub forward: bool,
 }
 
 /// A running device.
@@ -99,7 +101,6 @@ pub(super) struct Device {
     fields: Vec<Field>,
     /// For each field, the index of its read, and its offset in it, in items.
     parts: Vec<(usize, u32)>,
-    report: Option<Arc<Results>>,
     name: Arc<str>,
     learned: RefCell<Learned>,
     /// `None` while the device has no plan. The state has the error.
@@ -205,12 +206,10 @@ impl Device {
         state: Arc<DeviceState>,
         (link, turn): (Rc<Link>, Rc<Turn>),
         forwards: Vec<Rc<Forward>>,
-        report: Option<Arc<Results>>,
     ) -> Device {
         let device = Device {
             fields,
             parts,
-            report,
             name: settings.name.as_str().into(),
             learned: RefCell::default(),
             plan: RefCell::default(),
@@ -425,7 +424,8 @@ impl Device {
             self.draw_plan();
         }
         self.learn();
-        let mut gathered = Gathered { report: self.report.is_some(), ..Gathered::default() };
+        let mut gathered =
+            Gathered { report: self.settings.report.is_some(), ..Gathered::default() };
         let Some(plan) = self.plan.borrow().clone() else {
             return self.leave_out(due, gathered);
         };
@@ -478,7 +478,7 @@ impl Device {
 
     /// Sends the blocks of a poll to the results. Called after the health of the poll is stored.
     fn hand_over(&self, due: Instant, gathered: Gathered) {
-        if let Some(results) = &self.report {
+        if let Some(results) = &self.settings.report {
             let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
             results.push(Poll { device, due: results.counted(due.into_std()), blocks });
         }
@@ -603,6 +603,9 @@ impl Device {
                 self.state.counters.values.add_many(u64::from(read.count));
             }
             Err(_) => self.count_unstored(),
+        }
+        if !read.forward {
+            return;
         }
         for forward in &self.forwards {
             let count = u16::try_from(read.count).ok().and_then(NonZeroU16::new);

@@ -1,12 +1,12 @@
-//! Results of polls and writes, for a receiver in another thread. The receiver is woken once per
-//! batch, not once per block.
+//! Results of polls and writes, for receivers in other threads. A receiver is woken once per batch,
+//! not once per block.
 //!
-//! The queue is bounded. When it is full, the oldest polls are dropped and counted. Results of
+//! Each receiver has a bounded queue of its own, so a slow one loses nothing of the others. When it is full, the oldest polls are dropped and counted. Results of
 //! writes are never dropped.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant, SystemTime};
 
 use holdfast_memory::Area;
@@ -72,18 +72,16 @@ pub struct Results {
     dropped: AtomicU64,
 }
 
-impl Default for Results {
-    fn default() -> Results {
+impl Results {
+    fn since(began: Instant) -> Results {
         Results {
-            began: Instant::now(),
+            began,
             queue: Mutex::default(),
             ready: Condvar::default(),
             dropped: AtomicU64::default(),
         }
     }
-}
 
-impl Results {
     /// Converts a time to the clock of polls.
     pub(super) fn counted(&self, time: Instant) -> Duration {
         time.saturating_duration_since(self.began)
@@ -104,7 +102,7 @@ impl Results {
         self.put(|batch| batch.writes.push(written));
     }
 
-    pub(super) fn end(&self) {
+    fn end(&self) {
         self.put(|batch| batch.ended = true);
     }
 
@@ -142,5 +140,47 @@ impl Results {
     /// The number of polls that were dropped because the queue was full.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
+    }
+}
+
+/// All receivers of a poller.
+#[derive(Debug)]
+pub(super) struct Receivers {
+    /// The start of the poller, from which all receivers count.
+    began: Instant,
+    /// `None` when the poller has ended.
+    all: Mutex<Option<Vec<Weak<Results>>>>,
+}
+
+impl Default for Receivers {
+    fn default() -> Receivers {
+        Receivers { began: Instant::now(), all: Mutex::new(Some(Vec::new())) }
+    }
+}
+
+impl Receivers {
+    pub(super) fn add(&self) -> Arc<Results> {
+        let made = Arc::new(Results::since(self.began));
+        match &mut *self.all() {
+            Some(all) => {
+                all.retain(|other| other.strong_count() > 0);
+                all.push(Arc::downgrade(&made));
+            }
+            None => made.end(),
+        }
+        made
+    }
+
+    /// Tells all receivers, and those that come later, that no results will come.
+    pub(super) fn end(&self) {
+        for receiver in self.all().take().into_iter().flatten() {
+            if let Some(receiver) = receiver.upgrade() {
+                receiver.end();
+            }
+        }
+    }
+
+    fn all(&self) -> MutexGuard<'_, Option<Vec<Weak<Results>>>> {
+        self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

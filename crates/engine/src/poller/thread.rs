@@ -20,7 +20,7 @@ use super::caught::spawn_watched;
 use super::device::{Device, DeviceSettings, Inbox, Planned};
 use super::plan::{PlanError, PlanLimits};
 use super::raw_ingest::{Forward, ForwardCounters, ForwardSettings};
-use super::results::{Results, Written};
+use super::results::{Receivers, Results, Written};
 use super::state::DeviceState;
 use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
@@ -66,8 +66,8 @@ pub struct Polled {
     pub name: String,
     pub state: Arc<DeviceState>,
     pub forwards: Vec<Arc<ForwardCounters>>,
-    /// Whether its polls are in [`Poller::results`].
-    pub report: bool,
+    /// Who takes its polls.
+    pub report: Option<Arc<Results>>,
     address: Arc<Address>,
 }
 
@@ -76,7 +76,13 @@ impl Polled {
         state.set_stale_after(device.interval, device.timeout);
         let forwards = device.forward.iter().map(|_| Arc::default()).collect();
         let address = Arc::new(address(&device.endpoint));
-        Polled { name: device.name.clone(), state, forwards, report: device.report, address }
+        Polled {
+            name: device.name.clone(),
+            state,
+            forwards,
+            report: device.report.clone(),
+            address,
+        }
     }
 }
 
@@ -84,7 +90,7 @@ impl Polled {
 pub struct Poller {
     polled: Mutex<Vec<Polled>>,
     orders: mpsc::UnboundedSender<Order>,
-    results: Arc<Results>,
+    receivers: Arc<Receivers>,
     tickets: AtomicU64,
     /// Writes of Modbus clients into what is read from devices.
     passed: mpsc::UnboundedSender<PassedWrite>,
@@ -111,6 +117,7 @@ enum Order {
         device: String,
         ticket: u64,
         request: Box<EncodedRequest>,
+        to: Arc<Results>,
     },
     Stop,
 }
@@ -124,18 +131,18 @@ impl Poller {
         let devices = devices.into_iter().map(checked).collect::<Result<Vec<_>, _>>()?;
         let (orders, told) = mpsc::unbounded_channel();
         let (passed, writes) = mpsc::unbounded_channel();
-        let results = Arc::new(Results::default());
+        let receivers = Arc::new(Receivers::default());
         let runtime = Builder::new_current_thread()
             .enable_io()
             .enable_time()
             .build()
             .map_err(PollerError::Thread)?;
         let heartbeat = Arc::new(Heartbeat::new("holdfast-poller"));
-        let (to, own) = (Arc::clone(&results), Arc::clone(&heartbeat));
+        let (ended, own) = (Arc::clone(&receivers), Arc::clone(&heartbeat));
         let work = move || {
-            let work = own.during(obey(told, writes, Arc::clone(&to)));
+            let work = own.during(obey(told, writes));
             LocalSet::new().block_on(&runtime, work);
-            to.end();
+            ended.end();
             // Does not wait for name resolution in progress.
             runtime.shutdown_background();
         };
@@ -148,7 +155,7 @@ impl Poller {
         let poller = Poller {
             polled: Mutex::default(),
             orders,
-            results,
+            receivers,
             tickets: AtomicU64::default(),
             passed,
             shared: Mutex::default(),
@@ -273,12 +280,17 @@ impl Poller {
         Ok(Passage::new(memory, ranges, self.passed.clone()))
     }
 
-    /// Sends a write over the connection of a device. Returns a number; [`Poller::results`] reports
-    /// the result under this number.
+    /// Sends a write over the connection of a device. Returns a number, under which its result is
+    /// passed `to` a receiver.
     ///
     /// # Errors
     /// [`PollerError`] if there is no such device, or the request is not a write.
-    pub fn write(&self, name: &str, request: Box<EncodedRequest>) -> Result<u64, PollerError> {
+    pub fn write(
+        &self,
+        name: &str,
+        request: Box<EncodedRequest>,
+        to: &Arc<Results>,
+    ) -> Result<u64, PollerError> {
         if !request.request().is_some_and(|request| request.function().is_write()) {
             let function = request.pdu()[0];
             return Err(PollerError::NoWrite { device: name.to_owned(), function });
@@ -287,7 +299,8 @@ impl Poller {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
-        self.order(Order::Write { device: name.to_owned(), ticket, request })?;
+        let to = Arc::clone(to);
+        self.order(Order::Write { device: name.to_owned(), ticket, request, to })?;
         Ok(ticket)
     }
 
@@ -314,9 +327,9 @@ impl Poller {
         self.polled.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The results of devices with `report`, and of writes.
-    pub fn results(&self) -> &Results {
-        &self.results
+    /// A new receiver of polls and of the results of writes. It ends with the poller.
+    pub fn receiver(&self) -> Arc<Results> {
+        self.receivers.add()
     }
 
     /// Stops polling. Complete reads have been passed on. A read in progress is abandoned.
@@ -363,7 +376,6 @@ const IN_ORDER: &str = "the running devices are those in the list";
 async fn obey(
     mut orders: mpsc::UnboundedReceiver<Order>,
     mut passed: mpsc::UnboundedReceiver<PassedWrite>,
-    results: Arc<Results>,
 ) {
     let mut links: HashMap<Address, rc::Weak<Link>> = HashMap::new();
     let mut running: HashMap<String, Running> = HashMap::new();
@@ -400,7 +412,7 @@ async fn obey(
                 let name = planned.settings.name.clone();
                 let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
                 let link = link_to(endpoint, (*in_flight, *retry), &mut links);
-                let device = Running::start(*planned, polled, link, phase, &results);
+                let device = Running::start(*planned, polled, link, phase);
                 let before = running.insert(name, device);
                 debug_assert!(before.is_none(), "{IN_ORDER}");
             }
@@ -412,18 +424,18 @@ async fn obey(
                 let name = planned.settings.name.clone();
                 let device = match before {
                     Some(mut device) if !device.has_ended() => {
-                        device.replace(*planned, polled, link, at_once, &results);
+                        device.replace(*planned, polled, link, at_once);
                         device
                     }
                     // A panicked task cannot hand over to a new device.
-                    _ => Running::start(*planned, polled, link, Duration::ZERO, &results),
+                    _ => Running::start(*planned, polled, link, Duration::ZERO),
                 };
                 running.insert(name, device);
                 links.retain(|_, link| link.strong_count() > 0);
             }
-            Order::Write { device, ticket, request } => match running.get(&device) {
-                Some(device) => device.write(ticket, request, &results),
-                None => results.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
+            Order::Write { device, ticket, request, to } => match running.get(&device) {
+                Some(device) => device.write(ticket, request, to),
+                None => to.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
             },
         }
     }
@@ -431,19 +443,13 @@ async fn obey(
 
 impl Running {
     /// Starts the tasks of a device.
-    fn start(
-        planned: Planned,
-        polled: Polled,
-        link: Rc<Link>,
-        phase: Duration,
-        results: &Arc<Results>,
-    ) -> Running {
+    fn start(planned: Planned, polled: Polled, link: Rc<Link>, phase: Duration) -> Running {
         let inbox = Rc::new(Inbox::default());
         let DeviceSettings { unit_id, timeout, release, .. } = planned.settings;
         let turn = Rc::new(Turn::default());
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
-        let (device, forwards) = made(planned, polled, to, results);
+        let (device, forwards) = made(planned, polled, to);
         let device = spawn_watched(device.run(phase, Rc::clone(&inbox)), state);
         Running { link, turn, unit_id, timeout, release, inbox, device, forwards }
     }
@@ -453,19 +459,12 @@ impl Running {
         self.device.is_finished()
     }
 
-    fn replace(
-        &mut self,
-        planned: Planned,
-        polled: Polled,
-        link: Rc<Link>,
-        at_once: bool,
-        results: &Arc<Results>,
-    ) {
+    fn replace(&mut self, planned: Planned, polled: Polled, link: Rc<Link>, at_once: bool) {
         self.stop_forwards();
         let settings = &planned.settings;
         (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
         (self.release, self.link) = (settings.release, Rc::clone(&link));
-        let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)), results);
+        let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)));
         self.forwards = forwards;
         if at_once {
             device.want_soon();
@@ -475,10 +474,9 @@ impl Running {
 
     /// Sends a write between two reads, as soon as possible. Removing the device does not cancel
     /// it.
-    fn write(&self, ticket: u64, request: Box<EncodedRequest>, results: &Arc<Results>) {
+    fn write(&self, ticket: u64, request: Box<EncodedRequest>, to: Arc<Results>) {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
-        let results = Arc::clone(results);
         let Running { unit_id, timeout, release, .. } = *self;
         spawn_local(async move {
             let turn = turn.take().await;
@@ -490,7 +488,7 @@ impl Running {
             if answer.is_ok() {
                 inbox.wake();
             }
-            results.push_write(Written { ticket, outcome: answer.map(drop) });
+            to.push_write(Written { ticket, outcome: answer.map(drop) });
         });
     }
 
@@ -520,12 +518,7 @@ impl Running {
 }
 
 /// Creates a device, and starts the tasks that forward its reads.
-fn made(
-    planned: Planned,
-    polled: Polled,
-    to: (Rc<Link>, Rc<Turn>),
-    results: &Arc<Results>,
-) -> (Device, Vec<AbortHandle>) {
+fn made(planned: Planned, polled: Polled, to: (Rc<Link>, Rc<Turn>)) -> (Device, Vec<AbortHandle>) {
     polled.state.set_broken(false);
     let settings = &planned.settings;
     debug_assert_eq!(settings.forward.len(), polled.forwards.len());
@@ -540,8 +533,7 @@ fn made(
         .iter()
         .map(|forward| spawn_watched(Rc::clone(forward).run(), Arc::clone(&polled.state)));
     let tasks = tasks.collect();
-    let report = settings.report.then(|| Arc::clone(results));
-    (Device::new(planned, polled.state, to, forwards, report), tasks)
+    (Device::new(planned, polled.state, to, forwards), tasks)
 }
 
 /// The link to an address, shared by all that ask for it.
@@ -608,7 +600,10 @@ fn checked(device: DeviceSettings) -> Result<Planned, PollerError> {
         if !settings.into.as_ref().is_none_or(alike) {
             return Err(PollerError::Destination { device: name(), read });
         }
-        if !device.forward.is_empty() && settings.count > u32::from(u16::MAX) {
+        if !settings.forward || device.forward.is_empty() {
+            continue;
+        }
+        if settings.count > u32::from(u16::MAX) {
             return Err(PollerError::Forward { device: name(), read });
         }
         let (area, address) = match &settings.into {
@@ -668,14 +663,20 @@ mod tests {
             unit_id: 1,
             interval: Duration::from_secs(1),
             timeout: Duration::from_secs(1),
-            reads: vec![ReadSettings { area: AREA, address: 0, count: 4, into: None }],
+            reads: vec![ReadSettings {
+                area: AREA,
+                address: 0,
+                count: 4,
+                into: None,
+                forward: true,
+            }],
             limits: PlanLimits::default(),
             strategy: Strategy::Gap { max_gap: 0 },
             measured: false,
             forward: Vec::new(),
             status: None,
             start_within: Duration::ZERO,
-            report: false,
+            report: None,
             release: false,
         }
     }
@@ -714,7 +715,7 @@ mod tests {
     fn reads_beyond_the_last_address_are_refused() {
         for (address, count) in [(0, 0), (1, 65_536), (65_535, 2), (1, u32::MAX)] {
             let expected = "device meter: read 0 has no items, or goes beyond address 65535";
-            let beyond = ReadSettings { area: AREA, address, count, into: None };
+            let beyond = ReadSettings { area: AREA, address, count, into: None, forward: true };
             assert_eq!(refused(|device| device.reads = vec![beyond]), expected);
         }
     }
@@ -763,7 +764,9 @@ mod tests {
     fn a_request_that_does_not_write_is_refused() {
         let poller = Poller::start(Vec::new()).unwrap();
         let read = Request::ReadHoldingRegisters(Range::new(0, 1).unwrap());
-        let error = poller.write("meter", Box::new(EncodedRequest::new(&read))).unwrap_err();
+        let error = poller
+            .write("meter", Box::new(EncodedRequest::new(&read)), &poller.receiver())
+            .unwrap_err();
         assert_eq!(error.to_string(), "device meter: function 3 does not write");
     }
 }

@@ -33,7 +33,7 @@ fn polls_stay_due_at_whole_intervals_after_missed_polls() {
 #[test]
 fn reads_are_split_into_parts_that_fit_into_one_request() {
     let of = |area, count, limits: &PlanLimits| {
-        let read = ReadSettings { area, address: 5, count, into: None };
+        let read = ReadSettings { area, address: 5, count, into: None, forward: true };
         let (fields, parts) = parted(&[read], limits);
         let both = fields.iter().zip(parts);
         both.map(|(field, (_, at))| (field.address, field.count, at)).collect::<Vec<_>>()
@@ -102,7 +102,13 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
         unit_id: 1,
         interval: Duration::from_millis(1),
         timeout: TIMEOUT,
-        reads: vec![ReadSettings { area: AREA, address: 10, count: 4, into: Some(into) }],
+        reads: vec![ReadSettings {
+            area: AREA,
+            address: 10,
+            count: 4,
+            into: Some(into),
+            forward: true,
+        }],
         limits: PlanLimits::default(),
         strategy: Strategy::Gap { max_gap: 0 },
         measured: false,
