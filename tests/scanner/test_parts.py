@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from holdfast.client.url import NetworkTarget
 from holdfast.scanner import outbox as outboxes
 from holdfast.scanner.browsing import browsed
-from holdfast.scanner.decoding import decoder
 from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wanted
 from holdfast.scanner.groups import Group, grouped
 from holdfast.scanner.health import Health
@@ -21,7 +20,8 @@ from holdfast.scanner.heartbeat import Heart
 from holdfast.scanner.messages import BrowseRequest, HeartbeatMetadata, ServiceReport
 from holdfast.scanner.outbox import Outbox
 from holdfast.scanner.publishing import Publisher
-from holdfast.scanner.tags import Places, Tag
+from holdfast.scanner.tags import Tag
+from holdfast.tags.decoding import Places, decoder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,7 +17,8 @@ from holdfast.scanner.messages import (
     SubscriberReport,
     TagReport,
 )
-from holdfast.scanner.tags import CODE_OF_AREA, Places
+from holdfast.scanner.tags import CODE_OF_AREA
+from holdfast.tags.decoding import Places
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence, Set

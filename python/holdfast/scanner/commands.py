@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import logging
-import math
-import re
-from decimal import Decimal
 from typing import TYPE_CHECKING, Any
-
-import msgspec
 
 from holdfast import logs
 from holdfast.client.requests import write_typed
 from holdfast.faults import fault_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import is_unwritten
-from holdfast.scanner.tags import FLOATS
+from holdfast.tags.writing import from_text
 from holdfast.values import ConversionError, encode
 from holdfast.values.types import parsed
 
@@ -26,24 +19,13 @@ if TYPE_CHECKING:
     from holdfast.scanner.polling import Polling
     from holdfast.scanner.tags import Tag
 
-BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
-
-_NUMBER = re.compile(r"[+-]?([0-9]{1,400}(\.[0-9]{0,400})?|\.[0-9]{1,400})([eE][+-]?[0-9]{1,3})?")
-
 
 def value(text: str, tag: Tag) -> Any:
     """Parses a text to a value of a tag's type. Raises `Refused`."""
-    type = parsed(tag.type)
-    if type.count is not None:
-        return _array(text, tag)
-    if type.base == "string":
-        made: Any = text
-    elif type.base == "bytes":
-        made = _bytes(text, tag)
-    elif type.base in ("bool", "bit"):
-        made = _boolean(text, tag)
-    else:
-        made = _number(text.strip(), tag, type.base in FLOATS)
+    try:
+        made = from_text(text, parsed(tag.type), tag.asked_type)
+    except ValueError as error:
+        raise Refused(str(error)) from None
     return _checked(made, tag)
 
 
@@ -54,56 +36,6 @@ def _checked(made: Any, tag: Tag) -> Any:
     except ConversionError as error:
         raise Refused(str(error).replace(tag.type, tag.asked_type)) from None
     return made
-
-
-def _boolean(text: str, tag: Tag) -> bool:
-    found = BOOLEANS.get(text.strip().lower())
-    if found is None:
-        raise Refused(
-            f"{_shown(text)} is not a valid {tag.asked_type}, allowed are true, false, 1 and 0"
-        )
-    return found
-
-
-def _number(text: str, tag: Tag, is_float: bool) -> int | float:
-    if _NUMBER.fullmatch(text) is None:
-        raise Refused(f"{_shown(text)} is not a valid {tag.asked_type}, allowed is a JSON number")
-    if is_float:
-        number = float(text)
-        if math.isinf(number):
-            raise Refused(f"{_shown(text)} does not fit {tag.asked_type}")
-        return number
-    exact = Decimal(text)
-    if exact.adjusted() > 20 or exact != exact.to_integral_value():
-        raise Refused(f"{_shown(text)} is not a valid {tag.asked_type}")
-    return int(exact)
-
-
-def _bytes(text: str, tag: Tag) -> bytes:
-    try:
-        return base64.b64decode(text.strip(), validate=True)
-    except (binascii.Error, ValueError):
-        raise Refused(
-            f"{_shown(text)} is not a valid {tag.asked_type}, allowed is base64"
-        ) from None
-
-
-def _array(text: str, tag: Tag) -> list[Any]:
-    try:
-        items = msgspec.json.decode(text)
-    except (msgspec.DecodeError, RecursionError):
-        items = None
-    if not isinstance(items, list):
-        raise Refused(f"{_shown(text)} is not a valid {tag.asked_type}, allowed is a JSON array")
-    base = parsed(tag.type).base
-    if base == "bytes":
-        items = [_bytes(item, tag) if isinstance(item, str) else item for item in items]
-    made: list[Any] = _checked(items, tag)
-    return made
-
-
-def _shown(text: str) -> str:
-    return repr(text if len(text) <= 40 else f"{text[:40]}…")
 
 
 async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) -> None:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from holdfast.scanner.decoding import Undecoded, clean, value_of
+from holdfast.scanner.tags import clean
+from holdfast.tags.decoding import Undecoded, value_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.scanner.decoding import Undecoded, clean, decoder
 from holdfast.scanner.groups import Group
 from holdfast.scanner.subjects import data_subject
-from holdfast.scanner.tags import Places
+from holdfast.scanner.tags import clean
+from holdfast.tags.decoding import Places, Undecoded, decoder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
     from holdfast.config.scanning import Dialect
-    from holdfast.scanner.decoding import Decoder
     from holdfast.scanner.tags import Tag
+    from holdfast.tags.decoding import Decoder
     from holdfast.types import Area, PolledBlock
 
 Place: TypeAlias = "tuple[Area, int, int]"

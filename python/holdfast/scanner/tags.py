@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_left
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages import FunctionCode
+from holdfast.tags.decoding import Undecoded
+from holdfast.tags.markers import as_decoded
+from holdfast.tags.writing import unwritable
 from holdfast.types import AREAS, BIT_AREAS
-from holdfast.values import ConversionError, WrongArea, codec_for, decode, encode
+from holdfast.values import ConversionError, WrongArea, codec_for
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from holdfast.scanner.adjusting import Adjustments
-    from holdfast.scanner.messages import DataType, Marker, TagRequest
+    from holdfast.scanner.messages import DataType, TagRequest
     from holdfast.scanner.rules import Rules
+    from holdfast.tags.markers import Marker
     from holdfast.types import Area
     from holdfast.values.types import Type
 
@@ -27,7 +27,6 @@ AREA_OF_CODE: dict[FunctionCode, Area] = dict(zip(get_args(FunctionCode), AREAS,
 CODE_OF_AREA = {area: code for code, area in AREA_OF_CODE.items()}
 """The names of the areas in messages."""
 
-FLOATS = ("float16", "float32", "float64")
 ORDERS = {"big": "ABCD", "little": "DCBA"}
 """Other names of byte orders, as callers of tentacle-modbus use them."""
 
@@ -81,17 +80,9 @@ class Tag:
     @property
     def unwritable(self) -> str | None:
         """Returns why no Modbus request can write the tag; `None` if one can."""
-        type = parsed(self.type)
         if self.area not in WRITE_LIMITS:
             return f"functionCode {CODE_OF_AREA[self.area]} is not writable"
-        if type.base == "bit" and type.count is not None:
-            return f"{self.type} can't be written, only one bit can"
-        most = WRITE_LIMITS[self.area]
-        if type.registers > most:
-            kind = "coils" if self.of_bits else "registers"
-            has = f"{self.asked_type} has {type.registers} {kind}"
-            return f"{has}, one request writes at most {most}"
-        return None
+        return unwritable(self.area, parsed(self.type), self.asked_type)
 
     def __str__(self) -> str:
         kind = "" if self.of_bits else f" {self.order}"
@@ -103,20 +94,15 @@ class Tag:
         return self.area in BIT_AREAS
 
 
-class Places:
-    """An index of tags by address, to find the tags of a block quickly."""
-
-    def __init__(self, tags: Iterable[Tag]) -> None:
-        self._tags: dict[Area, list[Tag]] = {}
-        for tag in sorted(tags, key=lambda tag: tag.address):
-            self._tags.setdefault(tag.area, []).append(tag)
-        self._starts = {area: [tag.address for tag in tags] for area, tags in self._tags.items()}
-
-    def inside(self, area: Area, address: int, count: int) -> list[Tag]:
-        """Returns the tags that are entirely inside a block, sorted by address."""
-        starts, end = self._starts.get(area, []), address + count
-        first, last = bisect_left(starts, address), bisect_left(starts, end)
-        return [tag for tag in self._tags.get(area, [])[first:last] if tag.end <= end]
+def clean(value: Any, tag: Tag) -> Any:
+    """Returns a decoded value; `None` for NaN and for markers of the tag."""
+    if type(value) is list:
+        return [clean(item, tag) for item in value]
+    if type(value) is float and value != value:
+        return None
+    if tag.null and type(value) is not Undecoded and value in tag.null:
+        return None
+    return value
 
 
 def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules: Rules) -> Tag:
@@ -149,9 +135,12 @@ def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules
         raise Refused(
             f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
         )
-    null = frozenset(
-        _marker(marker, type, request.encoding, where) for marker in request.null or ()
-    )
+    try:
+        null = frozenset(
+            as_decoded(marker, type, request.encoding) for marker in request.null or ()
+        )
+    except ValueError as error:
+        raise Refused(f"{where}.null: {error}") from None
     made = Tag(request.id, area, request.address, name, order, null, request.encoding)
     if request.writable and (flaw := made.unwritable) is not None:
         if area in WRITE_LIMITS or rules.strict:
@@ -162,17 +151,3 @@ def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules
 
 def _is_number(type: Type) -> bool:
     return type.count is None and type.base.startswith(NUMERIC)
-
-
-def _marker(marker: Marker, type: Type, encoding: str | None, where: str) -> Marker:
-    """Converts a marker to the value that the tag's registers can hold."""
-    if type.base == "bytes":
-        raise Refused(f"{where}.null: not supported for {type.name}")
-    if marker == "nan" and type.base in FLOATS:
-        return math.nan
-    try:
-        registers = encode(marker, type.element, encoding=encoding)
-        made: Marker = decode(registers, type.element, encoding=encoding)
-    except (ConversionError, TypeError) as error:
-        raise Refused(f"{where}.null: {error}") from None
-    return made

@@ -1,17 +1,23 @@
-"""Decodes the bytes of blocks to values. Decoders are compiled once per block. Does no I/O."""
+"""Decodes the bytes of blocks to what the registers of tags hold.
+
+Decoders are compiled once per block.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar
 
 from holdfast.values import ConversionError, Field, Layout, decode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from holdfast.scanner.tags import Tag
+    from collections.abc import Iterable
+
+    from holdfast.types import Area
 
 Decoder: TypeAlias = Callable[[bytes], Sequence[Any]]
 
@@ -21,6 +27,61 @@ LAYOUTS = 1024
 _BITS = [tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256)]
 
 
+class PlacedTag(Protocol):
+    """What is needed of a tag to decode it."""
+
+    @property
+    def area(self) -> Area:
+        """The area."""
+
+    @property
+    def address(self) -> int:
+        """The first address."""
+
+    @property
+    def type(self) -> str:
+        """The type."""
+
+    @property
+    def order(self) -> str:
+        """The byte order."""
+
+    @property
+    def encoding(self) -> str | None:
+        """The encoding of text; `None` for ASCII."""
+
+    @property
+    def count(self) -> int:
+        """The number of bits or registers."""
+
+    @property
+    def end(self) -> int:
+        """The address after the last one."""
+
+    @property
+    def of_bits(self) -> bool:
+        """Whether the tag is in an area of bits."""
+
+
+T = TypeVar("T", bound=PlacedTag)
+
+
+class Places(Generic[T]):
+    """An index of tags by address, to find the tags of a block quickly."""
+
+    def __init__(self, tags: Iterable[T]) -> None:
+        self._tags: dict[Area, list[T]] = {}
+        for tag in sorted(tags, key=lambda tag: tag.address):
+            self._tags.setdefault(tag.area, []).append(tag)
+        self._starts = {area: [tag.address for tag in tags] for area, tags in self._tags.items()}
+
+    def inside(self, area: Area, address: int, count: int) -> list[T]:
+        """Returns the tags that are entirely inside a block, sorted by address."""
+        starts, end = self._starts.get(area, []), address + count
+        first, last = bisect_left(starts, address), bisect_left(starts, end)
+        return [tag for tag in self._tags.get(area, [])[first:last] if tag.end <= end]
+
+
 class Undecoded:
     """Stands for a value whose registers can't be decoded."""
 
@@ -28,7 +89,7 @@ class Undecoded:
         self.error = error
 
 
-def decoder(tags: Sequence[Tag], address: int, count: int) -> Decoder:
+def decoder(tags: Sequence[PlacedTag], address: int, count: int) -> Decoder:
     """Returns a decoder for tags of one area, which must all be inside the block."""
     if tags[0].of_bits:
         return _bits(tags, address)
@@ -52,25 +113,14 @@ def _layout(count: int, *fields: tuple[str, int, str, str | None]) -> Layout:
     return Layout(named, size=count)
 
 
-def value_of(tag: Tag, data: bytes, address: int) -> Any:
+def value_of(tag: PlacedTag, data: bytes, address: int) -> Any:
     """Decodes one tag of a block that begins at `address`."""
     if not tag.of_bits:
         return _alone(tag, data, address)
     return _bits([tag], address)(data)[0]
 
 
-def clean(value: Any, tag: Tag) -> Any:
-    """Returns the value; `None` for NaN and for markers of the tag."""
-    if type(value) is list:
-        return [clean(item, tag) for item in value]
-    if type(value) is float and value != value:
-        return None
-    if tag.null and type(value) is not Undecoded and value in tag.null:
-        return None
-    return value
-
-
-def _alone(tag: Tag, data: bytes, address: int) -> Any:
+def _alone(tag: PlacedTag, data: bytes, address: int) -> Any:
     """Decodes one tag, independently of the others."""
     start = 2 * (tag.address - address)
     try:
@@ -81,7 +131,7 @@ def _alone(tag: Tag, data: bytes, address: int) -> Any:
         return Undecoded(str(error))
 
 
-def _bits(tags: Sequence[Tag], address: int) -> Decoder:
+def _bits(tags: Sequence[PlacedTag], address: int) -> Decoder:
     places = [tag.address - address for tag in tags]
     if any(parsed(tag.type).count is not None for tag in tags):
         spans = [

@@ -1,0 +1,12 @@
+"""Tags: names, types and units for the bits and registers of a device. Does no I/O.
+
+A `TagList` is the same for everything that shows, publishes or writes values: the command line, the
+console, the scanner, outputs and `holdfast.Poller`.
+"""
+
+from __future__ import annotations
+
+from holdfast.tags.tag import Tag, TagError
+from holdfast.tags.tag_list import TagList
+
+__all__ = ["Tag", "TagError", "TagList"]

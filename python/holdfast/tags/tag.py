@@ -1,0 +1,210 @@
+"""A tag: a place in a device, the type of its value, and what the value means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
+from holdfast.tags.linear import Linear
+from holdfast.tags.markers import FLOATS, Marker, as_decoded
+from holdfast.tags.writing import unwritable
+from holdfast.types import AREAS, BIT_AREAS, Area
+from holdfast.values import ConversionError, DoesNotFit, codec_for
+from holdfast.values.types import Type, parsed
+
+INTEGERS = ("int", "uint", "bcd")
+"""What the names of integer types begin with."""
+
+
+class TagError(ValueError):
+    """A tag that can't be: `key` is the wrong part, such as `scale`."""
+
+    def __init__(self, key: str, message: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
+def default_type(area: Area) -> str:
+    """The type of a tag that names none."""
+    return "bool" if area in BIT_AREAS else "uint16"
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A tag. Raises `TagError`.
+
+    A value is scale × number + offset, where the number is what the registers hold.
+    """
+
+    name: str
+    area: Area
+    address: int
+    """Counted from 0, as in the protocol."""
+    type: str = ""
+    """As in `holdfast.values`. Default: `bool` in an area of bits, else `uint16`."""
+    order: str = "ABCD"
+    encoding: str | None = None
+    """The encoding of text; `None` for ASCII."""
+    scale: float = 1
+    offset: float = 0
+    unit: str = ""
+    """The unit of the value, such as `V` or `°C`."""
+    writable: bool = False
+    min: float | None = None
+    """The smallest value that may be written."""
+    max: float | None = None
+    """The largest value that may be written."""
+    states: Mapping[int, str] = field(default_factory=dict, hash=False)
+    """Names of values, for tags that have a state."""
+    null: frozenset[Marker] = frozenset()
+    """What the registers hold when no value is available; NaN never is one."""
+    deadband: float = 0
+    """How much a value must change to count as changed."""
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if self.area not in AREAS:
+            raise TagError("area", f"area is {self.area!r}, allowed: {', '.join(AREAS)}")
+        if type(self.address) is not int or not 0 <= self.address < ADDRESSES:
+            found = f"address is {self.address!r}"
+            raise TagError("address", f"{found}, allowed: 0 to {LAST_ADDRESS}")
+        if not self.type:
+            self._put("type", default_type(self.area))
+        try:
+            if parsed(self.type).base == "bool":
+                self._put("order", "ABCD")
+            codec_for(self.area, self.type, self.order, self.encoding)
+        except ConversionError as error:
+            raise TagError(_key_of(error), str(error)) from None
+        self._put("of_type", parsed(self.type))
+        last = self.address + self.count - 1
+        if last > LAST_ADDRESS:
+            found = f"{self.type} from address {self.address} ends at {last}"
+            raise TagError("address", f"{found}, allowed: up to {LAST_ADDRESS}")
+        try:
+            null = (as_decoded(marker, self.of_type, self.encoding) for marker in self.null)
+            self._put("null", frozenset(null))
+        except ValueError as error:
+            raise TagError("null", str(error)) from None
+        self._check_number()
+        self._check_writable()
+
+    def _put(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    of_type: Type = field(init=False, repr=False, compare=False)
+    """The type, split into its parts."""
+    _linear: Linear = field(init=False, repr=False, compare=False)
+
+    def _check_number(self) -> None:
+        try:
+            self._put("_linear", Linear(self.scale, self.offset))
+        except ValueError as error:
+            raise TagError(str(error).split()[0], str(error)) from None
+        if not self.is_number:
+            for key in ("scale", "offset", "min", "max", "deadband"):
+                if (given := getattr(self, key)) != getattr(Tag, key):
+                    raise TagError(key, f"{key} is {given}, allowed: only with numbers")
+        if not (math.isfinite(self.deadband) and self.deadband >= 0):
+            found = f"deadband is {self.deadband}"
+            raise TagError("deadband", f"{found}, allowed: a finite number from 0")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise TagError("max", f"max is {self.max}, allowed: at least min, {self.min}")
+        if self.states and (self.is_float or self.of_type.base in ("string", "bytes")):
+            raise TagError("states", f"found states of {self.type}, allowed: integers and bits")
+        if len(set(self.states.values())) < len(self.states):
+            names = list(self.states.values())
+            twice = next(name for name in names if names.count(name) > 1)
+            raise TagError("states", f"two states have the name {twice!r}")
+
+    def _check_writable(self) -> None:
+        if self.writable and (flaw := self.unwritable) is not None:
+            raise TagError("writable", f"found true, {flaw}")
+
+    @property
+    def count(self) -> int:
+        """The number of bits or registers."""
+        return self.of_type.registers
+
+    @property
+    def end(self) -> int:
+        """The address after the last one."""
+        return self.address + self.count
+
+    @property
+    def of_bits(self) -> bool:
+        """Whether the tag is in an area of bits."""
+        return self.area in BIT_AREAS
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the registers hold floating-point numbers."""
+        return self.of_type.base in FLOATS
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the values are numbers, and not bits or text."""
+        return self.is_float or self.of_type.base.startswith(INTEGERS)
+
+    @property
+    def unwritable(self) -> str | None:
+        """Why no Modbus request can write the tag; `None` if one can."""
+        if self.area not in WRITE_LIMITS:
+            return f"{self.area} can't be written"
+        return unwritable(self.area, self.of_type, self.type)
+
+    def value(self, raw: Any) -> Any:
+        """The value of what the registers hold; `None` if none is available."""
+        if type(raw) is list:
+            return [self.value(item) for item in raw]
+        if raw != raw or (self.null and raw in self.null):
+            return None
+        if self._linear.is_identity or not self.is_number:
+            return raw
+        return self._linear.value(raw)
+
+    def state(self, value: Any) -> str | None:
+        """The name of a value, if it has one."""
+        return self.states.get(value) if isinstance(value, int) else None
+
+    def raw(self, value: Any) -> Any:
+        """What the registers have to hold for a value, or for the name of one.
+
+        Raises `DoesNotFit` for a value that they can't hold exactly, and for one below `min` or
+        above `max`. Floating-point registers take the nearest number.
+        """
+        if isinstance(value, list | tuple):
+            return [self.raw(item) for item in value]
+        if isinstance(value, str) and self.states:
+            value = self._named(value)
+        if not self.is_number:
+            return value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise DoesNotFit(f"{value!r} is not a number")
+        if not math.isfinite(value):
+            raise DoesNotFit(f"{value} is not a finite number")
+        least, most = self.min, self.max
+        if (least is not None and value < least) or (most is not None and value > most):
+            allowed = f"{'' if least is None else least} to {'' if most is None else most}"
+            raise DoesNotFit(f"{value} is outside {allowed.strip()}")
+        if self.is_float:
+            return value if self._linear.is_identity else float(self._linear.number(value))
+        exact = self._linear.number(value)
+        if exact.denominator != 1:
+            steps = f"allowed: steps of {abs(self.scale)}"
+            raise DoesNotFit(f"{value} is between two values of the registers, {steps}")
+        return exact.numerator
+
+    def _named(self, name: str) -> int:
+        for value, known in self.states.items():
+            if known == name:
+                return value
+        raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(self.states.values())}")
+
+
+def _key_of(error: ConversionError) -> str:
+    kind = type(error).__name__
+    return {"UnknownOrder": "order", "UnknownEncoding": "encoding"}.get(kind, "type")

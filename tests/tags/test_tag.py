@@ -1,0 +1,130 @@
+"""What a tag makes of registers, what it writes, and which tags can't be."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.tags import Tag, TagError, TagList
+from holdfast.values import DoesNotFit
+
+
+def tag(**more: Any) -> Tag:
+    settings: dict[str, Any] = {"area": "holding_registers", "address": 0, "type": "int16"}
+    return Tag("t", **(settings | more))
+
+
+@pytest.mark.parametrize(
+    ("raw", "scale", "offset", "value"),
+    [
+        (215, 0.1, 0, 21.5),
+        (3, 0.1, 0, 0.3),
+        (-7, 0.01, 20, 19.93),
+        (12, 10, -5, 115),
+        (1, 1 / 3, 0, 1 / 3),
+        (0.5, 2, 0, 1.0),
+        (math.inf, 2, 0, math.inf),
+    ],
+)
+def test_a_value_is_the_scaled_number_without_a_rounding_error(
+    raw: float, scale: float, offset: float, value: float
+) -> None:
+    kind = "float64" if isinstance(raw, float) else "int16"
+    made = tag(type=kind, scale=scale, offset=offset).value(raw)
+    assert (made, type(made)) == (value, type(value))
+
+
+@given(
+    st.integers(-32768, 32767),
+    st.integers(-9999, 9999).filter(bool),
+    st.integers(0, 4),
+    st.integers(-9999, 9999),
+)
+def test_what_is_read_can_be_written_and_gives_the_same_registers(
+    raw: int, scale: int, places: int, offset: int
+) -> None:
+    it = tag(scale=float(f"{scale}e-{places}"), offset=float(f"{offset}e-{places}"))
+    assert it.raw(it.value(raw)) == raw
+
+
+@pytest.mark.parametrize(
+    ("value", "settings", "message"),
+    [
+        (
+            21.53,
+            {"scale": 0.1},
+            "21.53 is between two values of the registers, allowed: steps of 0",
+        ),
+        (31, {"min": 5, "max": 30}, "31 is outside 5 to 30"),
+        (4, {"min": 5}, "4 is outside 5 to"),
+        (1.5, {}, r"1.5 is between two values of the registers, allowed: steps of 1"),
+        (math.nan, {"type": "float32"}, "nan is not a finite number"),
+        (math.inf, {"scale": 2}, "inf is not a finite number"),
+        (True, {}, "True is not a number"),
+        ("on", {}, "'on' is not a number"),
+        ("on", {"states": {0: "off", 1: "running"}}, "'on' is no state, allowed: off, running"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_refused(
+    value: Any, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(DoesNotFit, match=message):
+        tag(**settings).raw(value)
+
+
+def test_states_have_names_both_ways() -> None:
+    it = tag(states={0: "off", 1: "running"})
+    assert [it.state(it.value(raw)) for raw in (0, 1, 2)] == ["off", "running", None]
+    assert (it.raw("running"), it.raw(1)) == (1, 1)
+
+
+def test_markers_and_nan_are_no_values() -> None:
+    it = tag(null=frozenset([-1]), scale=0.1)
+    assert [it.value(raw) for raw in (-1, 0, 5)] == [None, 0.0, 0.5]
+    assert tag(type="float32").value(math.nan) is None
+    assert tag(type="int16[3]", null=frozenset([7])).value([7, 8, 9]) == [None, 8, 9]
+
+
+@pytest.mark.parametrize(
+    ("settings", "key", "message"),
+    [
+        ({"area": "registers"}, "area", "area is 'registers', allowed: coils, "),
+        ({"address": 65536}, "address", "address is 65536, allowed: 0 to 65535"),
+        ({"address": True}, "address", "address is True"),
+        ({"address": 65535, "type": "float32"}, "address", "ends at 65536, allowed: up to 65535"),
+        ({"type": "flaot32"}, "type", "type 'flaot32' is unknown"),
+        ({"order": "ABDC"}, "order", "order"),
+        ({"area": "coils", "type": "int16"}, "type", "allowed in coils: bool"),
+        ({"type": "string:4", "encoding": "klingon"}, "encoding", "klingon"),
+        ({"scale": 0}, "scale", "scale is 0, allowed: any other number"),
+        ({"offset": math.inf}, "offset", "offset is inf, allowed: a finite number"),
+        ({"type": "string:4", "scale": 2}, "scale", "scale is 2, allowed: only with numbers"),
+        ({"type": "bool", "deadband": 1}, "deadband", "only with numbers"),
+        ({"deadband": -1}, "deadband", "allowed: a finite number from 0"),
+        ({"min": 2, "max": 1}, "max", "max is 1, allowed: at least min, 2"),
+        ({"type": "float32", "states": {0: "off"}}, "states", "states of float32"),
+        ({"states": {0: "off", 1: "off"}}, "states", "two states have the name 'off'"),
+        ({"area": "input_registers", "writable": True}, "writable", "input_registers can't be"),
+        ({"type": "bit:3[2]", "writable": True}, "writable", "only one bit can"),
+        ({"type": "uint16[124]", "writable": True}, "writable", "one request writes at most 123"),
+        ({"null": frozenset(["x"])}, "null", "x"),
+        ({"type": "bytes:4", "null": frozenset([1])}, "null", "not supported for bytes:4"),
+    ],
+)
+def test_a_wrong_tag_names_the_wrong_key(settings: dict[str, Any], key: str, message: str) -> None:
+    with pytest.raises(TagError, match=message.replace("[", r"\[")) as caught:
+        tag(**settings)
+    assert caught.value.key == key
+
+
+def test_a_tag_without_a_type_is_a_bit_or_a_register() -> None:
+    assert (Tag("a", "coils", 0).type, Tag("b", "input_registers", 0).type) == ("bool", "uint16")
+
+
+def test_a_list_has_each_name_once() -> None:
+    with pytest.raises(TagError, match="two tags have the name 't'"):
+        TagList([tag(), tag(address=1)])
