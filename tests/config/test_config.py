@@ -551,6 +551,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "      - sources: [10.0.0.7/32, fd00::/64]\n"
         "        units: {1: plant, 16: plant}\n"
         "        access: read-only\n"
+        "profiles: {}\n"
         "devices: {}\n"
         "links: {}\n"
         "adapters: {}\n"
@@ -650,7 +651,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "ClientTlsConfig": None,
         "CostConfig": ["per_request", "per_register"],
         "DestinationConfig": ["memory", "area", "address"],
-        "DeviceConfig": ["url", "unit"],
+        "DeviceConfig": ["url"],
         "ForwardConfig": ["url"],
         "ForwardedStatusConfig": ["area", "slot"],
         "GatewayConfig": ["bind", "sources", "allow", "access", "tokens"],
@@ -676,6 +677,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "NatsPingConfig": None,
         "RawIngestListener": ["type", "bind", "rules"],
         "OffsetsConfig": None,
+        "ProfileConfig": ["tags"],
         "RangeConfig": ["area", "start"],
         "RawIngestConfig": ["rules"],
         "RawRuleConfig": ["sources", "areas"],
@@ -692,6 +694,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "StatusConfig": ["area", "slot", "memory"],
         "SubscriptionConfig": ["topic", "memories", "areas"],
         "SyslogConfig": ["url"],
+        "TagConfig": ["area", "address"],
         "TlsRuleConfig": ["sources", "units", "access"],
         "TokenConfig": ["name", "sha256", "memories", "areas", "access"],
         "ToleranceConfig": None,

@@ -101,7 +101,6 @@ def test_a_right_device_is_right(folder: Folder) -> None:
          "5: url: 'tls://plc?cert=p.yaml': cert without key: give both, or neither"),
         ("tcp://10.0.0.9", "rtu:///dev/a%00",
          "5: url: found 'rtu:///dev/a%00', allowed: a URL without NUL"),
-        ("    unit: 1\n", "", "4: unit: missing, allowed: an integer from 0 to 255"),
         ("unit: 1", "unit: 256", "6: unit: found 256, allowed: a unit id from 0 to 255"),
         ("    interval: 1\n", "", "4: interval: missing, allowed: a number from 0.01 to 31622400"),
         ("interval: 1", "interval: 0.009",

@@ -233,7 +233,8 @@ def test_everything_else_needs_memories(
 ) -> None:
     assert folder.problems(memories + (more or "workers: 1\n"))[0] == (
         f"p.yaml:1: memories: {found}, allowed: a mapping with at least one entry "
-        "(optional when only nats, gateway, routes and devices that are forwarded are configured)"
+        "(optional when only nats, gateway, routes and devices that are forwarded or have tags are "
+        "configured)"
     )
 
 

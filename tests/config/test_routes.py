@@ -317,7 +317,7 @@ def test_a_function_code_is_1_to_127(folder: Folder, code: str, shown: str) -> N
 def test_settings_of_polling_have_no_effect_without_reads(folder: Folder, setting: str) -> None:
     key = setting.partition(":")[0]
     assert folder.warnings(changed("unit: 7}", f"unit: 7, {setting}}}")) == [
-        f"p.yaml:3: devices.drive.{key}: has no effect: the device has no reads"
+        f"p.yaml:3: devices.drive.{key}: has no effect: the device has no reads and no tags"
     ]
 
 
@@ -330,7 +330,8 @@ def test_reads_need_an_interval(folder: Folder) -> None:
 
 def test_what_no_route_names_has_no_effect(folder: Folder) -> None:
     assert folder.warnings(changed(', 7: {route: drive}, "20-40": {route: bus}', "")) == [
-        "p.yaml:3: devices.drive: has no effect: the device has no reads, and no route names it",
+        "p.yaml:3: devices.drive: has no effect: the device has no reads and no tags, and no route "
+        "names it",
         "p.yaml:5: links.bus: has no effect: no route names the link",
     ]
 

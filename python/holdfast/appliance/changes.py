@@ -34,7 +34,8 @@ def fingerprints(config: Config) -> dict[str, str]:
     found = {key: fingerprint(getattr(config, key)) for key in SINGLE}
     for key in SEVERAL:
         for name, settings in getattr(config, key).items():
-            found[f"{key}.{name}"] = fingerprint(settings)
+            tags = list(config.tags(name)) if key == "devices" else []
+            found[f"{key}.{name}"] = fingerprint(settings, tags)
     return found
 
 

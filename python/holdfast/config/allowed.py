@@ -96,6 +96,8 @@ def _words(node: Node) -> str:
 
 
 def _range(kind: str, node: Node) -> str:
+    if "minimum" not in node:
+        return kind
     if "maximum" not in node:
         return f"{kind} of at least {node['minimum']}"
     return f"{kind} from {node['minimum']} to {node['maximum']}"

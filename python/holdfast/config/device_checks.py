@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.allowed import allowed
-from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, takes_writes
+from holdfast.config.devices import LAST_SLOT, STATUS_BLOCK, TAKING_TIME, takes_writes
 from holdfast.config.initial import extent
 from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.memory_checks import area_of
@@ -88,8 +88,8 @@ class DeviceChecks:
             self._status((*path, "status"), device["status"])
 
     def _polling(self, path: KeyPath, device: dict[Any, Any]) -> None:
-        """Reads need an interval; without reads, all settings of polling have no effect."""
-        if "reads" in device:
+        """Reads and tags need an interval; without them, all settings of polling have no effect."""
+        if any(key in device for key in TAKING_TIME):
             if "interval" not in device:
                 words = allowed((*path, "interval"), self.report.document.data)
                 message = f"missing, allowed: {words}"
@@ -97,7 +97,9 @@ class DeviceChecks:
             return
         for key in _OF_POLLING:
             if device.get(key):
-                self.report.doubt((*path, key), "has no effect: the device has no reads")
+                self.report.doubt(
+                    (*path, key), "has no effect: the device has no reads and no tags"
+                )
 
     def _passing(self, path: KeyPath, device: dict[Any, Any]) -> None:
         """Warns about writes that can't be passed on to the device."""

@@ -14,6 +14,7 @@ from holdfast.config.memories import Register, Size
 from holdfast.config.receiver import Receiver, parse_receiver
 from holdfast.config.scalars import (
     MAX_TIME,
+    NAME_KEYS,
     DeviceUrl,
     Duration,
     Milliseconds,
@@ -24,6 +25,7 @@ from holdfast.config.scalars import (
     UnitId,
     whole_number,
 )
+from holdfast.config.tags import TagConfig
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, READ_BITS, READ_REGISTERS
 from holdfast.types import WRITABLE_AREAS, Area, RegisterArea
 
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MIN_INTERVAL = 0.01
+TAKING_TIME = ("reads", "profile", "tags")
+"""The keys that make a device polled, so that it needs an interval."""
 STATUS_BLOCK = 30
 """Registers in a status block."""
 LAST_SLOT = ADDRESSES // STATUS_BLOCK - 1
@@ -247,11 +251,13 @@ def _max_gap(data: dict[str, Any]) -> int | None:
 class DeviceConfig(Model):
     """A device that is polled, or that routes pass requests on to."""
 
-    model_config = ConfigDict(json_schema_extra={"dependentRequired": {"reads": ["interval"]}})
+    model_config = ConfigDict(
+        json_schema_extra={"dependentRequired": {key: ["interval"] for key in TAKING_TIME}}
+    )
 
     url: DeviceUrl
     """The URL of the device, or of the gateway in front of it."""
-    unit: UnitId
+    unit: UnitId = 1
     """The unit id, 0 to 255; on a serial line 1 to 247."""
     writes: Literal["refuse", "pass", "local"] = "refuse"
     """Writes into what it is read into: refused, sent to it, or kept until the next poll."""
@@ -260,7 +266,7 @@ class DeviceConfig(Model):
     enabled: bool = True
     """Whether it is used."""
     interval: Annotated[Interval | None, NotNull()] = None
-    """Seconds from the start of a poll to the start of the next; required with reads."""
+    """Seconds from the start of a poll to the start of the next; required with reads and tags."""
     timeout: Duration = 1.0
     """Seconds for a request and its reply."""
     in_flight: InFlight = 1
@@ -272,7 +278,13 @@ class DeviceConfig(Model):
     reads: Annotated[tuple[ReadConfig, ...], Strict(False)] = Field(
         default=(), min_length=1, exclude_if=lambda v: not v
     )
-    """The ranges to read. Without it, the device is only reachable by routes."""
+    """The ranges to read. Without reads and tags, the device is only reachable by routes."""
+    profile: Annotated[Name | None, NotNull()] = None
+    """The profile with its tags."""
+    tags: dict[Name, TagConfig] = Field(
+        default={}, json_schema_extra=NAME_KEYS, exclude_if=lambda v: not v
+    )
+    """Its own tags, by name, besides those of the profile or in place of them."""
     cost: Annotated[CostConfig | None, NotNull()] = None
     """Reads gaps between reads if that is cheaper; instead of max_gap."""
     max_gap: Annotated[Annotated[int, Field(ge=0, le=LAST_ADDRESS)] | None, NotNull()] = Field(
@@ -308,4 +320,9 @@ class DeviceConfig(Model):
     @property
     def is_polled(self) -> bool:
         """Whether it is read at an interval."""
-        return self.enabled and bool(self.reads)
+        return self.enabled and self.has_readings
+
+    @property
+    def has_readings(self) -> bool:
+        """Whether it has something to read."""
+        return bool(self.reads or self.tags or self.profile)

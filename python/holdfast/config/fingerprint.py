@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def signature(file: Path, config: Config) -> tuple[object, ...]:
     """What changes when a configuration, or a file that it names, is written."""
-    return tuple(map(_written, [file, *_files(config)]))
+    return tuple(map(_written, [file, *config.profile_files, *_files(config)]))
 
 
 def _written(file: Path) -> object:

@@ -20,12 +20,15 @@ from holdfast.config.listener_checks import ListenerChecks
 from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
 from holdfast.config.problems import ConfigError, Problem
+from holdfast.config.profile_files import ProfileFiles
 from holdfast.config.report import Report
 from holdfast.config.route_checks import RouteChecks, doubt_routes
 from holdfast.config.service_checks import ServiceChecks
 from holdfast.config.shared_connection_checks import AddressChecks
 from holdfast.config.socket_checks import check_sockets
 from holdfast.config.structure import build
+from holdfast.config.tag_checks import TagChecks
+from holdfast.config.templates import expanded
 from holdfast.config.words import shape, show
 
 
@@ -42,18 +45,27 @@ def load(path: Path | str) -> Config:
         message = f"found {found}, allowed: {allowed((), None)}"
         raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])
     assert isinstance(document.data, dict), "anything else is foreign"
-    report, data = Report(document), document.data
+    report = Report(document)
     folder = Path(path).absolute().parent
+    profiles = ProfileFiles(folder, report)
+    profiles.read()
+    expanded(report)
+    data = report.document.data
     memories = MemoryChecks(folder, report)
     memories.check(data.get("memories"))
     _check_others(data, folder, report)
     context = {"folder": folder, "initial_values": memories.values}
     config = build(data, context, report)
-    problems += [*report.problems, *memories.problems_elsewhere]
+    problems += [
+        *report.problems,
+        *memories.problems_elsewhere,
+        *profiles.problems_elsewhere,
+    ]
     if config is None or problems:
         raise ConfigError(file, problems)
     doubt_grants(config, report)
     doubt_routes(config, report)
+    config.with_profile_files(profiles.files)
     config.with_sha256(hashlib.sha256(content).hexdigest())
     return config.with_warnings(sorted(report.doubts, key=lambda doubt: doubt.line or 0))
 
@@ -81,4 +93,7 @@ def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     ServiceChecks(folder, report, grants).check(data)
     AddressChecks(folder, report).check(data)
     DeviceChecks(report, grants, memories).check(data.get("devices"))
+    tags = TagChecks(report)
+    tags.profiles(data.get("profiles"))
+    tags.devices(data.get("devices"), mapping(data.get("profiles")))
     check_sockets(data, report)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.metadata
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, PrivateAttr
+from pydantic import BeforeValidator, Field, PrivateAttr
 
 from holdfast.config import dump
 from holdfast.config.base import Model
@@ -39,9 +39,12 @@ from holdfast.config.services import (
     NatsConfig,
     RestConfig,
 )
+from holdfast.config.tags import ProfileConfig
+from holdfast.tags import TagList
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from holdfast.config.problems import Problem
 
@@ -86,18 +89,31 @@ class LogConfig(Model):
     """text: lines for people. json: one JSON object per line, for programs."""
 
 
+def _as_read(value: object) -> object:
+    """Profiles in files have been read before."""
+    return value
+
+
+Profiles = Annotated[
+    dict[Name, ProfileConfig],
+    BeforeValidator(_as_read, json_schema_input_type=dict[Name, ProfileConfig] | list[str]),
+]
+
+
 class Config(Model):
     """The configuration of a Holdfast appliance."""
 
     memories: dict[Name, MemoryConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
     """The memories, by name; optional when only nats, gateway, routes and
-    devices that are forwarded are configured."""
+    devices that are forwarded or have tags are configured."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
     """The identification of the appliance."""
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(
         default={}, json_schema_extra=NAME_KEYS
     )
     """The servers, by name; optional with rest, mqtt, nats, gateway or a device."""
+    profiles: Profiles = Field(default={}, json_schema_extra=NAME_KEYS)
+    """The tags of kinds of devices, by name; or a list of files with one profile each."""
     devices: dict[Name, DeviceConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
     """Devices to poll, or to pass requests on to, by name."""
     links: dict[Name, LinkConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
@@ -126,6 +142,25 @@ class Config(Model):
 
     _warnings: tuple[Problem, ...] = PrivateAttr(default=())
     _sha256: str | None = PrivateAttr(default=None)
+    _profile_files: tuple[Path, ...] = PrivateAttr(default=())
+
+    def tags(self, device: str) -> TagList:
+        """The tags of a device: those of its profile, and its own besides or in place of them."""
+        settings = self.devices[device]
+        profile = None if settings.profile is None else self.profiles[settings.profile]
+        order = "ABCD" if profile is None else profile.order
+        own = {name: tag.tag(name, order) for name, tag in settings.tags.items()}
+        return TagList({**({} if profile is None else profile.named()), **own}.values())
+
+    @property
+    def profile_files(self) -> tuple[Path, ...]:
+        """The files that profiles were read from."""
+        return self._profile_files
+
+    def with_profile_files(self, files: Iterable[Path]) -> Self:
+        """This configuration, with profiles from these files."""
+        self._profile_files = tuple(files)
+        return self
 
     @property
     def warnings(self) -> tuple[Problem, ...]:

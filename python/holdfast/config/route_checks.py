@@ -126,8 +126,8 @@ def doubt_routes(config: Config, report: Report) -> None:
     """Warns about devices and links that nothing uses."""
     named = routed(config)
     for name, device in config.devices.items():
-        if not device.reads and name not in named:
-            message = "has no effect: the device has no reads, and no route names it"
+        if not device.has_readings and name not in named:
+            message = "has no effect: the device has no reads and no tags, and no route names it"
             report.doubt(("devices", name), message)
     used = {_address(device.target) for device in config.devices.values()}
     for name, link in config.links.items():

@@ -58,7 +58,7 @@ class ServiceChecks:
         """Reports a missing server, and missing memories if a section uses them."""
         used = any(data.get(key, {}) != {} for key in _USERS_OF_MEMORIES) or _uses_memories(data)
         if data.get("memories", {}) == {} and (used or not data.keys() & _USERS_OF_NONE):
-            none = "nats, gateway, routes and devices that are forwarded"
+            none = "nats, gateway, routes and devices that are forwarded or have tags"
             self._empty("memories", data, f"when only {none} are configured")
         if data.get("listeners", {}) == {} and not data.keys() & {*_INSTEAD_OF_LISTENERS}:
             self._empty("listeners", data, f"with {choice(_INSTEAD_OF_LISTENERS)}")

@@ -20,6 +20,7 @@ from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.words import show
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from ruamel.yaml.nodes import Node
@@ -90,6 +91,13 @@ class Document:
             spot = spot.children[part][1]
         return True
 
+    def inside(self, *keys: Key) -> Document:
+        """A document that has this one at the path of these keys."""
+        data, root = self.data, self.root
+        for key in reversed(keys):
+            data, root = {key: data}, _Spot(root.place, {key: (root.place, root)})
+        return Document(self.file, data, root)
+
     def spell(self, path: KeyPath) -> str:
         """The path as text: `rules[0].units.1`."""
         text, spot = "", self.root
@@ -99,6 +107,21 @@ class Document:
             text += f"[{part}]" if spot.is_list else f"{dot}{word}"
             spot = spot.children[part][1] if part in spot.children else _Spot(spot.place)
         return text
+
+
+def table(file: str, data: Any, lines: Mapping[KeyPath, int]) -> Document:
+    """A document from a table; `lines` has the line of each mapping that is one row."""
+
+    def spot(value: Any, path: KeyPath, line: int) -> _Spot:
+        line = lines.get(path, line)
+        made = _Spot(Place(line, 1), is_scalar=not isinstance(value, dict))
+        if isinstance(value, dict):
+            for key, each in value.items():
+                child = spot(each, (*path, key), line)
+                made.children[key] = (child.place, child)
+        return made
+
+    return Document(file, data, spot(data, (), 1))
 
 
 def read_text(path: Path, file: str) -> str:
@@ -237,6 +260,8 @@ class _Reader:
 
     def _key(self, node: Node, path: KeyPath) -> Key | None:
         key = self._read(node, path)[0] if isinstance(node, ScalarNode) else ()
+        if isinstance(node, ScalarNode) and node.value == "null":
+            return "null"  # No mapping has a key that is nothing, but tags have one of that name.
         if isinstance(key, str) or type(key) is int:
             return key
         found = (

@@ -1,0 +1,179 @@
+"""Profiles and tags in a configuration, tag lists in files, and devices written once for many."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.config import ConfigError, load
+from holdfast.config.tag_files import load_tags
+from holdfast.tags import Tag
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PROFILE = """
+  pump:
+    order: CDAB
+    tags:
+      flow: {area: input_registers, address: 0, type: float32, unit: m³/h}
+      state: {area: holding_registers, address: 8, states: {0: off, 1: running}, null: [65535]}
+"""
+
+DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, interval: 1}}\n"
+FLOW = Tag("flow", "input_registers", 0, "float32", "CDAB", unit="m³/h")
+STATE = Tag(
+    "state",
+    "holding_registers",
+    8,
+    "uint16",
+    "CDAB",
+    states={0: "off", 1: "running"},
+    null=frozenset([65535]),
+)
+
+
+def written(folder: Path, text: str, name: str = "p.yaml") -> Path:
+    file = folder / name
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def problems(file: Path) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        load(file) if file.name == "p.yaml" else load_tags(file)
+    folder = f"{file.parent}/"
+    return [str(problem).removeprefix(folder) for problem in caught.value.problems]
+
+
+def test_a_device_has_the_tags_of_its_profile_and_its_own(tmp_path: Path) -> None:
+    file = written(
+        tmp_path,
+        f"profiles:{PROFILE}"
+        "devices:\n"
+        "  a: {url: tcp://10.0.0.5, profile: pump, interval: 1}\n"
+        "  b: {url: tcp://10.0.0.6, profile: pump, interval: 1, tags: {\n"
+        "    state: {area: coils, address: 3}, more: {area: coils, address: 4, writable: true}}}\n",
+    )
+    config = load(file)
+    assert list(config.tags("a")) == [FLOW, STATE]
+    assert list(config.tags("b")) == [
+        FLOW,
+        Tag("state", "coils", 3),
+        Tag("more", "coils", 4, writable=True),
+    ]
+    assert (config.devices["a"].unit, config.warnings) == (1, ())
+    assert load(written(tmp_path, config.dump(), "again.yaml")) == config
+
+
+def test_profiles_can_be_files(tmp_path: Path) -> None:
+    written(tmp_path, PROFILE.replace("\n  pump:", "").replace("\n    ", "\n"), "pump.yaml")
+    written(
+        tmp_path,
+        "# a list of the manufacturer\n"
+        "name;Area;address;type;scale;writable;null;unit\n"
+        "t;HR;3;int16;0.1;yes;-32768|32767;°C\n"
+        'on;coil;4;;;;;"a; b"\n',
+        "fan.CSV",
+    )
+    file = written(
+        tmp_path,
+        "profiles: [pump.yaml, fan.CSV]\n"
+        "devices:\n"
+        "  a: {url: tcp://10.0.0.5, profile: pump, interval: 1}\n"
+        "  b: {url: tcp://10.0.0.6, profile: fan, interval: 1}\n",
+    )
+    config = load(file)
+    assert list(config.tags("a")) == [FLOW, STATE]
+    null = frozenset([-32768, 32767])
+    t = Tag("t", "holding_registers", 3, "int16", scale=0.1, writable=True, null=null, unit="°C")
+    assert list(config.tags("b")) == [t, Tag("on", "coils", 4, unit="a; b")]
+    assert config.profile_files == (tmp_path / "pump.yaml", tmp_path / "fan.CSV")
+
+
+def test_the_columns_of_csv_have_an_order(tmp_path: Path) -> None:
+    text = "t,holding_registers,3,int16,CDAB,0.1,2,°C,true,outside\n"
+    [tag] = load_tags(written(tmp_path, text, "t.csv"))
+    plain = Tag("t", "holding_registers", 3, "int16", "CDAB", scale=0.1, offset=2.0)
+    assert tag == replace(plain, unit="°C", writable=True, description="outside")
+
+
+def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> None:
+    written(tmp_path, "tags:\n  a: {area: coils, address: 1, scale: 2}\n  b: {area: x}\n", "a.yaml")
+    written(tmp_path, "v,hr,0,float32\nw,ir,70000\nv,ir,1\nz,hr,1,flaot\n,hr,1\n", "b.csv")
+    found = problems(
+        written(tmp_path, f"profiles: [a.yaml, b.csv, c.yaml, d.txt, a.yaml]\n{DEVICE}")
+    )
+    assert [text.partition(", allowed")[0] for text in found] == [
+        "p.yaml:1: profiles[2]: found 'c.yaml', which can't be read: No such file or directory",
+        "p.yaml:1: profiles[3]: found 'd.txt'",
+        "p.yaml:1: profiles[4]: found 'a.yaml', a second file for the profile a",
+        "a.yaml:2: tags.a.scale: scale is 2.0",
+        "a.yaml:3: tags.b.address: missing",
+        "a.yaml:3: tags.b.area: found 'x'",
+        "b.csv:2: tags.w.address: found 70000",
+        "b.csv:3: duplicate tag 'v', first in line 1",
+        "b.csv:4: tags.z.type: type 'flaot' is unknown",
+        "b.csv:5: the tag has no name",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("t.csv", "name,adress\nx,1\n", "t.csv:1: found the column 'adress', allowed: name, area"),
+        ("t.csv", "name,name\n", "t.csv:1: two columns have the name 'name'"),
+        ("t.csv", "x,hr,1,,,,,,,,more\n", "t.csv:1: found 11 cells, allowed: up to 10"),
+        ("t.csv", "", "t.csv:1: tags: "),
+        ("t.yaml", "- a\n", "t.yaml:1: found a list, allowed: a mapping with the keys order"),
+        ("t.yaml", "tags: {a: {area: coils}}\n", "t.yaml:1: tags.a.address: missing"),
+        (
+            "t.yaml",
+            "order: A\ntags: {a: {area: input_registers, address: 1}}\n",
+            "t.yaml:1: order",
+        ),
+    ],
+)
+def test_a_wrong_file_is_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:
+    assert problems(written(tmp_path, text, name))[0].startswith(expected)
+
+
+def test_one_entry_makes_many_devices(tmp_path: Path) -> None:
+    file = written(
+        tmp_path,
+        f"profiles:{PROFILE}"
+        "devices:\n"
+        '  "p{floor}_{n:02}":\n'
+        "    for: {floor: [1, 3], n: 8-10}\n"
+        '    url: "tcp://10.0.{floor}.{n}"\n'
+        '    unit: "{n}"\n'
+        "    profile: pump\n"
+        "    interval: 1\n",
+    )
+    devices = load(file).devices
+    assert list(devices) == ["p1_08", "p1_09", "p1_10", "p3_08", "p3_09", "p3_10"]
+    assert (devices["p3_09"].url, devices["p3_09"].unit) == ("tcp://10.0.3.9", 9)
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ("'m{n}': {for: {n: 1-3}, url: 'tcp://a{m}', unit: 1}", "devices.'m{n}': found {m}, "),
+        ("'m{n}': {for: {n: 3-1}, url: tcp://a}", "devices.'m{n}'.for.n: found '3-1', allowed: as"),
+        ("'m{n}': {for: 3, url: tcp://a}", "devices.'m{n}'.for: found 3, allowed: as in"),
+        ("'m{n}': {for: {}, url: tcp://a}", "devices.'m{n}'.for: found an empty mapping"),
+        ("m: {for: {n: 1-3}, url: tcp://a}", "devices.m: makes a second device with the name 'm'"),
+        ("'m{n}': {for: {n: 1-10001}, url: tcp://a}", "devices.'m{n}'.for: makes more than 10000"),
+        ("'m{n}': {for: {n: 0-300}, url: tcp://a, unit: '{n}'}", "devices.'m{n}'.unit: found 256"),
+        (
+            "a: {url: tcp://a, profile: x, interval: 1}",
+            "devices.a.profile: found 'x', allowed",
+        ),
+        ("a: {url: tcp://a, tags: {x: {area: coils, address: 1}}}", "devices.a.interval: missing"),
+    ],
+)
+def test_a_wrong_entry_is_refused_once(tmp_path: Path, entry: str, expected: str) -> None:
+    [found] = problems(written(tmp_path, f"devices:\n  {entry}\n"))
+    assert found.startswith(f"p.yaml:2: {expected}")
