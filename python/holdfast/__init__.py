@@ -7,7 +7,7 @@ configuration in `holdfast.config`, and the native core in `holdfast._core`.
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from holdfast import raw_ingest, values
 from holdfast._core import Memory, OutOfRange, Rule, __version__
@@ -21,7 +21,12 @@ from holdfast.errors import (
     RequestTimeout,
     TlsFailed,
 )
+from holdfast.polling import Poller
 from holdfast.server import Server
+from holdfast.tags import Tag, TagError, TagList
+
+if TYPE_CHECKING:
+    from holdfast.config.tag_files import load_tags
 
 __all__ = [
     "Client",
@@ -32,19 +37,26 @@ __all__ = [
     "ModbusError",
     "ModbusException",
     "OutOfRange",
+    "Poller",
     "RequestTimeout",
     "Rule",
     "Server",
     "SyncClient",
+    "Tag",
+    "TagError",
+    "TagList",
     "TlsFailed",
     "__version__",
+    "load_tags",
     "raw_ingest",
     "values",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    """Supports the former name of `raw_ingest`, with a deprecation warning."""
+    """Supports the former name of `raw_ingest`, and imports what needs a YAML parser on demand."""
+    if name == "load_tags":
+        return importlib.import_module("holdfast.config.tag_files").load_tags
     if name == "raw":
         return importlib.import_module("holdfast.raw")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -120,6 +120,26 @@ def value_of(tag: PlacedTag, data: bytes, address: int) -> Any:
     return _bits([tag], address)(data)[0]
 
 
+def assembled(tag: PlacedTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None:
+    """The bytes of a tag that several requests have read; `None` if something is missing.
+
+    `pieces` are addresses and bytes.
+    """
+    units: dict[int, bytes | bool] = {}
+    for address, data in pieces:
+        of_piece: Sequence[bytes | bool] = (
+            _unpacked(data) if tag.of_bits else [data[at : at + 2] for at in range(0, len(data), 2)]
+        )
+        units.update(enumerate(of_piece, address))
+    wanted = [units.get(address) for address in range(tag.address, tag.end)]
+    if None in wanted:
+        return None
+    if not tag.of_bits:
+        return b"".join(unit for unit in wanted if isinstance(unit, bytes))
+    packed = sum(1 << at for at, bit in enumerate(wanted) if bit)
+    return packed.to_bytes((len(wanted) + 7) // 8, "little")
+
+
 def _alone(tag: PlacedTag, data: bytes, address: int) -> Any:
     """Decodes one tag, independently of the others."""
     start = 2 * (tag.address - address)

@@ -1,0 +1,221 @@
+"""`Poller`: the native poller as a library."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from typing import TYPE_CHECKING, Any, Self
+
+from holdfast import _core
+from holdfast.client.endpoint import endpoint
+from holdfast.client.requests import write_typed
+from holdfast.client.url import parse
+from holdfast.faults import fault_text
+from holdfast.polling.reader import Reader
+from holdfast.polling.readings import Batch
+from holdfast.tags import Tag, TagList
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator, Mapping
+
+    from holdfast.polling.readings import DevicePoll
+
+SLICE = 0.1
+"""Seconds of one wait, between which signal handlers run."""
+
+
+PATIENCE = 1.0
+"""Seconds that a thread waits for a batch, for a task that may not want it any more."""
+
+
+class WriteFailed(Exception):
+    """A write that a device did not confirm. It may have carried it out all the same."""
+
+    def __init__(self, device: str, tag: str, fault: int) -> None:
+        super().__init__(f"{device}.{tag}: {fault_text(fault)}")
+        self.fault = fault
+        """The code in `holdfast.faults`: an exception code, or why there was no valid reply."""
+
+
+class Poller:
+    """Polls devices on a native thread, and hands out their values in batches.
+
+    >>> with Poller() as poller:
+    ...     poller.add("tcp://10.0.0.5", tags={"flow": ("input_registers", 0, "float32")})
+    ...     for batch in poller:
+    ...         print(batch.rows())
+
+    Iterate over it from one thread or one task. `gather` is how many seconds a batch waits for the
+    polls of other devices, after its first. If nobody takes batches, the oldest polls are dropped
+    and counted.
+    """
+
+    def __init__(self, *, gather: float = 0.01) -> None:
+        self._poller = _core.Poller([])
+        self._results = self._poller.receiver()
+        self._gather = gather
+        self._readers: dict[str, Reader] = {}
+        self._names = itertools.count(1)
+        self._pending: asyncio.Future[Batch | None] | None = None
+        self._has_ended = False
+
+    def add(
+        self,
+        url: str,
+        tags: TagList | Mapping[str, Tag | tuple[Any, ...]],
+        *,
+        name: str | None = None,
+        unit: int = 1,
+        interval: float = 1.0,
+        timeout: float = 1.0,
+        max_gap: int = 10,
+        max_registers: int = 125,
+        max_bits: int = 2000,
+        in_flight: int | None = 1,
+    ) -> str:
+        """Polls the tags of a device every `interval` seconds. Returns its name.
+
+        `tags` are a tag list, or by name: a `Tag`, or area, address, type and order. The name is by
+        default that of the address, with a number if it is in use. `max_gap` is the largest gap, in
+        bits or registers, that is read to save a request.
+
+        Raises `ValueError` for invalid arguments and a name in use, `TagError` for an invalid tag,
+        and `RuntimeError` after `close`.
+        """
+        target = parse(url)
+        listed = tags if isinstance(tags, TagList) else TagList(_tags(tags))
+        if not len(listed):
+            raise ValueError("tags is empty, allowed: at least one tag")
+        if name is None:
+            name = self._free(url.partition("://")[2] or url)
+        reader = Reader(name, listed)
+        self._poller.add(
+            _core.PolledDevice(
+                name,
+                endpoint(target),
+                unit=unit,
+                interval=interval,
+                timeout=timeout,
+                reads=[],
+                fields=reader.fields,
+                report=self._results,
+                max_gap=max_gap,
+                max_registers=max_registers,
+                max_bits=max_bits,
+                in_flight=in_flight,
+                start_within=min(interval, SLICE * len(self._readers)),
+            )
+        )
+        self._readers[name] = reader
+        return name
+
+    def _free(self, name: str) -> str:
+        return name if name not in self._readers else f"{name}#{next(self._names)}"
+
+    def remove(self, name: str) -> None:
+        """Stops polling a device. Raises `KeyError` for an unknown name."""
+        del self._readers[name]
+        self._poller.remove(name)
+
+    def write(self, name: str, tag: str, value: Any) -> None:
+        """Writes a value, or the name of a state, between two reads of the device.
+
+        Returns when the device has confirmed it. Raises `KeyError` for an unknown device or tag,
+        `ValueError` for a tag that is not writable or a value that does not fit, `WriteFailed`, and
+        `RuntimeError` after `close`.
+        """
+        of = next((each for each in self._readers[name].tags if each.name == tag), None)
+        if of is None:
+            raise KeyError(tag)
+        if (flaw := of.unwritable) is not None:
+            raise ValueError(flaw)
+        raw = of.raw(value)
+        [request] = write_typed(
+            of.area, of.address, raw, of.type, of.order, of.encoding, split=False
+        )
+        writing = self._poller.receiver()
+        number = self._poller.write(name, request, writing)
+        while True:
+            taken = writing.take(SLICE)
+            if taken is None:
+                raise RuntimeError("the poller has been closed")
+            for done, fault in taken[1]:
+                if done == number and fault:
+                    raise WriteFailed(name, tag, fault)
+                if done == number:
+                    return
+
+    def counters(self) -> dict[str, dict[str, Any]]:
+        """Health and counters of each device, by name."""
+        return self._poller.counters()
+
+    @property
+    def dropped(self) -> int:
+        """Polls that nobody has taken in time."""
+        return self._results.dropped
+
+    def take(self, timeout: float | None = None) -> Batch | None:
+        """The next batch; `None` if none comes within `timeout` seconds, or after `close`."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while True:
+            left = SLICE if end is None else min(SLICE, end - time.monotonic())
+            taken = self._results.take(max(0.0, left))
+            if taken is None:
+                self._has_ended = True
+                return None
+            polls = self._polls(taken[0])
+            if polls:
+                return Batch(polls)
+            if end is not None and time.monotonic() >= end:
+                return None
+
+    def _polls(self, found: list[tuple[str, float, list[Any]]]) -> list[DevicePoll]:
+        if found and self._gather:
+            time.sleep(self._gather)
+            more = self._results.take(0.0)
+            found = found + (more[0] if more is not None else [])
+        polls = []
+        for name, _, blocks in found:
+            reader = self._readers.get(name)
+            if reader is not None:
+                polls.append(reader.poll(blocks))
+        return polls
+
+    def __iter__(self) -> Iterator[Batch]:
+        while (batch := self.take()) is not None:
+            yield batch
+
+    async def __aiter__(self) -> AsyncIterator[Batch]:
+        while True:
+            if self._pending is None:
+                loop = asyncio.get_running_loop()
+                self._pending = loop.run_in_executor(None, self.take, PATIENCE)
+            # A batch that nobody waits for any more is the first of the next iteration.
+            batch = await asyncio.shield(self._pending)
+            self._pending = None
+            if batch is not None:
+                yield batch
+            elif self._has_ended:
+                return
+
+    def close(self) -> None:
+        """Stops polling. Batches that wait can still be taken."""
+        self._poller.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
+    for name, tag in tags.items():
+        if isinstance(tag, Tag):
+            yield tag
+        elif isinstance(tag, tuple) and 2 <= len(tag) <= 4:
+            yield Tag(name, *tag)
+        else:
+            found = f"the tag {name} is {tag!r}"
+            raise ValueError(f"{found}, allowed: a Tag, or (area, address, type, order)")

@@ -1,0 +1,233 @@
+"""`holdfast.Poller`: the values of tags in batches, and writes between them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast import Tag, TagList
+from holdfast.faults import NO_CONNECTION
+from holdfast.polling import Poller, Reading, WriteFailed
+from support import wire
+from support.brokers import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PLACES: dict[str, tuple[Any, ...]] = {
+    "temp": ("holding_registers", 0, "float32", "CDAB"),
+    "name": ("holding_registers", 2, "string:4"),
+    "flag": ("holding_registers", 4, "bit:3"),
+    "many": ("input_registers", 0, "uint16[300]"),
+    "on": ("coils", 3),
+    "bits": ("discrete_inputs", 5, "bool[2500]"),
+}
+
+
+@pytest.fixture
+def memory() -> holdfast.Memory:
+    made = holdfast.Memory(holding_registers=10, input_registers=400, coils=8, discrete_inputs=3000)
+    made.write("holding_registers", 0, [0x0000, 0x4248, 0x6162, 0x6300, 8, 215, 65535])
+    made.write("input_registers", 0, list(range(300)))
+    made.write("coils", 3, [1])
+    made.write("discrete_inputs", 5, [1, 0, 1] + [0] * 2496 + [1])
+    return made
+
+
+@pytest.fixture
+def device(memory: holdfast.Memory) -> Iterator[holdfast.Server]:
+    with holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write") as server:
+        yield server
+
+
+@pytest.fixture
+def poller() -> Iterator[Poller]:
+    with Poller() as made:
+        yield made
+
+
+def taken(poller: Poller) -> list[Reading]:
+    batch = poller.take(wire.DEADLINE)
+    assert batch is not None
+    return list(batch)
+
+
+def url(server: holdfast.Server) -> str:
+    host, port = server.address
+    return f"tcp://{host}:{port}"
+
+
+def values(poller: Poller) -> dict[str, Any]:
+    return {reading.name: reading.value for reading in taken(poller)}
+
+
+def test_tags_of_every_kind_come_in_one_batch(device: holdfast.Server, poller: Poller) -> None:
+    host, port = device.address
+    assert poller.add(url(device), PLACES) == f"{host}:{port}"
+    found = values(poller)
+    assert found == {
+        "temp": 50.0,
+        "name": "abc",
+        "flag": True,
+        "many": list(range(300)),
+        "on": True,
+        "bits": [True, False, True] + [False] * 2496 + [True],
+    }
+    assert list(found) == list(PLACES)
+
+
+def test_scale_markers_and_states_are_those_of_the_tag(
+    device: holdfast.Server, poller: Poller
+) -> None:
+    scaled = Tag("t", "holding_registers", 5, scale=0.1, unit="°C")
+    none = Tag("n", "holding_registers", 6, null=frozenset([65535]))
+    poller.add(url(device), TagList([scaled, none]), name="oven")
+    t, n = taken(poller)
+    assert (t.device, t.tag, t.value, t.fault, t.error) == ("oven", scaled, 21.5, 0, None)
+    assert (n.value, n.error) == (None, None)
+
+
+def test_rows_are_plain(device: holdfast.Server, poller: Poller) -> None:
+    poller.add(url(device), {"t": ("holding_registers", 5)}, name="oven")
+    batch = poller.take(wire.DEADLINE)
+    assert batch is not None
+    assert len(batch) == 1
+    [row] = batch.rows()
+    time = row.pop("time")
+    assert row == {"device": "oven", "tag": "t", "value": 215, "unit": "", "error": None}
+    assert time == next(iter(batch)).time
+
+
+def test_a_refused_address_costs_only_its_own_tag(device: holdfast.Server, poller: Poller) -> None:
+    tags = {"good": ("holding_registers", 5), "bad": ("holding_registers", 10)}
+    poller.add(url(device), tags, interval=0.05)
+
+    def settled() -> bool:
+        good, bad = taken(poller)
+        return (good.value, bad.value, bad.fault, good.fault) == (215, None, 2, 0)
+
+    wire.until(settled, "only the bad tag is refused")
+
+
+def test_a_device_that_can_not_be_reached_has_readings_too(poller: Poller) -> None:
+    tags = {"a": ("coils", 0), "b": ("input_registers", 100)}
+    poller.add(f"tcp://127.0.0.1:{free_port()}", tags)
+    readings = taken(poller)
+    assert [(each.name, each.value, each.fault) for each in readings] == [
+        ("a", None, NO_CONNECTION),
+        ("b", None, NO_CONNECTION),
+    ]
+    assert {each.error for each in readings} == {"no connection"}
+
+
+def test_what_can_not_be_decoded_says_why(
+    device: holdfast.Server, memory: holdfast.Memory, poller: Poller
+) -> None:
+    memory.write("holding_registers", 5, [0xABCD])
+    poller.add(url(device), {"b": ("holding_registers", 5, "bcd16"), "c": ("coils", 3)})
+    b, c = taken(poller)
+    assert (b.value, b.fault, c.value) == (None, 0, True)
+    assert b.error is not None
+    assert "bcd16" in b.error
+
+
+def test_a_value_is_written_between_two_reads(
+    device: holdfast.Server, memory: holdfast.Memory, poller: Poller
+) -> None:
+    scaled = Tag("t", "holding_registers", 5, scale=0.1, min=5, max=30)
+    poller.add(url(device), TagList([scaled, Tag("in", "input_registers", 0)]), name="oven")
+    poller.write("oven", "t", 19.5)
+    assert memory.read("holding_registers", 5, 1) == [195]
+    for tag, value, error in (
+        ("t", 31, ValueError),
+        ("t", 19.55, ValueError),
+        ("in", 1, ValueError),
+        ("x", 1, KeyError),
+    ):
+        with pytest.raises(error):
+            poller.write("oven", tag, value)
+    with pytest.raises(KeyError):
+        poller.write("x", "t", 1)
+    assert memory.read("holding_registers", 5, 1) == [195]
+
+
+def test_a_write_that_is_refused_says_so(device: holdfast.Server, poller: Poller) -> None:
+    poller.add(url(device), {"x": ("holding_registers", 99)}, name="oven")
+    with pytest.raises(WriteFailed, match=r"oven\.x: exception 02") as caught:
+        poller.write("oven", "x", 1)
+    assert caught.value.fault == 2
+
+
+def test_devices_can_be_added_and_removed(device: holdfast.Server, poller: Poller) -> None:
+    names = [poller.add(url(device), {"x": ("coils", 0)}, interval=0.05) for _ in range(2)]
+    assert names == [at := url(device).removeprefix("tcp://"), f"{at}#1"]
+    found: set[str] = set()
+
+    def all_came() -> bool:
+        found.update(reading.device for reading in taken(poller))
+        return found == set(names)
+
+    wire.until(all_came, "both devices are polled")
+    poller.remove(names[0])
+    assert list(poller.counters()) == names[1:]
+    wire.until(lambda: {each.device for each in taken(poller)} == {names[1]}, "one is left")
+    with pytest.raises(KeyError):
+        poller.remove(names[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tags": {}}, "tags is empty, allowed: at least one tag"),
+        ({"tags": {"x": ("coils",)}}, "the tag x is"),
+        ({"tags": {"x": ("coil", 1)}}, "area is 'coil', allowed: coils"),
+        ({"url": "http://a"}, "http"),
+        ({"unit": 256}, "unit"),
+        ({"interval": -1}, "interval"),
+    ],
+)
+def test_wrong_arguments_are_refused(
+    poller: Poller, arguments: dict[str, Any], message: str
+) -> None:
+    settings: dict[str, Any] = {"url": "tcp://127.0.0.1", "tags": {"x": ("coils", 1)}}
+    with pytest.raises(ValueError, match=message):
+        poller.add(**(settings | arguments))
+    assert poller.counters() == {}
+
+
+def test_the_end_ends_the_iteration(device: holdfast.Server) -> None:
+    with Poller() as poller:
+        poller.add(url(device), {"x": ("coils", 3)}, interval=0.05)
+        count = 0
+        for batch in poller:
+            count += len(batch)
+            if count >= 3:
+                poller.close()
+    assert count >= 3
+    assert poller.take(0) is None
+    with pytest.raises(RuntimeError):
+        poller.add("tcp://127.0.0.1", {"x": ("coils", 3)})
+
+
+def test_a_batch_that_a_cancelled_task_waited_for_is_not_lost(device: holdfast.Server) -> None:
+    async def first(made: Poller) -> list[Reading]:
+        async for batch in made:
+            return list(batch)
+        raise AssertionError("the iteration has ended")
+
+    async def steps() -> None:
+        with Poller() as made:
+            waiting = asyncio.ensure_future(first(made))
+            await asyncio.sleep(0)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            made.add(url(device), {"x": ("coils", 3)}, interval=3600)
+            [reading] = await asyncio.wait_for(first(made), wire.DEADLINE)
+            assert reading.value is True
+        assert [batch async for batch in made] == []
+
+    asyncio.run(steps())
