@@ -26,6 +26,7 @@ from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
 from holdfast.config.scalars import MAX_TIME
 from holdfast.net.tls import NO_FILES
+from holdfast.polling.reader import Reader
 from holdfast.server import Identity
 from holdfast.tools import planning
 from holdfast.types import AREAS
@@ -262,11 +263,17 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
     )
 
 
-def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.PolledDevice:
-    """Creates the native poller's device of that name. Raises `OSError` for unusable files."""
+def device(
+    name: str, config: Config, memories: Mapping[str, Memory], report: _core.Results | None
+) -> _core.PolledDevice:
+    """Creates the native poller's device of that name. Raises `OSError` for unusable files.
+
+    `report` takes the polls of devices with tags.
+    """
     settings = config.devices[name]
+    fields = Reader(name, config.tags(name)).fields
     status = settings.status
-    assert settings.interval is not None, "a device with reads has an interval"
+    assert settings.interval is not None, "a device that is polled has an interval"
     return _core.PolledDevice(
         name,
         _endpoint(f"devices.{name}.url", settings.target),
@@ -283,6 +290,8 @@ def device(name: str, config: Config, memories: Mapping[str, Memory]) -> _core.P
         in_flight=None if settings.in_flight == "auto" else settings.in_flight,
         retry=settings.retry.pauses,
         measured=settings.cost is not None and settings.cost.measured,
+        report=report if fields else None,
+        fields=fields,
         **planning.rules(settings),
     )
 

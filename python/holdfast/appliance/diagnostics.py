@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     from holdfast._core import Engine, Link, Memory, Poller
     from holdfast.appliance.liveness import Liveness
     from holdfast.appliance.supervision import Supervisor
+    from holdfast.appliance.tag_values import TagValues
     from holdfast.audit import Audit
     from holdfast.ingest import MemoryAccess
+    from holdfast.polling import Reading
 
 
 def configured(poller: Poller) -> dict[str, dict[str, Any]]:
@@ -34,6 +36,7 @@ class Diagnostics:
         self.adapters: dict[str, tuple[Supervisor, MemoryAccess | None]] = {}
         self.audit: Audit | None = None
         self.poller: Poller | None = None
+        self.values: TagValues | None = None
         self.links: Mapping[str, Link] = {}
         """What listeners pass requests on to."""
         self.disabled: Sequence[str] = ()
@@ -77,6 +80,10 @@ class Diagnostics:
         """Returns the health and the counters of each device."""
         polled = {} if self.poller is None else configured(self.poller)
         return {**polled, **{name: {"health": "disabled"} for name in self.disabled}}
+
+    def tag_values(self) -> list[Reading]:
+        """Returns the last reading of each tag of the configured devices."""
+        return [] if self.values is None else self.values.latest()
 
     def adapter(self, name: str) -> dict[str, Any] | None:
         """Returns the state and the counters of one adapter; `None` if it does not exist."""

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
-from holdfast.appliance import assembly, auditing, changes, configured_certificates
+from holdfast.appliance import assembly, auditing, changes, configured_certificates, receivers
 from holdfast.appliance.diagnostics import Diagnostics, configured
 from holdfast.appliance.liveness import Liveness
-from holdfast.appliance.supervision import Supervisor
+from holdfast.appliance.supervision import STOP_TIMEOUT, Supervisor
+from holdfast.appliance.tag_values import TagValues
 from holdfast.client.endpoint import check_files
 from holdfast.config import (
     HTTP_SERVICES,
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
         MetricsConfig,
         RestConfig,
     )
+    from holdfast.config.outputs import Output
     from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
 
@@ -59,6 +61,9 @@ LEVELS = {
 
 # What the audit log has of a connection that was ended.
 _SHOWN = ("peer", "role", "subject", "serial")
+
+OUTPUT = "output/"
+"""The beginning of the names of outputs among the adapters, whose names have no slash."""
 
 # Seconds between checks of the health of devices.
 HEALTH_CHECK_INTERVAL = 1.0
@@ -206,11 +211,6 @@ class _Running:
         _check_parts(config)
         self._https = _loaded_https(config)
         assembly.mirror(config, memories)
-        devices = [
-            assembly.device(name, config, memories)
-            for name, device in config.devices.items()
-            if device.is_polled
-        ]
         disabled = self._tell_disabled()
         with ExitStack() as undo:
             self._audit = auditing.opened(config)
@@ -219,11 +219,18 @@ class _Running:
             self._ports = self._bound_ports(undo)
             # The links of listeners come first: the first use of an address decides its settings.
             self._poller: _core.Poller | None = None
-            links = assembly.Links()
+            self._values: TagValues | None = None
+            links, devices = assembly.Links(), list[_core.PolledDevice]()
             if _requires_poller(config):
                 self._poller = _core.Poller([])
                 undo.callback(self._poller.stop)
+                self._values = _tag_values(None, self._poller, config)
                 links = assembly.links(config, memories, self._poller)
+                devices = [
+                    assembly.device(name, config, memories, _results(self._values))
+                    for name, device in config.devices.items()
+                    if device.is_polled
+                ]
             self._engine = self._started_engine(links)
             self._passages.update(links.passages)
             undo.callback(self._engine.stop)
@@ -237,9 +244,13 @@ class _Running:
             self.diagnostics.links = links.links
             self.diagnostics.disabled = disabled
             self.diagnostics.expiries = configured_certificates.expiries(config)
+            self.diagnostics.values = self._values
             for name, part in self._adapters(config, self._ports).items():
                 self._add(name, part)
             undo.pop_all()
+        if self._values is not None:
+            self._values.adopt(config)
+            self._values.start()
         if self._audit is not None:
             self._recorder = auditing.WriteRecorder(self._audit, self._engine)
             self._recorder.start()
@@ -259,6 +270,8 @@ class _Running:
             supervisor.join()
         if self._poller is not None:
             self._poller.stop()
+        if self._values is not None:
+            self._values.join(STOP_TIMEOUT)
         for port in self._ports.values():
             port.close()
         if self._recorder is not None:
@@ -302,6 +315,8 @@ class _Running:
         heartbeats = self._engine.heartbeats()
         if self._poller is not None:
             heartbeats.append(self._poller.heartbeat)
+        if self._values is not None and (tags := self._values.heartbeat()) is not None:
+            heartbeats.append(tags)
         if self._recorder is not None:
             heartbeats.append(self._recorder.heartbeat())
         own = [supervisor.heartbeat() for supervisor in list(self._supervisors.values())]
@@ -328,15 +343,15 @@ class _Running:
 
     def _log_forwards(self, name: str, counted: Sequence[Mapping[str, int]]) -> None:
         """Logs what happened at the receivers of a device since the last check."""
-        receivers = self._config.devices[name].forward
-        for index, (receiver, now) in enumerate(zip(receivers, counted, strict=True)):
+        forwards = self._config.devices[name].forward
+        for index, (forward, now) in enumerate(zip(forwards, counted, strict=True)):
             key = (name, index)
             before = self._forwarded.get(key, {})
             self._forwarded[key] = now
             refused = now["refused"] - before.get("refused", 0)
             replied = refused + now["sent"] - before.get("sent", 0)
             failed = now["failed"] - before.get("failed", 0)
-            fields = {"device": name, "receiver": receiver.url}
+            fields = {"device": name, "receiver": forward.url}
             if refused:
                 logs.refused("forward_refused", kind=key, **fields, count=refused)
             if replied and key in self._unreachable:
@@ -412,10 +427,11 @@ class _Running:
             if poller is None and _requires_poller(config):
                 poller = _core.Poller([])
                 undo.callback(poller.stop)
+            tag_values = _tag_values(self._values, poller, config)
             if poller is not None:
                 links = assembly.links(config, memories, poller)
             devices = {
-                name: assembly.device(name, config, memories)
+                name: assembly.device(name, config, memories, _results(tag_values))
                 for name, device in config.devices.items()
                 if device.is_polled and f"devices.{name}" in changed
             }
@@ -429,8 +445,14 @@ class _Running:
             undo.pop_all()
         before, self._config, self._fingerprints = self._config, config, fingerprints
         self._poller = self.diagnostics.poller = poller
+        is_new = tag_values is not self._values
+        self._values = self.diagnostics.values = tag_values
         known.update(added)
         try:
+            if self._values is not None:
+                self._values.adopt(config)
+                if is_new:
+                    self._values.start()
             self._take_over(before, added, links, devices, https, ports)
         except Exception as error:
             raise changes.ReloadIncomplete(f"{type(error).__name__}: {error}") from error
@@ -608,11 +630,18 @@ class _Running:
                 ),
                 *_apart_from_files(metrics),
             )
+        for name, output in config.outputs.items():
+            if self._values is not None:
+                add(f"{OUTPUT}{name}", self._output(self._values, name, output), output)
         for name, settings in config.adapters.items():
             own = self._memory_access(name)
             part = add(name, foreign.factory(name, settings, own), settings)
             parts[name] = replace(part, access=own)
         return parts
+
+    @staticmethod
+    def _output(values: TagValues, name: str, settings: Output) -> Callable[[], Adapter]:
+        return lambda: values.sending(name, receivers.receiver(settings))
 
     def _memory_access(self, name: str) -> MemoryAccess:
         """The way to memory of an adapter. It keeps its counters over reloads."""
@@ -649,6 +678,20 @@ def _apart_from_files(service: RestConfig | GatewayConfig | MetricsConfig) -> tu
 def _requires_poller(config: Config) -> bool:
     polled = any(device.is_polled for device in config.devices.values())
     return bool(polled or config.links or routed(config) or config.nats is not None)
+
+
+def _tag_values(
+    known: TagValues | None, poller: _core.Poller | None, config: Config
+) -> TagValues | None:
+    """The thread that takes the values of tags, once there are some."""
+    has_tags = any(device.is_polled and device.has_tags for device in config.devices.values())
+    if known is None and poller is not None and has_tags:
+        return TagValues(poller.receiver())
+    return known
+
+
+def _results(values: TagValues | None) -> _core.Results | None:
+    return None if values is None else values.results
 
 
 def _review_interval(config: Config) -> float | None:

@@ -191,7 +191,7 @@ def _polled(device: DeviceConfig) -> str:
     """The polling of a device, in one line."""
     if not device.enabled:
         return f"{device.url} unit {device.unit}, not polled"
-    if device.interval is None or not device.reads:
+    if device.interval is None or not device.has_readings:
         return f"{device.url} unit {device.unit}, by routes only"
     return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
 

@@ -325,4 +325,9 @@ class DeviceConfig(Model):
     @property
     def has_readings(self) -> bool:
         """Whether it has something to read."""
-        return bool(self.reads or self.tags or self.profile)
+        return bool(self.reads) or self.has_tags
+
+    @property
+    def has_tags(self) -> bool:
+        """Whether it has tags."""
+        return bool(self.tags) or self.profile is not None

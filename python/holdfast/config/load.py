@@ -19,6 +19,7 @@ from holdfast.config.lenient import mapping
 from holdfast.config.listener_checks import ListenerChecks
 from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
+from holdfast.config.output_checks import OutputChecks
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.profile_files import ProfileFiles
 from holdfast.config.report import Report
@@ -93,6 +94,7 @@ def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     ServiceChecks(folder, report, grants).check(data)
     AddressChecks(folder, report).check(data)
     DeviceChecks(report, grants, memories).check(data.get("devices"))
+    OutputChecks(folder, report).check(data)
     tags = TagChecks(report)
     tags.profiles(data.get("profiles"))
     tags.devices(data.get("devices"), mapping(data.get("profiles")))

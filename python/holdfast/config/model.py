@@ -18,6 +18,7 @@ from holdfast.config.devices import DeviceConfig
 from holdfast.config.links import LinkConfig
 from holdfast.config.listeners import Listener
 from holdfast.config.memories import MemoryConfig
+from holdfast.config.outputs import Output
 from holdfast.config.scalars import (
     ADAPTER_KEYS,
     NAME_KEYS,
@@ -126,6 +127,10 @@ class Config(Model):
     """The scanner, which polls devices for NATS subscribers."""
     gateway: Annotated[GatewayConfig | None, NotNull()] = None
     """The gateway, which gives access to devices over HTTP and has a web console."""
+    outputs: dict[AdapterName, Annotated[Output, Field(discriminator="type")]] = Field(
+        default={}, json_schema_extra=ADAPTER_KEYS
+    )
+    """Where the values of tags are published, by name."""
     adapters: dict[AdapterName, AdapterConfig] = Field(default={}, json_schema_extra=ADAPTER_KEYS)
     """Third-party adapters, by name."""
     metrics: Annotated[MetricsConfig | None, NotNull()] = None

@@ -31,6 +31,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from holdfast.client.url import FORMS, in_folder, parse
 from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
 from holdfast.config.egress import parse_allowed
+from holdfast.config.http_url import parse_http
 from holdfast.config.ip_addresses import Bind, parse_bind, parse_peer, parse_source
 from holdfast.config.receiver import parse_receiver
 from holdfast.config.scanning import (
@@ -114,6 +115,11 @@ def parse_sha256(value: object) -> str:
 
 def _broker_url(value: object) -> str:
     parse_broker(value)
+    return str(value)
+
+
+def _http_url(value: object) -> str:
+    parse_http(value)
     return str(value)
 
 
@@ -315,6 +321,11 @@ BrokerUrl = Annotated[
     WithJsonSchema(
         {"type": "string", "examples": ["mqtt://127.0.0.1:1883", "mqtts://broker.example"]}
     ),
+]
+HttpUrl = Annotated[
+    str,
+    PlainValidator(_http_url),
+    WithJsonSchema({"type": "string", "examples": ["http://10.0.0.9:8086", "https://db.example"]}),
 ]
 SyslogUrl = Annotated[
     str,

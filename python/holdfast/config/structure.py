@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from holdfast.config.allowed import allowed, known_keys
 from holdfast.config.listeners import LISTENER_TYPES, UNIT_TAGS
 from holdfast.config.model import Config
+from holdfast.config.outputs import OUTPUT_TYPES
 from holdfast.config.words import choice, guess, listing, shape, show
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ def build(data: object, context: Mapping[str, Any], report: Report) -> Config | 
 def _untagged(path: KeyPath) -> KeyPath:
     """The path without the tags that pydantic inserts for discriminated unions."""
     of_listener = path[:1] == ("listeners",) and path[2:] != (_KEY,)
-    if of_listener or path[:2] in _TOKENS:
+    of_output = path[:1] == ("outputs",) and path[2:] != (_KEY,)
+    if of_listener or of_output or path[:2] in _TOKENS:
         path = path[:2] + path[3:]
     of_unit = of_listener and path[4:5] == ("units",) and path[6:7] and path[6] in UNIT_TAGS
     return path[:6] + path[7:] if of_unit else path
@@ -72,11 +74,12 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
 
 
 def _add_kind(path: KeyPath, owner: dict[str, Any], report: Report) -> None:
-    words = f"allowed: {choice(LISTENER_TYPES)}"
+    types = OUTPUT_TYPES if path[0] == "outputs" else LISTENER_TYPES
+    words = f"allowed: {choice(types)}"
     if "type" not in owner:
         report.add(path, f"missing, {words}", of_key=True)
     else:
-        near = guess(owner["type"], LISTENER_TYPES)
+        near = guess(owner["type"], types)
         report.add(path, f"found {show(owner['type'])}, {words}{near}")
 
 

@@ -25,6 +25,8 @@ class Reader:
     def __init__(self, device: str, tags: Iterable[Tag]) -> None:
         self.device = device
         self.tags = tuple(tags)
+        self.named = {tag.name: tag for tag in self.tags}
+        """The tags, by name."""
         self._places = Places(self.tags)
         self._blocks: dict[tuple[Area, int, int], tuple[Sequence[Tag], Decoder | None]] = {}
 

@@ -1,0 +1,30 @@
+"""Creates the receiver of an output. Its library is imported only if it is configured."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, assert_never
+
+from holdfast.config.outputs import FileConfig, InfluxConfig
+
+if TYPE_CHECKING:
+    from holdfast.config.outputs import Output
+    from holdfast.outputs import Receiver
+
+
+def receiver(settings: Output) -> Receiver:
+    """The receiver that the settings describe."""
+    match settings:
+        case InfluxConfig():
+            from holdfast.outputs.influx import Influx
+
+            return Influx(settings)
+        case FileConfig(format="sqlite"):
+            from holdfast.outputs.database import Database
+
+            return Database(settings)
+        case FileConfig():
+            from holdfast.outputs.text_file import TextFile
+
+            return TextFile(settings)
+        case _:
+            assert_never(settings)

@@ -1,0 +1,166 @@
+"""The values of tags: from the native poller to the outputs, on a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from holdfast import logs
+from holdfast.heartbeat import Heartbeat
+from holdfast.outputs import Buffer, Changes, Sending
+from holdfast.polling import Reading
+from holdfast.polling.reader import Reader
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast._core import Results
+    from holdfast.config import Config
+    from holdfast.config.outputs import Output
+    from holdfast.outputs import Receiver
+    from holdfast.outputs.stored import Stored
+    from holdfast.polling import DevicePoll
+    from holdfast.tags import Tag
+    from holdfast.types import ThreadHeartbeat
+
+WAIT = 1.0
+"""Seconds of one wait for polls."""
+
+GATHERED = 0.005
+"""Seconds that a batch waits for more polls, so that batches have a useful size."""
+
+
+@dataclass
+class _Output:
+    """What an output publishes, and what it has not sent yet."""
+
+    settings: Output
+    changes: Changes
+    buffer: Buffer
+
+
+class TagValues:
+    """Converts the polls that a receiver takes, and offers them to each output.
+
+    Ends with the poller.
+    """
+
+    def __init__(self, results: Results) -> None:
+        self.results = results
+        self._lock = threading.Lock()
+        self._readers: dict[str, Reader] = {}
+        self._outputs: dict[str, _Output] = {}
+        self._latest: dict[str, list[Reading]] = {}
+        self._heartbeat = Heartbeat()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="holdfast-tags", daemon=True)
+
+    def start(self) -> None:
+        """Starts the thread."""
+        self._thread.start()
+
+    def join(self, timeout: float) -> None:
+        """Waits for the thread, which ends with the poller."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+
+    def adopt(self, config: Config) -> None:
+        """Takes over devices and outputs. Outputs keep what they have to send."""
+        readers = {
+            name: Reader(name, tags)
+            for name, device in config.devices.items()
+            if device.is_polled and len(tags := config.tags(name))
+        }
+        with self._lock:
+            changed = {
+                name
+                for name in {*readers, *self._readers}
+                if name not in readers
+                or name not in self._readers
+                or readers[name].tags != self._readers[name].tags
+            }
+            self._readers = {
+                name: reader if name in changed else self._readers[name]
+                for name, reader in readers.items()
+            }
+            self._latest = {
+                name: found
+                for name, found in self._latest.items()
+                if name in readers and name not in changed
+            }
+            outputs: dict[str, _Output] = {}
+            for name, settings in config.outputs.items():
+                known = self._outputs.get(name)
+                if known is None or known.settings != settings:
+                    buffer = Buffer() if known is None else known.buffer
+                    changes = Changes(settings.publish, settings.heartbeat)
+                    known = _Output(settings, changes, buffer)
+                known.buffer.most = settings.buffer.values
+                known.changes.forget(changed)
+                outputs[name] = known
+            self._outputs = outputs
+
+    def sending(self, name: str, receiver: Receiver) -> Sending:
+        """The adapter of an output."""
+        output = self._outputs[name]
+        settings = output.settings.buffer
+        file = settings.file
+
+        def opened() -> Stored:
+            from holdfast.outputs.stored import Stored
+
+            assert file is not None, "called only with a file"
+            return Stored(file, settings.max_bytes, self.find)
+
+        return Sending(name, receiver, output.buffer, None if file is None else opened)
+
+    def find(self, device: str, tag: str) -> Tag | None:
+        """A tag of the configuration."""
+        reader = self._readers.get(device)
+        return None if reader is None else reader.named.get(tag)
+
+    def latest(self) -> list[Reading]:
+        """The last reading of each tag. Thread-safe."""
+        with self._lock:
+            return [reading for readings in self._latest.values() for reading in readings]
+
+    def heartbeat(self) -> ThreadHeartbeat | None:
+        """The heartbeat of the thread; `None` before the start."""
+        if self._thread.ident is None:
+            return None
+        return self._thread.name, self._heartbeat.age, self._thread.native_id
+
+    def _run(self) -> None:
+        while (taken := self.results.take(WAIT)) is not None:
+            self._heartbeat.beat()
+            found = taken[0]
+            if not found:
+                continue
+            self._ending.wait(GATHERED)
+            more = self.results.take(0.0)
+            if more is not None:
+                found += more[0]
+            try:
+                with self._lock:
+                    polls = [
+                        self._readers[name].poll(blocks)
+                        for name, _, blocks in found
+                        if name in self._readers
+                    ]
+                    self._hand_out(polls)
+            except Exception:  # A fault in one poll must not end all outputs.
+                logs.problem("tag_values_failed")
+
+    def _hand_out(self, polls: Iterable[DevicePoll]) -> None:
+        for poll in polls:
+            self._latest[poll.device] = poll.readings
+        for output in self._outputs.values():
+            only = output.settings.devices
+            readings = [
+                reading
+                for poll in polls
+                if only is None or poll.device in only
+                for reading in poll.readings
+            ]
+            output.buffer.offer(output.changes.of(readings))

@@ -1,0 +1,68 @@
+"""Checks rules between keys of outputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.files import check_readable
+from holdfast.config.http_url import parse_http
+from holdfast.config.lenient import entries, mapping, parsed
+from holdfast.config.tls_checks import check_client_tls
+from holdfast.config.words import guess, listing, show
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.config.report import Report
+    from holdfast.config.source import KeyPath
+
+
+@dataclass
+class OutputChecks:
+    """Checks the outputs of one file; files are relative to `folder`."""
+
+    folder: Path
+    report: Report
+
+    def check(self, data: dict[Any, Any]) -> None:
+        """Reports what is wrong."""
+        devices = mapping(data.get("devices"))
+        outputs = mapping(data.get("outputs"))
+        if outputs and not any(
+            mapping(device).get("tags") or "profile" in mapping(device)
+            for device in devices.values()
+        ):
+            self.report.doubt(("outputs",), "has no effect: no device has tags")
+        for name, output in outputs.items():
+            path: KeyPath = ("outputs", name)
+            for index, device in enumerate(entries(mapping(output).get("devices"))):
+                if device not in devices:
+                    words = f"allowed: {listing(devices) or 'none, there are no devices'}"
+                    near = guess(device, [str(each) for each in devices])
+                    message = f"found {show(device)}, {words}{near}"
+                    self.report.add((*path, "devices", index), message)
+            if mapping(output).get("type") == "influx":
+                self._influx(path, output)
+
+    def _influx(self, path: KeyPath, output: dict[Any, Any]) -> None:
+        target = parsed(parse_http, output.get("url"))
+        if target is None:
+            return
+        if target.path in ("", "/") and "bucket" not in output:
+            message = "missing, allowed: a bucket, or a url with a path"
+            self.report.add((*path, "bucket"), message, of_key=True)
+        if "tls" in output and not target.secure:
+            message = "found with http://, allowed: only with https://"
+            self.report.add((*path, "tls"), message, of_key=True)
+        if "username" in output and "token_file" in output:
+            message = "found together with token_file, allowed: only one of them"
+            self.report.add((*path, "username"), message, of_key=True)
+        if ("username" in output) != ("password_file" in output):
+            given, other = "username", "password_file"
+            if given not in output:
+                given, other = other, given
+            self.report.add((*path, given), f"found without {other}", of_key=True)
+        for key in ("token_file", "password_file"):
+            check_readable((*path, key), output.get(key), self.folder, self.report)
+        check_client_tls((*path, "tls"), mapping(output.get("tls")), self.folder, self.report)

@@ -1,0 +1,94 @@
+"""Models of outputs: where the values of tags are published."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field, Strict
+
+from holdfast.config.base import Model
+from holdfast.config.http_url import HttpTarget, parse_http
+from holdfast.config.scalars import Duration, FilePath, HttpUrl, Name, NotNull
+from holdfast.config.services import ClientTlsConfig
+
+MOST_VALUES = 1_000_000
+MEASUREMENT = "modbus"
+
+
+class BufferConfig(Model):
+    """What an output keeps while it can't send."""
+
+    values: Annotated[int, Field(ge=1000, le=10_000_000)] = MOST_VALUES
+    """The newest values that are kept in memory."""
+    file: Annotated[FilePath | None, NotNull()] = None
+    """A file for what can't be sent, in an existing folder; it survives a restart."""
+    max_bytes: Annotated[int, Field(ge=2**20, le=2**50)] = 2**30
+    """The bytes that the file may have; then the oldest values go."""
+
+
+class OutputConfig(Model):
+    """What all outputs have."""
+
+    publish: Literal["change", "scan"] = "change"
+    """change: values that differ from the last by more than their deadband; scan: all."""
+    heartbeat: Annotated[Duration | None, NotNull()] = None
+    """Seconds after which an unchanged value is published again. Default: never."""
+    devices: Annotated[tuple[Name, ...], Strict(False), Field(min_length=1)] | None = None
+    """The devices whose tags are published. Default: all."""
+    buffer: BufferConfig = Field(default_factory=BufferConfig)
+    """What is kept while the receiver can't be reached."""
+
+
+class InfluxConfig(OutputConfig):
+    """Line protocol over HTTP: InfluxDB, and others that accept it."""
+
+    type: Literal["influx"]
+    """The type of the output."""
+    url: HttpUrl
+    """http://host:port for the v2 write API of InfluxDB; other receivers with their path."""
+    org: Annotated[str | None, NotNull()] = None
+    """The organization."""
+    bucket: Annotated[str | None, NotNull()] = None
+    """The bucket; required if the URL has no path."""
+    token_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that contains the token."""
+    username: Annotated[str | None, NotNull()] = None
+    """A user name, instead of a token."""
+    password_file: Annotated[FilePath | None, NotNull()] = None
+    """A file that contains the password of the user."""
+    measurement: Annotated[str, Field(min_length=1)] = MEASUREMENT
+    """The measurement of all points; each device is a tag, each tag of it a field."""
+    tags: dict[Name, str] = Field(default={})
+    """More tags of all points, such as the site."""
+    gzip: bool = True
+    """Whether requests are compressed."""
+    timeout: Duration = 5.0
+    """Seconds for a request and its answer."""
+    tls: Annotated[ClientTlsConfig | None, NotNull()] = None
+    """Certificates; requires https://."""
+
+    @property
+    def target(self) -> HttpTarget:
+        """The parts of the URL."""
+        return parse_http(self.url)
+
+
+class FileConfig(OutputConfig):
+    """A file: lines of text, or an SQLite database."""
+
+    type: Literal["file"]
+    """The type of the output."""
+    file: FilePath
+    """The file, in an existing folder."""
+    format: Literal["csv", "jsonl", "influx", "sqlite"]
+    """csv, JSON Lines, line protocol, or an SQLite database with the table readings."""
+    max_bytes: Annotated[int, Field(ge=65536)] = 100 * 2**20
+    """The size in bytes at which a file of text is rotated, or old rows of a database go."""
+    keep: Annotated[int, Field(ge=0, le=1000)] = 10
+    """How many rotated files of text to keep."""
+
+
+OUTPUT_TYPES = ("influx", "file")
+"""All values of `type`."""
+
+Output: TypeAlias = InfluxConfig | FileConfig

@@ -1,0 +1,55 @@
+"""What an output publishes: everything, or what has changed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.polling import Reading
+
+
+class Changes:
+    """Selects the readings that are published.
+
+    With `change`, a value is published if it differs from the last one by more than the deadband of
+    its tag, if it appears or disappears, and after `heartbeat` seconds in any case.
+    """
+
+    def __init__(self, publish: Literal["change", "scan"], heartbeat: float | None) -> None:
+        self._every = publish == "scan"
+        self._heartbeat = heartbeat
+        self._last: dict[tuple[str, str], tuple[Any, float]] = {}
+
+    def of(self, readings: Iterable[Reading]) -> list[Reading]:
+        """The readings that are published."""
+        if self._every:
+            return list(readings)
+        return [reading for reading in readings if self._is_new(reading)]
+
+    def _is_new(self, reading: Reading) -> bool:
+        device, tag, value, time, _, _ = reading
+        key = (device, tag.name)
+        known = self._last.get(key)
+        if known is not None:
+            before, at = known
+            silent = self._heartbeat is None or 0 <= time - at < self._heartbeat
+            if silent and (value == before or not _differs(value, before, tag.deadband)):
+                return False
+        self._last[key] = (value, time)
+        return True
+
+    def forget(self, devices: Iterable[str]) -> None:
+        """Publishes the next readings of these devices in any case."""
+        gone = set(devices)
+        self._last = {key: last for key, last in self._last.items() if key[0] not in gone}
+
+
+def _differs(value: Any, before: Any, deadband: float) -> bool:
+    if value is None or before is None or not deadband:
+        return bool(value != before)
+    if isinstance(value, list) and isinstance(before, list):
+        pairs = zip(value, before, strict=True)
+        return any(_differs(one, other, deadband) for one, other in pairs)
+    return bool(abs(value - before) > deadband)

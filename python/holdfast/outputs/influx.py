@@ -1,0 +1,133 @@
+"""Sends line protocol over HTTP (InfluxDB v2 write API, and others that accept it)."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import gzip
+import http.client
+from typing import TYPE_CHECKING
+from urllib.parse import urlencode
+
+from holdfast.net.addresses import joined
+from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.outputs.line_protocol import lines
+from holdfast.outputs.sending import Refused
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.config.outputs import InfluxConfig
+    from holdfast.polling import Reading
+
+MAX_ANSWER = 65_536
+"""The bytes of an answer that are read."""
+
+SHOWN = 200
+"""The characters of an error message of the receiver that are shown."""
+
+UNWANTED = (400, 413, 422)
+"""Answers to a request that would be refused each time. All others are tried again: a token or a
+bucket can be put right."""
+
+
+class Influx:
+    """One connection, kept open between requests."""
+
+    def __init__(self, settings: InfluxConfig) -> None:
+        self._settings = settings
+        self._target = settings.target
+        self._connection: http.client.HTTPConnection | None = None
+        self._path = self._target.path
+        if self._path in ("", "/"):
+            query = {"org": settings.org, "bucket": settings.bucket, "precision": "ns"}
+            given = {key: value for key, value in query.items() if value is not None}
+            self._path = f"/api/v2/write?{urlencode(given)}"
+
+    def send(self, readings: list[Reading]) -> None:
+        """Sends all values in one request; those without a value are left out."""
+        body = lines(readings, self._settings.measurement, self._settings.tags)
+        if not body:
+            return
+        status, answer = self._answer(body)
+        if 200 <= status < 300:
+            return
+        text = answer.decode("utf-8", "replace").strip()[:SHOWN]
+        message = f"{self._at}: HTTP {status}{': ' if text else ''}{text}"
+        if status in UNWANTED:
+            raise Refused(message)
+        raise OSError(message)
+
+    def idle(self) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Closes the connection."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def status(self) -> dict[str, object]:
+        """Where values go."""
+        return {"url": self._at}
+
+    @property
+    def _at(self) -> str:
+        return joined(self._target.host, self._target.port)
+
+    def _answer(self, body: bytes) -> tuple[int, bytes]:
+        """Sends a request. A connection that was closed while it was idle is opened again."""
+        headers = {"Content-Type": "text/plain; charset=utf-8", **self._authorization()}
+        if self._settings.gzip:
+            body, headers["Content-Encoding"] = gzip.compress(body, 1), "gzip"
+        is_fresh = self._connection is None
+        try:
+            return self._request(body, headers)
+        except (http.client.RemoteDisconnected, ConnectionError):
+            self.close()
+            if is_fresh:
+                raise
+        return self._request(body, headers)
+
+    def _request(self, body: bytes, headers: dict[str, str]) -> tuple[int, bytes]:
+        if self._connection is None:
+            self._connection = self._opened()
+        try:
+            self._connection.request("POST", self._path, body, headers)
+            answer = self._connection.getresponse()
+            text = answer.read(MAX_ANSWER)
+            if not answer.isclosed():
+                self.close()
+        except http.client.HTTPException as error:
+            self.close()
+            if isinstance(error, ConnectionError):
+                raise
+            raise OSError(f"{self._at}: not HTTP: {error or type(error).__name__}") from error
+        except OSError:
+            self.close()
+            raise
+        return answer.status, text
+
+    def _opened(self) -> http.client.HTTPConnection:
+        host, port, secure, _ = self._target
+        timeout = self._settings.timeout
+        if not secure:
+            return http.client.HTTPConnection(host, port, timeout=timeout)
+        tls = NO_FILES if self._settings.tls is None else self._settings.tls.files
+        return http.client.HTTPSConnection(host, port, timeout=timeout, context=broker_context(tls))
+
+    def _authorization(self) -> dict[str, str]:
+        """The credentials, read each time, so that a new token needs no restart."""
+        settings = self._settings
+        if settings.token_file is not None:
+            return {"Authorization": f"Token {_secret(settings.token_file)}"}
+        if settings.username is not None and settings.password_file is not None:
+            pair = f"{settings.username}:{_secret(settings.password_file)}"
+            return {"Authorization": f"Basic {base64.b64encode(pair.encode()).decode()}"}
+        return {}
+
+
+def _secret(file: Path) -> str:
+    with contextlib.suppress(UnicodeDecodeError):
+        return file.read_text(encoding="utf-8").strip()
+    raise OSError(f"{file}: not UTF-8")

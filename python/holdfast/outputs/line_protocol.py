@@ -1,0 +1,68 @@
+"""The line protocol of InfluxDB, which Telegraf, VictoriaMetrics and QuestDB read too.
+
+One line has the values that a device gave at one time, one field for each tag. Null is a missing
+field.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from holdfast.polling import Reading
+
+MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
+"""Integers of the protocol have 64 bits. Others become floats."""
+
+_NAME = str.maketrans({",": r"\,", " ": r"\ ", "\n": r"\n", "\r": r"\r"})
+_KEY = str.maketrans({",": r"\,", " ": r"\ ", "=": r"\=", "\n": r"\n", "\r": r"\r"})
+_TEXT = str.maketrans({'"': r"\"", "\\": "\\\\"})
+
+
+def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]) -> bytes:
+    """The lines of readings. Empty if no reading has a value."""
+    points: dict[tuple[str, int], list[str]] = {}
+    for device, tag, value, time, _, _ in readings:
+        at = round(time * 1_000_000) * 1000
+        fields = points.setdefault((device, at), [])
+        fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, value)]
+    name = measurement.translate(_NAME)
+    more = "".join(f",{key.translate(_KEY)}={_tag(value)}" for key, value in tags.items())
+    return "".join(
+        f"{name},device={_tag(device)}{more} {','.join(fields)} {at}\n"
+        for (device, at), fields in points.items()
+        if fields
+    ).encode()
+
+
+def _tag(value: str) -> str:
+    """A tag value; a backslash at its end would escape what follows."""
+    written = value.translate(_KEY)
+    return f"{written} " if written.endswith("\\") else written
+
+
+def _fields(name: str, value: Any) -> Iterable[tuple[str, str]]:
+    """A field, or one for each item of an array."""
+    if isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _fields(f"{name}[{index}]", item)
+    elif (written := _written(value)) is not None:
+        yield name, written
+
+
+def _written(value: Any) -> str | None:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        inside = MIN_INTEGER <= value <= MAX_INTEGER
+        return f"{value}i" if inside else repr(float(value))
+    if isinstance(value, float):
+        return repr(value) if math.isfinite(value) else None
+    if isinstance(value, bytes):
+        return f'"{value.hex()}"'
+    if isinstance(value, str):
+        return f'"{value.translate(_TEXT)}"'
+    return None

@@ -1,0 +1,148 @@
+"""A file with readings that could not be sent yet.
+
+SQLite keeps it valid after a power cut. One row has the readings of one step, so that many values
+cost few writes.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.polling import Reading
+from holdfast.tags import Tag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    FindTag = Callable[[str, str], Tag | None]
+
+_CREATE = """
+CREATE TABLE IF NOT EXISTS readings (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, count INTEGER NOT NULL, data BLOB NOT NULL
+)"""
+
+
+class Stored:
+    """Readings in a file, oldest first. For one thread. Methods raise `OSError`.
+
+    `max_bytes` bounds the readings, not the file, which is a little larger.
+    """
+
+    def __init__(self, file: Path, max_bytes: int, find: FindTag) -> None:
+        self.file = file
+        self.count = 0
+        """How many readings there are."""
+        self._max_bytes, self._find = max_bytes, find
+        self._bytes = 0
+        try:
+            self._db = sqlite3.connect(
+                file, timeout=1.0, isolation_level=None, check_same_thread=False
+            )
+            self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
+            self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
+            self._db.execute(_CREATE)
+            row = self._db.execute(
+                "SELECT coalesce(sum(count), 0), coalesce(sum(length(data)), 0) FROM readings"
+            ).fetchone()
+        except sqlite3.Error as error:
+            raise OSError(f"{file}: {error}") from error
+        self.count, self._bytes = row
+
+    def add(self, readings: Sequence[Reading]) -> int:
+        """Stores readings durably. Returns how many old ones had to go for them."""
+        data = msgspec.msgpack.encode([_plain(reading) for reading in readings])
+        dropped = 0
+        try:
+            with _Step(self._db):
+                while self._bytes + len(data) > self._max_bytes and self.count:
+                    dropped += self._remove_first()
+                if len(data) > self._max_bytes:
+                    return dropped + len(readings)
+                self._db.execute(
+                    "INSERT INTO readings (count, data) VALUES (?, ?)", (len(readings), data)
+                )
+        except sqlite3.Error as error:
+            self._recount()
+            raise OSError(f"{self.file}: {error}") from error
+        self.count += len(readings)
+        self._bytes += len(data)
+        return dropped
+
+    def first(self) -> list[Reading]:
+        """The oldest readings that were stored together; empty if there are none."""
+        try:
+            row = self._db.execute("SELECT data FROM readings ORDER BY id LIMIT 1").fetchone()
+        except sqlite3.Error as error:
+            raise OSError(f"{self.file}: {error}") from error
+        if row is None:
+            return []
+        return [self._reading(*plain) for plain in msgspec.msgpack.decode(row[0])]
+
+    def remove_first(self) -> None:
+        """Removes what `first` returns."""
+        try:
+            with _Step(self._db):
+                self._remove_first()
+                if not self.count:
+                    self._db.execute("PRAGMA incremental_vacuum")
+        except sqlite3.Error as error:
+            raise OSError(f"{self.file}: {error}") from error
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._db.close()
+
+    def _remove_first(self) -> int:
+        row = self._db.execute(
+            "DELETE FROM readings WHERE id = (SELECT min(id) FROM readings) "
+            "RETURNING count, length(data)"
+        ).fetchone()
+        if row is None:
+            return 0
+        self.count -= row[0]
+        self._bytes -= row[1]
+        return int(row[0])
+
+    def _recount(self) -> None:
+        query = "SELECT coalesce(sum(count), 0), coalesce(sum(length(data)), 0) FROM readings"
+        try:
+            self.count, self._bytes = self._db.execute(query).fetchone()
+        except sqlite3.Error:
+            return
+
+    def _reading(
+        self, device: str, name: str, value: Any, time: float, fault: int, undecoded: str | None
+    ) -> Reading:
+        tag = self._find(device, name) or _stand_in(name, value)
+        return Reading(device, tag, value, time, fault, undecoded)
+
+
+class _Step:
+    """A transaction."""
+
+    def __init__(self, db: sqlite3.Connection) -> None:
+        self._db = db
+
+    def __enter__(self) -> None:
+        self._db.execute("BEGIN")
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._db.execute("COMMIT" if kind is None else "ROLLBACK")
+
+
+def _plain(reading: Reading) -> tuple[Any, ...]:
+    device, tag, value, time, fault, undecoded = reading
+    return device, tag.name, value, time, fault, undecoded
+
+
+def _stand_in(name: str, value: Any) -> Tag:
+    """A tag for a value whose own tag is not in the configuration any more."""
+    first = value[0] if isinstance(value, list) and value else value
+    if isinstance(first, bool):
+        return Tag(name, "coils", 0)
+    kind = "string:2" if isinstance(first, str) else "bytes:2"
+    return Tag(name, "input_registers", 0, kind if isinstance(first, str | bytes) else "float64")

@@ -1,0 +1,149 @@
+"""Writes values to a file of text: CSV, JSON Lines or line protocol."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.config.outputs import MEASUREMENT
+from holdfast.outputs.line_protocol import lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from holdfast.config.outputs import FileConfig
+    from holdfast.polling import Reading
+
+COLUMNS = ("time", "device", "tag", "value", "unit", "error")
+
+
+class TextFile:
+    """A file of whole lines. What a full disk cuts off is removed, and written again later."""
+
+    def __init__(self, settings: FileConfig) -> None:
+        self._file, self._keep = settings.file, settings.keep
+        self._max_bytes = settings.max_bytes
+        self._encode = ENCODINGS[settings.format]
+        self._head = f"{','.join(COLUMNS)}\n".encode() if settings.format == "csv" else b""
+        self._open: io.FileIO | None = None
+
+    def send(self, readings: list[Reading]) -> None:
+        """Appends lines. They are in the file when this returns."""
+        data = self._encode(readings)
+        if not data:
+            return
+        file = self._opened(len(data))
+        size = file.seek(0, os.SEEK_END)
+        whole = memoryview(data if size else self._head + data)
+        try:
+            while whole:
+                whole = whole[file.write(whole) :]
+        except OSError:
+            file.truncate(size)
+            raise
+
+    def idle(self) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Closes the file."""
+        if self._open is not None:
+            self._open.close()
+            self._open = None
+
+    def status(self) -> dict[str, object]:
+        """Where values go."""
+        return {"file": str(self._file)}
+
+    def _opened(self, more: int) -> io.FileIO:
+        """The file; another one if it is full, or if somebody has moved it."""
+        if self._open is not None and not _is_same(self._open, self._file):
+            self.close()
+        if self._open is None:
+            self._open = self._file.open("ab", buffering=0)
+            _end_line(self._open, self._file)
+        size = self._open.seek(0, os.SEEK_END)
+        if size and size + more > self._max_bytes:
+            self.close()
+            rotate(self._file, self._keep)
+            self._open = self._file.open("ab", buffering=0)
+        return self._open
+
+
+def rotate(file: Path, keep: int) -> None:
+    """Renames FILE to FILE.1, FILE.1 to FILE.2 and so on; removes the oldest."""
+    if keep == 0:
+        file.unlink(missing_ok=True)
+        return
+    for number in range(keep - 1, 0, -1):
+        older = file.with_name(f"{file.name}.{number}")
+        if older.exists():
+            older.replace(file.with_name(f"{file.name}.{number + 1}"))
+    file.replace(file.with_name(f"{file.name}.1"))
+
+
+def _is_same(file: io.FileIO, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
+
+
+def _end_line(file: io.FileIO, path: Path) -> None:
+    """Ends a line that a crash has cut off."""
+    size = file.seek(0, os.SEEK_END)
+    if size:
+        with path.open("rb") as reading:
+            reading.seek(size - 1)
+            if reading.read(1) != b"\n":
+                file.write(b"\n")
+
+
+def row(reading: Reading) -> tuple[Any, ...]:
+    """The columns of a reading."""
+    value = reading.value.hex() if isinstance(reading.value, bytes) else reading.value
+    return (
+        f"{datetime.fromtimestamp(reading.time, UTC):%Y-%m-%dT%H:%M:%S.%fZ}",
+        reading.device,
+        reading.tag.name,
+        value,
+        reading.tag.unit,
+        reading.error,
+    )
+
+
+def _csv(readings: list[Reading]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for reading in readings:
+        time, device, tag, value, unit, error = row(reading)
+        if isinstance(value, bool):
+            value = "true" if value else "false"
+        elif isinstance(value, list):
+            value = msgspec.json.encode(value).decode()
+        writer.writerow((time, device, tag, value, unit, error))
+    return text.getvalue().encode()
+
+
+def _json_lines(readings: list[Reading]) -> bytes:
+    encoder = msgspec.json.Encoder()
+    return encoder.encode_lines(
+        [dict(zip(COLUMNS, row(reading), strict=True)) for reading in readings]
+    )
+
+
+def _influx(readings: list[Reading]) -> bytes:
+    return lines(readings, MEASUREMENT, {})
+
+
+ENCODINGS: dict[str, Callable[[list[Reading]], bytes]] = {
+    "csv": _csv,
+    "jsonl": _json_lines,
+    "influx": _influx,
+}
