@@ -21,7 +21,7 @@ CREATE INDEX IF NOT EXISTS readings_of_tag ON readings (device, tag, time);
 CREATE INDEX IF NOT EXISTS readings_by_time ON readings (time);
 """
 
-STEP = 10_000
+STEP = 1000
 """Rows that are removed at once if the database is too large."""
 
 

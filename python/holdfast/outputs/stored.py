@@ -131,7 +131,10 @@ class _Step:
         self._db.execute("BEGIN")
 
     def __exit__(self, kind: object, *_: object) -> None:
-        self._db.execute("COMMIT" if kind is None else "ROLLBACK")
+        if kind is None:
+            self._db.execute("COMMIT")
+        elif self._db.in_transaction:  # SQLite has already undone it after some errors.
+            self._db.execute("ROLLBACK")
 
 
 def _plain(reading: Reading) -> tuple[Any, ...]:

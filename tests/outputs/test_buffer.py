@@ -1,0 +1,190 @@
+"""What waits in a buffer: in memory, in a file, and in which order."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from holdfast.outputs import Buffer
+from holdfast.outputs.stored import Stored
+from support.readings import numbered, numbers, reading, tag
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.polling import Reading
+
+PLENTY = 2**30
+
+
+def opened(file: Path, max_bytes: int = PLENTY, known: list[Any] | None = None) -> Stored:
+    tags = {each.name: each for each in known or [tag()]}
+    return Stored(file, max_bytes, lambda _, name: tags.get(name))
+
+
+def drained(buffer: Buffer, most: int = 3) -> list[int]:
+    found: list[int] = []
+    while readings := buffer.take(most, 0):
+        found += numbers(readings)
+        buffer.done()
+    return found
+
+
+def test_what_is_taken_stays_until_it_is_done() -> None:
+    buffer = Buffer()
+    buffer.offer(numbered(5))
+    assert numbers(buffer.take(3, 0)) == numbers(buffer.take(3, 0)) == [0, 1, 2]
+    assert len(buffer) == 5
+    buffer.done()
+    assert (len(buffer), drained(buffer)) == (2, [3, 4])
+
+
+def test_the_newest_stay_and_the_others_are_counted() -> None:
+    buffer = Buffer(4)
+    buffer.offer(numbered(3))
+    buffer.offer(numbered(3, 3))
+    assert (buffer.dropped, drained(buffer)) == (2, [2, 3, 4, 5])
+
+
+def test_a_file_comes_before_memory_and_survives(tmp_path: Path) -> None:
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(numbered(5))
+    assert numbers(buffer.take(2, 0)) == [0, 1]
+    buffer.keep(2)
+    buffer.offer(numbered(2, 5))
+    assert len(buffer) == 7
+    buffer.detach()
+    again = Buffer()
+    again.stored = opened(tmp_path / "b.db")
+    again.offer(numbered(2, 7))
+    assert len(again) == 7
+    assert drained(again) == [0, 1, 2, 3, 4, 7, 8]
+    assert drained(buffer) == [5, 6]
+
+
+def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(tmp_path: Path) -> None:
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(numbered(3))
+    buffer.keep()
+    assert numbers(buffer.take(9, 0)) == [0, 1, 2]
+    buffer.detach()
+    again = Buffer()
+    again.stored = opened(tmp_path / "b.db")
+    assert drained(again) == [0, 1, 2]
+
+
+def test_values_of_every_kind_survive_in_a_file(tmp_path: Path) -> None:
+    values = [None, True, 0, -(2**63), 2**64 - 1, 0.1, "ä", b"\0\xff", [1, None, 2.5], ["a"]]
+    stored = opened(tmp_path / "b.db")
+    readings = [reading(value, fault=7, undecoded="why") for value in values]
+    assert stored.add(readings) == 0
+    stored.close()
+    assert opened(tmp_path / "b.db").first() == readings
+
+
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [(True, "bool"), (1.5, "float64"), (None, "float64"), ("a", "string:2"), ([b"a"], "bytes:2")],
+)
+def test_a_tag_that_is_gone_is_replaced_by_one_of_its_kind(
+    tmp_path: Path, value: Any, kind: str
+) -> None:
+    stored = opened(tmp_path / "b.db", known=[])
+    stored.add([reading(value, tag=tag("gone"))])
+    [found] = stored.first()
+    assert (found.name, found.tag.type, found.value) == ("gone", kind, value)
+
+
+def test_the_oldest_go_when_the_file_is_full(tmp_path: Path) -> None:
+    stored = opened(tmp_path / "b.db", max_bytes=1000)
+    dropped = sum(stored.add(numbered(10, start)) for start in range(0, 100, 10))
+    left = 0
+    while stored.first():
+        left += len(stored.first())
+        stored.remove_first()
+    assert (dropped + left, stored.count) == (100, 0)
+    assert 0 < left < 100
+    assert stored.add(numbered(1000)) == 1000
+
+
+def test_a_file_that_is_in_use_is_an_error(tmp_path: Path) -> None:
+    first = opened(tmp_path / "b.db")
+    with pytest.raises(OSError, match=r"b\.db: database is locked"):
+        opened(tmp_path / "b.db")
+    first.close()
+    opened(tmp_path / "b.db").close()
+
+
+def test_a_file_that_is_no_database_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "b.db").write_bytes(b"not a database" * 100)
+    with pytest.raises(OSError, match=r"b\.db: file is not a database"):
+        opened(tmp_path / "b.db")
+
+
+def test_what_a_full_disk_refuses_stays_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(numbered(3))
+
+    def full(_: list[Reading]) -> int:
+        raise OSError("database or disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(buffer.stored, "add", full)
+        with pytest.raises(OSError, match="disk is full"):
+            buffer.keep()
+        assert numbers(buffer.take(2, 0)) == [0, 1]
+        with pytest.raises(OSError, match="disk is full"):
+            buffer.keep()
+    assert drained(buffer) == [0, 1, 2]
+
+
+def test_a_full_disk_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    stored = opened(tmp_path / "b.db")
+    stored.add(numbered(3))
+    pages = stored._db.execute("PRAGMA page_count").fetchone()[0]
+    stored._db.execute(f"PRAGMA max_page_count={pages}")
+    with pytest.raises(OSError, match="disk is full"):
+        stored.add(numbered(1000))
+    assert (stored.count, numbers(stored.first())) == (3, [0, 1, 2])
+    stored.remove_first()
+    assert stored.count == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(steps=st.lists(st.sampled_from(["offer", "take", "done", "keep", "restart"]), max_size=40))
+def test_nothing_is_lost_or_reordered(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[str]
+) -> None:
+    """Whatever happens, what is sent is everything, in its order; only what was taken and not done
+    may come twice."""
+    file = tmp_path_factory.mktemp("buffer") / "b.db"
+    buffer = Buffer()
+    buffer.stored = opened(file)
+    sent: list[int] = []
+    offered = 0
+    for step in [*steps, "restart"]:
+        if step == "offer":
+            buffer.offer(numbered(3, offered))
+            offered += 3
+        elif step == "take":
+            buffer.take(2, 0)
+        elif step == "done":
+            sent += numbers(buffer.take(2, 0))
+            buffer.done()
+        elif step == "keep":
+            buffer.keep(2)
+        else:
+            buffer.keep(2)
+            buffer.detach()
+            buffer.stored = opened(file)
+    sent += drained(buffer)
+    buffer.detach()
+    assert sent == list(range(offered))

@@ -1,0 +1,188 @@
+"""Line protocol over HTTP, against an HTTP server that reads it strictly."""
+
+from __future__ import annotations
+
+import gzip
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.config.outputs import InfluxConfig
+from holdfast.outputs import Refused
+from holdfast.outputs.influx import Influx
+from support.brokers import free_port
+from support.line_protocol import Point, parsed
+from support.readings import numbered, reading
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+class Database(ThreadingHTTPServer):
+    """Takes points; answers with `status`."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.points: list[Point] = []
+        self.requests: list[tuple[str, dict[str, str]]] = []
+        self.connections = 0
+        self.status, self.answer = 204, b""
+        self.closes = False
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: Database
+
+    def setup(self) -> None:
+        super().setup()
+        self.server.connections += 1
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        if self.headers.get("Content-Encoding") == "gzip":
+            body = gzip.decompress(body)
+        self.server.requests.append((self.path, dict(self.headers)))
+        if self.server.status == 204:
+            self.server.points += parsed(body)
+        self.send_response(self.server.status)
+        self.send_header("Content-Length", str(len(self.server.answer)))
+        self.end_headers()
+        self.wfile.write(self.server.answer)
+        self.close_connection = self.server.closes
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def database() -> Iterator[Database]:
+    with Database() as server:
+        thread = threading.Thread(target=server.serve_forever, args=[0.01])
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def influx(url: str, **more: Any) -> Influx:
+    return Influx(InfluxConfig.model_validate({"type": "influx", "url": url} | more))
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_points_arrive_over_one_connection(database: Database, compressed: bool) -> None:
+    output = influx(
+        database.url,
+        org="my org",
+        bucket="b/1",
+        measurement="m",
+        tags={"site": "n"},
+        gzip=compressed,
+    )
+    for start in range(3):
+        output.send(numbered(2, 2 * start))
+    output.send([reading(None)])
+    output.close()
+    assert [point.fields["t"] for point in database.points] == list(range(6))
+    assert database.points[0].tags == {"device": "pump", "site": "n"}
+    assert database.connections == 1
+    [path, *others] = [path for path, _ in database.requests]
+    assert path == "/api/v2/write?org=my+org&bucket=b%2F1&precision=ns"
+    assert others == [path] * 2
+
+
+def test_another_receiver_has_its_own_path(database: Database, tmp_path: Path) -> None:
+    (tmp_path / "p").write_text("secret\n")
+    output = influx(
+        f"{database.url}/write?db=x",
+        username="me",
+        password_file=str(tmp_path / "p"),
+    )
+    output.send(numbered(1))
+    output.close()
+    [(path, headers)] = database.requests
+    assert path == "/write?db=x"
+    assert headers["Authorization"] == "Basic bWU6c2VjcmV0"
+
+
+def test_a_token_is_read_for_each_request(database: Database, tmp_path: Path) -> None:
+    file = tmp_path / "t"
+    output = influx(database.url, bucket="b", token_file=str(file))
+    for token in ("one", "two"):
+        file.write_text(f"{token}\n")
+        output.send(numbered(1))
+    output.close()
+    tokens = [headers["Authorization"] for _, headers in database.requests]
+    assert tokens == ["Token one", "Token two"]
+
+
+@pytest.mark.parametrize(
+    ("status", "error"),
+    [
+        (400, Refused),
+        (413, Refused),
+        (422, Refused),
+        (401, OSError),
+        (404, OSError),
+        (503, OSError),
+    ],
+)
+def test_what_is_not_taken_says_why(
+    database: Database, status: int, error: type[Exception]
+) -> None:
+    database.status, database.answer = status, b'{"message":"unable to parse"}'
+    output = influx(database.url, bucket="b")
+    with pytest.raises(error, match=rf"HTTP {status}: .*unable to parse"):
+        output.send(numbered(1))
+    database.status = 204
+    output.send(numbered(1))
+    output.close()
+    assert len(database.points) == 1
+
+
+def test_a_connection_that_was_closed_meanwhile_is_opened_again(database: Database) -> None:
+    output = influx(database.url, bucket="b")
+    database.closes = True
+    for start in range(3):
+        output.send(numbered(1, start))
+    output.close()
+    assert [point.fields["t"] for point in database.points] == [0, 1, 2]
+    assert database.connections == 3
+
+
+def test_a_receiver_that_can_not_be_reached_is_an_error() -> None:
+    output = influx(f"http://127.0.0.1:{free_port()}", bucket="b")
+    with pytest.raises(ConnectionRefusedError):
+        output.send(numbered(1))
+
+
+def test_a_receiver_that_is_no_http_server_is_an_error(fake_server: int) -> None:
+    output = influx(f"http://127.0.0.1:{fake_server}", bucket="b", gzip=False)
+    with pytest.raises(OSError, match="not HTTP"):
+        output.send(numbered(1))
+
+
+@pytest.fixture
+def fake_server() -> Iterator[int]:
+    """Answers anything with something else."""
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                connection.recv(65536)
+                connection.sendall(b"SSH-2.0-dropbear\r\n\r\n")
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield listener.getsockname()[1]
+        thread.join()

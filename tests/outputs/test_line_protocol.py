@@ -1,0 +1,70 @@
+"""Lines that InfluxDB and others read, by a parser that knows only the specification."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.outputs.line_protocol import lines
+from support.line_protocol import parsed
+from support.readings import TIME, reading, tag
+
+AT = 1_700_000_000_250_000_000
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [
+        (21.5, "21.5"),
+        (7, "7i"),
+        (2**63 - 1, "9223372036854775807i"),
+        (2**63, "9.223372036854776e+18"),
+        (True, "true"),
+        ('a "b" \\ c', r'"a \"b\" \\ c"'),
+        (b"\0\xff", '"00ff"'),
+    ],
+)
+def test_a_value_is_written_in_its_kind(value: Any, written: str) -> None:
+    assert (
+        lines([reading(value)], "modbus", {}) == f"modbus,device=pump t={written} {AT}\n".encode()
+    )
+
+
+def test_the_values_of_one_time_share_a_line() -> None:
+    readings = [
+        reading(1, tag=tag("a")),
+        reading(None, tag=tag("b")),
+        reading([1.5, None], tag=tag("c")),
+        reading(2, TIME + 1, tag=tag("a")),
+        reading(3, tag=tag("a"), device="fan"),
+        reading(None, tag=tag("a"), device="off"),
+        reading(math.inf, tag=tag("d")),
+    ]
+    assert lines(readings, "modbus", {"site": "north"}).decode().splitlines() == [
+        f"modbus,device=pump,site=north a=1i,c[0]=1.5 {AT}",
+        f"modbus,device=pump,site=north a=2i {AT + 10**9}",
+        f"modbus,device=fan,site=north a=3i {AT}",
+    ]
+
+
+NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0\n\r"), min_size=1).filter(
+    lambda text: not text.endswith("\\")
+)
+
+
+@given(NAMES, NAMES, st.text(st.characters(codec="utf-8")), st.floats(allow_nan=False))
+def test_whatever_names_and_texts_are_a_parser_finds_them(
+    measurement: str, site: str, text: str, number: float
+) -> None:
+    readings = [reading(text, tag=tag("a"), device="x y"), reading(7, tag=tag("b"), device="x y")]
+    [point] = parsed(lines(readings, measurement, {"site": site}))
+    assert point.measurement == measurement
+    assert point.tags == {"device": "x y", "site": site}
+    assert point.fields == {"a": text, "b": 7}
+    assert point.time == AT
+    found = parsed(lines([reading(number)], "m", {}))
+    assert [each.fields for each in found] == ([{"t": number}] if math.isfinite(number) else [])

@@ -1,0 +1,200 @@
+"""How outputs send: in order, again after an outage, and what is left at the end."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.outputs import Buffer, Refused, Sending
+from holdfast.outputs import sending as module
+from holdfast.outputs.stored import Stored
+from holdfast.stop import Stop
+from support import wire
+from support.readings import numbered, numbers, tag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from holdfast.polling import Reading
+
+
+class Fake:
+    """A receiver that does what a test wants."""
+
+    def __init__(self) -> None:
+        self.sent: list[int] = []
+        self.attempts = 0
+        self.error: Exception | None = None
+        self.closed = 0
+
+    def send(self, readings: list[Reading]) -> None:
+        self.attempts += 1
+        if self.error is not None:
+            raise self.error
+        self.sent += numbers(readings)
+
+    def idle(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def status(self) -> dict[str, object]:
+        return {"place": "here"}
+
+
+class Running:
+    """An output that runs in a thread."""
+
+    def __init__(self, file: Path | None = None) -> None:
+        self.receiver, self.buffer, self.stop = Fake(), Buffer(), Stop()
+        self.open_file: Callable[[], Stored] | None = None
+        if file is not None:
+            self.open_file = lambda: Stored(file, 2**30, lambda *_: tag())
+        self.start()
+
+    def start(self) -> None:
+        self.sending = Sending("out", self.receiver, self.buffer, self.open_file)
+        self.thread = threading.Thread(target=self.sending.run, args=[self.stop])
+        self.thread.start()
+
+    def end(self) -> None:
+        self.stop.set()
+        self.thread.join(wire.DEADLINE)
+        assert not self.thread.is_alive()
+
+
+def count(caplog: pytest.LogCaptureFixture, event: str) -> int:
+    return [record.message for record in caplog.records].count(event)
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+        monkeypatch.setattr(module, name, 0.01)
+
+
+@pytest.fixture(autouse=True)
+def all_levels(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "holdfast")
+
+
+@pytest.fixture
+def output() -> Iterator[Running]:
+    made = Running()
+    yield made
+    made.end()
+
+
+def test_everything_is_sent_in_order(output: Running) -> None:
+    for start in range(0, 5000, 500):
+        output.buffer.offer(numbered(500, start))
+    wire.until(lambda: len(output.receiver.sent) == 5000, "all is sent")
+    assert output.receiver.sent == list(range(5000))
+    assert output.sending.status() == {
+        "place": "here",
+        "connected": True,
+        "sent": 5000,
+        "waiting": 0,
+        "dropped": 0,
+        "refused": 0,
+        "failures": 0,
+        "last_error": None,
+        "file_error": None,
+    }
+
+
+@pytest.mark.parametrize("with_file", [False, True])
+def test_nothing_is_lost_in_an_outage(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, with_file: bool
+) -> None:
+    output = Running(tmp_path / "b.db" if with_file else None)
+    try:
+        output.receiver.error = OSError("no route to host")
+        output.buffer.offer(numbered(1500))
+        wire.until(lambda: output.receiver.attempts >= 3, "it is tried again")
+        status = output.sending.status()
+        assert (status["connected"], status["waiting"]) == (False, 1500)
+        assert status["last_error"] == "no route to host"
+        output.buffer.offer(numbered(500, 1500))
+        output.receiver.error = None
+        wire.until(lambda: len(output.receiver.sent) == 2000, "all is sent")
+        assert output.receiver.sent == list(range(2000))
+    finally:
+        output.end()
+    assert count(caplog, "output_failed") == 1
+    assert count(caplog, "output_back") == 1
+
+
+def test_what_is_refused_is_counted_and_not_tried_again(
+    output: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    output.receiver.error = Refused("HTTP 400")
+    output.buffer.offer(numbered(3))
+    wire.until(lambda: output.sending.status()["refused"] == 3, "it is refused")
+    output.receiver.error = None
+    output.buffer.offer(numbered(2, 3))
+    wire.until(lambda: output.receiver.sent == [3, 4], "the rest is sent")
+    assert count(caplog, "output_refused") == 1
+
+
+def test_what_is_left_at_the_end_is_sent() -> None:
+    output = Running()
+    output.buffer.offer(numbered(2500))
+    output.end()
+    assert output.receiver.sent == list(range(2500))
+    assert output.receiver.closed == 1
+
+
+def test_what_can_not_be_sent_at_the_end_is_in_the_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    output = Running(tmp_path / "b.db")
+    output.receiver.error = OSError("down")
+    output.buffer.offer(numbered(1500))
+    output.end()
+    assert count(caplog, "output_unsent") == 0
+    again = Running(tmp_path / "b.db")
+    again.buffer.offer(numbered(1, 1500))
+    wire.until(lambda: len(again.receiver.sent) == 1501, "all is sent")
+    again.end()
+    assert again.receiver.sent == list(range(1501))
+
+
+def test_what_is_lost_at_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    output = Running()
+    output.receiver.error = OSError("down")
+    output.buffer.offer(numbered(5))
+    output.end()
+    [record] = [record for record in caplog.records if record.message == "output_unsent"]
+    assert vars(record)["fields"]["count"] == 5
+
+
+def test_a_buffer_keeps_what_waits_for_the_next_output() -> None:
+    """As after a reload with other settings."""
+    output = Running()
+    output.receiver.error = OSError("down")
+    output.buffer.offer(numbered(5))
+    wire.until(lambda: output.receiver.attempts > 0, "it is tried")
+    output.end()
+    output.receiver, output.stop = Fake(), Stop()
+    output.start()
+    wire.until(lambda: output.receiver.sent == [0, 1, 2, 3, 4], "all is sent")
+    output.end()
+
+
+def test_a_file_that_can_not_be_opened_stops_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    output = Running(tmp_path / "missing" / "b.db")
+    output.buffer.offer(numbered(3))
+    wire.until(lambda: output.receiver.sent == [0, 1, 2], "all is sent")
+    assert "unable to open database file" in str(output.sending.status()["file_error"])
+    (tmp_path / "missing").mkdir()
+    output.buffer.offer(numbered(1, 3))
+    wire.until(lambda: output.sending.status()["file_error"] is None, "the file is opened")
+    output.end()
+    assert count(caplog, "output_file_failed") == 1

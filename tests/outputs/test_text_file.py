@@ -1,0 +1,192 @@
+"""Files of text: whole lines, rotation, full disks."""
+
+from __future__ import annotations
+
+import csv
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.config.outputs import FileConfig
+from holdfast.outputs.database import Database
+from holdfast.outputs.text_file import TextFile
+from support.line_protocol import parsed
+from support.readings import reading, tag
+
+if TYPE_CHECKING:
+    import io
+    from pathlib import Path
+
+TIME = "2023-11-14T22:13:20.250000Z"
+READINGS = [
+    reading(21.5, tag=tag("t", unit="°C")),
+    reading(True, tag=tag("on", area="coils", type="bool")),
+    reading([1, 2], tag=tag("a")),
+    reading('x,"y"\nz', tag=tag("s", type="string:6")),
+    reading(b"\1\xff", tag=tag("b", type="bytes:2")),
+    reading(None, tag=tag("n"), fault=2),
+]
+
+
+def settings(file: Path, kind: str, **more: Any) -> FileConfig:
+    return FileConfig.model_validate(
+        {"type": "file", "file": str(file), "format": kind} | more, context={"folder": file.parent}
+    )
+
+
+def test_csv_has_a_head_and_one_line_for_each_value(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.csv", "csv"))
+    file.send(READINGS)
+    file.close()
+    again = TextFile(settings(tmp_path / "a.csv", "csv"))
+    again.send(READINGS[:1])
+    again.close()
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as text:
+        rows = list(csv.reader(text))
+    first = [TIME, "pump", "t", "21.5", "°C", ""]
+    assert rows == [
+        ["time", "device", "tag", "value", "unit", "error"],
+        first,
+        [TIME, "pump", "on", "true", "", ""],
+        [TIME, "pump", "a", "[1,2]", "", ""],
+        [TIME, "pump", "s", 'x,"y"\nz', "", ""],
+        [TIME, "pump", "b", "01ff", "", ""],
+        [TIME, "pump", "n", "", "", "exception 02 (Illegal Data Address)"],
+        first,
+    ]
+
+
+def test_json_lines_have_one_object_for_each_value(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.jsonl", "jsonl"))
+    file.send(READINGS)
+    file.close()
+    found = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text("utf-8").splitlines()]
+    assert [each["value"] for each in found] == [21.5, True, [1, 2], 'x,"y"\nz', "01ff", None]
+    assert found[0] == {
+        "time": TIME,
+        "device": "pump",
+        "tag": "t",
+        "value": 21.5,
+        "unit": "°C",
+        "error": None,
+    }
+
+
+def test_line_protocol_can_be_written_to_a_file(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.txt", "influx"))
+    file.send(READINGS)
+    file.send([reading(None)])
+    file.close()
+    [point] = parsed((tmp_path / "a.txt").read_bytes())
+    assert point.fields == {
+        "t": 21.5,
+        "on": True,
+        "a[0]": 1,
+        "a[1]": 2,
+        "s": 'x,"y"\nz',
+        "b": "01ff",
+    }
+
+
+def test_a_full_file_is_rotated(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.jsonl", "jsonl", max_bytes=65536, keep=2))
+    batch = [reading(number) for number in range(200)]
+    for _ in range(12):
+        file.send(batch)
+    file.close()
+    sizes = {each.name: each.stat().st_size for each in tmp_path.iterdir()}
+    assert sorted(sizes) == ["a.jsonl", "a.jsonl.1", "a.jsonl.2"]
+    assert all(0 < size <= 65536 for size in sizes.values())
+
+
+def test_a_file_that_is_moved_is_written_again(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.csv", "csv"))
+    file.send(READINGS[:1])
+    (tmp_path / "a.csv").rename(tmp_path / "b.csv")
+    file.send(READINGS[:1])
+    file.close()
+    assert (tmp_path / "a.csv").read_text("utf-8") == (tmp_path / "b.csv").read_text("utf-8")
+
+
+def test_a_line_that_a_crash_has_cut_off_is_ended(tmp_path: Path) -> None:
+    (tmp_path / "a.jsonl").write_text('{"time":"2023')
+    file = TextFile(settings(tmp_path / "a.jsonl", "jsonl"))
+    file.send(READINGS[:1])
+    file.close()
+    cut, whole = (tmp_path / "a.jsonl").read_text("utf-8").splitlines()
+    assert (cut, json.loads(whole)["value"]) == ('{"time":"2023', 21.5)
+
+
+def test_what_a_full_disk_cuts_off_is_removed(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.jsonl", "jsonl"))
+    file.send(READINGS[:1])
+    before = (tmp_path / "a.jsonl").read_bytes()
+    real = file._open
+    assert real is not None
+
+    class Full:
+        """Has room for ten more bytes."""
+
+        def __init__(self, real: io.FileIO) -> None:
+            self._real, self._left = real, 10
+
+        def write(self, data: memoryview) -> int:
+            if not self._left:
+                raise OSError(28, "No space left on device")
+            taken = self._real.write(data[: self._left])
+            self._left -= taken
+            return taken
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._real, name)
+
+    file._open = Full(real)  # type: ignore[assignment]
+    with pytest.raises(OSError, match="No space left"):
+        file.send(READINGS[:1])
+    assert (tmp_path / "a.jsonl").read_bytes() == before
+    file._open = real
+    file.send(READINGS[:1])
+    file.close()
+    assert (tmp_path / "a.jsonl").read_bytes() == before * 2
+
+
+def test_a_folder_that_is_missing_is_an_error(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "no" / "a.csv", "csv"))
+    with pytest.raises(OSError, match="No such file or directory"):
+        file.send(READINGS)
+    (tmp_path / "no").mkdir()
+    file.send(READINGS)
+    file.close()
+
+
+def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
+    database = Database(settings(tmp_path / "a.db", "sqlite"))
+    database.send(READINGS)
+    database.send([reading(2**64 - 1)])
+    assert database._db is not None
+    rows = database._db.execute("SELECT * FROM readings").fetchall()
+    database.close()
+    assert rows[0] == (TIME, "pump", "t", 21.5, "°C", None)
+    values = [21.5, 1, "[1,2]", 'x,"y"\nz', "01ff", None, float(2**64 - 1)]
+    assert [row[3] for row in rows] == values
+    assert rows[5][5] == "exception 02 (Illegal Data Address)"
+
+
+def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:
+    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
+    for start in range(0, 40_000, 5000):
+        database.send([reading(number, 1.7e9 + number) for number in range(start, start + 5000)])
+    assert database._db is not None
+    first, last, count = database._db.execute(
+        "SELECT min(value), max(value), count(*) FROM readings"
+    ).fetchone()
+    database.close()
+    assert (last, count) == (39_999, 40_000 - first)
+    assert 0 < first < 35_000
+
+
+def test_a_database_that_is_broken_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.db").write_bytes(b"no database" * 1000)
+    with pytest.raises(OSError, match=r"a\.db: file is not a database"):
+        Database(settings(tmp_path / "a.db", "sqlite")).send(READINGS)
