@@ -130,9 +130,11 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
     mqtt: Any = SimpleNamespace(status=lambda: status)
     made.adapters = {"rest": (rest, memory_access), "mqtt": (mqtt, None)}
     polled: Any = SimpleNamespace(
-        counters=lambda *, report: (
-            {} if report else {"meter": METER, "fresh": {**METER, "health": "unknown", "age": None}}
-        )
+        counters=lambda: {
+            "meter": METER,
+            "fresh": {**METER, "health": "unknown", "age": None},
+            "nats/1": METER,
+        }
     )
     made.poller = polled
     made.disabled = ["spare"]

@@ -554,6 +554,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "profiles: {}\n"
         "devices: {}\n"
         "links: {}\n"
+        "outputs: {}\n"
         "adapters: {}\n"
         "log:\n"
         "  level: info\n"
@@ -648,16 +649,19 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "AdapterConfig": ["type", "memories", "areas", "access"],
         "AsciiSerialConfig": ["device"],
         "AuditConfig": None,
+        "BufferConfig": None,
         "ClientTlsConfig": None,
         "CostConfig": ["per_request", "per_register"],
         "DestinationConfig": ["memory", "area", "address"],
         "DeviceConfig": ["url"],
+        "FileConfig": ["type", "file", "format"],
         "ForwardConfig": ["url"],
         "ForwardedStatusConfig": ["area", "slot"],
         "GatewayConfig": ["bind", "sources", "allow", "access", "tokens"],
         "GatewayTokenConfig": ["name", "sha256"],
         "HttpsConfig": ["cert_file", "key_file"],
         "IdentityConfig": None,
+        "InfluxConfig": ["type", "url"],
         "LinkConfig": ["url"],
         "LogConfig": None,
         "MemoryConfig": None,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from holdfast.polling import Reading
 
 
 class DiagnosticsSource(Protocol):
@@ -13,6 +16,9 @@ class DiagnosticsSource(Protocol):
 
     def stats(self) -> dict[str, Any]:
         """Returns all counters since the start."""
+
+    def tag_values(self) -> list[Reading]:
+        """Returns the last reading of each tag."""
 
     def adapter(self, name: str) -> dict[str, Any] | None:
         """Returns the state and the counters of one adapter; `None` if it does not exist."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector, make_asgi_app
@@ -89,6 +90,8 @@ class Metrics:
     ) -> None:
         registry = CollectorRegistry()
         registry.register(Figures(diagnostics))
+        if settings.values:
+            registry.register(TagFigures(diagnostics))
         ProcessCollector(registry=registry)
         GCCollector(registry=registry)
         self._exporter = make_asgi_app(registry)
@@ -189,6 +192,37 @@ class Figures(Collector):
         yield from _of_adapters(stats["adapters"])
         yield from _of_threads(stats["threads"])
         yield from _of_memories(self._diagnostics.memories())
+
+
+class TagFigures(Collector):
+    """Turns the last value of each tag into metrics."""
+
+    def __init__(self, diagnostics: DiagnosticsSource) -> None:
+        self._diagnostics = diagnostics
+
+    def describe(self) -> Iterable[Metric]:
+        """Returns no metrics: there may be no values yet."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yields the values that are numbers or bits. A tag without a value has no sample."""
+        values = _gauge("tag_value", "The value of a tag.", "device", "tag", "unit")
+        ages = _gauge("tag_age_seconds", "The age of the value of a tag.", "device", "tag")
+        now = time.time()
+        for reading in self._diagnostics.tag_values():
+            for name, value in _numbers(reading.name, reading.value):
+                values.add_metric([reading.device, name, reading.tag.unit], value)
+                ages.add_metric([reading.device, name], max(0.0, now - reading.time))
+        yield from (values, ages)
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
+    """A value that is a number or a bit; of an array, each item by its index."""
+    if isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _numbers(f"{name}[{index}]", item)
+    elif isinstance(value, int | float):
+        yield name, float(value)
 
 
 def _of_audit(audit: Mapping[str, Any]) -> Iterator[Metric]:
@@ -308,6 +342,7 @@ def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     restarts = _counter("adapter_restarts", "Restarts of the adapter.", "adapter")
     states = _gauge("adapter_state", "1 for the current state.", "adapter", "state")
     connections = _Connections("adapter_", "adapter")
+    readings = _counter("output_readings", "Readings of an output.", "adapter", "outcome")
     status = _gauge("adapter_status", "Other figures of an adapter.", "adapter", "field")
     plain = {"accepted": accepted, "values": values, "reads": reads, "restarts": restarts}
     for name, fields in adapters.items():
@@ -318,13 +353,15 @@ def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
                 plain[key].add_metric([name], value)
             elif key == "refused":
                 _add(refused, name, value)
+            elif key == "readings":
+                _add(readings, name, value)
             elif key == "connections" and isinstance(value, dict):
                 connections.add(name, value)
             elif key == "tls_failures":
                 _add(connections.tls_failed, name, value)
             else:
                 _add(status, name, dict(_flat(key, value)))
-    yield from (accepted, values, reads, refused, restarts, states, status)
+    yield from (accepted, values, reads, refused, readings, restarts, states, status)
     yield from connections.families()
 
 

@@ -26,7 +26,7 @@ class ReloadIncomplete(Exception):
 
 
 SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log")
-SEVERAL = ("memories", "listeners", "devices", "links", "adapters")
+SEVERAL = ("memories", "listeners", "devices", "links", "outputs", "adapters")
 
 
 def fingerprints(config: Config) -> dict[str, str]:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MIN_INTERVAL = 0.01
+TAG_GAP = 10
+"""The largest gap between tags that is read by default, as with the scanner."""
 TAKING_TIME = ("reads", "profile", "tags")
 """The keys that make a device polled, so that it needs an interval."""
 STATUS_BLOCK = 30
@@ -245,7 +247,10 @@ def takes_writes(area: object, into: object) -> bool:
 
 
 def _max_gap(data: dict[str, Any]) -> int | None:
-    return 0 if data["cost"] is None else None
+    if data["cost"] is not None:
+        return None
+    only_tags = not data.get("reads") and (data.get("tags") or data.get("profile"))
+    return TAG_GAP if only_tags else 0
 
 
 class DeviceConfig(Model):
@@ -290,7 +295,8 @@ class DeviceConfig(Model):
     max_gap: Annotated[Annotated[int, Field(ge=0, le=LAST_ADDRESS)] | None, NotNull()] = Field(
         default_factory=_max_gap
     )
-    """The largest gap, in bits or registers, that is read to join two reads. Default: 0."""
+    """The largest gap, in bits or registers, that is read to join two reads. Default: 0, or 10 with
+    tags alone."""
     max_registers: Annotated[int, Field(ge=1, le=READ_REGISTERS)] = READ_REGISTERS
     """Maximum number of registers in one request."""
     max_bits: Annotated[int, Field(ge=1, le=READ_BITS)] = READ_BITS

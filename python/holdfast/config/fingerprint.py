@@ -52,7 +52,8 @@ def _files(value: Any) -> Iterator[Path]:
         if tls is not None:
             yield from (Path(file) for _, file in tls.files())
         for name in type(value).model_fields:
-            yield from _files(getattr(value, name))
+            if name not in value.own_files:
+                yield from _files(getattr(value, name))
     elif isinstance(value, dict):
         for each in value.values():
             yield from _files(each)

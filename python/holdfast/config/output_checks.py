@@ -37,7 +37,7 @@ class OutputChecks:
         for name, output in outputs.items():
             path: KeyPath = ("outputs", name)
             for index, device in enumerate(entries(mapping(output).get("devices"))):
-                if device not in devices:
+                if isinstance(device, str) and device not in devices:
                     words = f"allowed: {listing(devices) or 'none, there are no devices'}"
                     near = guess(device, [str(each) for each in devices])
                     message = f"found {show(device)}, {words}{near}"

@@ -18,6 +18,8 @@ MEASUREMENT = "modbus"
 class BufferConfig(Model):
     """What an output keeps while it can't send."""
 
+    own_files = ("file",)
+
     values: Annotated[int, Field(ge=1000, le=10_000_000)] = MOST_VALUES
     """The newest values that are kept in memory."""
     file: Annotated[FilePath | None, NotNull()] = None
@@ -33,7 +35,9 @@ class OutputConfig(Model):
     """change: values that differ from the last by more than their deadband; scan: all."""
     heartbeat: Annotated[Duration | None, NotNull()] = None
     """Seconds after which an unchanged value is published again. Default: never."""
-    devices: Annotated[tuple[Name, ...], Strict(False), Field(min_length=1)] | None = None
+    devices: Annotated[
+        Annotated[tuple[Name, ...], Strict(False), Field(min_length=1)] | None, NotNull()
+    ] = None
     """The devices whose tags are published. Default: all."""
     buffer: BufferConfig = Field(default_factory=BufferConfig)
     """What is kept while the receiver can't be reached."""
@@ -75,6 +79,8 @@ class InfluxConfig(OutputConfig):
 
 class FileConfig(OutputConfig):
     """A file: lines of text, or an SQLite database."""
+
+    own_files = ("file",)
 
     type: Literal["file"]
     """The type of the output."""

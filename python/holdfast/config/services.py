@@ -312,6 +312,9 @@ class AdapterConfig(Model):
 class MetricsConfig(Model):
     """Metrics in the Prometheus text format."""
 
+    values: bool = False
+    """Whether the values of tags are metrics too."""
+
     bind: BindAddress
     """Where to listen: an IP address and a port."""
     sources: Sources = LOOPBACK
@@ -331,6 +334,8 @@ class SyslogConfig(Model):
 
 class AuditConfig(Model):
     """A log that records every write, one line each: a file, syslog, the journal."""
+
+    own_files = ("file",)
 
     file: Annotated[FilePath | None, NotNull()] = None
     """The file, in an existing folder; optional with syslog or journald."""

@@ -88,10 +88,12 @@ class Sending:
         return {
             **self._receiver.status(),
             "connected": not self._is_failing,
-            "sent": self._sent,
+            "readings": {
+                "sent": self._sent,
+                "refused": self._refused,
+                "dropped": self._buffer.dropped,
+            },
             "waiting": len(self._buffer),
-            "dropped": self._buffer.dropped,
-            "refused": self._refused,
             "failures": self._failures,
             "last_error": self._last_error,
             "file_error": self._file_error,

@@ -1,0 +1,214 @@
+"""The values of tags in a running appliance: outputs, metrics, reloads and outages."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast.appliance import Appliance
+from holdfast.config import load
+from holdfast.outputs.stored import Stored
+from support import wire
+from support.polled import Fake, data, exception
+from support.readings import tag
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.running import Serve
+
+METER = {
+    "tags": {
+        "power": {"area": "holding_registers", "address": 0, "scale": 0.1, "unit": "W"},
+        "on": {"area": "coils", "address": 0},
+        "label": {"area": "holding_registers", "address": 2, "type": "string:4"},
+        "phases": {"area": "holding_registers", "address": 4, "type": "int16[2]"},
+    }
+}
+
+
+def settings(port: int, **more: Any) -> dict[str, Any]:
+    device = {"url": f"tcp://127.0.0.1:{port}", "profile": "meter", "interval": 0.02}
+    out = {"type": "file", "file": "out.jsonl", "format": "jsonl"}
+    return {
+        "profiles": {"meter": METER},
+        "devices": {"m": device},
+        "outputs": {"out": out},
+        **more,
+    }
+
+
+def saved(folder: Path, made: dict[str, Any]) -> Path:
+    file = folder / "appliance.yaml"
+    file.write_text(json.dumps(made))
+    return file
+
+
+def rows(folder: Path, name: str = "out.jsonl") -> list[dict[str, Any]]:
+    file = folder / name
+    if not file.exists():
+        return []
+    return [json.loads(line) for line in file.read_text("utf-8").splitlines()]
+
+
+def values(folder: Path, of: str, name: str = "out.jsonl") -> list[Any]:
+    return [row["value"] for row in rows(folder, name) if row["tag"] == of]
+
+
+def _until_power_is(folder: Path, expected: list[float]) -> None:
+    wire.until(lambda: values(folder, "power") == expected, "all changes are there")
+
+
+@pytest.fixture
+def memory() -> holdfast.Memory:
+    made = holdfast.Memory(holding_registers=10, coils=8)
+    made.write("holding_registers", 0, [215, 0, 0x6162, 0x6300, 7, 65535])
+    return made
+
+
+@pytest.fixture
+def device(memory: holdfast.Memory, serve: Serve) -> int:
+    return serve({1: memory}).address[1]
+
+
+def test_changes_of_values_reach_a_file(
+    tmp_path: Path, device: int, memory: holdfast.Memory
+) -> None:
+    with Appliance(load(saved(tmp_path, settings(device)))):
+        wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+        found = {row["tag"]: (row["value"], row["unit"], row["error"]) for row in rows(tmp_path)}
+        assert found == {
+            "power": (21.5, "W", None),
+            "on": (False, "", None),
+            "label": ("abc", "", None),
+            "phases": ([7, -1], "", None),
+        }
+        for number in range(1, 4):
+            memory.write_many([("holding_registers", 0, [number]), ("coils", 0, [number % 2])])
+            expected = [21.5, *(each / 10 for each in range(1, number + 1))]
+            _until_power_is(tmp_path, expected)
+    assert values(tmp_path, "power") == [21.5, 0.1, 0.2, 0.3]
+    assert values(tmp_path, "on") == [False, True, False, True]
+    assert len(values(tmp_path, "label")) == 1
+
+
+def test_a_device_that_stops_answering_has_no_value(tmp_path: Path) -> None:
+    with Fake(data) as fake, Appliance(load(saved(tmp_path, settings(fake.port)))):
+        wire.until(lambda: values(tmp_path, "power") == [0.0], "it has a value")
+        fake.answer = lambda request: exception(request, 4)
+        wire.until(lambda: values(tmp_path, "power") == [0.0, None], "it has none")
+        fake.answer = data
+        wire.until(lambda: values(tmp_path, "power") == [0.0, None, 0.0], "it is back")
+    [row] = [row for row in rows(tmp_path) if row["tag"] == "power" and row["error"]]
+    assert row["error"] == "exception 04 (Server Device Failure)"
+
+
+def test_an_output_publishes_only_its_devices(tmp_path: Path, device: int) -> None:
+    made = settings(device)
+    made["devices"]["other"] = made["devices"]["m"]
+    made["outputs"]["out"]["devices"] = ["other"]
+    made["outputs"]["all"] = {"type": "file", "file": "all.jsonl", "format": "jsonl"}
+    with Appliance(load(saved(tmp_path, made))):
+        wire.until(lambda: len(rows(tmp_path, "all.jsonl")) == 8, "all are there")
+        wire.until(lambda: len(rows(tmp_path)) == 4, "its own are there")
+    assert {row["device"] for row in rows(tmp_path)} == {"other"}
+
+
+def test_tags_and_reads_share_a_poll_and_only_reads_are_stored(
+    tmp_path: Path, device: int, memory: holdfast.Memory
+) -> None:
+    read = {"area": "holding_registers", "address": 0, "count": 2}
+    read["into"] = {"memory": "p", "area": "holding_registers", "address": 0}
+    made = settings(device, memories={"p": {"holding_registers": 10}})
+    made["devices"]["m"]["reads"] = [read]
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+        there = appliance.memories["p"]
+        wire.until(
+            lambda: there.read("holding_registers", 0, 2) == [215, 0], "the read is mirrored"
+        )
+        counters = appliance.diagnostics.devices()["m"]
+    assert counters["requests_per_poll"] == 2
+    assert there.read("holding_registers", 2, 8) == [0] * 8
+    assert memory.read("holding_registers", 0, 1) == [215]
+
+
+def test_a_receiver_that_can_not_be_reached_delays_nothing_else(
+    tmp_path: Path, device: int, memory: holdfast.Memory
+) -> None:
+    made = settings(device)
+    memory.write("holding_registers", 0, [0])
+    down = {"type": "influx", "url": "http://127.0.0.1:9", "bucket": "b"}
+    made["outputs"]["down"] = {**down, "buffer": {"file": "down.db"}}
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        for number in range(20):
+            memory.write("holding_registers", 0, [number])
+            expected = [each / 10 for each in range(number + 1)]
+            _until_power_is(tmp_path, expected)
+        wire.until(lambda: appliance.diagnostics.adapter("output/down"), "it has a status")
+        status = appliance.diagnostics.adapter("output/down")
+        assert status is not None
+        assert (status["connected"], status["readings"]["sent"]) == (False, 0)
+    stored = Stored(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
+    kept = []
+    while found := stored.first():
+        kept += [each.value for each in found if each.name == "power"]
+        stored.remove_first()
+    stored.close()
+    assert kept == values(tmp_path, "power")
+
+
+def test_a_reload_changes_tags_and_outputs_and_loses_nothing(
+    tmp_path: Path, device: int, memory: holdfast.Memory
+) -> None:
+    made = settings(device)
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+        made["profiles"]["meter"] = {
+            "tags": {"power": {"area": "holding_registers", "address": 0, "scale": 10}}
+        }
+        made["outputs"]["new"] = {"type": "file", "file": "new.jsonl", "format": "jsonl"}
+        changed = appliance.reload(load(saved(tmp_path, made)))
+        assert changed == ["devices.m", "outputs.new"]
+        wire.until(lambda: values(tmp_path, "power")[-1] == 2150, "it has another scale")
+        wire.until(lambda: values(tmp_path, "power", "new.jsonl") == [2150], "both have it")
+        del made["outputs"]["out"]
+        assert appliance.reload(load(saved(tmp_path, made))) == ["outputs.out"]
+        memory.write("holding_registers", 0, [1])
+        wire.until(lambda: values(tmp_path, "power", "new.jsonl")[-1] == 10, "one is left")
+        assert values(tmp_path, "power")[-1] == 2150
+        assert set(appliance.diagnostics.stats()["adapters"]) == {"output/new"}
+
+
+def test_a_reload_can_add_the_first_tags(tmp_path: Path, device: int) -> None:
+    made = settings(device, gateway=None)
+    first: dict[str, Any] = {"memories": {"p": {"coils": 1}}, "listeners": {}}
+    first["rest"] = {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"}
+    del first["listeners"], made["gateway"]
+    with Appliance(load(saved(tmp_path, first))) as appliance:
+        appliance.reload(load(saved(tmp_path, {**made, **first})))
+        wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+
+
+def test_values_are_metrics(tmp_path: Path, device: int, memory: holdfast.Memory) -> None:
+    made = settings(device, metrics={"bind": "127.0.0.1:0", "values": True})
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+        host, port = endpoint(appliance, "metrics")
+        with urllib.request.urlopen(f"http://{host}:{port}/metrics") as answer:
+            lines = answer.read().decode().splitlines()
+    found = [line for line in lines if line.startswith("holdfast_tag_value")]
+    assert sorted(found) == [
+        'holdfast_tag_value{device="m",tag="on",unit=""} 0.0',
+        'holdfast_tag_value{device="m",tag="phases[0]",unit=""} 7.0',
+        'holdfast_tag_value{device="m",tag="phases[1]",unit=""} -1.0',
+        'holdfast_tag_value{device="m",tag="power",unit="W"} 21.5',
+    ]
+    ages = [line for line in lines if line.startswith("holdfast_tag_age_seconds{")]
+    assert len(ages) == 4
+    assert memory.read("coils", 0, 1) == [False]

@@ -1,0 +1,83 @@
+"""Errors in outputs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.config import ConfigError, load
+from holdfast.config.fingerprint import fingerprint, signature
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, interval: 1}}\n"
+
+
+@pytest.mark.parametrize(
+    ("output", "expected"),
+    [
+        ("{type: file, file: a, format: xml}", "o.format: found 'xml', allowed: csv, jsonl"),
+        ("{file: a, format: csv}", "o.type: missing, allowed: "),
+        ("{type: mysql}", "o.type: found 'mysql', allowed: "),
+        ("{type: file, file: a, format: csv, devices: [b]}", "o.devices[0]: found 'b', allowed: a"),
+        ("{type: file, file: a, format: csv, devices: []}", "o.devices: found an empty list"),
+        ("{type: file, file: a, format: csv, publish: all}", "o.publish: found 'all', allowed: ch"),
+        ("{type: influx, url: 'http://h:1'}", "o.bucket: missing, allowed: a bucket, or a url"),
+        ("{type: influx, url: 'ftp://h', bucket: b}", "o.url: found neither http:// nor https://"),
+        ("{type: influx, url: 'http://h/a b'}", "o.url: found a path with blanks"),
+        ("{type: influx, url: 'http://u:p@h/w'}", "o.url: found a user in the URL"),
+        ("{type: influx, url: 'http://h/w', tls: {}}", "o.tls: found with http://, allowed: only"),
+        (
+            "{type: influx, url: 'http://h/w', username: u}",
+            "o.username: found without password_file",
+        ),
+        (
+            "{type: influx, url: 'http://h/w', token_file: t}",
+            "o.token_file: found 't', which can't be read",
+        ),
+        (
+            "{type: file, file: a, format: csv, buffer: {max_bytes: 1}}",
+            "o.buffer.max_bytes: found 1, allowed",
+        ),
+    ],
+)
+def test_a_wrong_output_is_refused(tmp_path: Path, output: str, expected: str) -> None:
+    file = tmp_path / "p.yaml"
+    file.write_text(f"{DEVICE}outputs:\n  o: {output}\n")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    [problem] = caught.value.problems
+    assert str(problem).removeprefix(f"{file}:3: outputs.").startswith(expected)
+
+
+def test_outputs_without_tags_have_no_effect(tmp_path: Path) -> None:
+    file = tmp_path / "p.yaml"
+    file.write_text(
+        "memories: {m: {coils: 1}}\n"
+        "rest: {bind: '127.0.0.1:1', sources: [127.0.0.1], tokens: none}\n"
+        "outputs: {o: {type: file, file: a, format: csv}}\n"
+    )
+    [doubt] = load(file).warnings
+    assert str(doubt) == f"{file}:3: outputs: has no effect: no device has tags"
+
+
+def test_what_is_written_to_own_files_is_no_change_of_the_configuration(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("one")
+    file = tmp_path / "p.yaml"
+    file.write_text(
+        f"{DEVICE}audit: {{file: audit.log}}\n"
+        "outputs:\n"
+        "  o: {type: file, file: out, format: csv, buffer: {file: kept}}\n"
+        "  i: {type: influx, url: 'http://h/w', token_file: token}\n"
+    )
+    config = load(file)
+    before = signature(file, config), fingerprint(config)
+    for name in ("audit.log", "out", "kept"):
+        (tmp_path / name).write_text("lines")
+    assert (signature(file, config), fingerprint(config)) == before
+    (tmp_path / "token").write_text("two and more")
+    now = signature(file, config), fingerprint(config)
+    assert now[0] != before[0]
+    assert now[1] != before[1]
