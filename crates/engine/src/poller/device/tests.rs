@@ -13,6 +13,7 @@ use crate::client::Place;
 use crate::poller::BlockSettings;
 use crate::poller::caught::spawn_watched;
 use crate::poller::health::Health;
+use crate::poller::results::Receivers;
 
 #[test]
 fn polls_stay_due_at_whole_intervals_after_missed_polls() {
@@ -115,7 +116,7 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
         forward: Vec::new(),
         status: None,
         start_within: Duration::ZERO,
-        report: true,
+        report: None,
         release: false,
     }
 }
@@ -124,15 +125,21 @@ fn block(area: Area, slot: u16) -> BlockSettings {
     BlockSettings { area, slot, name: "meter".into(), keep_last_error: false }
 }
 
-fn made(settings: DeviceSettings, state: &Arc<DeviceState>, results: &Arc<Results>) -> Device {
+fn made(
+    mut settings: DeviceSettings,
+    state: &Arc<DeviceState>,
+    results: &Arc<Results>,
+) -> Device {
+    settings.report = Some(Arc::clone(results));
     let link = Link::new(settings.endpoint.clone(), settings.in_flight, settings.retry);
     let planned = Planned::new(settings).unwrap();
     let to = (link, Rc::default());
-    Device::new(planned, Arc::clone(state), to, Vec::new(), Some(Arc::clone(results)))
+    Device::new(planned, Arc::clone(state), to, Vec::new())
 }
 
 fn device(settings: DeviceSettings) -> (Device, Arc<DeviceState>, Arc<Results>) {
-    let (state, results) = <(Arc<DeviceState>, Arc<Results>)>::default();
+    let state = Arc::<DeviceState>::default();
+    let results = Receivers::default().add();
     state.set_stale_after(TIMEOUT, TIMEOUT);
     (made(settings, &state, &results), state, results)
 }
