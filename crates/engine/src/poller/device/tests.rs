@@ -125,11 +125,7 @@ fn block(area: Area, slot: u16) -> BlockSettings {
     BlockSettings { area, slot, name: "meter".into(), keep_last_error: false }
 }
 
-fn made(
-    mut settings: DeviceSettings,
-    state: &Arc<DeviceState>,
-    results: &Arc<Results>,
-) -> Device {
+fn made(mut settings: DeviceSettings, state: &Arc<DeviceState>, results: &Arc<Results>) -> Device {
     settings.report = Some(Arc::clone(results));
     let link = Link::new(settings.endpoint.clone(), settings.in_flight, settings.retry);
     let planned = Planned::new(settings).unwrap();
