@@ -653,6 +653,7 @@ def test_rest_without_tokens_stays_on_loopback(imported: Import) -> None:
     found = imported(FIRST + rest.replace("127.0.0.1", ""))
     assert "rest" not in found.data
     assert noted(found, "rest: left out: REST is left out: without auth", "holdfast token")
+    assert not noted(found, "rest.address")
 
 
 def test_rest_that_nobody_could_use_is_left_out(imported: Import) -> None:

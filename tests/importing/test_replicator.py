@@ -237,6 +237,14 @@ def test_the_other_import_names_this_one(tmp_path: Path) -> None:
     )
 
 
+def test_a_binary_file_is_refused_as_one(tmp_path: Path) -> None:
+    source = tmp_path / "replicator"
+    source.write_bytes(b"\x7fELF\x02\x01\x00\x00\xff")
+    result = CliRunner().invoke(main, ["import", "replicator", str(source)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.splitlines()[0] == f"{source}: a binary file, allowed: YAML in UTF-8"
+
+
 def test_the_command_writes_a_file_and_tells_programs(tmp_path: Path) -> None:
     source, made = tmp_path / "replicator.yaml", tmp_path / "mirror.yaml"
     source.write_text(UNIT)

