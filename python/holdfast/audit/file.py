@@ -9,11 +9,11 @@ from __future__ import annotations
 import itertools
 import os
 import stat
-import sys
 from typing import TYPE_CHECKING
 
 from holdfast import logs
 from holdfast.audit.chain import End, digest_of, place_of
+from holdfast.audit.lock import lock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -117,7 +117,7 @@ class AuditFile:
         self._identity = _identity(status)
         self._size = status.st_size
         self._is_regular = stat.S_ISREG(status.st_mode)
-        if self._is_regular and not _lock(self._descriptor):
+        if self._is_regular and not lock(self._descriptor):
             self.close()
             raise OSError(f"{self.file}: another process writes this audit log")
 
@@ -192,22 +192,3 @@ def last_lines(file: Path) -> list[bytes]:
             data = opened.read(before - at) + data
     *lines, rest = data.split(b"\n")
     return [*(line + b"\n" for line in lines), *([rest] if rest else [])][-2:]
-
-
-if sys.platform == "win32":  # pragma: no cover
-
-    def _lock(_descriptor: int) -> bool:
-        return True
-
-else:
-    import fcntl
-
-    def _lock(descriptor: int) -> bool:
-        """Locks a file until it is closed. Returns whether that was possible."""
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:
-            return True  # The file system has no locks.
-        return True
