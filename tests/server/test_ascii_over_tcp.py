@@ -306,6 +306,20 @@ def test_a_changed_delimiter_applies_to_requests_that_arrived_with_the_change(
     assert appliance.memories["plant"].read("holding_registers", 0, 1) == [0]
 
 
+def test_a_changed_delimiter_concerns_only_the_connection_that_changed_it(
+    appliance: Appliance, client: AsciiConnection, connect: Connect
+) -> None:
+    other = connect(appliance)
+    change = bytes.fromhex("0800032300")
+    assert client.ask(change) == change
+
+    assert other.ask(READ) == ZERO
+    assert connect(appliance).ask(READ) == ZERO
+    client.send(lines.ascii_frame(READ, 1)[:-1] + b"#")
+    assert client.replies(1) == [(1, ZERO)]
+    assert counters(appliance)["frames"]["damaged"] == 0
+
+
 # Units and rules
 
 

@@ -56,6 +56,7 @@ EVERY_FUNCTION = {
         43: "2b0e0100",
     }.items()
 }
+REFUSALS = ("refused_function", "refused_unit", "refused_address", "refused_sealed")
 WRITES = {5, 6, 15, 16, 22, 23}
 
 
@@ -350,6 +351,66 @@ def test_a_peer_cannot_silence_a_unit_for_others(
     fields = refused.fields  # type: ignore[attr-defined]
     assert fields["listener"] == "scada"
     assert fields["peer"].startswith("127.0.0.1:")
+
+
+# What the log has of refused requests
+
+
+def logged(plant: Plant, caplog: pytest.LogCaptureFixture) -> list[tuple[str, int, int]]:
+    """The refused requests in the log: event, unit and function. An event precedes its reply."""
+    for _ in range(20):
+        plant.appliance.log_events(0)
+    return [
+        (each.message, fields["unit"], fields["function"])
+        for each in caplog.records
+        if each.message in REFUSALS
+        for fields in [vars(each)["fields"]]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("asked", "answered", "event"),
+    [
+        ("0600001234", "8601", "refused_function"),
+        ("6300", "e301", "refused_function"),
+        ("03ffff0001", "8302", "refused_address"),
+    ],
+)
+def test_a_refused_request_is_logged_once_for_each_connection(
+    asked: str, answered: str, event: str, start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    plant = start(rule(["127.0.0.1"], access="read-only"))
+    peer = plant.peer()
+    for _ in range(2):
+        assert peer.ask(bytes.fromhex(asked)) == bytes.fromhex(answered)
+    assert peer.ask(READ) == ZERO
+
+    times = 2 if "udp" in plant.kind else 1
+    assert logged(plant, caplog) == [(event, 1, int(asked[:2], 16))] * times
+
+
+def test_a_unit_that_a_peer_does_not_have_is_logged(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    plant = start(rule(["127.0.0.1"]))
+    assert plant.peer().ask(READ, 9) == b"\x83\x0b"
+    assert logged(plant, caplog) == [("refused_unit", 9, 3)]
+
+
+def test_a_write_to_a_sealed_memory_is_logged_but_not_a_read(
+    run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    seal = {"area": "discrete_inputs", "address": 9, "mode": "level"}
+    text = configuration(
+        "tcp", rules=[rule(["127.0.0.1"])], memories={"plant": {**ALL, "seal": seal}}
+    )
+    with ExitStack() as opened:
+        plant = Plant("tcp", run(text), opened)
+        peer = plant.peer()
+        assert peer.ask(READ) == b"\x83\x06"
+        assert logged(plant, caplog) == []
+        assert peer.ask(WRITE) == b"\x86\x06"
+        assert logged(plant, caplog) == [("refused_sealed", 1, 6)]
 
 
 # Several listeners

@@ -4,7 +4,7 @@ use std::time::UNIX_EPOCH;
 
 use holdfast_engine::server::audit::Unrecordable;
 use holdfast_engine::server::counters::PacketCounters;
-use holdfast_engine::server::event::Verbosity;
+use holdfast_engine::server::event::{Kind, Verbosity};
 use holdfast_engine::server::{
     Engine as Core, ListenerCounters, Listening, ProtocolCounters, Session, Settings, StartError,
 };
@@ -114,6 +114,10 @@ impl Engine {
         }
         if let Some(bytes) = event.kind.bytes() {
             fields.set_item("bytes", bytes)?;
+        }
+        if let Kind::RefusedRequest(refused) = event.kind {
+            fields.set_item("unit", refused.unit_id)?;
+            fields.set_item("function", refused.function_code)?;
         }
         Ok(Some((event.listener.to_string(), event.kind.name(), fields)))
     }

@@ -27,8 +27,9 @@ use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::peer::Peer;
 use super::policy::PeerRights;
+use super::refused_request::{RefusedRequest, Reported};
 use super::stream::{self, Stream};
-use super::unit_server::UnitServer;
+use super::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
 
 /// Bytes per read of a socket.
 const INPUT: usize = 4096;
@@ -115,6 +116,9 @@ struct Answering<F: Framing> {
     partial_len: usize,
     /// Nothing followed that beginning for [`Timeouts::frame`]: it may be all of it.
     is_doubtful: bool,
+    /// The last character of an ASCII frame, which the peer can change.
+    delimiter: u8,
+    reported: Reported,
     /// `None` until a request is answered later.
     deferred: Option<Box<Deferred>>,
 }
@@ -277,6 +281,7 @@ impl<F: Framing, S: Stream> Connection<F, S> {
         if self.ticket.take_outdated() {
             let Terms { rights, timeouts } = (self.renewal)().ok_or(Kind::RightsRevoked)?;
             (self.answering.rights, self.timeouts) = (rights, timeouts);
+            self.answering.reported = Reported::default();
         }
         Ok(())
     }
@@ -383,6 +388,8 @@ impl<F: Framing> Answering<F> {
             partial: F::NO_PARTIAL,
             partial_len: 0,
             is_doubtful: false,
+            delimiter: ASCII_DELIMITER,
+            reported: Reported::default(),
             deferred: None,
         }
     }
@@ -401,7 +408,7 @@ impl<F: Framing> Answering<F> {
         let is_doubtful = mem::take(&mut self.is_doubtful);
         let mut decoded = F::NOT_DECODED;
         loop {
-            match F::next(rest, || self.unit_server.ascii_delimiter(), &mut decoded) {
+            match F::next(rest, || self.delimiter, &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
                     let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
                     if place.is_some() || self.deferred.is_some() {
@@ -409,7 +416,8 @@ impl<F: Framing> Answering<F> {
                         let ours = (&*self.unit_server, &*self.rights, &*self.context);
                         let request = (tag, unit_id, pdu);
                         match deferred.defer(ours, place, self.peer.ip(), request) {
-                            Deferral::Later => {
+                            Deferral::Later(refused) => {
+                                self.note_refused(refused);
                                 rest = &rest[len..];
                                 answered.requests += 1;
                                 continue;
@@ -521,22 +529,38 @@ impl<F: Framing> Answering<F> {
 
     /// Writes one framed reply at the start of `output`. Returns its length, 0 when there is none.
     #[inline]
-    fn reply(&self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
+    fn reply(&mut self, tag: u16, unit_id: u8, request: &[u8], output: &mut [u8]) -> usize {
         let room = output.get_mut(F::HEADER_LEN..);
         let Some(buffer) = room.and_then(<[u8]>::first_chunk_mut::<{ pdu::MAX_LEN }>) else {
             return 0;
         };
-        if self.unit_server.refuses_silence(request) {
+        let is_silence = self.unit_server.refuses_silence(request);
+        if is_silence {
             self.context.refuse_listen_only(self.peer.clone());
         }
         let permit = self.context.permit(request);
         let permitted = permit.is_some();
         let len = self.unit_server.answer(&self.rights, unit_id, request, permitted, buffer);
+        let answered = &buffer[..len.unwrap_or_default()];
+        if !is_silence {
+            self.note_refused(RefusedRequest::by(unit_id, request, answered));
+        }
+        self.delimiter = changed_delimiter(request, answered).unwrap_or(self.delimiter);
         if let Some(auditor) = &self.context.auditor {
-            let asked = (request, &buffer[..len.unwrap_or_default()]);
+            let asked = (request, answered);
             auditor.note(&self.context.name, Some(&self.peer), unit_id, asked, permit);
         }
         len.map_or(0, |len| F::complete(output, tag, unit_id, len))
+    }
+
+    /// Reports the first refusal for each reason.
+    #[inline]
+    fn note_refused(&self, refused: Option<RefusedRequest>) {
+        if let Some(refused) = refused
+            && self.reported.is_first(&refused)
+        {
+            self.context.refuse_request(refused, Some(self.peer.clone()));
+        }
     }
 
     /// Sends `unsent`, then reads, answers and sends until no input is left, without waiting.

@@ -15,6 +15,7 @@ use holdfast_protocol::pdu::ExceptionCode;
 use super::audit::Permit;
 use super::listener::ListenerContext;
 use super::policy::{Elsewhere, PeerRights};
+use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
 use crate::link::{Asker, Coming, exception, source};
 
@@ -57,8 +58,8 @@ pub(super) struct Completed {
 
 /// What becomes of a request.
 pub(super) enum Deferral {
-    /// Its reply comes later.
-    Later,
+    /// Its reply comes later. It may already be refused.
+    Later(Option<RefusedRequest>),
     /// It must wait until others are answered.
     Wait,
     /// It can be answered now.
@@ -99,13 +100,14 @@ impl Deferred {
         let permit = context.permit_forwarded(request);
         let permitted = permit.is_some();
         let sent = unit_server.forward(rights, place, &asker, unit_id, request, permitted);
+        let refused = RefusedRequest::before_device(unit_id, request, &sent);
         let (route, reply) = match sent {
             Ok((route, coming)) => (Some(route), Expected::Coming(coming)),
             Err(code) => (None, Expected::Known(exception(request, code.code()))),
         };
         let request = request.to_vec();
         self.waiting.push_back(Waiting { tag, unit_id, route, request, reply, permit });
-        Deferral::Later
+        Deferral::Later(refused)
     }
 
     /// The client has gone. Requests that wait for their turn are not sent. Returns the others, whose

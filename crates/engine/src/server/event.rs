@@ -9,6 +9,7 @@ use std::time::Duration;
 use holdfast_protocol::raw_ingest::Refusal;
 
 use super::peer::Peer;
+use super::refused_request::RefusedRequest;
 
 /// The most events in the queue.
 const CAPACITY: usize = 1024;
@@ -42,6 +43,8 @@ pub enum Kind {
     RefusedFull,
     /// A peer asked for listen only mode, which the listener does not allow.
     RefusedListenOnly,
+    /// A request was refused because of rights, or because a memory is sealed.
+    RefusedRequest(RefusedRequest),
     /// TLS failed, usually in the handshake. The reason is a word for programs.
     TlsFailed(&'static str),
     AcceptError,
@@ -58,7 +61,7 @@ pub enum Kind {
 impl Kind {
     /// Whether this event belongs to the normal life of a connection.
     const fn is_ordinary(self) -> bool {
-        matches!(self, Kind::Opened | Kind::Secured | Kind::Closed | Kind::Idle)
+        matches!(self, Kind::Opened | Kind::Closed | Kind::Idle | Kind::Ended)
     }
 
     pub const fn name(self) -> &'static str {
@@ -77,6 +80,7 @@ impl Kind {
             Kind::RefusedRole => "refused_role",
             Kind::RefusedFull => "refused_full",
             Kind::RefusedListenOnly => "refused_listen_only",
+            Kind::RefusedRequest(refused) => refused.why.name(),
             Kind::TlsFailed(_) => "tls_failed",
             Kind::AcceptError => "accept_error",
             Kind::PacketRefused(_) => "packet_refused",

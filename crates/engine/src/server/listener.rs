@@ -19,6 +19,7 @@ use super::counters::ConnectionCounters;
 use super::event::{Kind, Reporter};
 use super::live::Live;
 use super::peer::Peer;
+use super::refused_request::RefusedRequest;
 
 /// The most connections that wait in the system to be accepted.
 const BACKLOG: i32 = 1024;
@@ -145,6 +146,11 @@ impl ListenerContext {
     pub(crate) fn refuse_listen_only(&self, peer: impl Into<Peer>) {
         self.connections.refused_listen_only.add();
         self.report(Kind::RefusedListenOnly, Some(peer.into()));
+    }
+
+    /// Reports a refused request. The exceptions are counted elsewhere.
+    pub(crate) fn refuse_request(&self, refused: RefusedRequest, peer: Option<Peer>) {
+        self.report(Kind::RefusedRequest(refused), peer);
     }
 
     pub(crate) fn refuse_role(&self, peer: Peer) {

@@ -16,6 +16,7 @@ mod peer;
 pub mod policy;
 pub mod ranges;
 mod raw_ingest;
+mod refused_request;
 mod serial;
 mod stream;
 mod tcp;
@@ -30,6 +31,7 @@ pub use engine::{
 };
 pub use peer::Peer;
 pub use raw_ingest::{AfterRefusal, Flags, PacketsPerConnection, RawRule, RawSettings};
+pub use refused_request::{RefusedRequest, Why};
 pub use serial::SerialSettings;
 pub use tcp::{StreamFraming, StreamSettings};
 pub use udp::{DatagramFraming, UdpSettings};

@@ -6,6 +6,7 @@
 
 use std::io;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use holdfast_protocol::frame::{ascii, rtu};
@@ -20,7 +21,8 @@ use super::framing::{Framing, Rtu};
 use super::listener::ListenerContext;
 use super::live::Live;
 use super::policy::{PeerRights, Rule};
-use super::unit_server::UnitServer;
+use super::refused_request::{RefusedRequest, Reported};
+use super::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
 use crate::link::{Asker, exception, source};
 use crate::serial_line::{LineMode, SerialLine};
 
@@ -50,6 +52,9 @@ pub(crate) struct ModbusSerial {
     line: SerialLine,
     /// The number of the line as a source of requests to devices.
     source: u64,
+    /// The last character of an ASCII frame.
+    delimiter: AtomicU8,
+    reported: Reported,
 }
 
 impl ModbusSerial {
@@ -58,7 +63,14 @@ impl ModbusSerial {
         rights: Arc<Live<PeerRights>>,
         unit_server: Arc<UnitServer>,
     ) -> ModbusSerial {
-        ModbusSerial { unit_server, rights, line, source: source() }
+        ModbusSerial {
+            unit_server,
+            rights,
+            line,
+            source: source(),
+            delimiter: AtomicU8::new(ASCII_DELIMITER),
+            reported: Reported::default(),
+        }
     }
 
     /// Serves the line until `stop`.
@@ -171,8 +183,8 @@ impl ModbusSerial {
                 Err(error) => return error,
             };
             for &character in &input[..len] {
-                let ends =
-                    character == self.unit_server.ascii_delimiter() && frame.last() == Some(&b'\r');
+                let delimiter = self.delimiter.load(Ordering::Relaxed);
+                let ends = character == delimiter && frame.last() == Some(&b'\r');
                 if character == b':' && !ends {
                     if !frame.is_empty() {
                         damaged.add();
@@ -241,6 +253,7 @@ impl ModbusSerial {
             let permitted = permit.is_some();
             let sent =
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted);
+            self.note_refused(context, RefusedRequest::before_device(unit_id, request, &sent));
             let (route, answered) = match sent {
                 Ok((route, coming)) => {
                     (Some(route), come(&self.unit_server, request, coming.await.ok()))
@@ -261,11 +274,25 @@ impl ModbusSerial {
         let permit = context.permit(request);
         let permitted = permit.is_some();
         let len = self.unit_server.answer(&rights, unit_id, request, permitted, reply);
+        let answered = &reply[..len.unwrap_or_default()];
+        self.note_refused(context, RefusedRequest::by(unit_id, request, answered));
+        if let Some(delimiter) = changed_delimiter(request, answered) {
+            self.delimiter.store(delimiter, Ordering::Relaxed);
+        }
         if let Some(auditor) = &context.auditor {
-            let asked = (request, &reply[..len.unwrap_or_default()]);
+            let asked = (request, answered);
             auditor.note(&context.name, None, unit_id, asked, permit);
         }
         len
+    }
+
+    /// Reports the first refusal for each reason.
+    fn note_refused(&self, context: &ListenerContext, refused: Option<RefusedRequest>) {
+        if let Some(refused) = refused
+            && self.reported.is_first(&refused)
+        {
+            context.refuse_request(refused, None);
+        }
     }
 
     /// Carries out a broadcast: every memory carries out the write, no unit replies.

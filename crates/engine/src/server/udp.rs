@@ -20,6 +20,7 @@ use super::framing::{Datagram, Mbap, Next, Rtu};
 use super::listener::ListenerContext;
 use super::live::Live;
 use super::policy::{Policy, Rule};
+use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
 use crate::link::{Asker, source};
 
@@ -215,6 +216,9 @@ impl ModbusUdp {
             } else {
                 Err(ExceptionCode::ServerDeviceBusy)
             };
+            if let Some(refused) = RefusedRequest::before_device(unit_id, request, &coming) {
+                context.refuse_request(refused, Some(peer.into()));
+            }
             return match coming {
                 Ok((route, coming)) => {
                     let (meta, request) = (*meta, request.to_vec());
@@ -242,14 +246,19 @@ impl ModbusUdp {
                 }
             };
         }
-        if self.unit_server.refuses_silence(request) {
+        let is_silence = self.unit_server.refuses_silence(request);
+        if is_silence {
             context.refuse_listen_only(peer);
         }
         let permit = context.permit(request);
         let permitted = permit.is_some();
         let len = self.unit_server.answer(&rights, unit_id, request, permitted, buffer);
+        let answered = &buffer[..len.unwrap_or_default()];
+        if !is_silence && let Some(refused) = RefusedRequest::by(unit_id, request, answered) {
+            context.refuse_request(refused, Some(peer.into()));
+        }
         if let Some(auditor) = &context.auditor {
-            let asked = (request, &buffer[..len.unwrap_or_default()]);
+            let asked = (request, answered);
             auditor.note(&context.name, Some(&peer.into()), unit_id, asked, permit);
         }
         len.map_or(0, |len| D::complete(output, tag, unit_id, len))

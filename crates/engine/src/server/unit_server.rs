@@ -7,7 +7,7 @@
 //! peer without rights cannot discover units. A unit in listen only mode never answers.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use holdfast_memory::{Access, Area, Memory, Read, Refusal, Write};
 use holdfast_protocol::pdu::{
@@ -29,28 +29,31 @@ pub struct UnitServer {
     listen_only: AtomicBool,
     /// Units in listen only mode (V1.1b3, 6.8.1, sub-function 04).
     silent: [AtomicBool; 256],
-    /// The last character of an ASCII frame (V1.1b3, 6.8.1, sub-function 03).
-    ascii_delimiter: AtomicU8,
+}
+
+/// The last character of the ASCII frames of a connection or line, until it is changed.
+pub(crate) const ASCII_DELIMITER: u8 = b'\n';
+
+/// The last character of later ASCII frames, if this request has changed it (V1.1b3, 6.8.1,
+/// sub-function 03).
+pub(crate) fn changed_delimiter(request: &[u8], reply: &[u8]) -> Option<u8> {
+    let changes = reply.first() == Some(&Function::Diagnostics.code())
+        && SubFunction::from_pdu(request) == Some(SubFunction::ChangeAsciiInputDelimiter);
+    if changes { request.get(3).copied() } else { None }
 }
 
 impl UnitServer {
     pub fn new(identity: Identity, listen_only: bool) -> UnitServer {
         let silent = [const { AtomicBool::new(false) }; 256];
-        let ascii_delimiter = AtomicU8::new(b'\n');
         let (counters, identity) = (Counters::default(), Live::new(identity));
         let listen_only = AtomicBool::new(listen_only);
-        UnitServer { counters, identity, listen_only, silent, ascii_delimiter }
+        UnitServer { counters, identity, listen_only, silent }
     }
 
     /// Changes what a reload can change.
     pub(crate) fn update(&self, identity: Identity, listen_only: bool) {
         self.identity.replace(Arc::new(identity));
         self.listen_only.store(listen_only, Ordering::Relaxed);
-    }
-
-    /// The character that follows the carriage return at the end of an ASCII frame.
-    pub fn ascii_delimiter(&self) -> u8 {
-        self.ascii_delimiter.load(Ordering::Relaxed)
     }
 
     /// Carries out a request and writes the reply. Returns its length, or `None` when there is no
@@ -314,10 +317,8 @@ impl UnitServer {
     fn diagnose(&self, unit_id: u8, asked: Diagnostics<'_>, reply: &mut Buffer) -> Option<usize> {
         let bus = self.counters.bus();
         let count = match asked.sub_function() {
-            SubFunction::ReturnQueryData => return Some(reply::diagnostics_echo(asked, reply)),
-            SubFunction::ChangeAsciiInputDelimiter => {
-                let delimiter = asked.data().first().copied().unwrap_or(b'\n');
-                self.ascii_delimiter.store(delimiter, Ordering::Relaxed);
+            // Each connection and line has a delimiter of its own, see `changed_delimiter`.
+            SubFunction::ReturnQueryData | SubFunction::ChangeAsciiInputDelimiter => {
                 return Some(reply::diagnostics_echo(asked, reply));
             }
             SubFunction::RestartCommunications | SubFunction::ClearCounters => {

@@ -1,0 +1,134 @@
+//! Modbus requests that a listener refuses because of rights, or because a memory is sealed: what
+//! the log has of them.
+
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use holdfast_protocol::pdu::{ExceptionCode, Function};
+
+/// A refused request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RefusedRequest {
+    pub unit_id: u8,
+    pub function_code: u8,
+    pub why: Why,
+}
+
+/// Why a request was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Why {
+    /// The function is not known, or not allowed for the peer.
+    Function,
+    /// The peer does not have the unit.
+    Unit,
+    /// An address does not exist, or the peer may not use it.
+    Address,
+    /// A write to a memory that is sealed.
+    Sealed,
+}
+
+impl Why {
+    /// The name of the event.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Why::Function => "refused_function",
+            Why::Unit => "refused_unit",
+            Why::Address => "refused_address",
+            Why::Sealed => "refused_sealed",
+        }
+    }
+}
+
+impl RefusedRequest {
+    /// The refusal that a memory's reply to a request is; `None` for any other reply.
+    #[inline]
+    pub(crate) fn by(unit_id: u8, request: &[u8], reply: &[u8]) -> Option<RefusedRequest> {
+        let &[code, exception, ..] = reply else { return None };
+        if code & 0x80 == 0 {
+            return None;
+        }
+        let code = ExceptionCode::from_code(exception)?;
+        let refused = RefusedRequest::with(unit_id, request, code);
+        let sealed = code == ExceptionCode::ServerDeviceBusy && writes(request);
+        refused.or_else(|| sealed.then(|| RefusedRequest::new(unit_id, request, Why::Sealed)))
+    }
+
+    /// The refusal of a request that was not sent to its device; `None` if it was, or can't be.
+    pub(crate) fn before_device<T>(
+        unit_id: u8,
+        request: &[u8],
+        sent: &Result<T, ExceptionCode>,
+    ) -> Option<RefusedRequest> {
+        RefusedRequest::with(unit_id, request, *sent.as_ref().err()?)
+    }
+
+    fn with(unit_id: u8, request: &[u8], code: ExceptionCode) -> Option<RefusedRequest> {
+        let why = match code {
+            ExceptionCode::IllegalFunction => Why::Function,
+            ExceptionCode::IllegalDataAddress => Why::Address,
+            ExceptionCode::GatewayTargetFailedToRespond => Why::Unit,
+            _ => return None,
+        };
+        Some(RefusedRequest::new(unit_id, request, why))
+    }
+
+    fn new(unit_id: u8, request: &[u8], why: Why) -> RefusedRequest {
+        let function_code = request.first().copied().unwrap_or_default();
+        RefusedRequest { unit_id, function_code, why }
+    }
+}
+
+fn writes(request: &[u8]) -> bool {
+    request.first().copied().and_then(Function::from_code).is_some_and(Function::is_write)
+}
+
+/// The reasons that were reported for a connection or line: each is reported once.
+#[derive(Debug, Default)]
+pub(crate) struct Reported(AtomicU8);
+
+impl Reported {
+    /// Whether a refusal is the first for its reason.
+    pub(crate) fn is_first(&self, refused: &RefusedRequest) -> bool {
+        let bit = 1 << refused.why as u8;
+        self.0.fetch_or(bit, Ordering::Relaxed) & bit == 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const READ: [u8; 5] = [3, 0, 0, 0, 1];
+    const WRITE: [u8; 5] = [6, 0, 0, 0, 1];
+
+    fn why(request: &[u8], reply: &[u8]) -> Option<Why> {
+        RefusedRequest::by(1, request, reply).map(|refused| refused.why)
+    }
+
+    #[test]
+    fn a_refusal_has_the_reason_of_its_exception() {
+        assert_eq!(why(&WRITE, &[0x86, 1]), Some(Why::Function));
+        assert_eq!(why(&READ, &[0x83, 2]), Some(Why::Address));
+        assert_eq!(why(&WRITE, &[0x86, 6]), Some(Why::Sealed));
+        assert_eq!(why(&READ, &[0x83, 0x0B]), Some(Why::Unit));
+    }
+
+    #[test]
+    fn other_replies_are_no_refusal() {
+        // A sealed memory is read again and again until it is opened.
+        for (request, reply) in [(READ, [0x83, 6]), (READ, [0x83, 3]), (WRITE, [0x86, 4])] {
+            assert_eq!(why(&request, &reply), None);
+        }
+        assert_eq!(why(&WRITE, &WRITE), None);
+        assert_eq!(why(&WRITE, &[]), None);
+    }
+
+    #[test]
+    fn each_reason_is_reported_once() {
+        let reported = Reported::default();
+        let refused = |why| RefusedRequest { unit_id: 1, function_code: 6, why };
+        for why in [Why::Function, Why::Unit, Why::Address, Why::Sealed] {
+            assert!(reported.is_first(&refused(why)));
+            assert!(!reported.is_first(&refused(why)));
+        }
+    }
+}
