@@ -406,7 +406,8 @@ class Engine:
     def next_event(self, timeout: float) -> tuple[str, str, dict[str, object]] | None:
         """Listener, kind and fields of the next event; `None` after `timeout` seconds.
 
-        Fields, as far as they apply: peer, role, subject and serial (TLS), reason, bytes.
+        Fields, as far as they apply: peer, role, subject and serial (TLS), reason, bytes, unit,
+        function.
         """
 
     @property

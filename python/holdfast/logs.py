@@ -1,4 +1,4 @@
-"""The log: one line per event, as text or JSON, with the same fields.
+"""The log: one line per event, as text, JSON or ECS documents, with the same fields.
 
 Log lines never contain secrets or values from memory.
 """
@@ -10,14 +10,17 @@ import logging
 import sys
 import threading
 import time
-from typing import Literal
+from typing import Literal, TypeAlias
 
+from holdfast import ecs
 from holdfast.log_output import QueuedHandler
 
 LOGGER = logging.getLogger("holdfast")
 
+Format: TypeAlias = Literal["text", "json", "ecs"]
 
-def configure(level: str, form: Literal["text", "json"]) -> None:
+
+def configure(level: str, form: Format) -> None:
     """Sends the log to standard error; `level` is debug, info, warning or error."""
     handler = QueuedHandler(sys.stderr)
     handler.setFormatter(_formatter(form))
@@ -26,7 +29,7 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
     LOGGER.propagate = False
 
 
-def change(level: str, form: Literal["text", "json"]) -> None:
+def change(level: str, form: Format) -> None:
     """Changes level and format of a log that `configure` has begun."""
     for handler in LOGGER.handlers:
         handler.setFormatter(_formatter(form))
@@ -43,12 +46,24 @@ def write(level: int, event: str, **fields: object) -> None:
     LOGGER.log(level, event, extra={"fields": fields})
 
 
+def listening(listener: str, address: str, port: int | None = None) -> None:
+    """Logs that a listener or service is ready. A serial device has no port."""
+    if port is not None:
+        ecs.note_port(listener, port)
+    write(logging.INFO, "listening", listener=listener, address=address)
+
+
 def refused(event: str, *, kind: object, **fields: object) -> None:
     """Logs a refusal. The number of logged refusals of a kind is limited, see `Throttle`."""
+    limited(logging.WARNING, event, kind=kind, **fields)
+
+
+def limited(level: int, event: str, *, kind: object, **fields: object) -> None:
+    """Logs an event that peers can cause. The number of a kind is limited, see `Throttle`."""
     admitted, held_back = _REFUSALS.admit((event, kind), time.monotonic())
     if admitted:
         more = {"held_back": held_back} if held_back else {}
-        write(logging.WARNING, event, **fields, **more)
+        write(level, event, **fields, **more)
 
 
 def problem(event: str, **fields: object) -> None:
@@ -68,8 +83,8 @@ def tell_held_back() -> None:
         write(logging.WARNING, "held_back", of=event, kind=shown, count=count)
 
 
-def _formatter(form: Literal["text", "json"]) -> logging.Formatter:
-    return JsonFormatter() if form == "json" else TextFormatter()
+def _formatter(form: Format) -> logging.Formatter:
+    return {"text": TextFormatter, "json": JsonFormatter, "ecs": EcsFormatter}[form]()
 
 
 class TextFormatter(logging.Formatter):
@@ -91,6 +106,21 @@ class JsonFormatter(logging.Formatter):
             "event": record.getMessage(),
         }
         return json.dumps(head | _fields(record), default=str)
+
+
+class EcsFormatter(logging.Formatter):
+    """One document of the Elastic Common Schema per line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, without a line end."""
+        made = ecs.document(
+            timestamp(record.created),
+            record.levelname.lower(),
+            record.getMessage(),
+            _fields(record),
+            message(record),
+        )
+        return json.dumps(made, default=str)
 
 
 def message(record: logging.LogRecord) -> str:

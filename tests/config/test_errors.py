@@ -358,7 +358,7 @@ def test_listeners_need_sockets_of_their_own(folder: Folder, one: str, other: st
         ("workers: 0", "workers: found 0, allowed: an integer from 1 to 64"),
         ("workers: 1.0", "workers: found 1.0, allowed: an integer from 1 to 64"),
         ("log: {level: loud}", "log.level: found 'loud', allowed: debug, info, warning or error"),
-        ("log: {format: xml}", "log.format: found 'xml', allowed: text or json"),
+        ("log: {format: xml}", "log.format: found 'xml', allowed: text, json or ecs"),
         ("log:", "log: found nothing, allowed: a mapping with the keys level, format"),
         (
             "identity: {revision: 1.0}",
@@ -469,7 +469,8 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
         ("a: 1\n---\nb: 1\n", "2: not YAML: expected a single document in the stream, "
          "but found another document"),
         ("a: 1\nb: \x01\n", "2: the character U+0001 is not allowed in YAML"),
-        (b"a: 1\nb: \xff\n", "2: not UTF-8, allowed: YAML or CSV in UTF-8"),
+        (b"a: 1\nb: \xff\n", "2: not UTF-8, allowed: YAML in UTF-8"),
+        (b"\x7fELF\x00\x00\xff", " a binary file, allowed: YAML in UTF-8"),
         ("a: *b\n", "1: not YAML: found undefined alias 'b'"),
         ("!x 1", "1: the tag '!x' is not allowed"),
     ],

@@ -15,6 +15,7 @@ from holdfast import _core, logs
 from holdfast.adapters import foreign
 from holdfast.appliance import assembly, auditing, changes, configured_certificates, receivers
 from holdfast.appliance.diagnostics import Diagnostics, configured
+from holdfast.appliance.expiring import Expiring
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.supervision import STOP_TIMEOUT, Supervisor
 from holdfast.appliance.tag_values import TagValues
@@ -48,16 +49,18 @@ if TYPE_CHECKING:
     from holdfast.types import ThreadHeartbeat
     from holdfast.web.https import Https
 
-# All other events of a listener are refusals or faults.
+# All other events of a listener are limited in number, and warnings except `secured`.
 LEVELS = {
     "opened": logging.DEBUG,
-    "secured": logging.DEBUG,
     "closed": logging.DEBUG,
     "idle": logging.DEBUG,
     "line_back": logging.INFO,
     "rights_revoked": logging.INFO,
-    "ended": logging.INFO,
+    "ended": logging.DEBUG,
 }
+
+# Events whose number is limited for each role.
+BY_ROLE = ("secured", "refused_role")
 
 # What the audit log has of a connection that was ended.
 _SHOWN = ("peer", "role", "subject", "serial")
@@ -89,11 +92,12 @@ class Appliance:
     `start` raises `OSError` if the address of a listener can't be bound or a file can't be opened,
     and `UnknownAdapter` if an adapter is not installed. Nothing is left running then. The ports of
     REST, gateway and metrics are tried again until they can be bound, because these services must
-    not keep Modbus from starting.
+    not keep Modbus from starting. Without `retries_ports`, `start` raises `OSError` for them too.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, *, retries_ports: bool = True) -> None:
         self.config = config
+        self._retries_ports = retries_ports
         self.memories = {
             name: assembly.memory(settings) for name, settings in config.memories.items()
         }
@@ -103,13 +107,11 @@ class Appliance:
         """Binds the listeners and serves. Raises `RuntimeError` if already running."""
         if self._running is not None:
             raise RuntimeError("the appliance is already running")
-        self._running = _Running(self.config, self.memories)
-        for endpoint in self.endpoints():
-            if endpoint.error is not None:
-                continue
-            host, port = endpoint.host, endpoint.port
-            address = host if port is None else joined(host, port)
-            logs.write(logging.INFO, "listening", listener=endpoint.name, address=address)
+        self._running = _Running(self.config, self.memories, retries_ports=self._retries_ports)
+        logs.write(
+            logging.INFO, "started", version=_core.__version__, sha256=self.config.sha256 or "-"
+        )
+        self._running.log_listening()
         return self
 
     def stop(self) -> None:
@@ -129,6 +131,7 @@ class Appliance:
         """
         changed = self._parts().reload(config)
         self.config = config
+        self._parts().log_listening()
         return changed
 
     @property
@@ -189,7 +192,9 @@ class _Part:
 class _Running:
     """The parts of a running appliance. The constructor starts all of them or none."""
 
-    def __init__(self, config: Config, memories: dict[str, _core.Memory]) -> None:
+    def __init__(
+        self, config: Config, memories: dict[str, _core.Memory], *, retries_ports: bool
+    ) -> None:
         self._config = config
         self._fingerprints = changes.fingerprints(config)
         self._memories = memories
@@ -205,6 +210,9 @@ class _Running:
         self._unstored: dict[str, int] = {}
         self._forwarded: dict[tuple[str, int], Mapping[str, int]] = {}
         self._unreachable: set[tuple[str, int]] = set()
+        self._expiring = Expiring()
+        self._listening: dict[str, tuple[str, int | None]] = {}
+        """Where listeners have logged that they listen."""
         self._looked = self._reviewed = time.monotonic()
         self._recorder: auditing.WriteRecorder | None = None
         # Missing adapters and unusable TLS files are reported before any socket is opened.
@@ -216,7 +224,7 @@ class _Running:
             self._audit = auditing.opened(config)
             if self._audit is not None:
                 undo.callback(auditing.closed, self._audit, config)
-            self._ports = self._bound_ports(undo)
+            self._ports = self._bound_ports(undo, retried=retries_ports)
             # The links of listeners come first: the first use of an address decides its settings.
             self._poller: _core.Poller | None = None
             self._values: TagValues | None = None
@@ -302,6 +310,7 @@ class _Running:
         self._looked = now
         logs.tell_held_back()
         self.liveness.check()
+        self._expiring.check(self.diagnostics.expiries)
         interval = _review_interval(self._config)
         if interval is not None and now - self._reviewed >= interval:
             self._reviewed = now
@@ -366,16 +375,23 @@ class _Running:
         if event in LEVELS:
             logs.write(LEVELS[event], event, **fields)
         else:
-            about = found.get("role" if event == "refused_role" else "reason")
-            logs.refused(event, kind=(listener, about), **fields)
+            level = logging.INFO if event == "secured" else logging.WARNING
+            about = found.get("role" if event in BY_ROLE else "reason")
+            logs.limited(level, event, kind=(listener, about), **fields)
 
-    def _bound_ports(self, undo: ExitStack) -> dict[str, Port]:
-        """Tries to bind the ports of the HTTP services. The others are tried again later."""
+    def _bound_ports(self, undo: ExitStack, *, retried: bool) -> dict[str, Port]:
+        """Tries to bind the ports of the HTTP services. The others are tried again later.
+
+        Raises `OSError` if they are not to be `retried`.
+        """
         ports: dict[str, Port] = {}
         for name, settings in _http_services(self._config).items():
             ports[name] = Port(name, settings.bind.host, settings.bind.port)
             undo.callback(ports[name].close)
-            ports[name].bind()
+            if retried:
+                ports[name].bind()
+            else:
+                ports[name].open()
         return ports
 
     def _started_engine(self, links: assembly.Links) -> _core.Engine:
@@ -500,9 +516,7 @@ class _Running:
                 continue
             ports[name] = Port(name, settings.bind.host, settings.bind.port)
             undo.callback(ports[name].close)
-            if not ports[name].bind():
-                at = ports[name].bind_address
-                raise OSError(f"{name}: can't listen on {at}: {ports[name].error}")
+            ports[name].open()
         return ports
 
     def _replace_devices(self, before: Config, devices: Mapping[str, _core.PolledDevice]) -> None:
@@ -572,6 +586,17 @@ class _Running:
             scheme = "http" if service.tls is None else "https"
             endpoints.append(ListenAddress(name, scheme, *port.address, service, port.error))
         return endpoints
+
+    def log_listening(self) -> None:
+        """Logs the listeners and bound ports that were not logged yet."""
+        before, self._listening = self._listening, {}
+        for endpoint in self.endpoints():
+            if endpoint.type in ("http", "https"):
+                self._ports[endpoint.name].log_listening()
+                continue
+            host, port = at = self._listening[endpoint.name] = (endpoint.host, endpoint.port)
+            if at != before.get(endpoint.name):
+                logs.listening(endpoint.name, host if port is None else joined(host, port), port)
 
     def _adapters(self, config: Config, ports: Mapping[str, Port]) -> dict[str, _Part]:
         """The adapters of a configuration, by name."""

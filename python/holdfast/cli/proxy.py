@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.cli.device import checked_url, usable
+from holdfast.cli.log_options import log_config, log_options
 from holdfast.cli.parsing import by
 from holdfast.cli.run import serve
 from holdfast.client.endpoint import endpoint
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from holdfast.appliance import Appliance
     from holdfast.client.url import Target
     from holdfast.config.ip_addresses import Bind
+    from holdfast.logs import Format
     from holdfast.net.addresses import Network
 
 LISTENER = "proxy"
@@ -132,7 +134,7 @@ def parse_functions(text: str) -> list[int]:
     metavar="SECONDS",
     help="Time for which a reply answers equal reads.",
 )
-@click.option("--json-log", is_flag=True, help="Log one JSON object per line.")
+@log_options
 def proxy(
     url: str,
     listen: Bind,
@@ -143,6 +145,7 @@ def proxy(
     timeout: float,
     in_flight: int | str,
     cache: float,
+    log_format: Format,
     json_log: bool,
 ) -> None:
     """Serve the device at DEVICE-URL to many Modbus TCP clients.
@@ -177,7 +180,7 @@ def proxy(
             "links": {LINK: link},
             "devices": {} if unit is None else {DEVICE: {**shared, "unit": unit}},
             "listeners": {LISTENER: {"type": "modbus-tcp", "bind": listen, "rules": [rule]}},
-            "log": {"format": "json" if json_log else "text"},
+            "log": log_config(log_format, json_log),
         }
     )
     serve(config, lambda appliance: _greeting(appliance, config, target, unit), named="proxy")

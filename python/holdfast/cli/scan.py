@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 import click
 
 from holdfast import logs
+from holdfast.cli.log_options import FORMATS
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.signals import ending_signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
@@ -238,9 +239,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     default="info",
     show_default=True,
 )
-@click.option(
-    "--log-format", type=click.Choice(["text", "json"]), default="text", show_default=True
-)
+@click.option("--log-format", type=FORMATS, default="text", show_default=True)
 @click.option(
     "--schema",
     is_flag=True,

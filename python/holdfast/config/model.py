@@ -86,8 +86,9 @@ class LogConfig(Model):
 
     level: Literal["debug", "info", "warning", "error"] = "info"
     """The lowest level that is logged."""
-    format: Literal["text", "json"] = "text"
-    """text: lines for people. json: one JSON object per line, for programs."""
+    format: Literal["text", "json", "ecs"] = "text"
+    """text: lines for people. json: one JSON object per line, for programs. ecs: the same in the
+    names of the Elastic Common Schema, for a SIEM."""
 
 
 def _as_read(value: object) -> object:

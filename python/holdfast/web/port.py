@@ -10,6 +10,7 @@ import errno
 import logging
 import socket
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -76,6 +77,8 @@ class Port:
         self._bound: tuple[str, int] | None = None
         self._pause = FIRST_PAUSE
         self._logged: tuple[str, float] | None = None
+        self._lock = threading.Lock()
+        self._is_logged = False
 
     @property
     def bind_address(self) -> str:
@@ -107,18 +110,29 @@ class Port:
             **told,
         }
 
+    def open(self) -> None:
+        """Binds the port. Raises `OSError`, with the name of the service."""
+        try:
+            self._open()
+        except OSError as error:
+            at = self.bind_address
+            raise OSError(f"{self.name}: can't listen on {at}: {explained(error)}") from error
+
     def bind(self) -> bool:
         """Tries once to bind the port. A failure is logged. Returns whether the port is bound."""
+        try:
+            self._open()
+        except OSError as error:
+            self._note(explained(error))
+            return False
+        return True
+
+    def _open(self) -> None:
         if self._listener is None:
-            try:
-                listener = listen(self._host, self._port)
-            except OSError as error:
-                self._note(explained(error))
-                return False
+            listener = listen(self._host, self._port)
             host, port = listener.getsockname()[:2]
             self._listener, self._bound = listener, (host, port)
             self.error = None
-        return True
 
     def wait(self, stop: Stop) -> bool:
         """Tries to bind the port until it succeeds. Returns `False` if `stop` was set."""
@@ -130,10 +144,18 @@ class Port:
                 self._pause = min(2 * self._pause, MAX_PAUSE)
             if self.bind():
                 if late:
-                    address = joined(*self.address)
-                    logs.write(logging.INFO, "listening", listener=self.name, address=address)
+                    self.log_listening()
                 return True
         return False
+
+    def log_listening(self) -> None:
+        """Logs once that the port is bound. Thread-safe."""
+        with self._lock:
+            if self._bound is None or self._is_logged:
+                return
+            self._is_logged = True
+            host, port = self._bound
+        logs.listening(self.name, joined(host, port), port)
 
     def close(self) -> None:
         """Frees the port."""

@@ -1,0 +1,72 @@
+"""The names of all events that the code can log, from its text."""
+
+from __future__ import annotations
+
+import ast
+import re
+from typing import TYPE_CHECKING
+
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+PYTHON = ROOT / "python" / "holdfast"
+SERVER = ROOT / "crates" / "engine" / "src" / "server"
+
+BY_VARIABLE = {
+    "appliance/expiring.py": {"certificate_expires", "certificate_expired"},
+    "appliance/running.py": set(),  # The events of listeners.
+    "logs.py": set(),
+    "scanner/kept.py": {"restored", "not_restored"},
+    "scanner/service.py": {
+        *(f"device_{state}" for state in ("connecting", "online", "offline")),
+        "datatype_ignored",
+        "keys_ignored",
+        "scan_rate_raised",
+        "tag_repeated",
+        "writable_ignored",
+    },
+    "web/host.py": {"refused_source", "refused_full"},
+}
+"""The names that a file logs without a literal."""
+
+PLACES = {"write": 1, "limited": 1, "refused": 0, "problem": 0}
+"""The functions of `logs`, and the place of the name among their arguments."""
+
+
+def logged() -> set[str]:
+    """The names of all events. Raises `AssertionError` for a name that can't be found."""
+    found = {"log_dropped", *_of_listeners()}
+    for file in PYTHON.rglob("*.py"):
+        for argument in _names(file):
+            words = {each.value for each in ast.walk(argument) if isinstance(each, ast.Constant)}
+            known = {str(word) for word in words if isinstance(word, str)}
+            if not known or isinstance(argument, ast.JoinedStr):
+                place = str(file.relative_to(PYTHON))
+                assert place in BY_VARIABLE, f"{file}:{argument.lineno}: which events?"
+                known = BY_VARIABLE[place]
+            found |= known
+    return found
+
+
+def _of_listeners() -> Iterator[str]:
+    for file in ("event.rs", "refused_request.rs"):
+        body = (SERVER / file).read_text().split("pub const fn name(self)")[1].split("\n    }\n")[0]
+        yield from re.findall(r'=> "(\w+)"', body)
+
+
+def _names(file: Path) -> Iterator[ast.expr]:
+    """The arguments that are names of events."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        owner, _, name = called.rpartition(".")
+        if (owner == "logs" or (file.name == "logs.py" and not owner)) and name in PLACES:
+            yield node.args[PLACES[name]]
+        elif called == "logs.LOGGER.error" or (
+            file.name == "host.py" and called.endswith((".note", "host.note"))
+        ):
+            yield node.args[0]
