@@ -558,6 +558,9 @@ class BlockingClient:
         Raises `holdfast.ModbusError`.
         """
 
+    def end_call(self) -> None:
+        """Ends the call that waits for its reply, within 0.1 s: it raises `ConnectionLost`."""
+
     def close(self) -> None:
         """Closes the connection; the next call reconnects."""
 

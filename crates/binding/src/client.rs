@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use holdfast_engine::client::{
     BlockingClient as Core, ClientError, Endpoint as CoreEndpoint, Place, exception_name,
@@ -29,6 +30,9 @@ pyo3::import_exception!(holdfast.errors, ConnectionLost);
 pyo3::import_exception!(holdfast.errors, RequestTimeout);
 pyo3::import_exception!(holdfast.errors, InvalidResponse);
 pyo3::import_exception!(holdfast.errors, TlsFailed);
+
+/// What a call raises that `end_call` has ended.
+const CLOSED: &str = "connection lost: closed by this side";
 
 /// The number of addresses of an area.
 const ADDRESSES: i128 = 65_536;
@@ -278,13 +282,15 @@ impl Endpoint {
 #[pyclass(frozen, module = "holdfast")]
 pub struct BlockingClient {
     core: Core,
+    /// How often calls were ended.
+    ended: AtomicU64,
 }
 
 #[pymethods]
 impl BlockingClient {
     #[new]
     fn new(endpoint: PyRef<'_, Endpoint>) -> BlockingClient {
-        BlockingClient { core: Core::new(endpoint.core.clone()) }
+        BlockingClient { core: Core::new(endpoint.core.clone()), ended: AtomicU64::new(0) }
     }
 
     /// Sends a request and returns its result as a Python object.
@@ -302,8 +308,13 @@ impl BlockingClient {
         let result = self.interruptible(py, |interrupted| {
             self.core.interruptible_call(interrupted, unit, request, timeout, take)
         })?;
-        let result = result.expect("only an interrupted call has no result");
+        let result = result.ok_or_else(|| ConnectionLost::new_err(CLOSED))?;
         result.map_err(raised)?.into_python(py)
+    }
+
+    /// Ends the call that waits for its reply, and its connection.
+    fn end_call(&self) {
+        self.ended.fetch_add(1, Ordering::Relaxed);
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
@@ -323,7 +334,7 @@ thread_local! {
 
 impl BlockingClient {
     /// Runs `work` without the interpreter. While it waits, handlers of Python signals run; an
-    /// exception of a handler ends it.
+    /// exception of a handler ends it, as does `end_call`.
     fn interruptible<T: Send>(
         &self,
         py: Python<'_>,
@@ -335,8 +346,12 @@ impl BlockingClient {
             return Err(PyRuntimeError::new_err(message));
         }
         let mut raised = None;
+        let ended = self.ended.load(Ordering::Relaxed);
         let result = py.detach(|| {
             work(&mut || {
+                if self.ended.load(Ordering::Relaxed) != ended {
+                    return true;
+                }
                 let before = CHECKING.replace(me);
                 raised = Python::attach(|py| py.check_signals()).err();
                 CHECKING.set(before);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any
 
 from holdfast.client.asyncio_connection import CLOSED
@@ -13,6 +13,10 @@ from holdfast.errors import ConnectionLost
 if TYPE_CHECKING:
     from holdfast._core import Request
     from holdfast.client.url import Target
+
+
+PATIENCE = 0.2
+"""Seconds after which a call is ended again that was not there before."""
 
 
 class OneAtATime:
@@ -38,11 +42,18 @@ class OneAtATime:
         return self._core.call(request, unit, timeout)
 
     async def close(self) -> None:
-        """Closes the connection after the current call; waiting calls fail."""
+        """Closes the connection; the current call and waiting calls fail."""
         executor, self._executor = self._executor, None
         if executor is not None:
-            executor.submit(self._core.close)
-            await asyncio.to_thread(executor.shutdown)
+            await asyncio.to_thread(self._end, executor)
+
+    def _end(self, executor: ThreadPoolExecutor) -> None:
+        closed = executor.submit(self._core.close)
+        while not closed.done():
+            # A call may begin only now.
+            self._core.end_call()
+            wait([closed], PATIENCE)
+        executor.shutdown()
 
     @property
     def late(self) -> int:
