@@ -42,6 +42,12 @@ settings.register_profile(
 settings.load_profile("any machine")
 
 
+@pytest.fixture(autouse=True)
+def _forget_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refusals of one test do not limit how many another one logs."""
+    monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
 @pytest.fixture
 def ipv6() -> None:
     """Requires IPv6 on the loopback interface."""

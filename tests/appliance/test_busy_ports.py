@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import signal
 import socket
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.adapters import Stop
+from holdfast.net.addresses import joined
 from holdfast.web import port as ports
 from holdfast.web.port import Port
 from support import web, wire
@@ -78,16 +78,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pauses that tests can wait for."""
     monkeypatch.setattr(ports, "FIRST_PAUSE", 0.01)
     monkeypatch.setattr(ports, "MAX_PAUSE", 0.02)
-
-
-@pytest.fixture
-def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[web.Records]:
-    logger = logging.getLogger("holdfast")
-    monkeypatch.setattr(logger, "level", logging.INFO)
-    records = web.Records()
-    logger.addHandler(records)
-    yield records
-    logger.removeHandler(records)
 
 
 def status(appliance: Appliance, name: str) -> dict[str, Any]:
@@ -315,3 +305,14 @@ def test_a_wait_in_another_thread_ends_when_the_port_is_free(taken: Taken) -> No
         stop.set()
         thread.join()
         port.close()
+
+
+def test_a_port_is_logged_once_whoever_finds_it_bound(log: web.Records) -> None:
+    port = Port("rest", "127.0.0.1", 0)
+    port.log_listening()
+    assert log.of("listening") == []
+    assert port.bind()
+    for _ in range(2):
+        port.log_listening()
+    assert [each["address"] for each in log.of("listening")] == [joined(*port.address)]
+    port.close()

@@ -22,7 +22,7 @@ from holdfast.config import load
 from support import wire
 from support.certificates import Certificates, Issued, named
 from support.config_folder import written
-from support.running import endpoint
+from support.running import endpoint, log_events
 from support.tls_peer import Peer, Refused, context
 
 if TYPE_CHECKING:
@@ -341,7 +341,7 @@ def test_a_revoked_client_is_ended_and_the_others_stay(
         trust = context(party.authority.ca, party.lost)
         with Peer(rig.address(), trust) as again, pytest.raises((Refused, ConnectionError)):
             again.shake().ask(READ)
-    rig.appliance.log_events(0)
+    log_events(rig.appliance)
     fields = [vars(each)["fields"] for each in caplog.records if each.message == "tls_failed"]
     assert (fields[0]["reason"], fields[0]["role"]) == ("revoked", "lost")
 
@@ -427,9 +427,28 @@ def test_sessions_are_listed_with_their_certificates_and_ended(
         assert stays.ask(READ) == READ_42
         assert [each["role"] for each in rig.appliance.sessions()] == ["engineer"]
     assert rig.counted()["connections"]["ended"] == 1
-    rig.appliance.log_events(0)
-    (ended,) = [record for record in caplog.records if record.message == "ended"]
-    assert vars(ended)["fields"]["subject"] == "CN=laptop"
+    log_events(rig.appliance)
+    # The end of the connection itself is only logged at level debug.
+    assert [record for record in caplog.records if record.message == "ended"] == []
+    (ended,) = [record for record in caplog.records if record.message == "session_ended"]
+    assert vars(ended)["fields"]["session_subject"] == "CN=laptop"
+
+
+def test_a_listener_that_is_added_is_logged_and_the_others_are_not_again(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+
+    def listening() -> list[str]:
+        found = [vars(each) for each in caplog.records if each.message == "listening"]
+        caplog.clear()
+        return [each["fields"]["listener"] for each in found]
+
+    scada = listener(rule("127.0.0.0/8"))
+    rig.start(plant(listeners={"scada": scada}))
+    assert listening() == ["scada"]
+    rig.reload(plant(listeners={"scada": scada, "other": scada}))
+    assert listening() == ["other"]
 
 
 # Devices

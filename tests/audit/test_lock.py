@@ -46,6 +46,7 @@ def msvcrt(monkeypatch: pytest.MonkeyPatch) -> Msvcrt:
 @pytest.fixture
 def windows(msvcrt: Msvcrt, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The module as Windows imports it."""
+    assert sys.modules["msvcrt"] is msvcrt
     monkeypatch.setattr(sys, "platform", "win32")
     assert own.__file__ is not None
     spec = importlib.util.spec_from_file_location("lock_of_windows", own.__file__)

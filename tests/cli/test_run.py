@@ -255,9 +255,9 @@ def test_a_stranger_is_closed_and_logged_with_listener_and_address(
         assert stranger.recv(1) == b""
         # A listener's refusals are logged in the order they come, and before the process ends.
         assert running.process.stderr is not None
-        entries = [json.loads(running.process.stderr.readline()) for _ in range(2)]
-    assert entries[1] == {
-        "time": entries[1]["time"],
+        entries = [json.loads(running.process.stderr.readline()) for _ in range(3)]
+    assert entries[2] == {
+        "time": entries[2]["time"],
         "level": "warning",
         "event": "refused_source",
         "listener": "scada",

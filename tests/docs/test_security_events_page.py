@@ -46,7 +46,7 @@ def test_the_tables_have_every_security_event_and_what_it_is() -> None:
         told[key] = security_events.Meaning(
             tuple(category.split(", ")),
             tuple(kind.split(", ")),
-            outcome,  # type: ignore[arg-type]
+            outcome,
         )
     known = {(event,): meaning for event, meaning in security_events.EVENTS.items()}
     assert told == known | dict(security_events.BY_REASON)
@@ -79,8 +79,8 @@ def test_the_fields_of_the_tables_are_explained() -> None:
 
 def test_the_example_is_what_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     [line] = re.findall(r"^```json\n(.*)\n```$", PAGE, re.MULTILINE)
-    monkeypatch.setattr(ecs.socket, "gethostname", lambda: "edge-7")
-    monkeypatch.setattr(ecs.os, "getpid", lambda: 812)
+    monkeypatch.setattr("socket.gethostname", lambda: "edge-7")
+    monkeypatch.setattr("os.getpid", lambda: 812)
     monkeypatch.setattr(ecs, "_ports", {})
     ecs.note_port("scada", 502)
     record = logging.LogRecord("holdfast", logging.WARNING, "", 0, "refused_source", (), None)

@@ -14,7 +14,7 @@ import pytest
 from support import wire
 from support.config_folder import written
 from support.machine import needs_127_0_0_2
-from support.running import content, endpoint
+from support.running import content, endpoint, log_events
 from support.transports import (
     ALL,
     TYPES,
@@ -358,8 +358,7 @@ def test_a_peer_cannot_silence_a_unit_for_others(
 
 def logged(plant: Plant, caplog: pytest.LogCaptureFixture) -> list[tuple[str, int, int]]:
     """The refused requests in the log: event, unit and function. An event precedes its reply."""
-    for _ in range(20):
-        plant.appliance.log_events(0)
+    log_events(plant.appliance)
     return [
         (each.message, fields["unit"], fields["function"])
         for each in caplog.records

@@ -31,6 +31,7 @@ from support.certificates import (
     self_signed,
 )
 from support.machine import resident, tool
+from support.running import log_events
 from support.tls_peer import (
     READ,
     ZERO,
@@ -149,8 +150,7 @@ def test_a_role_that_no_rule_names_keeps_its_session_without_rights(
 
     counted = connections(appliance)
     assert (counted["refused_role"], counted["tls_failed"], counted["accepted"]) == (2, 0, 2)
-    for _ in range(2):
-        appliance.log_events(wire.DEADLINE)
+    log_events(appliance)
     fields = [
         record.fields  # type: ignore[attr-defined]
         for record in caplog.records
@@ -644,7 +644,7 @@ def test_silent_connections_displace_each_other_and_no_session(
         counted = connections(appliance)
         assert (counted["evicted"], counted["evicted_handshakes"]) == (0, 16)
         assert (counted["open"], counted["tls_failed"], counted["refused_full"]) == (13, 0, 0)
-        appliance.log_events(wire.DEADLINE)
+        log_events(appliance)
         logged = [each for each in caplog.records if each.message == "evicted"]
         assert {each.fields["reason"] for each in logged} == {"handshake"}  # type: ignore[attr-defined]
 

@@ -127,3 +127,9 @@ def content(memory: holdfast.Memory) -> dict[Area, list[int]]:
     """Returns all four areas of a memory whose areas start at 0 and have 1000 items."""
     ranges: list[tuple[Area, int, int]] = [(area, 0, 1000) for area in AREAS]
     return dict(zip(AREAS, memory.read_many(ranges), strict=True))
+
+
+def log_events(appliance: Appliance) -> None:
+    """Has an appliance log the events of its listeners that have occurred, up to a hundred."""
+    for _ in range(100):
+        appliance.log_events(0)

@@ -274,6 +274,7 @@ class _Running:
         for supervisor in self._supervisors.values():
             supervisor.stop()
         self._engine.stop()
+        self._log_last_events()
         for supervisor in self._supervisors.values():
             supervisor.join()
         if self._poller is not None:
@@ -286,6 +287,11 @@ class _Running:
             self._recorder.finish()
         if self._audit is not None:
             auditing.closed(self._audit, self._config)
+
+    def _log_last_events(self) -> None:
+        while (event := self._engine.next_event(0)) is not None:
+            self._log_event(*event)
+        logs.tell_held_back()
 
     def log_events(self, timeout: float) -> None:
         event = self._engine.next_event(timeout)
