@@ -189,6 +189,7 @@ def test_secrets_are_used_and_not_shown(
         wrong.write_text("guess")
         refused = start("--nats", own.url, "--user", "scan", "--password-file", str(wrong))
         assert refused.stderr is not None
+        assert "started" in refused.stderr.readline()
         line = refused.stderr.readline()
         assert "nats_connect_failed" in line
         assert "uthorization" in line
@@ -208,6 +209,45 @@ def test_secrets_are_used_and_not_shown(
             assert "s3cret" not in log
     finally:
         own.kill()
+
+
+def test_a_new_password_is_used_after_sighup_and_a_wrong_file_changes_nothing(
+    start: Start, tmp_path: Path, server: holdfast.Server
+) -> None:
+    own = NatsServer(tmp_path, "--user", "scan", "--pass", "s3cret")
+    try:
+        password = tmp_path / "password"
+        password.write_text("guess")
+        process = start("--nats", own.url, "--user", "scan", "--password-file", str(password))
+        assert process.stderr is not None
+        _await_line(process, "nats_connect_failed")
+        password.write_bytes(b"\xff")
+        process.send_signal(signal.SIGHUP)
+        assert "is not UTF-8 text" in _await_line(process, "reload_refused")
+        password.write_text("s3cret")
+        process.send_signal(signal.SIGHUP)
+        assert "changed=files" in _await_line(process, "reloaded")
+        connected(process)
+        process.send_signal(signal.SIGHUP)
+        assert "changed=nothing" in _await_line(process, "reloaded")
+        with Caller(own.url.replace("//", "//scan:s3cret@")) as caller:
+            data = caller.listen("modbus.data.plc1")
+            _subscribe(caller, server)
+            data.next()
+        process.terminate()
+        process.communicate(timeout=wire.DEADLINE)
+        assert process.returncode == 0
+    finally:
+        own.kill()
+
+
+def _await_line(process: subprocess.Popen[str], event: str) -> str:
+    """The next line of the log that has this event."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        if event in line:
+            return line
+    raise AssertionError(process.communicate())
 
 
 def test_credentials_are_used_and_not_shown(start: Start, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import asyncio
 import json
 import logging
 import os
-import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,11 +14,13 @@ from urllib.parse import urlsplit
 
 import click
 
-from holdfast import logs
+from holdfast import __version__, logs
 from holdfast.cli.log_options import FORMATS
 from holdfast.cli.open_files import allow_open_files
-from holdfast.cli.signals import ending_signals
+from holdfast.cli.run import JOIN_TIMEOUT
+from holdfast.cli.signals import Signals
 from holdfast.cli.tls_options import DEVICES, tls_of, tls_options
+from holdfast.config.fingerprint import fingerprint
 from holdfast.config.scanning import (
     MAX_DEADBAND,
     MAX_PING_INTERVAL,
@@ -60,9 +61,6 @@ if TYPE_CHECKING:
 
 DEFAULT_URL = f"nats://127.0.0.1:{SERVER_PORT}"
 FAILED = 1
-
-WATCHED = 1.0
-"""Seconds between checks that the embedded server is running."""
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -252,8 +250,8 @@ def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **opti
     """Poll Modbus devices for NATS subscribers.
 
     Connects to a device when a client subscribes to its tags, and disconnects after the last
-    subscriber leaves. Runs until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. Exit codes: 0
-    stopped, 1 failed, 2 wrong usage.
+    subscriber leaves. Runs until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. On SIGHUP, the
+    files of the options are read anew. Exit codes: 0 stopped, 1 failed, 2 wrong usage.
     """
     urls = [url for each in nats for url in each] or _servers(os.environ.get("NATS_SERVERS", ""))
     servers = _identity(tuple(urls) or (DEFAULT_URL,), options)
@@ -353,28 +351,60 @@ def _embedded_port(servers: Servers) -> int:
 
 
 async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
-    scanner = Scanner(settings)
-    loop = asyncio.get_running_loop()
-
-    def end(number: int, _: object) -> None:
-        signal.signal(number, signal.SIG_DFL)  # The second signal ends the process at once.
-        loop.call_soon_threadsafe(scanner.end)
-
-    for number in ending_signals():
-        signal.signal(number, end)
-    running = asyncio.create_task(scanner.run())
-    while not running.done():
-        await asyncio.wait([running], timeout=WATCHED)
-        logs.tell_held_back()
-        if check is not None and not running.done():
-            try:
-                check()
-            except EmbeddedFailed:
-                scanner.end()
-                await running
-                raise
-    await running
+    signals = Signals(reload="with a terminal")
+    logs.write(logging.INFO, "started", version=__version__)
+    while await _scan(settings, check, signals):
+        pass
     logs.write(logging.INFO, "stopped")
+
+
+async def _scan(settings: Settings, check: Callable[[], None] | None, signals: Signals) -> bool:
+    """Runs a scanner. Returns whether it ended because of files that have changed."""
+    scanner, known = Scanner(settings), _contents(settings)
+    running = asyncio.create_task(scanner.run())
+    changed = False
+    while not running.done():
+        await asyncio.wait([running], timeout=JOIN_TIMEOUT)
+        logs.tell_held_back()
+        if running.done():
+            break
+        try:
+            if check is not None:
+                check()
+        except EmbeddedFailed:
+            scanner.end()
+            await running
+            raise
+        if signals.received:
+            scanner.end()
+        elif signals.take_reload():
+            changed = _is_reloaded(settings, known)
+            if changed:
+                scanner.end()
+    await running
+    return changed and not signals.received
+
+
+def _contents(settings: Settings) -> str:
+    """A digest of the files of the options."""
+    servers = settings.servers
+    named = [servers.password_file, servers.token_file, servers.credentials]
+    for tls in (servers.tls, settings.device_tls):
+        named += [Path(file) for _, file in tls.files()]
+    return fingerprint([file for file in named if file is not None])
+
+
+def _is_reloaded(settings: Settings, known: str) -> bool:
+    """Whether the files have changed and can be used. Logs what it finds."""
+    try:
+        settings.servers.options()
+        device_tls.check(settings.device_tls)
+    except OSError as error:
+        logs.write(logging.ERROR, "reload_refused", problem=str(error))
+        return False
+    changed = _contents(settings) != known
+    logs.write(logging.INFO, "reloaded", changed="files" if changed else "nothing")
+    return changed
 
 
 def _greeting(settings: Settings) -> str:
