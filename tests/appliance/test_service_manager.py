@@ -151,7 +151,7 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
     steps: list[str] = []
 
     class Appliance:
-        def __init__(self, _: object) -> None:
+        def __init__(self, _: object, **_more: object) -> None:
             self.live = iter([True, False, True])
             self.is_live = False
 

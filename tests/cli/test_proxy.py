@@ -131,7 +131,7 @@ def test_a_signal_ends_it_with_exit_code_0(
         assert client.ask(READ) == FIVE
         code, log = running.end(number)
     events = [json.loads(line)["event"] for line in log.splitlines()]
-    assert (code, events) == (0, ["listening", "stopped"])
+    assert (code, events) == (0, ["started", "listening", "stopped"])
 
 
 def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
@@ -179,3 +179,19 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
 )  # fmt: skip
 def test_wrong_usage_is_explained(arguments: list[str], error: str) -> None:
     assert usage_error("proxy", *arguments).startswith(error)
+
+
+def test_sighup_reads_the_files_of_the_url_anew() -> None:
+    with Stream("tcp") as device:
+        command = ProxyCommand(device.url)
+        try:
+            address = command.wait_until_it_serves()
+            command.process.send_signal(signal.SIGHUP)
+            assert command.process.stderr is not None
+            log = iter(command.process.stderr)
+            assert next(line for line in log if " reload" in line).split()[2] == "reloaded"
+            with wire.Connection(address) as client:
+                assert client.ask(bytes.fromhex("0300000001"))[0] == 3
+        finally:
+            command.process.kill()
+            command.process.communicate()

@@ -1,43 +1,33 @@
-"""`holdfast gateway`: serves Modbus devices over HTTP, with a web console, until a signal."""
+"""`holdfast gateway`: serves Modbus devices over HTTP, with a web console, without a file."""
 
 from __future__ import annotations
 
 import shlex
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast import logs
+from holdfast.appliance import assembly
+from holdfast.cli.log_options import log_config, log_options
 from holdfast.cli.parsing import by
-from holdfast.cli.run import JOIN_TIMEOUT
-from holdfast.cli.signals import Signals
-from holdfast.cli.tls_options import DEVICES, https_of, https_options, tls_of, tls_options
+from holdfast.cli.run import serve
+from holdfast.cli.tls_options import DEVICES, https_config, https_options, tls_of, tls_options
 from holdfast.client.endpoint import check_files
+from holdfast.config import Config
 from holdfast.config.egress import parse_allowed
 from holdfast.config.ip_addresses import parse_bind, parse_source
-from holdfast.gateway import Gateway, GatewayLimits, Settings, tokens
+from holdfast.gateway import tokens
 from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
-from holdfast.net.tls import NO_FILES
 from holdfast.protocol import PORT
-from holdfast.stop import Stop
-from holdfast.web.port import explained, listen
 
 if TYPE_CHECKING:
-    import socket
-    from concurrent.futures import Future
-
+    from holdfast.appliance import Appliance
     from holdfast.config.ip_addresses import Bind
+    from holdfast.gateway import Settings
+    from holdfast.logs import Format
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork
-    from holdfast.net.tls import Tls
-    from holdfast.web.https import Https
-
-FAILED = 1
 
 
 @click.command(epilog="Example: holdfast gateway --allow 10.0.0.0/8 --allow 10.0.0.5:5020")
@@ -84,7 +74,7 @@ FAILED = 1
     metavar="N",
     help="Requests in flight to one device.",
 )
-@click.option("--json-log", is_flag=True, help="Log one JSON object per line.")
+@log_options
 def gateway(
     bind: Bind,
     allow: tuple[AllowedNetwork, ...],
@@ -99,6 +89,7 @@ def gateway(
     https_passphrase_file: Path | None,
     https_client_ca: Path | None,
     in_flight: int,
+    log_format: Format,
     json_log: bool,
 ) -> None:
     """Serve Modbus devices over HTTP, with a web console.
@@ -114,44 +105,35 @@ def gateway(
 
     With --https-cert and --https-key, clients of the gateway use HTTPS.
 
+    On SIGHUP, the token file and the TLS files are read anew. This is `holdfast run` with a gateway
+    alone; a configuration file allows more services.
+
     Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage.
     """
-    settings = Settings(
-        allow=allow,
-        writes=writes,
-        tokens=() if token_file is None else _tokens(token_file),
-        sources=sources,
-        limits=replace(GatewayLimits(), in_flight=in_flight),
-        tls=_tls(tls_ca, tls_cert, tls_key),
-    )
-    if not settings.tokens and any(not each.is_loopback for each in sources):
-        raise click.UsageError("--sources beyond this machine require --token-file.")
-    https = https_of(https_cert, https_key, https_passphrase_file, https_client_ca)
-    logs.configure("info", "json" if json_log else "text")
-    signals = Signals()
-    try:
-        listener = listen(bind.host, bind.port)
-    except OSError as error:
-        click.echo(f"holdfast: can't listen on {bind}: {explained(error)}", err=True)
-        sys.exit(FAILED)
-    with listener:
-        _serve(settings, listener, signals, https)
+    https = https_config(https_cert, https_key, https_passphrase_file, https_client_ca)
+    device_tls = _device_tls(tls_ca, tls_cert, tls_key)
+    log = log_config(log_format, json_log)
 
+    def load() -> Config:
+        """Reads the files of the options."""
+        found = [] if token_file is None else _tokens(token_file)
+        if not found and any(not each.is_loopback for each in sources):
+            raise click.UsageError("--sources beyond this machine require --token-file.")
+        settings: dict[str, Any] = {
+            "bind": bind,
+            "sources": list(sources),
+            "allow": list(allow),
+            "access": "read-write" if writes else "read-only",
+            "tokens": [{"name": name, "sha256": digest.hex()} for name, digest in found] or "none",
+            "in_flight": in_flight,
+        }
+        if https is not None:
+            settings["tls"] = https
+        if device_tls is not None:
+            settings["device_tls"] = device_tls
+        return _checked(Config.model_validate({"gateway": settings, "log": log}))
 
-def _serve(
-    settings: Settings, listener: socket.socket, signals: Signals, https: Https | None
-) -> None:
-    """Serves in a thread until a signal arrives."""
-    served = Gateway(settings, listener, https=https)
-    stop = Stop()
-    with ThreadPoolExecutor(1, "gateway") as threads:
-        running: Future[None] = threads.submit(served.run, stop)
-        click.echo(_greeting(served.url, settings))
-        while not signals.received and not running.done():
-            wait_for([running], JOIN_TIMEOUT)
-            logs.tell_held_back()
-        stop.set()
-        running.result()
+    serve(load(), _greeting, named="gateway", load=load, retries_ports=False)
 
 
 def _tokens(file: Path) -> tuple[tokens.Token, ...]:
@@ -165,18 +147,40 @@ def _tokens(file: Path) -> tuple[tokens.Token, ...]:
         raise click.BadParameter(f"{error}.", param_hint="'--token-file'") from error
 
 
-def _tls(ca: str | None, cert: str | None, key: str | None) -> Tls:
-    """The TLS files, checked."""
-    tls = tls_of("tls", ca, cert, key)
-    if tls != NO_FILES:
-        try:
-            check_files(tls)
-        except (OSError, ValueError) as error:
-            raise click.UsageError(f"TLS for devices: {error}.") from error
-    return tls
+def _device_tls(ca: str | None, cert: str | None, key: str | None) -> dict[str, Path] | None:
+    """The TLS files for devices, as in a configuration."""
+    files = tls_of("tls", ca, cert, key)
+    named = {"ca_file": files.ca, "cert_file": files.cert, "key_file": files.key}
+    return {key: Path(file) for key, file in named.items() if file is not None} or None
 
 
-def _greeting(served: str, settings: Settings) -> str:
+def _checked(config: Config) -> Config:
+    """Raises `click.UsageError` for TLS files that can't be used."""
+    gateway = config.gateway
+    assert gateway is not None
+    try:
+        if gateway.device_tls is not None:
+            check_files(assembly.gateway_tls(gateway))
+    except (OSError, ValueError) as error:
+        raise click.UsageError(f"TLS for devices: {error}.") from error
+    try:
+        if gateway.tls is not None:
+            assembly.https(gateway.tls)
+    except ValueError as error:
+        raise click.UsageError(f"HTTPS: {error}.") from error
+    return config
+
+
+def _greeting(appliance: Appliance) -> str:
+    [listening] = appliance.endpoints()
+    settings = appliance.config.gateway
+    assert settings is not None
+    assert listening.port is not None
+    served = f"{listening.type}://{joined(listening.host, listening.port)}"
+    return _told(served, assembly.gateway(settings))
+
+
+def _told(served: str, settings: Settings) -> str:
     scheme, _, address = served.partition("://")
     at, _, port = address.rpartition(":")
     url = f"{scheme}://{joined(reachable(unbracketed(at)), int(port))}"

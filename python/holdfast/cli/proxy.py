@@ -157,8 +157,8 @@ def proxy(
     Unit ids pass through: 0 to 255 to a network address, 1 to 247 to a serial line, where requests
     to 0 are broadcast and have no reply. With --unit, all unit ids lead to one device.
 
-    This is `holdfast run` with one listener and one link. A configuration file allows more
-    listeners, rules and devices.
+    On SIGHUP, the TLS files in DEVICE-URL are read anew. This is `holdfast run` with one listener
+    and one link. A configuration file allows more listeners, rules and devices.
 
     Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage.
     """
@@ -183,7 +183,12 @@ def proxy(
             "log": log_config(log_format, json_log),
         }
     )
-    serve(config, lambda appliance: _greeting(appliance, config, target, unit), named="proxy")
+    serve(
+        config,
+        lambda appliance: _greeting(appliance, config, target, unit),
+        named="proxy",
+        load=lambda: config,  # The files in the URL are read anew.
+    )
 
 
 def _check(

@@ -19,7 +19,7 @@ from holdfast.appliance import Appliance, assembly
 from holdfast.appliance.control import Control
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.supervision import give_way
-from holdfast.cli.configuration import WRONG, load_or_exit
+from holdfast.cli.configuration import WRONG, load_or_exit, load_whole
 from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
 from holdfast.cli.reloading import Reloading
@@ -85,17 +85,21 @@ def serve(
     *,
     named: str,
     file: Path | None = None,
+    load: Callable[[], Config] | None = None,
+    retries_ports: bool = True,
 ) -> None:
     """Runs an appliance until a signal. Exits with 1 or 2 if it can't start.
 
-    With `file`, it is reread at SIGHUP, at a request of `holdfast reload`, or when it changes.
+    With `file`, it is reread at SIGHUP, at a request of `holdfast reload`, or when it changes. With
+    `load`, what it returns is taken over at SIGHUP. Without `retries_ports`, a port of HTTP that is
+    in use is an error.
     """
     logs.configure(config.log.level, config.log.format)
     give_way()
     allow_open_files(_connections(config))
-    signals = Signals(reloads=file is not None)
+    signals = Signals(reload="always" if file else "with a terminal" if load else "never")
     manager = ServiceManager()
-    appliance = Appliance(config)
+    appliance = Appliance(config, retries_ports=retries_ports)
     try:
         appliance.start()
     except OSError as error:
@@ -110,8 +114,10 @@ def serve(
         parts.callback(manager.stopping)
         reloading = None
         if file is not None:
-            reloading = Reloading(appliance, file, manager)
+            reloading = Reloading(appliance, manager, lambda: load_whole(file), file)
             parts.callback(_control(appliance, reloading, file))
+        elif load is not None:
+            reloading = Reloading(appliance, manager, load)
         click.echo(greeting(appliance))
         manager.ready()
         while not signals.received:

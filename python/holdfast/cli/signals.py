@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,16 +43,18 @@ def ending_signals() -> Iterator[signal.Signals]:
 class Signals:
     """Records the signals that end a service. The second signal ends the process at once.
 
-    With `reloads`, SIGHUP requests a reload instead, also that of a terminal that is closed.
+    SIGHUP can request a reload instead: `always`, also that of a terminal that is closed, or only
+    `with a terminal` that is still there, or without any.
     """
 
-    def __init__(self, *, reloads: bool = False) -> None:
+    def __init__(self, *, reload: Literal["always", "with a terminal", "never"] = "never") -> None:
         self.received = False
         self._reload = False
+        self._needs_terminal = reload == "with a terminal" and _has_terminal()
         for number in ending_signals():
             signal.signal(number, self._note)
         hangup = getattr(signal, "SIGHUP", None)
-        if reloads and hangup is not None:
+        if reload != "never" and hangup is not None:
             signal.signal(hangup, self._request_reload)
 
     def take_reload(self) -> bool:
@@ -59,9 +62,20 @@ class Signals:
         requested, self._reload = self._reload, False
         return requested
 
-    def _request_reload(self, _number: int, _frame: FrameType | None) -> None:
-        self._reload = True
+    def _request_reload(self, number: int, frame: FrameType | None) -> None:
+        if self._needs_terminal and not _has_terminal():
+            self._note(number, frame)
+        else:
+            self._reload = True
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self.received = True
         signal.signal(number, signal.SIG_DFL)
+
+
+def _has_terminal() -> bool:
+    """Whether standard input is a terminal that was not closed."""
+    try:
+        return os.isatty(0)
+    except OSError:
+        return False

@@ -12,8 +12,6 @@ from holdfast.net.tls import Tls, alone
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from holdfast.web.https import Https
-
 Command = TypeVar("Command", bound="Callable[..., Any]")
 
 DEVICES = (
@@ -60,10 +58,13 @@ def https_options(command: Command) -> Command:
     return command
 
 
-def https_of(
+def https_config(
     cert: Path | None, key: Path | None, passphrase_file: Path | None, client_ca: Path | None
-) -> Https | None:
-    """The TLS settings of the options; `None` for HTTP. Raises `click.UsageError`."""
+) -> dict[str, Path] | None:
+    """The files of the options, as in a configuration; `None` for HTTP.
+
+    Raises `click.UsageError`.
+    """
     lonely = alone(cert=cert is not None, key=key is not None)
     if lonely is not None:
         given, missing = lonely
@@ -74,9 +75,10 @@ def https_of(
                 "--https-passphrase-file and --https-client-ca require --https-cert."
             )
         return None
-    from holdfast.web.https import Https, HttpsFiles
-
-    try:
-        return Https(HttpsFiles(cert, key, passphrase_file, client_ca))
-    except ValueError as error:
-        raise click.UsageError(f"HTTPS: {error}.") from error
+    named = {
+        "cert_file": cert,
+        "key_file": key,
+        "key_passphrase_file": passphrase_file,
+        "client_ca_file": client_ca,
+    }
+    return {key: file for key, file in named.items() if file is not None}
