@@ -50,7 +50,7 @@ LISTENER: dict[str, Any] = {
     "frames": {"foreign": 6, "broken": 0},
 }
 RAW: dict[str, Any] = {
-    "packets": {"accepted": 9, "refused": {"crc": 1, "range": 2}},
+    "packets": {"accepted": 9, "held_bytes": 70, "refused": {"crc": 1, "range": 2}},
     "fresh": 8,
     "name": "not a number",
 }
@@ -206,6 +206,7 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_listener_total", "frames_broken", "scada"), 0),
         (("holdfast_listener_total", "fresh", "replication"), 8),
         (("holdfast_listener_total", "packets_accepted", "replication"), 9),
+        (("holdfast_packets_held_bytes", "replication"), 70),
         (("holdfast_packets_refused_total", "replication", "crc"), 1),
         (("holdfast_packets_refused_total", "replication", "range"), 2),
         (("holdfast_device_health", "meter", "error"), 1),

@@ -250,6 +250,7 @@ def test_accepted_vectors_reach_memory(plant: Plant, kind: str) -> None:
         "accepted": 2 * len(ACCEPTED),
         "values": 2 * values,
         "dropped_bytes": 0,
+        "held_bytes": 0,
         "refused": {},
     }
 
@@ -453,7 +454,13 @@ def test_a_peer_that_sends_nothing_gets_nothing(start: Start, kind: str) -> None
     plant.connect().close()
     plant.connect().reset()
     wire.until(lambda: plant.counted("connections")["open"] == 0, "all connections have ended")
-    assert plant.counted() == {"accepted": 0, "values": 0, "dropped_bytes": 0, "refused": {}}
+    assert plant.counted() == {
+        "accepted": 0,
+        "values": 0,
+        "dropped_bytes": 0,
+        "held_bytes": 0,
+        "refused": {},
+    }
 
 
 def test_stopping_ends_what_has_begun(start: Start) -> None:
@@ -516,7 +523,13 @@ def test_a_source_that_no_rule_names_gets_no_byte(start: Start) -> None:
             client.send(good("v1", "coils", 0, [0]))
         assert client.rest() == b""
     assert plant.content() == before
-    assert plant.counted() == {"accepted": 0, "values": 0, "dropped_bytes": 0, "refused": {}}
+    assert plant.counted() == {
+        "accepted": 0,
+        "values": 0,
+        "dropped_bytes": 0,
+        "held_bytes": 0,
+        "refused": {},
+    }
     assert plant.counted("connections")["refused_source"] == 1
 
 
@@ -704,6 +717,7 @@ def test_a_packet_over_a_whole_area_is_never_seen_in_part(
         "accepted": packets_sent,
         "values": packets_sent * 65535,
         "dropped_bytes": 0,
+        "held_bytes": 0,
         "refused": {},
     }
 
@@ -723,7 +737,13 @@ def test_200_connections_at_once_all_get_their_byte(start: Start, workers: int) 
             packet = good("v1", "holding_registers", number % 128, [number])
             client.send(packet[number % len(packet) :])
         assert [client.rest() for client in clients] == [DONE] * 200
-    assert plant.counted() == {"accepted": 200, "values": 200, "dropped_bytes": 0, "refused": {}}
+    assert plant.counted() == {
+        "accepted": 200,
+        "values": 200,
+        "dropped_bytes": 0,
+        "held_bytes": 0,
+        "refused": {},
+    }
     wire.until(lambda: plant.counted("connections")["open"] == 0, "all connections have ended")
     assert plant.counted("connections")["accepted"] == 200
 

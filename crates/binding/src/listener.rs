@@ -99,18 +99,19 @@ pub struct RawRule {
 #[pymethods]
 impl RawRule {
     #[new]
-    #[pyo3(signature = (targets, *, sources, areas))]
+    #[pyo3(signature = (targets, *, sources, areas, roles=None))]
     fn new(
         targets: &Bound<'_, PyMapping>,
         sources: Vec<String>,
         areas: Vec<String>,
+        roles: Option<Vec<String>>,
     ) -> PyResult<RawRule> {
         let targets = self::targets(targets)?.into_iter().map(|(target, memory)| {
             Ok((within("unit or memory id", target, 0..=65_535)? as u16, memory))
         });
         let targets = targets.collect::<PyResult<_>>()?;
         let areas = areas.iter().map(|area| named(area)).collect::<PyResult<_>>()?;
-        Ok(RawRule { core: CoreRawRule { sources: networks(&sources)?, targets, areas } })
+        Ok(RawRule { core: CoreRawRule { sources: networks(&sources)?, roles, targets, areas } })
     }
 }
 
@@ -173,7 +174,9 @@ impl Listener {
     ) -> PyResult<Listener> {
         let raw_ingest = match raw_ingest.map(|listener| listener.core.kind.clone()) {
             None => None,
-            Some(ListenerKind::RawIngest(settings)) if framing == "mbap" && tls.is_none() => {
+            Some(ListenerKind::RawIngest(settings))
+                if framing == "mbap" && tls.is_none() && settings.tls.is_none() =>
+            {
                 Some(settings)
             }
             Some(_) => {
@@ -183,7 +186,6 @@ impl Listener {
             }
         };
         let idle_timeout = seconds("idle_timeout", idle_timeout)?;
-        let max_handshakes = within("max_handshakes", max_handshakes, 1..=65_535)?;
         let limits = limits(max_connections, max_connections_per_source, when_full)?;
         let framings = [
             ("mbap", StreamFraming::Mbap),
@@ -194,10 +196,7 @@ impl Listener {
             bind: address(bind)?,
             framing: word("framing", framing, &framings)?,
             rules: cores(&rules),
-            limits: ConnectionLimits {
-                max_handshakes: tls.is_some().then_some(max_handshakes),
-                ..limits
-            },
+            limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             frame_timeout: frame_timeout
@@ -249,7 +248,7 @@ impl Listener {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0, after_refusal="close"))]
+    #[pyo3(signature = (name, bind, rules, *, format="v1", crc="required", flags="strict", max_connections=256, max_connections_per_source=None, when_full="refuse", request_timeout=10.0, packets="one", idle_timeout=300.0, after_refusal="close", tls=None, max_handshakes=256))]
     fn raw_ingest(
         name: String,
         bind: &str,
@@ -264,6 +263,8 @@ impl Listener {
         packets: &str,
         idle_timeout: f64,
         after_refusal: &str,
+        tls: Option<PyRef<'_, ServerTls>>,
+        max_handshakes: i128,
     ) -> PyResult<Listener> {
         let idle = time_to_wait("idle_timeout", idle_timeout)?;
         let refusals = [("close", AfterRefusal::Close), ("continue", AfterRefusal::Continue)];
@@ -278,15 +279,17 @@ impl Listener {
             return Err(PyValueError::new_err("crc if-present: allowed only with packets one"));
         }
         let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
+        let limits = limits(max_connections, max_connections_per_source, when_full)?;
         let kind = ListenerKind::RawIngest(RawSettings {
             bind: address(bind)?,
             format: word("format", format, &formats)?,
             crc_if_present,
             flags: word("flags", flags, &[("strict", Flags::Strict), ("ignore", Flags::Ignore)])?,
             rules: rules.iter().map(|rule| rule.core.clone()).collect(),
-            limits: limits(max_connections, max_connections_per_source, when_full)?,
+            limits: secure_limits(limits, tls.is_some(), max_handshakes)?,
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             packets,
+            tls: tls.map(|tls| Arc::clone(&tls.core)),
         });
         Ok(Listener { core: ListenerSettings { name, kind } })
     }
@@ -345,6 +348,16 @@ fn limits(
         when_full: word("when_full", when_full, &allowed)?,
         max_handshakes: None,
     })
+}
+
+/// The limits of a listener that may have TLS.
+fn secure_limits(
+    limits: ConnectionLimits,
+    has_tls: bool,
+    max_handshakes: i128,
+) -> PyResult<ConnectionLimits> {
+    let most = within("max_handshakes", max_handshakes, 1..=65_535)?;
+    Ok(ConnectionLimits { max_handshakes: has_tls.then_some(most), ..limits })
 }
 
 fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {

@@ -246,6 +246,9 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
     packets = _counter(
         "packets_refused", "Raw Ingest packets refused, by reason.", "listener", "reason"
     )
+    held = _gauge(
+        "packets_held_bytes", "Memory of Raw Ingest packets that are not complete.", "listener"
+    )
     refused = _counter("requests_refused", "Requests refused, by reason.", "listener", "reason")
     for name, counters in listeners.items():
         for key, counted in counters.items():
@@ -261,11 +264,13 @@ def _of_listeners(listeners: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
                 _add(connections.tls_failed, name, counted)
             elif key == "packets":
                 _add(packets, name, counted["refused"])
-                rest = {key: value for key, value in counted.items() if key != "refused"}
+                held.add_metric([name], counted["held_bytes"])
+                apart = ("refused", "held_bytes")
+                rest = {key: value for key, value in counted.items() if key not in apart}
                 _add(more, name, dict(_flat(key, rest)))
             else:
                 _add(more, name, dict(_flat(key, counted)))
-    yield from (requests, exceptions, refused, packets, *connections.families(), more)
+    yield from (requests, exceptions, refused, packets, held, *connections.families(), more)
 
 
 def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
@@ -318,8 +323,8 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             if told.get(key) is not None:
                 gauge.add_metric([name], told[key])
         for number, packets in enumerate(told.get("forward", ())):
-            for outcome, count in packets.items():
-                forward.add_metric([name, str(number), outcome], count)
+            for outcome in ("sent", "refused", "failed", "replaced"):
+                forward.add_metric([name, str(number), outcome], packets[outcome])
     yield from (health, requests, *counters.values(), *gauges.values(), forward)
 
 

@@ -13,7 +13,7 @@ from holdfast.config import (
     ModbusTcpListener,
     RawIngestListener,
 )
-from holdfast.config.listeners import DATAGRAM_TYPES, RawIngestConfig
+from holdfast.config.listeners import DATAGRAM_TYPES, RawIngestConfig, tls_of
 from holdfast.config.rights import matching, together
 
 if TYPE_CHECKING:
@@ -78,13 +78,21 @@ def _packet_rule(listener: Listener, peer: Peer) -> RawRuleConfig | None:
     taker = listener.raw_ingest if isinstance(listener, ModbusTcpListener) else listener
     if not isinstance(taker, RawIngestListener | RawIngestConfig):
         return None
-    return next(iter(matching(taker.rules, peer.address)), None)
+    role = None if tls_of(listener) is None else peer.role
+    return next(iter(matching(taker.rules, peer.address, role)), None)
+
+
+def _without_packets(listener: RawIngestListener, peer: Peer) -> str:
+    """What a Raw Ingest listener does with a sender without a rule."""
+    return "no_packets" if matching(listener.rules, peer.address) else "disconnected"
 
 
 def _told(listener: Listener, peer: Peer) -> list[str]:
     packets = _packet_rule(listener, peer)
     if isinstance(listener, RawIngestListener):
-        return [_outcomes(peer)["disconnected"]] if packets is None else _raw_told(packets)
+        if packets is None:
+            return [_outcomes(peer)[_without_packets(listener, peer)]]
+        return _raw_told(packets)
     outcome, rights = _rights(listener, peer)
     told = [_outcomes(peer)[outcome]] if outcome != "served" else []
     told += table(HEAD, [_row(units, each) for units, each in _joined(rights)]) if rights else []
@@ -99,6 +107,7 @@ def _outcomes(peer: Peer) -> dict[str, str]:
         "unanswered": f"no rule names {peer.address}: it gets no reply",
         "only_packets": f"no rule names {peer.address}: every request gets exception 01",
         "no_rights": f"no rule names {peer.address} with {role}: every request gets exception 01",
+        "no_packets": f"no rule names {peer.address} with {role}: every packet is refused",
     }
 
 
@@ -144,7 +153,7 @@ def _data(listener: Listener, peer: Peer) -> dict[str, Any]:
     rule = _packet_rule(listener, peer)
     packets = [] if rule is None else _packets_data(rule)
     if isinstance(listener, RawIngestListener):
-        outcome = "disconnected" if rule is None else "served"
+        outcome = _without_packets(listener, peer) if rule is None else "served"
         return {**where, "outcome": outcome, "units": packets}
     outcome, rights = _rights(listener, peer)
     units = [_unit_data(unit, each) for unit, each in sorted(rights.items())]

@@ -146,7 +146,7 @@ def _connections(config: Config) -> int:
     """The maximum number of open connections of a configuration."""
     served = [*config.listeners.values(), config.rest]
     limits = ("max_connections", "max_handshakes")
-    most = sum(getattr(each, limit, 0) for each in served for limit in limits)
+    most = sum(getattr(each, limit, 0) or 0 for each in served for limit in limits)
     most += sum(1 + len(device.forward) for device in config.devices.values())
     most += len(config.links)
     if config.nats is not None:

@@ -35,11 +35,13 @@ from holdfast.config.listeners import (
     RouteConfig,
     RtuSerialConfig,
     RuleConfig,
+    SecureRawRuleConfig,
     SerialConfig,
     SerialRuleConfig,
     ServerTlsConfig,
     TlsRuleConfig,
     UnitMemoryConfig,
+    tls_of,
 )
 from holdfast.config.load import load
 from holdfast.config.memories import MemoryConfig, Seal, Span
@@ -114,6 +116,7 @@ __all__ = [
     "RtuSerialConfig",
     "RuleConfig",
     "Seal",
+    "SecureRawRuleConfig",
     "SerialConfig",
     "SerialRuleConfig",
     "ServerTlsConfig",
@@ -126,4 +129,5 @@ __all__ = [
     "UnitMemoryConfig",
     "json_schema",
     "load",
+    "tls_of",
 ]

@@ -13,6 +13,7 @@ from holdfast.config.words import guess, listing, show
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from holdfast.config.listeners import RawRuleConfig
     from holdfast.config.memories import Seal
     from holdfast.config.model import Config
     from holdfast.config.report import Report
@@ -63,7 +64,9 @@ def grants(config: Config) -> Iterator[WriterGrant]:
     """All grants except those of Modbus clients."""
     for name, listener in config.listeners.items():
         path: KeyPath = ("listeners", name, "rules")
-        rules = listener.rules if listener.type == "raw-ingest" else ()
+        rules: Sequence[RawRuleConfig] = ()
+        if listener.type == "raw-ingest":
+            rules = listener.rules
         if listener.type == "modbus-tcp" and listener.raw_ingest is not None:
             path, rules = ("listeners", name, "raw_ingest", "rules"), listener.raw_ingest.rules
         for index, rule in enumerate(rules):

@@ -51,9 +51,10 @@ class ListenerChecks:
             self._limits(path, listener)
             if kind == "raw-ingest":
                 self._raw(path, listener)
+                self._secure_raw(path, listener)
             if kind == "modbus-tcp" and isinstance(listener.get("raw_ingest"), dict):
                 self._shared_port((*path, "raw_ingest"), listener["raw_ingest"])
-            if kind == "modbus-tls":
+            if kind == "modbus-tls" or (kind == "raw-ingest" and "tls" in listener):
                 tls = mapping(listener.get("tls"))
                 check_server_tls((*path, "tls"), tls, self.folder, self.report)
             for rule_path, rule in self._rules(path, listener):
@@ -112,6 +113,17 @@ class ListenerChecks:
         if listener.get("after_refusal") == "continue" and listener.get("packets", "one") == "one":
             message = "found continue with packets: one, allowed: close, or packets: many"
             self.report.add((*path, "after_refusal"), message)
+
+    def _secure_raw(self, path: KeyPath, listener: dict[Any, Any]) -> None:
+        """Checks keys of a raw ingest listener that belong to TLS."""
+        places = [(path, listener, "max_handshakes")]
+        places += [(where, rule, "roles") for where, rule in self._rules(path, listener)]
+        for where, of, key in places:
+            if key in of and "tls" not in listener:
+                message = "found without tls, allowed: only with it"
+                self.report.add((*where, key), message, of_key=True)
+        for where, rule in self._rules(path, listener):
+            refuse_repeats((*where, "roles"), entries(rule.get("roles")), self.report)
 
     def _raw_rule(self, path: KeyPath, rule: dict[Any, Any], form: object) -> None:
         for unit, target in mapping(rule.get("units")).items():

@@ -149,6 +149,16 @@ class RawRuleConfig(Model):
     """The areas that may be written."""
 
 
+class SecureRawRuleConfig(RawRuleConfig):
+    """What the senders of these sources may write; with tls, those with one of these roles."""
+
+    roles: Annotated[
+        Annotated[tuple[Role, ...], Strict(False), Field(min_length=1)] | None, NotNull()
+    ] = None
+    """With tls: roles of certificates of senders; "" is a certificate without a role. Default: any
+    role."""
+
+
 FEW = 16
 """So many connections from one address are not limited by default."""
 
@@ -197,6 +207,10 @@ def _flags(data: dict[str, Any]) -> Literal["strict"] | None:
 def _handshakes(data: dict[str, Any]) -> int:
     most: int = data["max_connections"]
     return max(256, most)
+
+
+def _secure_handshakes(data: dict[str, Any]) -> int | None:
+    return None if data.get("tls") is None else _handshakes(data)
 
 
 class RawIngestConfig(Model):
@@ -396,6 +410,8 @@ class RawIngestListener(Model):
     strict."""
     bind: BindAddress
     """Where to listen: an IP address and a port."""
+    tls: Annotated[ServerTlsConfig | None, NotNull()] = None
+    """TLS: the server's certificate, and the senders it trusts. Default: plain TCP."""
     max_connections: Connections = 256
     """Maximum number of open connections."""
     max_connections_per_source: Connections | None = Field(default_factory=_per_source)
@@ -403,8 +419,15 @@ class RawIngestListener(Model):
     max_connections, but at least 16."""
     when_full: Literal["refuse", "evict"] = "refuse"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
+    max_handshakes: Annotated[Connections | None, NotNull()] = Field(
+        default_factory=_secure_handshakes
+    )
+    """With tls: maximum number of open connections that are not authenticated yet, beside
+    max_connections; at the limit, the oldest is closed. Default: as many as max_connections, at
+    least 256."""
     request_timeout: Duration = 10.0
-    """Seconds from the start of a connection to the last byte of its packet."""
+    """Seconds from the start of a connection to the last byte of its packet; with tls, also for the
+    handshake, before that."""
     packets: Literal["one", "many"] = "one"
     """Packets that a connection carries; many: until the sender closes, or one is refused."""
     after_refusal: Literal["close", "continue"] = "close"
@@ -413,8 +436,8 @@ class RawIngestListener(Model):
     idle_timeout: DurationOrZero = 300.0
     """With packets: many, seconds without a packet after which a connection is closed; 0:
     unlimited."""
-    rules: Annotated[tuple[RawRuleConfig, ...], Strict(False), Field(min_length=1)]
-    """The first rule whose sources contain the sender applies."""
+    rules: Annotated[tuple[SecureRawRuleConfig, ...], Strict(False), Field(min_length=1)]
+    """The first rule that matches the sender applies: its sources and, with tls, its roles."""
 
 
 Listener: TypeAlias = (
@@ -428,6 +451,12 @@ Listener: TypeAlias = (
     | ModbusAsciiListener
     | RawIngestListener
 )
+
+
+def tls_of(listener: Listener) -> ServerTlsConfig | None:
+    """The certificates of a listener; `None` without TLS."""
+    return listener.tls if isinstance(listener, ModbusTlsListener | RawIngestListener) else None
+
 
 CONNECTION_TYPES = (
     "modbus-tcp",

@@ -116,7 +116,7 @@ def _deciding(rule: _Holder, unit: int, earlier: list[_Holder]) -> list[_Holder]
 
 def _covered(rule: _Holder, kind: object) -> str:
     if kind == "raw-ingest":
-        return "all its sources"
+        return "all its sources" if rule.roles is None else "its sources and roles"
     if kind in SERIAL_TYPES:
         return "all its units"
     return "all its sources and units" if rule.roles is None else "its sources, roles and units"

@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 use holdfast_protocol::pdu::ExceptionCode;
 use holdfast_protocol::raw_ingest::Refusal;
 
-use crate::counter::{Counter, ReasonCounters};
+use crate::counter::{Counter, Gauge, ReasonCounters};
 
 /// The counters of one listener since its start.
 #[derive(Debug)]
@@ -42,6 +42,8 @@ pub struct PacketCounters {
     pub values: Counter,
     /// Bytes behind accepted packets that were dropped.
     pub dropped_bytes: Counter,
+    /// Memory of packets that are not complete, in bytes.
+    pub held_bytes: Gauge,
     refused: [Counter; 14],
 }
 

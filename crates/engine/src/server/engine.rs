@@ -295,9 +295,10 @@ impl Engine {
     /// Judges all open connections again: a certificate may have expired.
     pub fn review(&self) {
         for listener in self.listeners().iter() {
-            if let Served::Stream(live, _) = &listener.served {
-                let service = live.get();
-                listener.context.review(&*service, &*service);
+            match &listener.served {
+                Served::Stream(live, _) => listener.review(live),
+                Served::Packets(live) => listener.review(live),
+                Served::Datagrams(..) | Served::Serial(..) => {}
             }
         }
     }
@@ -481,6 +482,11 @@ impl Listener {
         let service = Arc::new(service);
         let before = live.replace(Arc::clone(&service));
         self.context.review(&*before, &*service);
+    }
+
+    fn review<S: Service>(&self, live: &Live<S>) {
+        let service = live.get();
+        self.context.review(&*service, &*service);
     }
 
     /// Stops listening and closes all connections.

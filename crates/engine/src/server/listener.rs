@@ -24,6 +24,10 @@ use super::refused_request::RefusedRequest;
 /// The most connections that wait in the system to be accepted.
 const BACKLOG: i32 = 1024;
 
+/// The most bytes that the system keeps of a connection and that nobody has read, in each direction.
+/// Linux doubles it for its own bookkeeping. Without it, systems allow several megabytes.
+const SYSTEM_BUFFER: usize = 256 * 1024;
+
 /// TCP keepalive: the idle time before the first probe, the number of probes, the interval between
 /// them.
 const KEEPALIVE: (Duration, u32, Duration) = (Duration::from_secs(60), 4, Duration::from_secs(15));
@@ -280,6 +284,9 @@ pub(crate) fn bind_tcp(address: SocketAddr) -> io::Result<std::net::TcpListener>
     // On other systems, the option lets two programs bind the same port.
     #[cfg(unix)]
     socket.set_reuse_address(true)?;
+    // Connections inherit both. The system may have lower limits.
+    let _ = socket.set_recv_buffer_size(SYSTEM_BUFFER);
+    let _ = socket.set_send_buffer_size(SYSTEM_BUFFER);
     bind(&socket, address)?;
     socket.listen(BACKLOG)?;
     Ok(socket.into())
@@ -326,14 +333,14 @@ pub(crate) async fn drain(
         return drained;
     }
     let deadline = Instant::now() + DRAIN;
-    let mut chunk = vec![0; DRAIN_CHUNK];
     while drained < most && Instant::now() < deadline {
         let readable = tokio::select! {
             readable = timeout_at(deadline, stream.readable()) => readable,
             _ = stop.wait_for(|stop| *stop) => break,
         };
         let Ok(Ok(())) = readable else { break };
-        match stream.try_read(&mut chunk) {
+        // On the stack, because many peers may be read at the same time.
+        match stream.try_read(&mut [0; DRAIN_CHUNK]) {
             Ok(0) => break,
             Ok(len) => {
                 drained += len;

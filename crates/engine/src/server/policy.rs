@@ -45,23 +45,50 @@ pub enum Elsewhere {
     Mirror(Arc<Passage>),
 }
 
-/// Which peers have which rights: the first entry whose sources contain a peer applies.
+/// The rights of some peers.
+#[derive(Debug)]
+pub struct Grant<G> {
+    pub sources: Vec<IpNet>,
+    /// As in [`Rule`].
+    pub roles: Option<Vec<String>>,
+    pub rights: G,
+}
+
+/// Which peers have which rights: the first entry that matches a peer applies.
 #[derive(Debug)]
 pub struct Grants<G> {
-    entries: Vec<(Vec<IpNet>, Arc<G>)>,
+    entries: Vec<Grant<Arc<G>>>,
 }
 
 impl<G> Grants<G> {
-    pub fn new(entries: impl IntoIterator<Item = (Vec<IpNet>, G)>) -> Grants<G> {
-        let entries = entries.into_iter().map(|(sources, rights)| (sources, Arc::new(rights)));
-        Grants { entries: entries.collect() }
+    pub fn new(entries: impl IntoIterator<Item = Grant<G>>) -> Grants<G> {
+        let shared = |Grant { sources, roles, rights }| {
+            let rights = Arc::new(rights);
+            Grant { sources, roles, rights }
+        };
+        Grants { entries: entries.into_iter().map(shared).collect() }
     }
 
-    /// The rights of a peer; `None` when no entry matches.
+    /// The rights of a peer, whatever its role; `None` when no entry matches.
     pub fn rights(&self, peer: IpAddr) -> Option<Arc<G>> {
-        let mut entries = self.entries.iter();
-        entries.find(|(sources, _)| contain(sources, peer)).map(|(_, rights)| Arc::clone(rights))
+        self.find(peer, |_| true)
     }
+
+    /// The rights of a peer with that role; `None` when no entry matches.
+    pub fn rights_of_role(&self, peer: IpAddr, role: &str) -> Option<Arc<G>> {
+        self.find(peer, |roles| has(roles, role))
+    }
+
+    fn find(&self, peer: IpAddr, allows: impl Fn(&[String]) -> bool) -> Option<Arc<G>> {
+        let matches = |entry: &&Grant<Arc<G>>| {
+            contain(&entry.sources, peer) && entry.roles.as_deref().is_none_or(&allows)
+        };
+        self.entries.iter().find(matches).map(|entry| Arc::clone(&entry.rights))
+    }
+}
+
+fn has(roles: &[String], role: &str) -> bool {
+    roles.iter().any(|allowed| allowed == role)
 }
 
 /// Whether one of the networks has this address. An IPv4-mapped IPv6 address is treated as IPv4.
@@ -94,7 +121,7 @@ impl Policy {
 
     /// The rights of a peer with that role; `None` when no rule matches.
     pub fn rights_of_role(&self, peer: IpAddr, role: &str) -> Option<Arc<PeerRights>> {
-        self.find(peer, |roles| roles.iter().any(|allowed| allowed == role))
+        self.find(peer, |roles| has(roles, role))
     }
 
     fn find(&self, peer: IpAddr, allows: impl Fn(&[String]) -> bool) -> Option<Arc<PeerRights>> {

@@ -6,7 +6,8 @@
 //! resets the connection, and the reply could be lost.
 
 use std::collections::HashMap;
-use std::io::{ErrorKind, Read, Write as _};
+use std::future::poll_fn;
+use std::io::{Read, Write as _};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,11 +27,14 @@ use super::admission::{ConnectionLimits, Ticket};
 use super::audit::{Permit, Record, Written};
 use super::counters::PacketCounters;
 use super::event::Kind;
-use super::listener::{Admitted, ListenerContext, Service, drain};
+use super::incoming::Incoming;
+use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::live::Live;
 use super::peer::Peer;
-use super::policy::Grants;
-use super::stream::send_all;
+use super::policy::{Grant, Grants};
+use super::secure::secured;
+use super::stream::{self, End, Stream, send_all};
+use crate::tls::server::ServerTls;
 
 /// The most bytes that are needed to tell a packet from a Modbus frame.
 pub(crate) const DECISIVE: usize = 4;
@@ -58,6 +62,8 @@ const BEHIND: usize = 5;
 #[derive(Debug, Clone)]
 pub struct RawRule {
     pub sources: Vec<IpNet>,
+    /// The roles that a rule applies to, as in the rules of Modbus listeners.
+    pub roles: Option<Vec<String>>,
     /// The memory of each unit id (v1) or memory id (crc).
     pub targets: Vec<(u16, Arc<Memory>)>,
     pub areas: Vec<Area>,
@@ -75,9 +81,12 @@ pub struct RawSettings {
     pub crc_if_present: bool,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
-    /// The longest time from the start of a connection to the last byte of its packet.
+    /// The longest time from the start of a connection to the last byte of its packet. With TLS also
+    /// for the handshake, before that.
     pub request_timeout: Duration,
     pub packets: PacketsPerConnection,
+    /// `None` is plain TCP.
+    pub tls: Option<Arc<ServerTls>>,
 }
 
 /// What flags and the reserved byte of a packet of format crc may be.
@@ -127,6 +136,9 @@ pub(crate) struct RawGrant {
 pub(crate) struct RawIngest {
     pub(crate) packets: Arc<PacketCounters>,
     policy: Grants<RawGrant>,
+    /// The rights of a peer that no rule names, by its role.
+    nobody: Arc<RawGrant>,
+    tls: Option<Arc<ServerTls>>,
     format: Format,
     flags: Flags,
     crc_if_present: bool,
@@ -148,11 +160,45 @@ enum Packet<'p> {
     },
 }
 
-/// Why there is no packet to answer.
-enum Gone {
-    Closed,
-    Timeout,
-    Stopped,
+/// A connection of a sender.
+pub(crate) struct Sending<S> {
+    stream: S,
+    peer: Peer,
+    rights: Arc<RawGrant>,
+    /// Bytes that were received and not answered.
+    bytes: Incoming,
+    /// Bytes that the system has not accepted yet.
+    unsent: Vec<u8>,
+    ticket: Ticket,
+}
+
+impl<S: Stream> Sending<S> {
+    /// Reads once, at most about `most` bytes. Returns their number, which can be 0.
+    async fn read(&mut self, most: usize) -> Result<usize, End> {
+        let Sending { stream, bytes, unsent, .. } = self;
+        poll_fn(|context| bytes.poll_read(context, (stream, unsent), most)).await
+    }
+
+    /// Whether part of a packet has arrived.
+    fn is_amid_packet(&self) -> bool {
+        !self.bytes.is_empty() || self.stream.is_amid_record()
+    }
+
+    /// Appends bytes that have arrived behind a packet, without waiting. Returns whether there are any.
+    fn read_behind(&mut self) -> bool {
+        let mut behind = [0; BEHIND];
+        let len = self.stream.read_now(&mut behind, &mut self.unsent).unwrap_or(0);
+        self.bytes.extend(&behind[..len]);
+        len > 0
+    }
+
+    /// Announces the end, if nothing was cut off before.
+    fn end(&mut self) {
+        if self.unsent.is_empty() {
+            self.stream.end(&mut self.unsent);
+        }
+        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+    }
 }
 
 /// Looks up the rights of a connection again; `None` if it has none any more.
@@ -163,7 +209,8 @@ impl RawIngest {
         debug_assert!(!settings.crc_if_present || settings.packets == PacketsPerConnection::One);
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
-            (rule.sources.clone(), RawGrant { targets, areas: rule.areas.clone() })
+            let rights = RawGrant { targets, areas: rule.areas.clone() };
+            Grant { sources: rule.sources.clone(), roles: rule.roles.clone(), rights }
         });
         let (many, after_refusal) = match settings.packets {
             PacketsPerConnection::One => (None, AfterRefusal::Close),
@@ -172,6 +219,8 @@ impl RawIngest {
         RawIngest {
             packets,
             policy: Grants::new(rules),
+            nobody: Arc::new(RawGrant { targets: HashMap::new(), areas: Vec::new() }),
+            tls: settings.tls.clone(),
             format: settings.format,
             flags: settings.flags,
             crc_if_present: settings.crc_if_present,
@@ -211,10 +260,65 @@ impl RawIngest {
         packet: &[u8],
         stop: watch::Receiver<bool>,
     ) {
-        self.refuse(context, peer, packet, Refusal::NotGranted);
+        self.refuse(context, &peer.into(), packet, Refusal::NotGranted);
         let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
         drain(&stream, usize::MAX, stop).await;
         context.ended(Kind::Closed, peer);
+    }
+
+    /// The connection of a sender over plain TCP.
+    pub(crate) fn sending(&self, admitted: Admitted<RawGrant>) -> Sending<TcpStream> {
+        let Admitted { stream, peer, rights, received, ticket } = admitted;
+        self.begin((stream, peer.into()), rights, &received, ticket)
+    }
+
+    fn begin<S: Stream>(
+        &self,
+        (stream, peer): (S, Peer),
+        rights: Arc<RawGrant>,
+        received: &[u8],
+        ticket: Ticket,
+    ) -> Sending<S> {
+        let mut bytes = Incoming::new(Arc::clone(&self.packets));
+        bytes.extend(received);
+        Sending { stream, peer, rights, bytes, unsent: Vec::new(), ticket }
+    }
+
+    /// Performs the handshake, selects the rights by the role in the certificate, and serves the
+    /// connection.
+    async fn secure(
+        &self,
+        tls: &ServerTls,
+        live: Arc<Live<RawIngest>>,
+        context: Arc<ListenerContext>,
+        admitted: Admitted<RawGrant>,
+        stop: watch::Receiver<bool>,
+    ) {
+        let Admitted { stream, peer, ticket, .. } = admitted;
+        let (patience, stopping) = (self.request_timeout, stop.clone());
+        let secured = secured(tls, &context, (stream, peer), &ticket, patience, stopping).await;
+        let Some((stream, peer)) = secured else { return };
+        // A reload reviews connections by their roles. This one looks up its rights only now.
+        let rights = live.get().granted(&peer).unwrap_or_else(|| {
+            // Each packet is refused, which tells the sender more than the end of the connection.
+            context.refuse_role(peer.clone());
+            Arc::clone(&self.nobody)
+        });
+        let by_role = peer.clone();
+        let renewal = Box::new(move || {
+            let service = live.get();
+            Some(service.granted(&by_role).unwrap_or_else(|| Arc::clone(&service.nobody)))
+        });
+        let sending = self.begin((stream, peer), rights, &[], ticket);
+        self.serve_packets(context, sending, renewal, stop).await;
+    }
+
+    /// The rights of a peer: of any role, or of the role in its certificate.
+    fn granted(&self, peer: &Peer) -> Option<Arc<RawGrant>> {
+        match &peer.certificate {
+            None => self.policy.rights(peer.ip()),
+            Some(certificate) => self.policy.rights_of_role(peer.ip(), &certificate.role),
+        }
     }
 
     /// Checks the bytes received so far.
@@ -223,6 +327,9 @@ impl RawIngest {
             let missing = self.format.header_len().saturating_sub(bytes.len()).max(1);
             return Ok(Packet::Incomplete { missing });
         };
+        if rights.areas.is_empty() {
+            return Err(Refusal::NotGranted);
+        }
         let unmapped = match self.format {
             Format::V1 => Refusal::Unit,
             Format::Crc { .. } => Refusal::Memory,
@@ -256,7 +363,7 @@ impl RawIngest {
     fn write(
         &self,
         context: &ListenerContext,
-        peer: SocketAddr,
+        peer: &Peer,
         (header, memory, payload): (Header, &Memory, &[u8]),
     ) -> Result<(), Refusal> {
         let (address, count) = (header.address, header.count.get());
@@ -275,97 +382,93 @@ impl RawIngest {
     }
 
     /// Receives a packet. The inner error is a refusal; the outer one says why no reply is due.
-    async fn receive(
+    async fn receive<S: Stream>(
         &self,
-        stream: &TcpStream,
-        rights: &RawGrant,
-        packet: &mut Vec<u8>,
-        ticket: &Ticket,
+        sending: &mut Sending<S>,
         mut stop: watch::Receiver<bool>,
-    ) -> Result<Result<(), Refusal>, Gone> {
+    ) -> Result<Result<(), Refusal>, Kind> {
         let deadline = Instant::now() + self.request_timeout;
         loop {
-            ticket.set_amid_packet(!packet.is_empty());
-            let missing = match self.judge(rights, packet) {
+            sending.ticket.set_amid_packet(sending.is_amid_packet());
+            let missing = match self.judge(&sending.rights, &sending.bytes) {
                 Ok(Packet::Incomplete { missing }) => missing,
                 Ok(Packet::Whole { .. }) => 0,
                 Err(refusal) => return Ok(Err(refusal)),
             };
             if missing == 0 {
-                if read_behind(stream, packet) {
+                if sending.read_behind() {
                     continue;
                 }
                 return Ok(Ok(()));
             }
-            let readable = tokio::select! {
-                readable = timeout_at(deadline, stream.readable()) => readable,
-                _ = stop.wait_for(|stop| *stop) => return Err(Gone::Stopped),
-            };
-            match readable {
-                Err(_) if packet.is_empty() => return Err(Gone::Timeout),
-                Err(_) => return Ok(Err(Refusal::Late)),
-                Ok(Err(_)) => return Err(Gone::Closed),
-                Ok(Ok(())) => {}
-            }
             // One byte more than the packet has, to detect extra bytes.
-            packet.reserve(missing + 1);
-            match stream.try_read_buf(packet) {
-                Ok(0) if packet.is_empty() => return Err(Gone::Closed),
-                Ok(0) => return Ok(Err(Refusal::Short)),
-                Ok(_) => {}
-                Err(error) if error.kind() == ErrorKind::WouldBlock => {}
-                Err(_) => return Err(Gone::Closed),
+            let read = tokio::select! {
+                read = timeout_at(deadline, sending.read(missing + 1)) => read,
+                _ = stop.wait_for(|stop| *stop) => return Err(Kind::Closed),
+            };
+            match read {
+                Err(_) if sending.bytes.is_empty() => return Err(Kind::RequestTimeout),
+                Err(_) => return Ok(Err(Refusal::Late)),
+                Ok(Err(End::ByPeer)) if !sending.bytes.is_empty() => {
+                    return Ok(Err(Refusal::Short));
+                }
+                Ok(Err(end)) => return Err(end.into()),
+                Ok(Ok(_)) => self.flush(sending).await?,
             }
         }
     }
 
     /// Serves the packets of a connection to its end.
-    pub(crate) async fn serve_packets(
+    pub(crate) async fn serve_packets<S: Stream>(
         &self,
         context: Arc<ListenerContext>,
-        connection: Admitted<RawGrant>,
+        mut sending: Sending<S>,
         renewal: Renewal,
         stop: watch::Receiver<bool>,
     ) {
         if let Some(idle) = self.many {
-            return self.serve_many(context, connection, renewal, idle, stop).await;
+            return self.serve_many(context, sending, renewal, idle, stop).await;
         }
-        let Admitted { stream, peer, rights, received: mut packet, ticket } = connection;
-        let judged = self.receive(&stream, &rights, &mut packet, &ticket, stop.clone()).await;
-        let judged = match judged {
-            Err(Gone::Timeout) => return context.ended(Kind::RequestTimeout, peer),
-            Err(Gone::Closed | Gone::Stopped) => return context.ended(Kind::Closed, peer),
+        let judged = match self.receive(&mut sending, stop.clone()).await {
+            Err(end) => {
+                context.ended(end, sending.peer.clone());
+                return sending.end();
+            }
             Ok(judged) => judged,
         };
-        let written = judged.and_then(|()| match self.judge(&rights, &packet)? {
+        let written = judged.and_then(|()| match self.judge(&sending.rights, &sending.bytes)? {
             Packet::Whole { header, memory, payload } => {
-                self.write(&context, peer, (header, memory, payload))
+                self.write(&context, &sending.peer, (header, memory, payload))
             }
             Packet::Incomplete { .. } => Err(Refusal::Short),
         });
-        ticket.set_amid_packet(false);
+        sending.ticket.set_amid_packet(false);
         if let Err(refusal) = written {
-            self.refuse(&context, peer, &packet, refusal);
-            drop(packet);
-            let _ = (&*SockRef::from(&stream)).write(&[REFUSED]);
-            drain(&stream, usize::MAX, stop).await;
+            self.refuse(&context, &sending.peer, &sending.bytes, refusal);
+            sending.bytes.clear();
+            send_last(&mut sending.stream, &mut sending.unsent, REFUSED);
+            drain(sending.stream.socket(), usize::MAX, stop).await;
         } else {
-            let mut dropped = RawIngest::confirm(&stream);
-            if self.crc_if_present {
+            sending.bytes.clear();
+            let mut dropped = RawIngest::confirm(&mut sending.stream, &mut sending.unsent);
+            if self.crc_if_present && self.tls.is_none() {
                 // A CRC that comes too late must not reset the connection, reply and all.
-                dropped += drain(&stream, LATE_BYTES, stop).await;
+                dropped += drain(sending.stream.socket(), LATE_BYTES, stop).await;
+            } else if self.tls.is_some() {
+                // Nor must the message that ends TLS.
+                drain(sending.stream.socket(), LATE_BYTES, stop).await;
             }
-            self.drop_bytes(&context, peer, dropped);
+            self.drop_bytes(&context, &sending.peer, dropped);
         }
-        context.ended(Kind::Closed, peer);
-        drop(ticket);
+        context.ended(Kind::Closed, sending.peer);
+        drop(sending.ticket);
     }
 
     /// Serves packets one after another.
-    async fn serve_many(
+    async fn serve_many<S: Stream>(
         &self,
         context: Arc<ListenerContext>,
-        Admitted { stream, peer, mut rights, received: mut bytes, ticket }: Admitted<RawGrant>,
+        mut sending: Sending<S>,
         renewal: Renewal,
         idle: Duration,
         mut stop: watch::Receiver<bool>,
@@ -375,20 +478,21 @@ impl RawIngest {
         let mut answered = 0;
         let mut packets: usize = 0;
         loop {
-            if ticket.take_outdated() {
+            if sending.ticket.take_outdated() {
                 let Some(renewed) = renewal() else {
                     end = Kind::RightsRevoked;
                     break;
                 };
-                rights = renewed;
+                sending.rights = renewed;
             }
-            let refusal = match self.first_of(&context, peer, &rights, &bytes[answered..]) {
+            let waiting = &sending.bytes[answered..];
+            let refusal = match self.first_of(&context, &sending.peer, &sending.rights, waiting) {
                 Ok(Some((len, reply))) => {
                     answered += len;
                     accepted |= reply == DONE;
                     begun = Instant::now();
-                    ticket.touch(begun.into_std());
-                    if let Err(slow) = self.reply(&stream, reply).await {
+                    sending.ticket.touch(begun.into_std());
+                    if let Err(slow) = self.reply(&mut sending, reply).await {
                         end = slow;
                         break;
                     }
@@ -399,32 +503,40 @@ impl RawIngest {
                     continue;
                 }
                 Ok(None) => {
-                    bytes.drain(..answered);
+                    sending.bytes.consume(answered);
                     answered = 0;
-                    ticket.set_amid_packet(!bytes.is_empty());
-                    let patience = if bytes.is_empty() { idle } else { self.request_timeout };
-                    let was_empty = bytes.is_empty();
-                    let readable = tokio::select! {
-                        readable = timeout_at(begun + patience, stream.readable()) => readable,
+                    let was_empty = !sending.is_amid_packet();
+                    sending.ticket.set_amid_packet(!was_empty);
+                    let patience = if was_empty { idle } else { self.request_timeout };
+                    let read = tokio::select! {
+                        read = timeout_at(begun + patience, sending.read(usize::MAX)) => read,
                         _ = stop.wait_for(|stop| *stop) => break,
                     };
-                    match readable.map(|ready| ready.and_then(|()| stream.try_read_buf(&mut bytes)))
-                    {
-                        Ok(Ok(0)) if was_empty => break,
-                        Ok(Ok(0)) => Refusal::Short,
+                    match read {
                         Ok(Ok(_)) => {
                             if was_empty {
                                 begun = Instant::now();
                             }
-                            ticket.set_amid_packet(true);
+                            sending.ticket.set_amid_packet(sending.is_amid_packet());
+                            if let Err(slow) = self.flush(&mut sending).await {
+                                end = slow;
+                                break;
+                            }
                             // A sender that never pauses leaves time for other connections.
                             yield_now().await;
                             continue;
                         }
-                        Ok(Err(error)) if error.kind() == ErrorKind::WouldBlock => continue,
-                        Ok(Err(_)) => break,
+                        Ok(Err(End::ByPeer)) if !sending.bytes.is_empty() => Refusal::Short,
+                        Ok(Err(ended)) => {
+                            end = ended.into();
+                            break;
+                        }
                         Err(_) if was_empty => {
                             end = Kind::Idle;
+                            break;
+                        }
+                        Err(_) if sending.bytes.is_empty() => {
+                            end = Kind::RequestTimeout;
                             break;
                         }
                         Err(_) => Refusal::Late,
@@ -432,30 +544,41 @@ impl RawIngest {
                 }
                 Err(refusal) => refusal,
             };
-            ticket.set_amid_packet(false);
-            self.refuse(&context, peer, &bytes[answered..], refusal);
-            let _ = self.reply(&stream, REFUSED).await;
-            answered = bytes.len();
-            drain(&stream, usize::MAX, stop).await;
+            sending.ticket.set_amid_packet(false);
+            self.refuse(&context, &sending.peer, &sending.bytes[answered..], refusal);
+            sending.bytes.clear();
+            answered = 0;
+            let _ = self.reply(&mut sending, REFUSED).await;
+            sending.end();
+            drain(sending.stream.socket(), usize::MAX, stop).await;
             break;
         }
         if accepted {
-            self.drop_bytes(&context, peer, bytes.len() - answered);
+            self.drop_bytes(&context, &sending.peer, sending.bytes.len() - answered);
         }
-        context.ended(end, peer);
-        drop(ticket);
+        context.ended(end, sending.peer.clone());
+        sending.end();
     }
 
     /// Replies to one of several packets. Packets of a peer that has left are still written: it may
     /// not wait for replies.
-    async fn reply(&self, stream: &TcpStream, reply: u8) -> Result<(), Kind> {
-        match (&*SockRef::from(stream)).write(&[reply]) {
-            Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                match send_all(stream, &[reply], self.request_timeout).await {
-                    Err(Kind::SlowReader) => Err(Kind::SlowReader),
-                    _ => Ok(()),
-                }
-            }
+    async fn reply<S: Stream>(&self, sending: &mut Sending<S>, reply: u8) -> Result<(), Kind> {
+        match sending.stream.send(&[reply], &mut sending.unsent) {
+            Ok(()) => self.flush(sending).await,
+            Err(_) => Ok(()),
+        }
+    }
+
+    /// Waits until the system has accepted what was sent, unless the peer has left.
+    async fn flush<S: Stream>(&self, sending: &mut Sending<S>) -> Result<(), Kind> {
+        if sending.unsent.is_empty() {
+            return Ok(());
+        }
+        let Sending { stream, unsent, .. } = sending;
+        let sent = send_all(stream.socket(), unsent, self.request_timeout).await;
+        *unsent = Vec::new();
+        match sent {
+            Err(Kind::SlowReader) => Err(Kind::SlowReader),
             _ => Ok(()),
         }
     }
@@ -465,7 +588,7 @@ impl RawIngest {
     fn first_of(
         &self,
         context: &ListenerContext,
-        peer: SocketAddr,
+        peer: &Peer,
         rights: &RawGrant,
         bytes: &[u8],
     ) -> Result<Option<(usize, u8)>, Refusal> {
@@ -504,28 +627,27 @@ impl RawIngest {
 
     /// Confirms the only packet of a connection. Bytes that have arrived behind it by then are read,
     /// because closing a socket with unread bytes could lose the reply. Returns their number.
-    fn confirm(stream: &TcpStream) -> usize {
-        let socket = SockRef::from(stream);
-        let _ = (&*socket).write(&[DONE]);
+    fn confirm<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>) -> usize {
+        send_last(stream, unsent, DONE);
         let (mut chunk, mut dropped) = ([0; CHUNK], 0);
         for _ in 0..LAST_READS {
-            let Ok(len @ 1..) = (&*socket).read(&mut chunk) else { break };
+            let Some(len) = stream.read_now(&mut chunk, unsent) else { break };
             dropped += len;
         }
         dropped
     }
 
     /// Counts and reports bytes behind an accepted packet that are not part of another one.
-    fn drop_bytes(&self, context: &ListenerContext, peer: SocketAddr, count: usize) {
+    fn drop_bytes(&self, context: &ListenerContext, peer: &Peer, count: usize) {
         if count > 0 {
             self.packets.dropped_bytes.add_many(count as u64);
-            context.report(Kind::BytesDropped(count as u64), Some(peer.into()));
+            context.report(Kind::BytesDropped(count as u64), Some(peer.clone()));
         }
     }
 
-    fn refuse(&self, context: &ListenerContext, peer: SocketAddr, packet: &[u8], refusal: Refusal) {
+    fn refuse(&self, context: &ListenerContext, peer: &Peer, packet: &[u8], refusal: Refusal) {
         self.packets.refuse(refusal);
-        context.report(Kind::PacketRefused(refusal), Some(peer.into()));
+        context.report(Kind::PacketRefused(refusal), Some(peer.clone()));
         let header = self.header(packet).ok().flatten();
         self.audit(context, peer, (header, &[]), Err(refusal));
     }
@@ -533,7 +655,7 @@ impl RawIngest {
     fn audit(
         &self,
         context: &ListenerContext,
-        peer: SocketAddr,
+        peer: &Peer,
         (header, payload): (Option<Header>, &[u8]),
         outcome: Result<Permit, Refusal>,
     ) {
@@ -541,7 +663,7 @@ impl RawIngest {
             let (format, payload, refused) =
                 (self.format, payload.to_vec(), outcome.as_ref().err());
             let write = Written::Packet { format, header, payload, refused: refused.copied() };
-            let (listener, peer) = (Arc::clone(&context.name), Some(peer.into()));
+            let (listener, peer) = (Arc::clone(&context.name), Some(peer.clone()));
             auditor.send(Record { listener, peer, write }, outcome.ok());
         }
     }
@@ -560,22 +682,21 @@ impl Service for RawIngest {
         context: &ListenerContext,
         mut connection: Admitted<RawGrant>,
     ) -> Option<Admitted<RawGrant>> {
-        if self.many.is_some() || self.crc_if_present {
+        if self.many.is_some() || self.crc_if_present || self.tls.is_some() {
             return Some(connection);
         }
         let mut chunk = [0; CHUNK];
-        let socket = SockRef::from(&connection.stream);
-        let Ok(len) = (&*socket).read(&mut chunk) else {
+        let Ok(len) = (&*SockRef::from(&connection.stream)).read(&mut chunk) else {
             return Some(connection);
         };
         let bytes = &chunk[..len];
-        let peer = connection.peer;
+        let peer = Peer::from(connection.peer);
         if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
             && len < CHUNK
-            && self.write(context, peer, (header, memory, payload)).is_ok()
+            && self.write(context, &peer, (header, memory, payload)).is_ok()
         {
-            let dropped = RawIngest::confirm(&connection.stream);
-            self.drop_bytes(context, peer, dropped);
+            let dropped = RawIngest::confirm(&mut connection.stream, &mut Vec::new());
+            self.drop_bytes(context, &peer, dropped);
             context.ended(Kind::Closed, peer);
             return None;
         }
@@ -584,8 +705,18 @@ impl Service for RawIngest {
         Some(connection)
     }
 
-    fn ends(&self, _: &RawIngest, peer: &Peer) -> Option<Kind> {
-        self.rights(peer.ip()).is_none().then_some(Kind::RightsRevoked)
+    fn ends(&self, before: &RawIngest, peer: &Peer) -> Option<Kind> {
+        let is_other = self.tls.is_some() != before.tls.is_some();
+        if is_other || self.rights(peer.ip()).is_none() {
+            return Some(Kind::RightsRevoked);
+        }
+        let (tls, certificate) = (self.tls.as_ref()?, peer.certificate.as_ref()?);
+        if let Err(failure) = tls.judge(certificate) {
+            return Some(Kind::TlsFailed(failure.reason()));
+        }
+        // A sender that never had rights keeps its refusals.
+        let had_rights = before.granted(peer).is_some();
+        (had_rights && self.granted(peer).is_none()).then_some(Kind::RightsRevoked)
     }
 
     async fn serve(
@@ -595,18 +726,23 @@ impl Service for RawIngest {
         connection: Admitted<RawGrant>,
         stop: watch::Receiver<bool>,
     ) {
+        if let Some(tls) = &self.tls {
+            set_options(&connection.stream);
+            // In a box of its own, so that plain connections do not reserve memory for it.
+            return Box::pin(self.secure(tls, live, context, connection, stop)).await;
+        }
         let peer = connection.peer.ip();
         let renewal = Box::new(move || live.get().rights(peer));
-        self.serve_packets(context, connection, renewal, stop).await;
+        self.serve_packets(context, self.sending(connection), renewal, stop).await;
     }
 }
 
-/// Appends bytes that have arrived behind a packet, without waiting. Returns whether there are any.
-fn read_behind(stream: &TcpStream, packet: &mut Vec<u8>) -> bool {
-    let mut behind = [0; BEHIND];
-    let len = (&*SockRef::from(stream)).read(&mut behind).unwrap_or(0);
-    packet.extend_from_slice(&behind[..len]);
-    len > 0
+/// Sends the last reply of a connection and announces the end, without waiting.
+fn send_last<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>, reply: u8) {
+    if stream.send(&[reply], unsent).is_ok() {
+        stream.end(unsent);
+        let _ = stream::write(stream.socket(), unsent);
+    }
 }
 
 #[cfg(test)]
@@ -629,8 +765,26 @@ mod tests {
             limits: ConnectionLimits::NONE,
             request_timeout: Duration::from_secs(10),
             packets: PacketsPerConnection::One,
+            tls: None,
         };
         RawIngest::new(&settings, Arc::default())
+    }
+
+    /// An admitted connection, with bytes that were already read.
+    fn admitted(
+        accepted: std::net::TcpStream,
+        peer: SocketAddr,
+        received: Vec<u8>,
+    ) -> Admitted<RawGrant> {
+        accepted.set_nonblocking(true).unwrap();
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
+        let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 1).unwrap());
+        let memory = Arc::new(Memory::new(layout, None).unwrap());
+        let rights =
+            RawGrant { targets: HashMap::from([(1, memory)]), areas: vec![Area::HoldingRegisters] };
+        let stream = TcpStream::from_std(accepted).unwrap();
+        Admitted { stream, peer, rights: Arc::new(rights), received, ticket }
     }
 
     /// Both ends of a connection.
@@ -646,17 +800,16 @@ mod tests {
         let mut runtime = tokio::runtime::Builder::new_current_thread();
         let runtime = runtime.enable_all().build().unwrap();
         let _guard = runtime.enter();
-        let (client, accepted, _) = connected();
-        accepted.set_nonblocking(true).unwrap();
-        let stream = TcpStream::from_std(accepted).unwrap();
+        let (client, accepted, peer) = connected();
         let mut raw = listener(Format::V1, Flags::Strict);
         raw.request_timeout = Duration::from_millis(50);
-        while (&*SockRef::from(&stream)).write(&[DONE; CHUNK]).is_ok() {}
-        assert_eq!(runtime.block_on(raw.reply(&stream, DONE)), Err(Kind::SlowReader));
+        let mut sending = raw.sending(admitted(accepted, peer, Vec::new()));
+        while (&*SockRef::from(&sending.stream)).write(&[DONE; CHUNK]).is_ok() {}
+        assert_eq!(runtime.block_on(raw.reply(&mut sending, DONE)), Err(Kind::SlowReader));
         // Nobody can get a reply from a connection that is gone, but that is no reason to stop.
         drop(client);
-        while (&*SockRef::from(&stream)).write(&[DONE]).is_ok() {}
-        assert_eq!(runtime.block_on(raw.reply(&stream, DONE)), Ok(()));
+        while (&*SockRef::from(&sending.stream)).write(&[DONE]).is_ok() {}
+        assert_eq!(runtime.block_on(raw.reply(&mut sending, DONE)), Ok(()));
     }
 
     #[test]
@@ -665,31 +818,16 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let _guard = runtime.enter();
         let (client, accepted, peer) = connected();
-        client.shutdown(std::net::Shutdown::Write).unwrap();
-        accepted.set_nonblocking(true).unwrap();
-        let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 1).unwrap());
-        let memory = Arc::new(Memory::new(layout, None).unwrap());
-        let rights = RawGrant {
-            targets: HashMap::from([(1, Arc::clone(&memory))]),
-            areas: vec![Area::HoldingRegisters],
-        };
         let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07";
         let context = Arc::new(ListenerContext::for_tests());
-        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
-        let (ticket, _) = Arc::new(Admission::new(limits)).admit(peer).unwrap();
-        let admitted = Admitted {
-            stream: TcpStream::from_std(accepted).unwrap(),
-            peer,
-            rights: Arc::new(rights),
-            received: packet.repeat(PACKETS),
-            ticket,
-        };
+        client.shutdown(std::net::Shutdown::Write).unwrap();
         let raw = listener(Format::V1, Flags::Strict);
+        let sending = raw.sending(admitted(accepted, peer, packet.repeat(PACKETS)));
         let (_engine, stop) = watch::channel(false);
         let mut turns = 0;
         runtime.block_on(async {
             let serving =
-                raw.serve_many(context, admitted, Box::new(|| None), Duration::from_secs(10), stop);
+                raw.serve_many(context, sending, Box::new(|| None), Duration::from_secs(10), stop);
             tokio::select! {
                 biased;
                 () = serving => {}
@@ -744,11 +882,11 @@ mod tests {
         let mut all = vec![0; CHUNK + 3];
         while accepted.peek(&mut all).unwrap() < all.len() {}
         accepted.set_nonblocking(true).unwrap();
-        let stream = TcpStream::from_std(accepted).unwrap();
+        let mut stream = TcpStream::from_std(accepted).unwrap();
 
         let raw = listener(Format::V1, Flags::Strict);
-        let dropped = RawIngest::confirm(&stream);
-        raw.drop_bytes(&ListenerContext::for_tests(), peer, dropped);
+        let dropped = RawIngest::confirm(&mut stream, &mut Vec::new());
+        raw.drop_bytes(&ListenerContext::for_tests(), &peer.into(), dropped);
         assert_eq!(raw.packets.dropped_bytes.get(), CHUNK as u64 + 3);
         drop(stream);
         let mut reply = Vec::new();

@@ -12,6 +12,26 @@ use tokio::time::timeout;
 
 use super::event::Kind;
 
+/// Why a stream has no more data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum End {
+    /// The peer has sent everything.
+    ByPeer,
+    /// The connection broke.
+    Broken,
+    /// TLS failed. The reason is a word for programs.
+    TlsFailed(&'static str),
+}
+
+impl From<End> for Kind {
+    fn from(end: End) -> Kind {
+        match end {
+            End::ByPeer | End::Broken => Kind::Closed,
+            End::TlsFailed(reason) => Kind::TlsFailed(reason),
+        }
+    }
+}
+
 /// `unsent` holds bytes that the system has not accepted yet. Further bytes are appended to it, so
 /// that they keep their order.
 pub(crate) trait Stream: Send {
@@ -22,7 +42,7 @@ pub(crate) trait Stream: Send {
         context: &mut Context<'_>,
         input: &mut [u8],
         unsent: &mut Vec<u8>,
-    ) -> Poll<Result<usize, Kind>>;
+    ) -> Poll<Result<usize, End>>;
 
     /// Reads once what the system has already received; `None` when there is no more.
     fn read_now(&mut self, input: &mut [u8], unsent: &mut Vec<u8>) -> Option<usize>;
@@ -46,13 +66,17 @@ impl Stream for TcpStream {
         context: &mut Context<'_>,
         input: &mut [u8],
         _unsent: &mut Vec<u8>,
-    ) -> Poll<Result<usize, Kind>> {
+    ) -> Poll<Result<usize, End>> {
         let mut buffer = ReadBuf::new(input);
         let Poll::Ready(read) = AsyncRead::poll_read(Pin::new(self), context, &mut buffer) else {
             return Poll::Pending;
         };
         let len = buffer.filled().len();
-        Poll::Ready(if read.is_err() || len == 0 { Err(Kind::Closed) } else { Ok(len) })
+        Poll::Ready(match read {
+            Err(_) => Err(End::Broken),
+            Ok(()) if len == 0 => Err(End::ByPeer),
+            Ok(()) => Ok(len),
+        })
     }
 
     fn read_now(&mut self, input: &mut [u8], _unsent: &mut Vec<u8>) -> Option<usize> {

@@ -6,22 +6,21 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::watch;
-use tokio::time::{Instant, timeout, timeout_at};
+use tokio::time::{Instant, timeout_at};
 
-use super::admission::{ConnectionLimits, Full, Ticket};
+use super::admission::{ConnectionLimits, Ticket};
 use super::connection::{Connection, Renewal, Terms, Timeouts};
 use super::counters::PacketCounters;
 use super::event::Kind;
 use super::framing::{Ascii, Framing, Mbap, MbapBesidePackets, Rtu};
-use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
+use super::listener::{Admitted, ListenerContext, Service, set_options};
 use super::live::Live;
 use super::peer::Peer;
 use super::policy::{PeerRights, Policy, Rule};
 use super::raw_ingest::{Beginning, DECISIVE, RawIngest, RawSettings};
+use super::secure::secured;
 use super::stream::Stream;
-use super::tls::ServerTlsStream;
 use super::unit_server::UnitServer;
-use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 
 /// The time that an unlimited wait lasts.
@@ -147,46 +146,12 @@ impl ModbusStream {
         live: Arc<Live<ModbusStream>>,
         context: Arc<ListenerContext>,
         admitted: Admitted<PeerRights>,
-        mut stop: watch::Receiver<bool>,
+        stop: watch::Receiver<bool>,
     ) {
         let Admitted { stream, peer, ticket, .. } = admitted;
-        let mut stream = match ServerTlsStream::new(stream, tls) {
-            Ok(stream) => stream,
-            Err(end) => return context.ended(end, peer),
-        };
-        let patience = self.timeouts.request;
-        let shaken = tokio::select! {
-            biased;
-            _ = stop.wait_for(|stop| *stop) => return context.ended(Kind::Closed, peer),
-            shaken = timeout(patience, stream.handshake(patience)) => shaken,
-        };
-        let certificate = match shaken {
-            Ok(Ok(())) => stream.peer_certificate(),
-            Ok(Err(Kind::Closed)) => {
-                let reason = TlsFailure::ClosedDuringHandshake.reason();
-                return context.ended(Kind::TlsFailed(reason), peer);
-            }
-            Ok(Err(end)) => Err(end),
-            Err(_) => return context.ended(Kind::TlsFailed("timeout"), peer),
-        };
-        let certificate = match certificate {
-            Ok(certificate) => Arc::new(certificate),
-            Err(end) => {
-                context.ended_with(end, peer, stream.presented_subject().as_deref());
-                drain(&stream.into_socket(), usize::MAX, stop).await;
-                return;
-            }
-        };
-        ticket.identify(Arc::clone(&certificate));
-        let peer = Peer { address: peer, certificate: Some(certificate) };
-        match ticket.establish() {
-            Ok(evicted) => context.evicted(evicted),
-            Err(Full) => {
-                context.refuse_full(peer);
-                return stream.refuse(stop).await;
-            }
-        }
-        context.report(Kind::Secured, Some(peer.clone()));
+        let (patience, stopping) = (self.timeouts.request, stop.clone());
+        let secured = secured(tls, &context, (stream, peer), &ticket, patience, stopping).await;
+        let Some((stream, peer)) = secured else { return };
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().terms(&peer).map(|terms| terms.rights).unwrap_or_else(|| {
             // The session stays, and each request gets exception 01 (MB-TCP-Security, R-23, R-31).
@@ -244,7 +209,7 @@ impl ModbusStream {
                     let admitted = Admitted { stream, peer, rights, received, ticket };
                     let renewal =
                         Box::new(move || live.get().raw_ingest.as_ref()?.rights(peer.ip()));
-                    return raw.serve_packets(context, admitted, renewal, stop).await;
+                    return raw.serve_packets(context, raw.sending(admitted), renewal, stop).await;
                 }
             }
             let is_new = admitted.received.is_empty();

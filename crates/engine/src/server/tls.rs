@@ -18,7 +18,7 @@ use tokio::sync::watch;
 
 use super::event::Kind;
 use super::listener::drain;
-use super::stream::{self, Stream};
+use super::stream::{self, End, Stream};
 use crate::tls::TlsFailure;
 use crate::tls::server::{PeerCertificate, ServerChannel, ServerTls};
 
@@ -51,12 +51,13 @@ pub(crate) struct ServerTlsStream {
     plain: Vec<u8>,
     taken: usize,
     /// Why the stream has ended.
-    ended: Option<Kind>,
+    ended: Option<End>,
 }
 
 impl ServerTlsStream {
     pub(crate) fn new(socket: TcpStream, tls: &ServerTls) -> Result<ServerTlsStream, Kind> {
-        let channel = tls.channel().map_err(|error| failed(&TlsFailure::from(error)))?;
+        let channel =
+            tls.channel().map_err(|error| Kind::from(failed(&TlsFailure::from(error))))?;
         let records = Records::default();
         Ok(ServerTlsStream { socket, channel, records, plain: Vec::new(), taken: 0, ended: None })
     }
@@ -80,7 +81,7 @@ impl ServerTlsStream {
 
     /// The certificate of the peer, after the handshake.
     pub(crate) fn peer_certificate(&self) -> Result<PeerCertificate, Kind> {
-        self.channel.peer_certificate().map_err(|failure| failed(&failure))
+        self.channel.peer_certificate().map_err(|failure| failed(&failure).into())
     }
 
     /// The subject of the certificate of a peer whose handshake has failed.
@@ -107,17 +108,17 @@ impl ServerTlsStream {
         (plain, output): (&mut Vec<u8>, &mut Vec<u8>),
         input: &mut [u8],
         unsent: &mut Vec<u8>,
-    ) -> Result<usize, Kind> {
+    ) -> Result<usize, End> {
         plain.clear();
         output.clear();
         self.records.pass(bytes);
         if let Err(error) = self.channel.receive(bytes, plain, output) {
             self.ended = Some(failed(&error));
         } else if self.channel.has_ended() {
-            self.ended = Some(Kind::Closed);
+            self.ended = Some(End::ByPeer);
         }
         if !output.is_empty() {
-            stream::send(&self.socket, output, unsent)?;
+            stream::send(&self.socket, output, unsent).map_err(|_| End::Broken)?;
         }
         let len = plain.len().min(input.len());
         input[..len].copy_from_slice(&plain[..len]);
@@ -127,7 +128,7 @@ impl ServerTlsStream {
 
     /// Takes waiting plain text, or returns the reason why there is no more; `None` when bytes must
     /// be read.
-    fn take(&mut self, input: &mut [u8]) -> Option<Result<usize, Kind>> {
+    fn take(&mut self, input: &mut [u8]) -> Option<Result<usize, End>> {
         let waiting = &self.plain[self.taken..];
         if waiting.is_empty() {
             return self.ended.map(Err);
@@ -148,7 +149,7 @@ impl Stream for ServerTlsStream {
         context: &mut Context<'_>,
         input: &mut [u8],
         unsent: &mut Vec<u8>,
-    ) -> Poll<Result<usize, Kind>> {
+    ) -> Poll<Result<usize, End>> {
         if let Some(taken) = self.take(input) {
             return Poll::Ready(taken);
         }
@@ -159,8 +160,10 @@ impl Stream for ServerTlsStream {
                 return Poll::Pending;
             };
             let len = buffer.filled().len();
-            if read.is_err() || len == 0 {
-                return Poll::Ready(Err(Kind::Closed));
+            match read {
+                Err(_) => return Poll::Ready(Err(End::Broken)),
+                Ok(()) if len == 0 => return Poll::Ready(Err(End::ByPeer)),
+                Ok(()) => {}
             }
             let buffers = (&mut scratch.plain, &mut scratch.output);
             Poll::Ready(self.receive(&scratch.input[..len], buffers, input, unsent))
@@ -207,8 +210,8 @@ fn acknowledge(_socket: &TcpStream) {
     let _ = SockRef::from(_socket).set_tcp_quickack(true);
 }
 
-fn failed(failure: &TlsFailure) -> Kind {
-    Kind::TlsFailed(failure.reason())
+fn failed(failure: &TlsFailure) -> End {
+    End::TlsFailed(failure.reason())
 }
 
 /// Finds the boundaries of records.

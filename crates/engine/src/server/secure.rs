@@ -1,0 +1,70 @@
+//! The handshake of an admitted connection.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use super::admission::{Full, Ticket};
+use super::event::Kind;
+use super::listener::{ListenerContext, drain};
+use super::peer::Peer;
+use super::tls::ServerTlsStream;
+use crate::tls::TlsFailure;
+use crate::tls::server::ServerTls;
+
+/// Performs the handshake, and gives the connection its place among the sessions. `None`: the connection
+/// has ended, which was counted and reported.
+pub(crate) async fn secured(
+    tls: &ServerTls,
+    context: &ListenerContext,
+    (stream, peer): (TcpStream, SocketAddr),
+    ticket: &Ticket,
+    patience: Duration,
+    mut stop: watch::Receiver<bool>,
+) -> Option<(ServerTlsStream, Peer)> {
+    let ended = |end| {
+        context.ended(end, peer);
+        None
+    };
+    let mut stream = match ServerTlsStream::new(stream, tls) {
+        Ok(stream) => stream,
+        Err(end) => return ended(end),
+    };
+    let shaken = tokio::select! {
+        biased;
+        _ = stop.wait_for(|stop| *stop) => return ended(Kind::Closed),
+        shaken = timeout(patience, stream.handshake(patience)) => shaken,
+    };
+    let certificate = match shaken {
+        Ok(Ok(())) => stream.peer_certificate(),
+        Ok(Err(Kind::Closed)) => {
+            return ended(Kind::TlsFailed(TlsFailure::ClosedDuringHandshake.reason()));
+        }
+        Ok(Err(end)) => Err(end),
+        Err(_) => return ended(Kind::TlsFailed("timeout")),
+    };
+    let certificate = match certificate {
+        Ok(certificate) => Arc::new(certificate),
+        Err(end) => {
+            context.ended_with(end, peer, stream.presented_subject().as_deref());
+            drain(&stream.into_socket(), usize::MAX, stop).await;
+            return None;
+        }
+    };
+    ticket.identify(Arc::clone(&certificate));
+    let peer = Peer { address: peer, certificate: Some(certificate) };
+    match ticket.establish() {
+        Ok(evicted) => context.evicted(evicted),
+        Err(Full) => {
+            context.refuse_full(peer);
+            stream.refuse(stop).await;
+            return None;
+        }
+    }
+    context.report(Kind::Secured, Some(peer.clone()));
+    Some((stream, peer))
+}
