@@ -50,6 +50,7 @@ __all__ = [
     "Route",
     "Rule",
     "ServerTls",
+    "TlsChannel",
     "__version__",
     "encode_raw_ingest",
     "pack_raw_ingest",
@@ -222,12 +223,17 @@ class Rule:
 class RawRule:
     """What the senders of Raw Ingest packets from some sources may write.
 
-    `targets` maps unit ids (v1) or memory ids (crc), 0 to 65535, to memories. Raises `ValueError`
-    for an invalid id, source or area.
+    `targets` maps unit ids (v1) or memory ids (crc), 0 to 65535, to memories. `roles` are those of
+    `Rule`. Raises `ValueError` for an invalid id, source or area.
     """
 
     def __new__(
-        cls, targets: Mapping[int, Memory], *, sources: Sequence[str], areas: Sequence[Area]
+        cls,
+        targets: Mapping[int, Memory],
+        *,
+        sources: Sequence[str],
+        areas: Sequence[Area],
+        roles: Sequence[str] | None = None,
     ) -> RawRule: ...
 
 @final
@@ -334,6 +340,8 @@ class Listener:
         packets: Literal["one", "many"] = "one",
         idle_timeout: float = 300.0,
         after_refusal: Literal["close", "continue"] = "close",
+        tls: ServerTls | None = None,
+        max_handshakes: int = 256,
     ) -> Listener:
         """A listener for Raw Ingest packets.
 
@@ -341,7 +349,7 @@ class Listener:
         its CRC. With `flags` ignore, flags and the reserved byte may have any value. With `packets`
         many, a connection carries any number of them, until the sender closes, one is refused, or
         none comes for `idle_timeout` seconds. With `after_refusal` continue, only an invalid header
-        or CRC ends the connection.
+        or CRC ends the connection. `tls` and `max_handshakes` are those of the constructor.
         """
 
 @final
@@ -505,11 +513,13 @@ class Endpoint:
         cert: str | PathLike[str] | None = None,
         key: str | PathLike[str] | None = None,
         name: str | None = None,
+        unlocked: bytes | None = None,
     ) -> Endpoint:
         """A device with Modbus TCP over TLS. Reads the PEM files at once.
 
         `ca` has the trusted certificates, of authorities or of the device itself. Default: the
         system's authorities. `name` is the name in the device's certificate, if it is not `host`.
+        `unlocked` is the content of `key` without its passphrase, if it has one.
         Raises `OSError` and `ValueError` for files that can't be used.
         """
 
@@ -541,6 +551,37 @@ class Endpoint:
         reconnect: float = 0.0,
     ) -> Endpoint:
         """The same device, treated as `holdfast.client.tolerance.Tolerance` says."""
+
+@final
+class TlsChannel:
+    """The client side of TLS over a connection whose socket belongs to the caller.
+
+    A failure is a reason, a text, and whether the peer may have carried out what it was sent.
+    """
+
+    def __new__(cls, endpoint: Endpoint) -> TlsChannel: ...
+    @property
+    def is_ready(self) -> bool:
+        """Whether the handshake is complete."""
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the peer has announced the end."""
+
+    def send(self, data: bytes) -> None:
+        """Encrypts data. During the handshake, it is queued until the end of the handshake."""
+
+    def outgoing(self) -> bytes:
+        """Takes the bytes to send now."""
+
+    def receive(self, data: bytes) -> tuple[bytes, tuple[str, str, bool] | None]:
+        """Processes received bytes. Returns their data, and why TLS has failed, if it has."""
+
+    def end(self) -> None:
+        """Announces the end."""
+
+    def lost(self, broken: bool) -> tuple[str, str, bool] | None:
+        """Interprets the end of the connection; `None` if TLS has nothing to do with it."""
 
 @final
 class BlockingClient:
@@ -663,7 +704,7 @@ class PolledDevice:
         max_bits: int = 2000,
         readable: Sequence[tuple[Area, int, int]] | None = None,
         forbidden: Sequence[tuple[Area, int, int]] | None = None,
-        forward: Sequence[Forward] | None = None,
+        forward: Sequence[tuple[Endpoint, Forward]] | None = None,
         status: tuple[Memory, StatusBlock] | None = None,
         start_within: float | None = None,
         in_flight: int | None = 1,

@@ -45,8 +45,6 @@ StatusBlock: TypeAlias = tuple[Area, int, str, bool]
 """A status block of a device: area, slot, name, and whether it keeps the last error."""
 
 Forward: TypeAlias = tuple[
-    str,
-    int,
     Literal["v1", "crc"],
     Literal["required", "none"],
     int,
@@ -54,9 +52,9 @@ Forward: TypeAlias = tuple[
     list[tuple[Area, int]],
     tuple[int, StatusBlock] | None,
 ]
-"""A raw ingest receiver of a polled device: host, port, format, crc, unit id or memory id, timeout
-in seconds, what is added to the addresses of areas, and the status block with its own unit id or
-memory id."""
+"""The packets for a raw ingest receiver of a polled device: format, crc, unit id or memory id,
+timeout in seconds, what is added to the addresses of areas, and the status block with its own unit
+id or memory id."""
 
 PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
 """One block of a poll: area, address, count, the bytes or `None`, the fault, and the time of the
@@ -103,12 +101,14 @@ class FrameCounters(TypedDict):
 class PacketCounters(TypedDict):
     """Raw Ingest packets: written packets, their values, and refused packets by reason.
 
-    `dropped_bytes`: bytes behind accepted packets that were dropped.
+    `dropped_bytes`: bytes behind accepted packets that were dropped. `held_bytes`: the memory of
+    packets that are not complete.
     """
 
     accepted: int
     values: int
     dropped_bytes: int
+    held_bytes: int
     refused: dict[str, int]
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import pytest
 from hypothesis import given, settings
 
+from holdfast.client.receiver import Receiver
 from holdfast.client.url import parse
 from holdfast.config import (
     AuditConfig,
@@ -444,7 +445,7 @@ def test_a_forward_names_a_unit_or_a_memory(
 ) -> None:
     more = f", forward: [{{url: 'raw://[fd00::9]:9000', {written}}}]"
     (forward,) = device_of(loaded, more, "{area: coils, address: 0, count: 1}").forward
-    assert forward.receiver == ("fd00::9", 9000)
+    assert forward.receiver == Receiver("fd00::9", 9000)
     assert (forward.crc, forward.target, forward.timeout) == (crc, target, 5)
 
 
@@ -685,6 +686,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RangeConfig": ["area", "start"],
         "RawIngestConfig": ["rules"],
         "RawRuleConfig": ["sources", "areas"],
+        "SecureRawRuleConfig": ["sources", "areas"],
         "ReadConfig": ["area", "address", "count"],
         "RestConfig": ["bind", "sources", "tokens"],
         "RetryConfig": None,

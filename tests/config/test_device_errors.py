@@ -41,7 +41,7 @@ URLS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
     "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
-RECEIVER = "raw://host:port, as in raw://10.0.2.9:9000 or raw://[fd00::9]:9000"
+RECEIVER = "raw://10.0.2.9:9000 or raw+tls://10.0.2.9:9000?ca=ca.pem"
 READS = "  reads: a list"
 WORD = "an integer from 0 to 65535"
 SERIAL = "a unit id from 1 to 247; 0 is the broadcast, 248 to 255 are reserved"

@@ -232,9 +232,11 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
          "7: after_refusal: found continue with packets: one, allowed: close, or packets: many"),
         ("    bind", "    when_full: wait\n    bind",
          "7: when_full: found 'wait', allowed: refuse or evict"),
-        ("    bind", "    tls: 1\n    bind", "7: tls: unknown key, allowed: "
-         "type, format, crc, flags, bind, max_connections, max_connections_per_source, when_full, "
-         "request_timeout, packets, after_refusal, idle_timeout, rules"),
+        ("    bind", "    listen_only: true\n    bind", "7: listen_only: unknown key, allowed: "
+         "type, format, crc, flags, bind, tls, max_connections, max_connections_per_source, "
+         "when_full, max_handshakes, request_timeout, packets, after_refusal, idle_timeout, rules"),
+        ("    bind", "    tls: 1\n    bind", "7: tls: found 1, allowed: a mapping with the keys "
+         "cert_file, key_file, key_passphrase_file, ca_file, crl_file, expired_crl, review"),
         ("    bind", "    max_connections: 0\n    bind",
          "7: max_connections: found 0, allowed: an integer from 1 to 65535"),
         ("units: {1: plant}, ", "",
@@ -255,7 +257,7 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
          "9: rules[0].areas[2]: found 'coils' again, allowed: once"),
         ("sources: [10.0.0.0/8], ", "", f"9: rules[0].sources: missing, allowed: {SOME}"),
         ("areas: [coils]", "areas: [coils], access: read-write",
-         "9: rules[0].access: unknown key, allowed: sources, units, memories, areas"),
+         "9: rules[0].access: unknown key, allowed: sources, units, memories, areas, roles"),
     ],
 )  # fmt: skip
 def test_raw_ingest_of_format_v1_is_checked(

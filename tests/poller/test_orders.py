@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast._core import Poller, Request
+from holdfast._core import Endpoint, Poller, Request
 from support import wire
 from support.fake_device import HANG_UP
 from support.native_poller import (
@@ -170,7 +170,8 @@ def test_a_poller_that_has_been_stopped_refuses_orders(poller: ReportingPoller) 
 
 def test_a_read_that_no_packet_can_carry_is_not_forwarded(poller: ReportingPoller) -> None:
     fake = Fake(data)
-    receiver: Forward = ("127.0.0.1", 9, "v1", "required", 1, 1.0, [], None)
+    packets: Forward = ("v1", "required", 1, 1.0, [], None)
+    receiver = (Endpoint.network("tcp", "127.0.0.1", 9), packets)
     for count, forward in ((65535, [receiver]), (65536, None)):
         poller.add(device(fake, str(count), reads=[("coils", 0, count, None)], forward=forward))
     reads = [("coils", 0, 1, None), ("coils", 0, 65536, None)]

@@ -843,6 +843,8 @@ def test_what_happens_at_receivers_is_logged(
     first = {record.message: vars(record)["fields"] for record in reversed(caplog.records)}
     assert first["forward_refused"].pop("count") > 0
     for event in ("forward_refused", "forward_failed", "forward_back"):
+        error = first[event].pop("error", "")
+        assert error.startswith("Connection refused") == (event == "forward_failed")
         assert first[event] == {"device": "meter", "receiver": receiver}
 
 

@@ -210,7 +210,7 @@ impl Endpoint {
     }
 
     #[staticmethod]
-    #[pyo3(signature = (host, port, ca=None, cert=None, key=None, name=None))]
+    #[pyo3(signature = (host, port, ca=None, cert=None, key=None, name=None, unlocked=None))]
     fn tls(
         host: String,
         port: u16,
@@ -218,6 +218,7 @@ impl Endpoint {
         cert: Option<PathBuf>,
         key: Option<PathBuf>,
         name: Option<&str>,
+        unlocked: Option<&[u8]>,
     ) -> PyResult<Endpoint> {
         let own = match (cert.as_deref(), key.as_deref()) {
             (Some(cert), Some(key)) => Some((cert, key)),
@@ -225,7 +226,7 @@ impl Endpoint {
             _ => return Err(PyValueError::new_err("cert and key: give both, or neither")),
         };
         let name = name.unwrap_or(&host);
-        let tls = ClientTls::new(ClientSettings { ca: ca.as_deref(), own, name });
+        let tls = ClientTls::new(ClientSettings { ca: ca.as_deref(), own, key: unlocked, name });
         let tls = Some(Arc::new(tls.map_err(unusable)?));
         Ok(Endpoint { core: Place::Tcp { host, port, tls }.into() })
     }

@@ -6,8 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use holdfast_engine::client::{ClientError, Lost, Place};
-use holdfast_engine::tls::client::ClientTls;
-use holdfast_engine::tls::{Channel, TlsFailure};
+use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
 };
@@ -16,6 +15,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arguments::{byte, seconds};
+use crate::channel::Tls;
 use crate::client::{Endpoint, Reply, Request, exception, raised};
 
 #[pyclass(frozen, module = "holdfast")]
@@ -30,16 +30,6 @@ struct State {
     tls: Option<Tls>,
     /// Why I/O or TLS ended the connection.
     ending: Option<Ending>,
-}
-
-struct Tls {
-    channel: Channel,
-    plain: Vec<u8>,
-    out: Vec<u8>,
-    /// Whether the handshake has succeeded.
-    agreed: bool,
-    /// Whether data has been received after the handshake.
-    heard: bool,
 }
 
 /// A request that failed may be sent again.
@@ -94,7 +84,7 @@ impl Connection {
     #[getter]
     fn is_ready(&self) -> bool {
         let state = self.state();
-        let agreed = state.tls.as_ref().is_none_or(|tls| !tls.channel.is_handshaking());
+        let agreed = state.tls.as_ref().is_none_or(|tls| !tls.is_handshaking());
         agreed && state.core.closed().is_none()
     }
 
@@ -127,7 +117,7 @@ impl Connection {
         let bytes = match tls {
             None => PyBytes::new(py, plain),
             Some(tls) => {
-                tls.channel.send(plain, &mut tls.out);
+                tls.send(plain);
                 let bytes = PyBytes::new(py, &tls.out);
                 tls.out.clear();
                 bytes
@@ -147,17 +137,10 @@ impl Connection {
             core.receive(data, now, |done| completed.add(self, ending, done));
             return completed.all;
         };
-        tls.plain.clear();
-        let received = tls.channel.receive(data, &mut tls.plain, &mut tls.out);
-        tls.agreed |= !tls.channel.is_handshaking();
-        tls.heard |= !tls.plain.is_empty();
+        let received = tls.receive(data);
         core.receive(&tls.plain, now, |done| completed.add(self, ending, done));
-        if received.is_err() || tls.channel.has_ended() {
-            *ending = received.err().map(|error| {
-                let failure = TlsFailure::from(&error);
-                let maybe_sent = tls.agreed && !failure.refuses_connection();
-                Ending::Tls(failure, maybe_sent)
-            });
+        if received.is_err() || tls.has_ended() {
+            *ending = received.err().map(|(failure, maybe_sent)| Ending::Tls(failure, maybe_sent));
             core.close(Closed::ByPeer, |done| completed.add(self, ending, done));
         }
         completed.all
@@ -188,7 +171,7 @@ impl Connection {
         let mut completed = Completions::new(py);
         core.close(Closed::BySelf, |done| completed.add(self, ending, done));
         if let Some(tls) = tls {
-            tls.channel.end(&mut tls.out);
+            tls.end();
         }
         completed.all
     }
@@ -199,14 +182,10 @@ impl Connection {
         let State { core, tls, ending } = &mut *self.state();
         let mut completed = Completions::new(py);
         if core.closed().is_none() {
-            *ending = match tls {
-                Some(tls) if tls.channel.is_handshaking() => {
-                    Some(Ending::Tls(TlsFailure::ClosedDuringHandshake, false))
-                }
-                Some(tls) if error.is_some() && !tls.heard => {
-                    Some(Ending::Tls(TlsFailure::ClosedBeforeReply, true))
-                }
-                _ => error.map(Ending::Io),
+            let of_tls = tls.as_ref().and_then(|tls| tls.lost(error.is_some()));
+            *ending = match of_tls {
+                Some((failure, maybe_sent)) => Some(Ending::Tls(failure, maybe_sent)),
+                None => error.map(Ending::Io),
             };
         }
         core.close(Closed::ByPeer, |done| completed.add(self, ending, done));
@@ -244,16 +223,6 @@ impl Connection {
             }
             (failure, _) => ClientError::new(failure, timeout),
         }
-    }
-}
-
-impl Tls {
-    /// Starts TLS. The `ClientHello` is in `out`.
-    fn new(tls: &ClientTls) -> Result<Tls, TlsFailure> {
-        let mut channel = tls.channel().map_err(|error| TlsFailure::from(&error))?;
-        let mut out = Vec::new();
-        channel.send(&[], &mut out);
-        Ok(Tls { channel, plain: Vec::new(), out, agreed: false, heard: false })
     }
 }
 

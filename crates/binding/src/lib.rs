@@ -6,6 +6,7 @@
 mod arguments;
 mod audit;
 mod batch;
+mod channel;
 mod client;
 mod connection;
 mod engine;
@@ -26,6 +27,8 @@ mod _core {
 
     #[pymodule_export]
     use super::batch::{BatchRefused, write_across};
+    #[pymodule_export]
+    use super::channel::TlsChannel;
     #[pymodule_export]
     use super::client::{BlockingClient, Endpoint, Request};
     #[pymodule_export]

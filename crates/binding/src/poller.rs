@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
+use holdfast_engine::client::Place as HostPlace;
 use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
@@ -32,10 +33,9 @@ type Read<'py> = (String, i128, i128, Option<Place<'py>>);
 /// Area and slot of a status block, its name, and whether it keeps the last error.
 type StatusBlock = (String, u16, String, bool);
 
-/// Host, port, format, crc, unit or memory id, timeout, offsets by area, and the unit or memory id of
-/// the status block with the block.
-type Forward =
-    (String, u16, String, String, u16, f64, Vec<(String, u16)>, Option<(u16, StatusBlock)>);
+/// Format, crc, unit or memory id, timeout, offsets by area, and the unit or memory id of the status
+/// block with the block.
+type Forward = (String, String, u16, f64, Vec<(String, u16)>, Option<(u16, StatusBlock)>);
 
 /// Area, address, count, indexes of fields, number of items that no field covers.
 type PlannedBlock = (&'static str, u16, u16, Vec<usize>, u32);
@@ -63,7 +63,7 @@ impl PolledDevice {
         max_bits: i128,
         readable: Option<Vec<Range>>,
         forbidden: Option<Vec<Range>>,
-        forward: Option<Vec<Forward>>,
+        forward: Option<Vec<(PyRef<'_, Endpoint>, Forward)>>,
         status: Option<(PyRef<'_, Memory>, StatusBlock)>,
         start_within: Option<f64>,
         in_flight: Option<i128>,
@@ -211,6 +211,10 @@ impl Poller {
                 counters.set_item("refused", forward.refused.get())?;
                 counters.set_item("failed", forward.failed.get())?;
                 counters.set_item("replaced", forward.replaced.get())?;
+                let failure = forward.failure();
+                let reason = failure.as_ref().and_then(|failure| failure.reason);
+                counters.set_item("reason", reason)?;
+                counters.set_item("error", failure.map(|failure| failure.text))?;
                 forwards.push(counters);
             }
             counted.set_item("forward", forwards)?;
@@ -309,8 +313,11 @@ fn block((area, slot, name, keep_last_error): StatusBlock) -> PyResult<BlockSett
     Ok(BlockSettings { area: named(&area)?, slot, name, keep_last_error })
 }
 
-fn target(forward: Forward) -> PyResult<ForwardSettings> {
-    let (host, port, format, crc, target, timeout, offsets, status) = forward;
+fn target((receiver, forward): (PyRef<'_, Endpoint>, Forward)) -> PyResult<ForwardSettings> {
+    let (format, crc, target, timeout, offsets, status) = forward;
+    let HostPlace::Tcp { host, port, tls } = receiver.core.place.clone() else {
+        return Err(PyValueError::new_err("the endpoint of a receiver is not one of TCP or TLS"));
+    };
     let required = word("crc", &crc, &[("required", true), ("none", false)])?;
     let formats = [("v1", Format::V1), ("crc", Format::Crc { required })];
     let format = word("format", &format, &formats)?;
@@ -318,7 +325,7 @@ fn target(forward: Forward) -> PyResult<ForwardSettings> {
     let offsets = offsets.into_iter().map(|(area, offset)| Ok((named(&area)?, offset)));
     let offsets = offsets.collect::<PyResult<_>>()?;
     let status = status.map(|(target, of)| Ok::<_, PyErr>((target, block(of)?))).transpose()?;
-    Ok(ForwardSettings { host, port, format, target, timeout, offsets, status })
+    Ok(ForwardSettings { host, port, tls, format, target, timeout, offsets, status })
 }
 
 fn strategy(max_gap: Option<i128>, cost: Option<(f64, f64)>) -> PyResult<Strategy> {

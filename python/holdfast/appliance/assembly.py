@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, assert_never
 
 from holdfast import _core
-from holdfast.client.endpoint import endpoint
+from holdfast.client.endpoint import endpoint, receiver_endpoint
 from holdfast.config import (
     ModbusAsciiListener,
     ModbusAsciiOverTcpListener,
@@ -21,6 +21,7 @@ from holdfast.config import (
     ModbusTlsListener,
     ModbusUdpListener,
     RawIngestListener,
+    SecureRawRuleConfig,
 )
 from holdfast.config.rights import items, together, unit_rights
 from holdfast.config.route_checks import routed
@@ -57,6 +58,9 @@ if TYPE_CHECKING:
     from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area, Forward, NarrowedRights, StatusBlock
     from holdfast.web.https import Https
+
+_HANDSHAKES = 256
+"""The limit on handshakes of listeners without TLS, which have none."""
 
 _FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
     "modbus-tcp": "mbap",
@@ -182,7 +186,7 @@ def listener(
                 frame_timeout=None if rtu is None else rtu.frame_timeout,
                 listen_only=settings.listen_only,
                 tls=None if secure is None else server_tls(secure.tls),
-                max_handshakes=256 if secure is None else secure.max_handshakes,
+                max_handshakes=_HANDSHAKES if secure is None else secure.max_handshakes,
                 raw_ingest=_shared_port(name, settings, config, memories),
             )
         case ModbusUdpListener() | ModbusRtuOverUdpListener():
@@ -223,6 +227,8 @@ def listener(
                 packets=settings.packets,
                 idle_timeout=settings.idle_timeout or MAX_TIME,
                 after_refusal=settings.after_refusal,
+                tls=None if settings.tls is None else server_tls(settings.tls),
+                max_handshakes=settings.max_handshakes or _HANDSHAKES,
             )
         case _:
             assert_never(settings)
@@ -284,7 +290,10 @@ def device(
             (read.area, read.address, read.count, _place(read.into, memories))
             for read in settings.reads
         ],
-        forward=[_forward(name, each) for each in settings.forward],
+        forward=[
+            (_receiver(f"devices.{name}.forward[{index}].url", each), _forward(name, each))
+            for index, each in enumerate(settings.forward)
+        ],
         status=None if status is None else (memories[status.memory], _block(name, status)),
         start_within=min(settings.interval, SPREAD),
         in_flight=None if settings.in_flight == "auto" else settings.in_flight,
@@ -314,10 +323,9 @@ def mirror(config: Config, memories: Mapping[str, Memory]) -> None:
 
 
 def _forward(device: str, settings: ForwardConfig) -> Forward:
-    """A receiver, as the native poller has it."""
+    """The packets for a receiver, as the native poller has them."""
     status = settings.status
     return (
-        *settings.receiver,
         settings.format,
         settings.crc or "required",
         settings.target,
@@ -412,6 +420,14 @@ def _endpoint(key: str, target: Target) -> _core.Endpoint:
         raise OSError(f"{key}: {error}") from error
 
 
+def _receiver(key: str, settings: ForwardConfig) -> _core.Endpoint:
+    """The native endpoint of a receiver. Raises `OSError` for unusable files."""
+    try:
+        return receiver_endpoint(settings.receiver)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{key}: {error}") from error
+
+
 def _place(
     into: DestinationConfig | None, memories: Mapping[str, Memory]
 ) -> tuple[Memory, Area, int] | None:
@@ -475,6 +491,10 @@ def _raw_rule(rule: RawRuleConfig, config: Config, memories: Mapping[str, Memory
     ids = ((config.memories[name].id, name) for name in rule.memories)
     named = {memory_id: memories[name] for memory_id, name in ids if memory_id is not None}
     units = {unit: memories[name] for unit, name in rule.units.items()}
+    roles = rule.roles if isinstance(rule, SecureRawRuleConfig) else None
     return _core.RawRule(
-        units or named, sources=[str(source) for source in rule.sources], areas=list(rule.areas)
+        units or named,
+        sources=[str(source) for source in rule.sources],
+        areas=list(rule.areas),
+        roles=None if roles is None else list(roles),
     )

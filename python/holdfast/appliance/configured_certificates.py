@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from holdfast.client.url import NetworkTarget
-from holdfast.config import HTTP_SERVICES, ModbusTlsListener
+from holdfast.config import HTTP_SERVICES, tls_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from holdfast.client.url import Target
     from holdfast.config import ClientTlsConfig, Config
     from holdfast.config.source import KeyPath
+    from holdfast.net.tls import Tls
 
     Kind: TypeAlias = Literal["server", "certificates", "revocation lists"]
 
@@ -77,8 +78,8 @@ def doubts(config: Config) -> list[tuple[KeyPath, str]]:
 
 def _named(config: Config) -> Iterator[_Named]:
     for name, listener in config.listeners.items():
-        if isinstance(listener, ModbusTlsListener):
-            tls = listener.tls
+        tls = tls_of(listener)
+        if tls is not None:
             place: KeyPath = ("listeners", name, "tls")
             found = _of_server(place, tls.cert_file, tls.crl_file, "ca_file", tls.ca_file)
             yield from (replace(each, by_core=True) for each in found)
@@ -97,6 +98,8 @@ def _named(config: Config) -> Iterator[_Named]:
                 yield _Named((section, part, key), str(file), "certificates")
     for name, device in config.devices.items():
         yield from _of_url(("devices", name, "url"), device.target)
+        for index, forward in enumerate(device.forward):
+            yield from _of_client(("devices", name, "forward", index, "url"), forward.receiver.tls)
     for name, link in config.links.items():
         yield from _of_url(("links", name, "url"), link.target)
 
@@ -113,6 +116,10 @@ def _of_server(
 
 def _of_url(place: KeyPath, target: Target) -> Iterator[_Named]:
     if isinstance(target, NetworkTarget):
-        for file in (target.tls.ca, target.tls.cert):
-            if file is not None:
-                yield _Named(place, file, "certificates")
+        yield from _of_client(place, target.tls)
+
+
+def _of_client(place: KeyPath, tls: Tls | None) -> Iterator[_Named]:
+    for file in () if tls is None else (tls.ca, tls.cert):
+        if file is not None:
+            yield _Named(place, file, "certificates")

@@ -24,9 +24,9 @@ from holdfast.config import (
     HTTP_SERVICES,
     ModbusAsciiListener,
     ModbusRtuListener,
-    ModbusTlsListener,
 )
 from holdfast.config.fingerprint import fingerprint
+from holdfast.config.listeners import tls_of
 from holdfast.config.route_checks import routed
 from holdfast.faults import fault_word
 from holdfast.ingest import MemoryAccess
@@ -208,7 +208,7 @@ class _Running:
         self._health = dict.fromkeys(config.devices, "unknown")
         self._plan_errors: dict[str, str | None] = {}
         self._unstored: dict[str, int] = {}
-        self._forwarded: dict[tuple[str, int], Mapping[str, int]] = {}
+        self._forwarded: dict[tuple[str, int], Mapping[str, Any]] = {}
         self._unreachable: set[tuple[str, int]] = set()
         self._expiring = Expiring()
         self._listening: dict[str, tuple[str, int | None]] = {}
@@ -356,7 +356,7 @@ class _Running:
             fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
         logs.write(logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields)
 
-    def _log_forwards(self, name: str, counted: Sequence[Mapping[str, int]]) -> None:
+    def _log_forwards(self, name: str, counted: Sequence[Mapping[str, Any]]) -> None:
         """Logs what happened at the receivers of a device since the last check."""
         forwards = self._config.devices[name].forward
         for index, (forward, now) in enumerate(zip(forwards, counted, strict=True)):
@@ -366,7 +366,7 @@ class _Running:
             refused = now["refused"] - before.get("refused", 0)
             replied = refused + now["sent"] - before.get("sent", 0)
             failed = now["failed"] - before.get("failed", 0)
-            fields = {"device": name, "receiver": forward.url}
+            fields: dict[str, object] = {"device": name, "receiver": str(forward.receiver)}
             if refused:
                 logs.refused("forward_refused", kind=key, **fields, count=refused)
             if replied and key in self._unreachable:
@@ -374,7 +374,8 @@ class _Running:
                 logs.write(logging.INFO, "forward_back", **fields)
             elif failed and not replied and key not in self._unreachable:
                 self._unreachable.add(key)
-                logs.write(logging.WARNING, "forward_failed", **fields)
+                told = {key: now[key] for key in ("reason", "error") if now[key] is not None}
+                logs.write(logging.WARNING, "forward_failed", **fields, **told)
 
     def _log_event(self, listener: str, event: str, found: Mapping[str, object]) -> None:
         fields = {"listener": listener, "peer": "-", **found}
@@ -727,9 +728,8 @@ def _results(values: TagValues | None) -> _core.Results | None:
 
 def _review_interval(config: Config) -> float | None:
     """Seconds after which the certificates of open connections are judged again."""
-    listeners = config.listeners.values()
-    intervals = [each.tls.review for each in listeners if isinstance(each, ModbusTlsListener)]
-    return min(filter(None, intervals), default=None)
+    found = map(tls_of, config.listeners.values())
+    return min((tls.review for tls in found if tls is not None and tls.review), default=None)
 
 
 def _events(config: Config) -> Literal["all", "refusals"]:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.appliance import assembly, configured_certificates
-from holdfast.client.endpoint import check_files, endpoint
-from holdfast.config import HTTP_SERVICES, ConfigError, ModbusTlsListener, load, source
+from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
+from holdfast.config import HTTP_SERVICES, ConfigError, load, source, tls_of
 from holdfast.config.report import Report
 
 if TYPE_CHECKING:
@@ -32,10 +32,11 @@ def load_whole(path: Path | str) -> Config:
     problems: dict[KeyPath, str] = {}
     doubts: list[tuple[KeyPath, str]] = []
     for name, listener in config.listeners.items():
-        if isinstance(listener, ModbusTlsListener):
+        tls = tls_of(listener)
+        if tls is not None:
             place: KeyPath = ("listeners", name, "tls")
             try:
-                loaded = assembly.server_tls(listener.tls)
+                loaded = assembly.server_tls(tls)
             except ValueError as error:
                 problems[place] = str(error)
             else:
@@ -49,6 +50,12 @@ def load_whole(path: Path | str) -> Config:
             endpoint(target)
         except (OSError, ValueError) as error:
             problems[*where, "url"] = str(error)
+    for name, device in config.devices.items():
+        for index, forward in enumerate(device.forward):
+            try:
+                receiver_endpoint(forward.receiver)
+            except (OSError, ValueError) as error:
+                problems["devices", name, "forward", index, "url"] = str(error)
     if config.nats is not None and config.nats.device_tls is not None:
         from holdfast.scanner import device_tls
 

@@ -11,6 +11,7 @@ import click
 
 from holdfast import raw_ingest
 from holdfast.cli.places import number
+from holdfast.client.receiver import Receiver, parse_receiver
 from holdfast.protocol import MAX_WORD
 from holdfast.types import AREAS, Area
 
@@ -32,8 +33,13 @@ def _word(text: str) -> int:
     return found
 
 
-def _receiver(text: str) -> tuple[str, int]:
-    """Parses HOST:PORT; returns an IPv6 address without brackets."""
+def _receiver(text: str) -> Receiver:
+    """Parses HOST:PORT or a URL."""
+    if "://" in text:
+        try:
+            return parse_receiver(text)
+        except ValueError as error:
+            raise click.BadParameter(f"{error}.") from None
     host, _, digits = text.rpartition(":")
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]
@@ -44,7 +50,7 @@ def _receiver(text: str) -> tuple[str, int]:
         raise click.BadParameter(f"{text!r} is not HOST:PORT, as in 127.0.0.1:9000.")
     if not 1 <= port <= MAX_WORD:
         raise click.BadParameter(f"{text!r}: port {port} is outside 1 to {MAX_WORD}.")
-    return host, port
+    return Receiver(host, port)
 
 
 @click.command(
@@ -79,7 +85,7 @@ def _receiver(text: str) -> tuple[str, int]:
 @click.option("--dry-run", is_flag=True, help="Print the packet in hex and send nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
 def raw_send(
-    receiver: tuple[str, int],
+    receiver: Receiver,
     area: Area,
     address: int,
     values: tuple[int, ...],
@@ -94,6 +100,8 @@ def raw_send(
     as_json: bool,
 ) -> None:
     """Write VALUEs to AREA, starting at ADDRESS, in one step with one Raw Ingest packet.
+
+    Instead of HOST:PORT, for TLS: raw+tls://host:port?ca=ca.pem&cert=own.pem&key=own.key
 
     AREA is coils, discrete_inputs, holding_registers or input_registers. Numbers are decimal or 0x.
     Values in a file are separated by line ends, spaces, commas or semicolons.
@@ -124,20 +132,23 @@ def raw_send(
     if dry_run:
         click.echo(json.dumps({"packet": packet.hex()}) if as_json else packet.hex())
         return
-    host, port = receiver
     answer: dict[str, object] = {"area": area, "address": address, "bytes": len(packet)}
     try:
-        raw_ingest.send_packet_sync(host, port, packet, timeout=timeout)
-    except ValueError as error:
-        raise click.UsageError(f"{error}.") from error
+        raw_ingest.send_packet_sync(
+            receiver.host, receiver.port, packet, timeout=timeout, tls=receiver.tls
+        )
     except raw_ingest.RawError as error:
         if not as_json:
             click.echo(f"holdfast: {error}", err=True)
             sys.exit(1)
         answer["reason"] = _reason(error)
+        if isinstance(error, raw_ingest.RawTlsFailed):
+            answer["tls"] = error.reason
         answer |= {"detail": str(error), "maybe_written": error.maybe_written}
         click.echo(json.dumps({"ok": False} | answer))
         sys.exit(1)
+    except (OSError, ValueError) as error:
+        raise click.UsageError(f"{error}.") from error
     if as_json:
         click.echo(json.dumps({"ok": True} | answer))
     else:

@@ -10,6 +10,7 @@ from holdfast.client.url import NetworkTarget, SerialTarget
 from holdfast.protocol import TLS_PORT
 
 if TYPE_CHECKING:
+    from holdfast.client.receiver import Receiver
     from holdfast.client.url import Target, Tls
 
 
@@ -36,9 +37,24 @@ def _place(target: Target) -> Endpoint:
             rs485=target.rs485,
         )
     if target.transport == "tls":
-        of = target.tls
-        return Endpoint.tls(target.host, target.port, of.ca, of.cert, of.key, of.name)
+        return _secure(target.host, target.port, target.tls)
     return Endpoint.network(target.transport, target.host, target.port)
+
+
+def receiver_endpoint(receiver: Receiver) -> Endpoint:
+    """A receiver of Raw Ingest packets as the native core has it."""
+    if receiver.tls is None:
+        return Endpoint.network("tcp", receiver.host, receiver.port)
+    return _secure(receiver.host, receiver.port, receiver.tls)
+
+
+def _secure(host: str, port: int, of: Tls) -> Endpoint:
+    unlocked: bytes | None = None
+    if of.key is not None and of.key_passphrase_file is not None:
+        from holdfast.certificates import pem
+
+        unlocked = pem.unlocked(of.key, of.key_passphrase_file)
+    return Endpoint.tls(host, port, of.ca, of.cert, of.key, of.name, unlocked)
 
 
 def check_files(tls: Tls) -> None:

@@ -37,6 +37,9 @@ MBAP = tuple(each for each in TRANSPORTS if each not in SERIAL_FRAMES)
 MAX_SILENCE = 10.0
 """Seconds."""
 
+SECURE = ("tls", "raw+tls")
+"""The schemes with TLS: of devices, and of receivers of Raw Ingest packets."""
+
 IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
 """The transports that allow several requests in flight."""
 
@@ -105,7 +108,7 @@ def parse(url: str) -> Target:
         if port == 0:
             raise ValueError(f"{url!r}: port 0, allowed: 1 to {LAST_PORT}")
         port = usual_port(scheme) if port is None else port
-        chosen = _chosen(url, scheme, parts.query)
+        chosen = options_of(url, scheme, parts.query)
         tolerance = _taken(Tolerance, chosen)
         try:
             tls = Tls(**chosen)
@@ -122,12 +125,17 @@ def in_folder(url: str, folder: Path) -> str:
     target = parse(url)
     if not isinstance(target, NetworkTarget) or target.transport != "tls":
         return url
-    tls = target.tls.in_folder(folder)
-    if tls == target.tls:
+    return with_tls_in_folder(url, target.tls, folder)
+
+
+def with_tls_in_folder(url: str, tls: Tls, folder: Path) -> str:
+    """A URL with these TLS files, whose paths are resolved relative to this folder."""
+    resolved = tls.in_folder(folder)
+    if resolved == tls:
         return url
     location, _, query = url.partition("?")
     kept = [each for each in query.split("&") if unquote(each.partition("=")[0]) not in TLS_KEYS]
-    return f"{location}?{'&'.join([tls.query, *kept])}"
+    return f"{location}?{'&'.join([resolved.query, *kept])}"
 
 
 @dataclass(frozen=True)
@@ -206,14 +214,15 @@ OPTIONS: Mapping[str, _Option] = {
     "retry_busy": _flag(ALL),
     "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), ALL),
     "reconnect": _Option(f"seconds, up to {MAX_PAUSE}", _pause, ALL),
-    "ca": _Option("paths of files", _text, ("tls",)),
-    "cert": _Option("paths of files", _text, ("tls",)),
-    "key": _Option("paths of files", _text, ("tls",)),
-    "name": _Option("host names and IP addresses", _text, ("tls",)),
+    "ca": _Option("paths of files", _text, SECURE),
+    "cert": _Option("paths of files", _text, SECURE),
+    "key": _Option("paths of files", _text, SECURE),
+    "key_passphrase_file": _Option("paths of files", _text, SECURE),
+    "name": _Option("host names and IP addresses", _text, SECURE),
 }
 
 
-TLS_KEYS = tuple(name for name, each in OPTIONS.items() if each.schemes == ("tls",))
+TLS_KEYS = tuple(name for name, each in OPTIONS.items() if each.schemes == SECURE)
 
 
 def _taken(kind: type[Any], chosen: dict[str, Any]) -> Any:
@@ -223,7 +232,7 @@ def _taken(kind: type[Any], chosen: dict[str, Any]) -> Any:
     )
 
 
-def _chosen(url: str, scheme: str, query: str) -> dict[str, Any]:
+def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
     """Parses a query with the options of a scheme."""
     chosen: dict[str, Any] = {}
     # `+` is a literal in a URL; `parse_qsl` would read it as a space, as in HTML forms.
@@ -247,7 +256,7 @@ def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
         device = device[1:]  # Ports of Windows have no leading slash.
     if device in ("", "/"):
         raise ValueError(f"{url!r} has no device, allowed: {FORMS}")
-    chosen = _chosen(url, mode, query)
+    chosen = options_of(url, mode, query)
     if mode == "rtu" and chosen.get("data_bits", 8) != 8:
         raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu: 8")
     chosen.setdefault("data_bits", 8 if mode == "rtu" else 7)

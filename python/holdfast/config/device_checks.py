@@ -11,7 +11,7 @@ from holdfast.config.initial import extent
 from holdfast.config.lenient import entries, integer, mapping, parsed
 from holdfast.config.memory_checks import area_of
 from holdfast.config.range_checks import check_ranges, counted
-from holdfast.config.receiver import parse_receiver
+from holdfast.config.scalars import parse_receiver_url
 from holdfast.config.words import choice, show
 from holdfast.net.addresses import joined
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
@@ -139,12 +139,12 @@ class DeviceChecks:
         self, path: KeyPath, forward: dict[Any, Any], status: dict[Any, Any], form: str
     ) -> None:
         """Each block of a receiver has one device."""
-        receiver = parsed(parse_receiver, forward.get("url"))
+        receiver = parsed(parse_receiver_url, forward.get("url"))
         area, slot = status.get("area"), integer(status.get("slot"), 0, LAST_SLOT)
         target = integer(status.get(_NAMING[form]), 0, MAX_WORD)
         if receiver is None or area not in REGISTER_AREAS or slot is None or target is None:
             return
-        of = f"{_NAMING[form]} {target} of {joined(*receiver)}"
+        of = f"{_NAMING[form]} {target} of {joined(receiver.host, receiver.port)}"
         block = range(slot * STATUS_BLOCK, (slot + 1) * STATUS_BLOCK)
         self._claims.append(Claim(path, of, area, block))
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, Strict
 
+from holdfast.client.receiver import Receiver, parse_receiver
 from holdfast.client.tolerance import MAX_CLOSE_AFTER, MAX_PAUSE, MAX_RETRIES, Tolerance
 from holdfast.client.url import MAX_IN_FLIGHT, Target, parse
 from holdfast.config.base import Model
 from holdfast.config.memories import Register, Size
-from holdfast.config.receiver import Receiver, parse_receiver
 from holdfast.config.scalars import (
     MAX_TIME,
     NAME_KEYS,
@@ -152,7 +152,7 @@ class ForwardConfig(Model):
     """A raw ingest receiver to which every read is forwarded."""
 
     url: ReceiverUrl
-    """The receiver: raw://host:port."""
+    """The receiver: raw://host:port, or raw+tls://host:port with the options of tls:// URLs."""
     format: Literal["v1", "crc"] = "v1"
     """v1: a 10-byte header with a unit id; crc: a 12-byte header with a memory id, and a CRC."""
     crc: Annotated[Literal["required", "none"] | None, NotNull()] = Field(default_factory=_crc)
@@ -170,7 +170,7 @@ class ForwardConfig(Model):
 
     @property
     def receiver(self) -> Receiver:
-        """Host and port."""
+        """The receiver, parsed."""
         return parse_receiver(self.url)
 
     @property

@@ -44,13 +44,14 @@ def fingerprint(*settings: object) -> str:
 
 
 def _files(value: Any) -> Iterator[Path]:
-    """The files that settings name: as a path, or in the URL of a device."""
+    """The files that settings name: as a path, or in the URL of a device or receiver."""
     if isinstance(value, Path):
         yield value
     elif isinstance(value, Model):
-        tls: Tls | None = getattr(getattr(value, "target", None), "tls", None)
-        if tls is not None:
-            yield from (Path(file) for _, file in tls.files())
+        for named in ("target", "receiver"):
+            tls: Tls | None = getattr(getattr(value, named, None), "tls", None)
+            if tls is not None:
+                yield from (Path(file) for _, file in tls.files())
         for name in type(value).model_fields:
             if name not in value.own_files:
                 yield from _files(getattr(value, name))

@@ -28,12 +28,17 @@ from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue, WithJsonSchema
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from holdfast.client.receiver import (
+    RECEIVER_FORM,
+    Receiver,
+    parse_receiver,
+    receiver_in_folder,
+)
 from holdfast.client.url import FORMS, in_folder, parse
 from holdfast.config.broker import MAX_TEXT, parse_broker, parse_topic_filter
 from holdfast.config.egress import parse_allowed
 from holdfast.config.http_url import parse_http
 from holdfast.config.ip_addresses import Bind, parse_bind, parse_peer, parse_source
-from holdfast.config.receiver import parse_receiver
 from holdfast.config.scanning import (
     PREFIX,
     parse_pollable,
@@ -147,9 +152,18 @@ def _device_url(value: object, info: ValidationInfo) -> str:
     return in_folder(parse_url(value), _folder(info))
 
 
-def _receiver_url(value: object) -> str:
-    parse_receiver(value)
-    return str(value)
+def parse_receiver_url(value: object) -> Receiver:
+    """Parses the URL of a receiver. Raises `ValueError` for anything else."""
+    if not isinstance(value, str):
+        raise ValueError(f"found {show(value)}, allowed: {RECEIVER_FORM}")
+    if "\0" in unquote(value):
+        raise ValueError(f"found {show(value)}, allowed: a URL without NUL")
+    return parse_receiver(value)
+
+
+def _receiver_url(value: object, info: ValidationInfo) -> str:
+    parse_receiver_url(value)
+    return receiver_in_folder(str(value), _folder(info))
 
 
 def _integral(value: object) -> object:
@@ -369,7 +383,9 @@ DeviceUrl = Annotated[
 ReceiverUrl = Annotated[
     str,
     PlainValidator(_receiver_url),
-    WithJsonSchema({"type": "string", "examples": ["raw://10.0.2.9:9000"]}),
+    WithJsonSchema(
+        {"type": "string", "examples": ["raw://10.0.2.9:9000", "raw+tls://10.0.2.9:9000?ca=ca.pem"]}
+    ),
 ]
 TopicFilter = Annotated[
     str,

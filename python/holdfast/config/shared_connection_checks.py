@@ -17,7 +17,7 @@ from holdfast.config.devices import RetryConfig, ToleranceConfig
 from holdfast.config.files import check_readable
 from holdfast.config.lenient import entries, fitting, integer, mapping, parsed
 from holdfast.config.listeners import SERIAL_TYPES
-from holdfast.config.scalars import NOT_ON_A_LINE, parse_url
+from holdfast.config.scalars import NOT_ON_A_LINE, parse_receiver_url, parse_url
 from holdfast.config.scanning import parse_pollable
 from holdfast.config.words import show
 from holdfast.net.allow_list import AllowedDevice
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from holdfast.client.url import NetworkTarget, Target
     from holdfast.config.report import Report
     from holdfast.config.source import KeyPath
+    from holdfast.net.tls import Tls
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class _Shared:
 
 @dataclass
 class AddressChecks:
-    """Checks the URLs of devices and links of one file; files are relative to `folder`.
+    """Checks the URLs of devices, links and receivers of one file; files are relative to `folder`.
 
     A link decides for the devices at its address, except for what they set differently.
     """
@@ -62,6 +63,7 @@ class AddressChecks:
             for name, user in mapping(data.get(section)).items():
                 if isinstance(user, dict):
                     self._user((section, name), user, taken)
+                    self._receivers((section, name, "forward"), user.get("forward"))
         self._subscribed(entries(mapping(data.get("nats")).get("devices")), taken)
 
     def _user(self, path: KeyPath, user: dict[Any, Any], taken: dict[str, KeyPath]) -> None:
@@ -75,9 +77,18 @@ class AddressChecks:
             self._line(path, target, retry, user, taken)
             return
         self._shared(path, target, retry, user)
-        for key, file in target.tls.files():
-            where, shown = (*path, "url"), f"{key}={show(file)}"
-            check_readable(where, file, self.folder, self.report, shown=shown)
+        self._files((*path, "url"), target.tls)
+
+    def _receivers(self, path: KeyPath, forward: object) -> None:
+        for index, each in enumerate(entries(forward)):
+            receiver = parsed(parse_receiver_url, mapping(each).get("url"))
+            if receiver is not None and receiver.tls is not None:
+                self._files((*path, index, "url"), receiver.tls)
+
+    def _files(self, path: KeyPath, tls: Tls) -> None:
+        for key, file in tls.files():
+            shown = f"{key}={show(file)}"
+            check_readable(path, file, self.folder, self.report, shown=shown)
 
     def _tolerance(self, path: KeyPath, target: Target, user: dict[Any, Any]) -> Target:
         """The target with what its device needs tolerated."""

@@ -27,7 +27,7 @@ def alone(*, cert: bool, key: bool) -> tuple[str, str] | None:
 class Tls:
     """The TLS files of a connection, in PEM.
 
-    Raises `ValueError` for `cert` without `key`, or `key` without `cert`.
+    Raises `ValueError` for `cert` without `key`, `key` without `cert`, or a passphrase without key.
     """
 
     ca: str | None = None
@@ -36,11 +36,15 @@ class Tls:
     key: str | None = None
     name: str | None = None
     """The expected name in the device's certificate; `None` for the host."""
+    key_passphrase_file: str | None = None
+    """A file that contains the passphrase of the key."""
 
     def __post_init__(self) -> None:
         lonely = alone(cert=self.cert is not None, key=self.key is not None)
         if lonely is not None:
             raise ValueError(f"{lonely[0]} without {lonely[1]}: give both, or neither")
+        if self.key_passphrase_file is not None and self.key is None:
+            raise ValueError("key_passphrase_file without key: give both, or key alone")
 
     @staticmethod
     def of(
@@ -59,7 +63,7 @@ class Tls:
 
     def files(self) -> Iterator[tuple[str, str]]:
         """Yields the key and the path of each given file."""
-        for key in ("ca", "cert", "key"):
+        for key in ("ca", "cert", "key", "key_passphrase_file"):
             file: str | None = getattr(self, key)
             if file is not None:
                 yield key, file

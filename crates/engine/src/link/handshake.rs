@@ -13,7 +13,7 @@ const CHUNK: usize = 4096;
 
 /// # Errors
 /// The handshake failed: close the connection. An alert has been sent.
-pub(super) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result<Channel> {
+pub(crate) async fn agree(stream: &mut TcpStream, tls: &ClientTls) -> io::Result<Channel> {
     let failed = |error| io::Error::other(TlsFailure::from(&error));
     let mut channel = tls.channel().map_err(failed)?;
     let (mut plain, mut out) = (Vec::new(), Vec::new());

@@ -29,6 +29,7 @@ pub use caller::{Called, Caller, Wakes};
 pub(crate) use coming::{Coming, ReplyTo, coming};
 pub use fault::Fault;
 pub(crate) use fault::exception;
+pub(crate) use handshake::agree;
 pub use pace::InFlight;
 pub(crate) use queue::{Priority, source};
 pub(crate) use route::{Asker, Call};

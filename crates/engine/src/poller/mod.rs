@@ -23,7 +23,7 @@ mod turn;
 mod write_through;
 
 pub use device::{DeviceSettings, ReadSettings};
-pub use raw_ingest::{ForwardCounters, ForwardSettings};
+pub use raw_ingest::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use sink::Destination;
 pub use state::{DeviceCounters, DeviceState};

@@ -3,10 +3,10 @@
 
 use std::cell::{Cell, RefCell};
 use std::collections::{HashMap, VecDeque};
-use std::io;
+use std::io::{self, ErrorKind};
 use std::num::NonZeroU16;
 use std::rc::Rc;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use holdfast_memory::Area;
@@ -18,17 +18,24 @@ use tokio::time::{sleep, timeout};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::counter::Counter;
-use crate::link::Retry;
+use crate::link::{Retry, agree};
 use crate::packet_area::in_packet;
+use crate::tls::TlsFailure;
+use crate::tls::client::ClientTls;
 
 /// The longest pause before a target that is down is tried again.
 const MAX_PAUSE: Duration = Duration::from_secs(10);
+
+/// Bytes per read of a socket.
+const CHUNK: usize = 1024;
 
 /// A receiver of Raw Ingest packets.
 #[derive(Debug, Clone)]
 pub struct ForwardSettings {
     pub host: String,
     pub port: u16,
+    /// `None` is plain TCP.
+    pub tls: Option<Arc<ClientTls>>,
     pub format: Format,
     /// The unit id (v1) or memory id (crc) in packets.
     pub target: u16,
@@ -64,6 +71,30 @@ pub struct ForwardCounters {
     pub failed: Counter,
     /// Packets replaced by newer bytes of the same read before they were sent.
     pub replaced: Counter,
+    failure: Mutex<Option<ForwardFailure>>,
+}
+
+/// Why a packet was not confirmed.
+#[derive(Debug, Clone)]
+pub struct ForwardFailure {
+    /// A word for programs, if TLS failed.
+    pub reason: Option<&'static str>,
+    pub text: String,
+}
+
+impl ForwardCounters {
+    /// The last failure.
+    pub fn failure(&self) -> Option<ForwardFailure> {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn fail(&self, error: &io::Error) {
+        let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsFailure>());
+        let failure =
+            ForwardFailure { reason: tls.map(TlsFailure::reason), text: error.to_string() };
+        self.failed.add();
+        *self.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(failure);
+    }
 }
 
 /// One target of one device.
@@ -180,14 +211,19 @@ impl Forward {
                 self.news.notified().await;
                 continue;
             };
-            match timeout(self.settings.timeout, self.send(&packet)).await {
-                Ok(Ok(reply)) => {
+            let sent = timeout(self.settings.timeout, self.send(&packet)).await;
+            let too_late = || {
+                let seconds = self.settings.timeout.as_secs_f64();
+                io::Error::new(ErrorKind::TimedOut, format!("no reply within {seconds} s"))
+            };
+            match sent.unwrap_or_else(|_| Err(too_late())) {
+                Ok(reply) => {
                     self.failures.set(0);
                     let counters = &self.counters;
                     if reply == DONE { counters.sent.add() } else { counters.refused.add() }
                 }
-                Ok(Err(_)) | Err(_) => {
-                    self.counters.failed.add();
+                Err(error) => {
+                    self.counters.fail(&error);
                     if self.waiting.borrow_mut().put_back(of, packet) {
                         self.counters.replaced.add();
                     }
@@ -201,9 +237,44 @@ impl Forward {
     async fn send(&self, packet: &[u8]) -> io::Result<u8> {
         let address = (self.settings.host.as_str(), self.settings.port);
         let mut stream = TcpStream::connect(address).await?;
+        if let Some(tls) = &self.settings.tls {
+            return send_over_tls(stream, tls, packet).await;
+        }
         stream.write_all(packet).await?;
         stream.read_u8().await
     }
+}
+
+/// Sends a packet over TLS. Returns the reply.
+async fn send_over_tls(mut stream: TcpStream, tls: &ClientTls, packet: &[u8]) -> io::Result<u8> {
+    let mut channel = agree(&mut stream, tls).await?;
+    let (mut plain, mut out, mut chunk) = (Vec::new(), Vec::new(), [0; CHUNK]);
+    channel.send(packet, &mut out);
+    // A receiver that refuses the certificate closes the connection. Its alert says why.
+    let sent = stream.write_all(&out).await;
+    loop {
+        let len = match stream.read(&mut chunk).await {
+            Ok(len @ 1..) => len,
+            Ok(_) => return Err(sent.err().unwrap_or_else(|| lost(TlsFailure::ClosedBeforeReply))),
+            Err(error) => return Err(sent.err().unwrap_or(error)),
+        };
+        out.clear();
+        let received = channel.receive(&chunk[..len], &mut plain, &mut out);
+        if let Some(reply) = plain.first() {
+            channel.end(&mut out);
+            let _ = stream.try_write(&out);
+            return Ok(*reply);
+        }
+        received.map_err(|error| lost(TlsFailure::from(&error)))?;
+        if channel.has_ended() {
+            return Err(lost(TlsFailure::ClosedBeforeReply));
+        }
+        stream.write_all(&out).await?;
+    }
+}
+
+fn lost(failure: TlsFailure) -> io::Error {
+    io::Error::other(failure)
 }
 
 #[cfg(test)]

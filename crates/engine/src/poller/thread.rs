@@ -737,6 +737,7 @@ mod tests {
         let forward = |offset, status: Option<BlockSettings>| ForwardSettings {
             host: "127.0.0.1".into(),
             port: 1,
+            tls: None,
             format: Format::V1,
             target: 1,
             timeout: Duration::from_secs(1),

@@ -1,0 +1,96 @@
+"""The outcome of one packet: written, refused, or unknown."""
+
+from __future__ import annotations
+
+import math
+import os
+import reprlib
+import socket
+
+from holdfast.net.addresses import joined
+from holdfast.raw_ingest.encoding import checked_field
+
+DONE, REFUSED = b"\x00", b"\x01"
+
+
+class RawError(Exception):
+    """The packet was not confirmed.
+
+    `maybe_written`: the whole packet was sent, but no valid reply arrived.
+    """
+
+    def __init__(self, what: str, *, maybe_written: bool) -> None:
+        outcome = "the packet may have been written" if maybe_written else "nothing was written"
+        super().__init__(f"{what}; {outcome}")
+        self.maybe_written = maybe_written
+
+
+class RawRefused(RawError):
+    """The receiver refused the packet (reply 01) and wrote nothing. It gives no reason."""
+
+
+class RawTimeout(RawError, TimeoutError):
+    """Connection, packet and reply took longer than the timeout."""
+
+
+class RawTlsFailed(RawError):
+    """TLS failed. `reason` is a word from docs/modbus-tls.md, such as `expired` or `wrong_name`."""
+
+    def __init__(self, what: str, reason: str, *, maybe_written: bool) -> None:
+        super().__init__(what, maybe_written=maybe_written)
+        self.reason = reason
+
+
+class TlsLost(OSError):
+    """TLS ended a connection, for a reason. `maybe_sent`: the peer may have executed the packet."""
+
+    def __init__(self, reason: str, text: str, maybe_sent: bool) -> None:
+        super().__init__(text)
+        self.reason = reason
+        self.maybe_sent = maybe_sent
+
+
+class Attempt:
+    """The progress of one packet, and its outcome."""
+
+    def __init__(self, host: str, port: int, timeout: float) -> None:
+        checked_field("port", port, least=1)
+        if not 0 < timeout < math.inf:
+            raise ValueError(f"timeout is {timeout}, allowed: more than 0 seconds")
+        try:
+            if not host.encode("idna"):
+                raise UnicodeError
+        except UnicodeError:
+            raise ValueError(f"{reprlib.repr(host)} is not a host name") from None
+        self.peer = joined(host, port)
+        self.timeout = timeout
+        self.connected = False
+        self.sent = False
+
+    def failed(self, error: OSError) -> RawError:
+        """The error of a connection as an outcome."""
+        if isinstance(error, TimeoutError):
+            what = "reply" if self.connected else "connection"
+            text = f"{self.peer}: no {what} within {self.timeout:g} s"
+            return RawTimeout(text, maybe_written=self.sent)
+        if isinstance(error, TlsLost):
+            written = error.maybe_sent and self.sent
+            return RawTlsFailed(f"{self.peer}: {error}", error.reason, maybe_written=written)
+        what = error.strerror or str(error)
+        if error.errno is not None and not isinstance(error, socket.gaierror):
+            what = os.strerror(error.errno)
+        return RawError(f"{self.peer}: {what}", maybe_written=self.sent)
+
+    def conclude(self, reply: bytes) -> None:
+        """Returns if the reply confirms the packet; otherwise raises `RawError`."""
+        if reply == DONE and self.sent:
+            return
+        if reply == REFUSED:
+            raise RawRefused(f"{self.peer} refused the packet", maybe_written=False)
+        if reply == DONE:
+            what = "answered 00 before it had the whole packet"
+        elif reply:
+            what = f"answered {reply.hex()}, allowed: 00 or 01"
+        else:
+            what = "closed the connection without a reply"
+        raise RawError(f"{self.peer} {what}", maybe_written=self.sent)
