@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 import ssl
 from typing import TYPE_CHECKING, Any
 
@@ -223,6 +224,17 @@ def verdict(appliance: Appliance, trust: ssl.SSLContext) -> str:
             return verdicts.get(client.shake().ask(READ), "answered")
         except Refused as refused:
             return str(refused)
+
+
+def secure_reply(to: tuple[str, int], trust: ssl.SSLContext, packet: bytes) -> bytes:
+    """Returns all that a Raw Ingest listener sends for a packet; nothing if it refuses TLS."""
+    with socket.create_connection(to, wire.DEADLINE) as plain:
+        try:
+            with trust.wrap_socket(plain, server_hostname="localhost") as secured:
+                secured.sendall(packet)
+                return b"".join(iter(lambda: secured.recv(16), b""))
+        except (ssl.SSLError, ConnectionError):
+            return b""
 
 
 def failures(appliance: Appliance) -> dict[str, int]:

@@ -1,25 +1,32 @@
 """One judgement of certificates: every face gives the same answer to every certificate.
 
 Devices show them to the blocking client, the asyncio client and the native poller; clients show
-them to the listener. The right answers are in the table of `support/certificate_cases.py`.
+them to the listener. So do receivers and senders of Raw Ingest packets. The right answers are in
+the table of `support/certificate_cases.py`.
 """
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
-from holdfast import _core, logs
-from holdfast.client.endpoint import endpoint
+from holdfast import _core, logs, raw_ingest
+from holdfast.client.endpoint import endpoint, receiver_endpoint
+from holdfast.client.receiver import Receiver
 from holdfast.client.url import parse
-from support import wire
+from holdfast.net.tls import Tls
+from support import native_poller, wire
 from support.certificate_cases import ACCEPTED, CASES, KEYS, OWN_KEYS, SERVED, Mint
 from support.certificates import Issued, openssl
+from support.config_folder import written
 from support.faces import FACES
+from support.polled import Fake, data
+from support.running import endpoint as endpoint_of
 from support.secured import Relay, context
-from support.tls_peer import configuration, reasons, verdict
+from support.tls_peer import configuration, reasons, secure_reply, verdict
 from support.tls_peer import context as peer_context
 
 if TYPE_CHECKING:
@@ -174,6 +181,58 @@ def test_the_salt_of_a_signature_is_told(mint: Mint, device: Address) -> None:
     assert answer.endswith("a salt as long as the hash")
 
 
+def packet_sent(face: str, address: Address, tls: Tls) -> str:
+    """The answer of a sender of Raw Ingest packets, as that of `read`."""
+    packet = raw_ingest.encode("coils", 0, [1], unit=1)
+    options: dict[str, Any] = {"tls": tls, "timeout": wire.DEADLINE}
+    try:
+        if face == "sync":
+            raw_ingest.send_packet_sync(*address, packet, **options)
+        else:
+            asyncio.run(raw_ingest.send_packet(*address, packet, **options))
+    except raw_ingest.RawTlsFailed as failed:
+        return f"{failed.reason}, maybe written" if failed.maybe_written else failed.reason
+    return ACCEPTED
+
+
+def forwarded(fake: Fake, receiver: Receiver) -> str:
+    """The answer of a device whose reads are forwarded, as that of `read`."""
+    to: Any = (receiver_endpoint(receiver), ("v1", "required", 1, wire.DEADLINE, [], None))
+    reads: Any = [("coils", 0, 1, None)]
+    poller = native_poller.ReportingPoller()
+    try:
+        poller.add(native_poller.device(fake, "plc", reads=reads, forward=[to]))
+
+        def counted() -> dict[str, Any]:
+            counters: dict[str, Any] = poller.counters()["plc"]["forward"][0]
+            return counters
+
+        wire.until(lambda: counted()["sent"] or counted()["failed"], "the packet has an outcome")
+        return ACCEPTED if counted()["sent"] else str(counted()["reason"])
+    finally:
+        poller.stop()
+
+
+@pytest.mark.parametrize("face", ["sync", "async", "forward"])
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_a_receiver_is_judged_alike_by_every_sender(
+    case: Case, face: str, mint: Mint, shown: dict[str, Shown], run: Run
+) -> None:
+    show = made(case, mint, shown)
+    rule = {"sources": ["127.0.0.1"], "units": {1: "plant"}, "areas": ["coils"]}
+    raw = {"type": "raw-ingest", "bind": "127.0.0.1:0", "rules": [rule]}
+    plain = run(written({"memories": {"plant": {"coils": 1}}, "listeners": {"raw": raw}}))
+    with Relay(endpoint_of(plain, "raw"), context((show.chain, show.key), weak=True)) as relay:
+        receiver = Receiver(*relay.address, Tls(ca=str(show.trusted)))
+        if face == "forward":
+            with Fake(data) as fake:
+                answer = forwarded(fake, receiver)
+        else:
+            assert receiver.tls is not None
+            answer = packet_sent(face, relay.address, receiver.tls)
+    assert answer == case.device
+
+
 # Clients
 
 
@@ -187,6 +246,13 @@ def own(mint: Mint) -> Shown:
 def listener(own: Shown, trusted: Path) -> str:
     files = {"cert_file": own.chain, "key_file": own.key, "ca_file": trusted}
     return configuration(files, ANYONE)
+
+
+def packets(own: Shown, trusted: Path) -> str:
+    """As `listener`, for Raw Ingest packets."""
+    files = {"cert_file": own.chain, "key_file": own.key, "ca_file": trusted}
+    rules: list[dict[str, Any]] = [{"sources": ["127.0.0.1"], "areas": ["coils"]}]
+    return configuration(files, rules, type="raw-ingest")
 
 
 def listener_cases(version: str) -> list[Any]:
@@ -217,6 +283,28 @@ def test_a_client_is_judged_alike_by_the_listener(
         assert answer == SERVED
     else:
         assert answer != SERVED
+        assert reasons(appliance, caplog) == [case.client]
+
+
+@pytest.mark.parametrize(
+    ("case", "version"), [each for version in ("1.2", "1.3") for each in listener_cases(version)]
+)
+def test_a_sender_is_judged_alike_by_the_listener_for_packets(
+    case: Case,
+    version: str,
+    mint: Mint,
+    shown: dict[str, Shown],
+    own: Shown,
+    run: Run,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    show = made(case, mint, shown)
+    appliance = run(packets(own, show.trusted))
+    trust = peer_context(own.trusted, Issued(show.chain, show.key), version, weak=True)
+    packet = raw_ingest.encode("coils", 0, [1], unit=1)
+    reply = secure_reply(endpoint_of(appliance, "secure"), trust, packet)
+    assert reply == (b"\0" if case.client == SERVED else b"")
+    if case.client != SERVED:
         assert reasons(appliance, caplog) == [case.client]
 
 
