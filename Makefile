@@ -58,8 +58,9 @@ format: .venv/dev.stamp
 # NAME is a benchmark of benches/, BENCH its options.
 NAME ?= server
 # Long runs of tests that `make test` does in short.
-torture:
+torture: .venv/core.stamp .venv/dev.stamp
 	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-engine --test route
+	HOLDFAST_TORTURE=1 $(BIN)/pytest tests/server/test_slow_connections.py
 
 bench: .venv/core.stamp .venv/dev.stamp
 	cargo build --locked --quiet --release -p holdfast-benches
