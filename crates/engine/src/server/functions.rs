@@ -64,6 +64,13 @@ fn is_allowed(code: u8, functions: &Functions, access: AccessMode, of_device: bo
         }
 }
 
+/// Whether a request counts as a write for the limits of a source.
+#[inline]
+pub(super) fn is_write(request: &[u8]) -> bool {
+    let code = request.first().copied().unwrap_or_default();
+    code == WRITE_FILE_RECORD || Function::from_code(code).is_some_and(Function::is_write)
+}
+
 /// Whether a request is known to change nothing in a device.
 pub(super) fn only_reads(request: &[u8]) -> bool {
     let code = request.first().copied().unwrap_or_default();

@@ -16,6 +16,7 @@ mod live;
 mod peer;
 pub mod policy;
 pub mod ranges;
+mod rates;
 mod raw_ingest;
 mod refused_request;
 mod secure;
@@ -32,6 +33,7 @@ pub use engine::{
     Settings, StartError,
 };
 pub use peer::Peer;
+pub use rates::{ByExcess, Excess, RateCounters, RateLimits};
 pub use raw_ingest::{AfterRefusal, Flags, PacketsPerConnection, RawRule, RawSettings};
 pub use refused_request::{RefusedRequest, Why};
 pub use serial::SerialSettings;

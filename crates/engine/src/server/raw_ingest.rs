@@ -32,6 +32,7 @@ use super::listener::{Admitted, ListenerContext, Service, drain, set_options};
 use super::live::Live;
 use super::peer::Peer;
 use super::policy::{Grant, Grants};
+use super::rates::RateLimits;
 use super::secure::secured;
 use super::stream::{self, End, Stream, send_all};
 use crate::tls::server::ServerTls;
@@ -81,6 +82,8 @@ pub struct RawSettings {
     pub crc_if_present: bool,
     pub rules: Vec<RawRule>,
     pub limits: ConnectionLimits,
+    /// Packets count as writes.
+    pub rates: RateLimits,
     /// The longest time from the start of a connection to the last byte of its packet. With TLS also
     /// for the handshake, before that.
     pub request_timeout: Duration,
@@ -424,10 +427,14 @@ impl RawIngest {
         context: Arc<ListenerContext>,
         mut sending: Sending<S>,
         renewal: Renewal,
-        stop: watch::Receiver<bool>,
+        mut stop: watch::Receiver<bool>,
     ) {
         if let Some(idle) = self.many {
             return self.serve_many(context, sending, renewal, idle, stop).await;
+        }
+        if !context.pace_packet(sending.peer.address, &mut stop).await {
+            context.ended(Kind::Closed, sending.peer.clone());
+            return sending.end();
         }
         let judged = match self.receive(&mut sending, stop.clone()).await {
             Err(end) => {
@@ -496,6 +503,10 @@ impl RawIngest {
                         end = slow;
                         break;
                     }
+                    if !context.pace_packet(sending.peer.address, &mut stop).await {
+                        break;
+                    }
+                    begun = Instant::now();
                     packets += 1;
                     if packets.is_multiple_of(TURN) {
                         yield_now().await;
@@ -691,12 +702,15 @@ impl Service for RawIngest {
         };
         let bytes = &chunk[..len];
         let peer = Peer::from(connection.peer);
+        let is_slowed = context.is_slowed(connection.peer);
         if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
             && len < CHUNK
+            && !is_slowed
             && self.write(context, &peer, (header, memory, payload)).is_ok()
         {
             let dropped = RawIngest::confirm(&mut connection.stream, &mut Vec::new());
             self.drop_bytes(context, &peer, dropped);
+            context.charge_packet(connection.peer);
             context.ended(Kind::Closed, peer);
             return None;
         }
@@ -763,6 +777,7 @@ mod tests {
             crc_if_present: false,
             rules: Vec::new(),
             limits: ConnectionLimits::NONE,
+            rates: RateLimits::default(),
             request_timeout: Duration::from_secs(10),
             packets: PacketsPerConnection::One,
             tls: None,

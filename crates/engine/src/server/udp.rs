@@ -16,10 +16,13 @@ use tokio::task::JoinSet;
 
 use super::audit::Permit;
 use super::deferred::come;
+use super::event::Kind;
 use super::framing::{Datagram, Mbap, Next, Rtu};
+use super::functions::is_write;
 use super::listener::ListenerContext;
 use super::live::Live;
 use super::policy::{Policy, Rule};
+use super::rates::RateLimits;
 use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
 use crate::link::{Asker, source};
@@ -54,6 +57,7 @@ pub struct UdpSettings {
     pub bind: SocketAddr,
     pub framing: DatagramFraming,
     pub rules: Vec<Rule>,
+    pub rates: RateLimits,
     /// Whether function 8 may set a unit to listen only mode, for all peers.
     pub listen_only: bool,
 }
@@ -203,6 +207,12 @@ impl ModbusUdp {
                 return 0;
             }
         };
+        if let Err((excess, is_to_report)) = context.rates.admit(peer.ip(), is_write(request)) {
+            if is_to_report {
+                context.report(Kind::RateLimited(excess), Some(peer.into()));
+            }
+            return 0;
+        }
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
