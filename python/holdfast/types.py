@@ -85,6 +85,23 @@ class ConnectionCounters(TypedDict):
     open: int
 
 
+class Excess(TypedDict):
+    """What sources had too many of."""
+
+    requests: int
+    writes: int
+
+
+class RateCounters(TypedDict):
+    """How often sources exceeded their requests or writes per second.
+
+    `paused`: connections that were not read for a while. `dropped`: datagrams.
+    """
+
+    paused: Excess
+    dropped: Excess
+
+
 class FrameCounters(TypedDict):
     """Frames that are not requests.
 
@@ -119,6 +136,7 @@ class ModbusCounters(TypedDict):
     exceptions: dict[int, int]
     unanswered: int
     connections: ConnectionCounters
+    rate_limited: RateCounters
     tls_failures: dict[str, int]
     frames: FrameCounters
 
@@ -128,6 +146,7 @@ class RawCounters(TypedDict):
 
     packets: PacketCounters
     connections: ConnectionCounters
+    rate_limited: RateCounters
     tls_failures: dict[str, int]
 
 

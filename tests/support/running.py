@@ -30,6 +30,8 @@ class ServerOptions(TypedDict, total=False):
     deny: Collection[int]
     max_connections: int
     max_connections_per_source: int
+    max_requests_per_source: int
+    max_writes_per_source: int
     when_full: Literal["refuse", "evict"]
     idle_timeout: float
     request_timeout: float

@@ -56,6 +56,7 @@ from holdfast.types import Area
 
 MAX_BYTES = 244
 MAX_CONNECTIONS = 65535
+MAX_RATE = 1_000_000
 MAX_DEVICE = 4095
 MAX_ROLE = 255
 MAX_TIME = 31_622_400
@@ -401,6 +402,7 @@ StopBits = Annotated[Literal[1, 2], BeforeValidator(_integral)]
 DataBits = Annotated[Literal[7, 8], BeforeValidator(_integral)]
 EightBits = Annotated[Literal[8], BeforeValidator(_integral)]
 Connections = Annotated[int, Field(ge=1, le=MAX_CONNECTIONS)]
+Rate = Annotated[int, Field(ge=1, le=MAX_RATE)]
 Source = Annotated[
     Network,
     PlainValidator(parse_source),
