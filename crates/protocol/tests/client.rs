@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use holdfast_protocol::client::{
     AcceptUnit, Attempt, BUSY_PAUSE, Closed, Connection, Done, Failure, InvalidResponse,
-    TURNAROUND, Ticket, Tolerance, Transport,
+    MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, EncodedRequest, Range, Request, Response, ResponseError};
@@ -307,17 +307,135 @@ fn a_read_is_sent_three_times_as_a_datagram_and_a_write_once() {
 }
 
 #[test]
-fn a_datagram_of_another_request_is_counted_and_a_malformed_one_ends_the_connection() {
+fn a_datagram_that_answers_no_request_is_counted_and_a_malformed_one_ends_the_connection() {
     let mut client = Client::new(Transport::Udp);
     let ticket = client.send(read());
     client.receive(&mbap_frame(5, 7, &[3, 2, 0, 1]));
     client.receive(&mbap_frame(0, 8, &[3, 2, 0, 1]));
-    assert_eq!((client.got(), client.connection.late()), (vec![], 2));
+    assert_eq!((client.got(), client.connection.late()), (vec![], 0));
+    assert_eq!(client.connection.take_strays(), Strays { replies: 2, bytes: 22 });
     client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
     assert_eq!(client.got(), [(ticket, Ok(vec![0, 1]))]);
     client.send(read());
     client.receive(&[mbap_frame(1, 7, &[3, 2, 0, 1]), vec![0]].concat());
     assert_eq!(client.connection.closed(), Some(Closed::Invalid(InvalidResponse::Datagram)));
+}
+
+#[test]
+fn late_datagrams_are_told_apart_from_those_that_no_request_asked_for() {
+    let mut client = Client::new(Transport::Udp);
+    let reply = |id| mbap_frame(id, 7, &[3, 2, 0, 1]);
+    client.send(read());
+    client.after(SECOND);
+    client.send(read());
+    client.receive(&reply(0));
+    client.receive(&reply(1));
+    assert_eq!((client.got().len(), client.connection.late()), (2, 1));
+    // A read is sent up to three times, so a fourth reply is one too many.
+    for _ in 0..3 {
+        client.receive(&reply(1));
+    }
+    assert_eq!(client.connection.late(), 3);
+    client.receive(&reply(2));
+    assert_eq!(client.connection.take_strays(), Strays { replies: 2, bytes: 22 });
+    assert_eq!(client.connection.take_strays(), Strays::default());
+}
+
+#[test]
+fn a_flood_of_datagrams_ends_the_connection() {
+    let mut client = Client::new(Transport::Udp);
+    let ticket = client.send(read());
+    for _ in 0..MAX_STRAY_DATAGRAMS {
+        client.receive(&mbap_frame(9, 7, &[3, 2, 0, 1]));
+    }
+    assert_eq!((client.got(), client.connection.closed()), (vec![], None));
+    client.receive(&mbap_frame(9, 7, &[3, 2, 0, 1]));
+    let flood = InvalidResponse::Flood;
+    assert_eq!(client.got(), [(ticket, Err(Failure::Invalid(flood)))]);
+    assert_eq!(client.connection.closed(), Some(Closed::Invalid(flood)));
+}
+
+#[test]
+fn unpredictable_transaction_ids_of_datagrams_do_not_repeat_soon_or_count_up() {
+    let ids = |seed| -> Vec<u16> {
+        let mut client = Client::new(Transport::Udp);
+        client.connection = Connection::new(Transport::Udp).unpredictable(seed);
+        let id = |_| {
+            client.send(read());
+            let sent = client.outgoing();
+            let id = u16::from_be_bytes([sent[0], sent[1]]);
+            client.receive(&mbap_frame(id, 7, &[3, 2, 0, 1]));
+            assert_eq!(client.got().len(), 1);
+            id
+        };
+        (0..10_000).map(id).collect()
+    };
+    let (first, second) = (ids(1), ids(2));
+    assert_ne!(first[0], second[0]);
+    assert!(first.windows(16).all(|last| (1..16).all(|at| last[at] != last[0])));
+    let counted_up = first.windows(2).filter(|pair| pair[1] == pair[0].wrapping_add(1)).count();
+    assert!(counted_up < 10, "{counted_up}");
+}
+
+#[test]
+fn what_no_request_asked_for_is_counted_in_streams_and_on_lines() {
+    let reply = mbap_frame(0, 7, &[3, 2, 0, 1]);
+    let foreign = [vec![0, 0, 0, 9], vec![0; 20]].concat();
+    for (sent, replies, bytes) in [
+        (mbap_frame(5, 7, &[3, 2, 0, 1]), 1, 11),
+        (foreign, 0, 24),
+        ([&reply[..]; 3].concat(), 1, 22),
+    ] {
+        let mut client = Client::new(Transport::Tcp);
+        client.send(read());
+        client.receive(&sent);
+        assert_eq!(client.connection.take_strays(), Strays { replies, bytes });
+    }
+
+    let reply = rtu_frame(7, &[3, 2, 0, 42]);
+    let silence = SECOND / 100;
+    for transport in [Transport::RtuOverTcp, Transport::SerialRtu { silence }] {
+        let mut client = Client::new(transport);
+        client.after(SECOND);
+        client.send(read());
+        client.receive(&[&[0, 0, 0][..], &reply, &reply].concat());
+        assert_eq!(client.got().len(), 1);
+        let bytes = 3 + reply.len() as u64;
+        assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes });
+        client.receive(&reply);
+        let bytes = reply.len() as u64;
+        assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes });
+    }
+
+    let mut client = Client::new(Transport::AsciiOverTcp);
+    client.send(read());
+    let reply = ascii_frame(7, &[3, 2, 0, 42]);
+    client.receive(&[b"xy", &reply[..], &b"z"[..]].concat());
+    assert_eq!(client.got().len(), 1);
+    assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes: 3 });
+}
+
+#[test]
+fn a_reply_that_is_expected_leaves_no_stray_bytes() {
+    for transport in [Transport::Tcp, Transport::Udp] {
+        let mut client = Client::new(transport);
+        client.send(read());
+        client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+        assert_eq!(client.connection.take_strays(), Strays::default());
+    }
+    let mut client = Client::new(Transport::Tcp);
+    client.send(read());
+    client.after(SECOND);
+    client.receive(&mbap_frame(0, 7, &[3, 2, 0, 1]));
+    assert_eq!(client.connection.late(), 1, "late is not stray");
+    assert_eq!(client.connection.take_strays(), Strays::default());
+    let mut client = Client::new(Transport::RtuOverTcp);
+    client.send(read());
+    let frame = rtu_frame(7, &[3, 2, 0, 42]);
+    let echo = client.outgoing();
+    client.receive(&[echo, frame].concat());
+    assert_eq!(client.got().len(), 1);
+    assert_eq!(client.connection.take_strays(), Strays::default(), "an echo is not stray");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use core::time::Duration;
 
-use super::flights::{Call, Done, Flights, Ticket};
+use super::flights::{Call, Done, Flights, Strays, Ticket};
 use super::mbap_datagrams::Datagrams;
 use super::mbap_stream::Stream;
 use super::rtu_and_ascii::{Framing, OneAtATime};
@@ -73,6 +73,16 @@ impl Connection {
         let pause = tolerance.pause_after_connect;
         let ready_at = if pause.is_zero() { Time::ZERO } else { now + pause };
         Connection { wire, flights, ready_at, sent: 0 }
+    }
+
+    /// Lets the transaction ids of datagrams follow from a random number, so that nobody who sees none of
+    /// them can forge a reply. In a stream they count up: forging a part of it takes more than an id.
+    #[must_use]
+    pub fn unpredictable(mut self, seed: u64) -> Connection {
+        if let Wire::Datagrams(datagrams) = &mut self.wire {
+            datagrams.randomize(seed);
+        }
+        self
     }
 
     /// Sends a request, or queues it until the line is silent. `timeout` runs from now, and again
@@ -234,6 +244,11 @@ impl Connection {
     /// The reason why the connection has ended; `None` while it is open.
     pub fn closed(&self) -> Option<Closed> {
         self.flights.closed
+    }
+
+    /// Takes the counts of what was received without a request, since the last call.
+    pub fn take_strays(&mut self) -> Strays {
+        core::mem::take(&mut self.flights.strays)
     }
 
     /// The number of late replies, which were dropped.

@@ -12,6 +12,15 @@ use crate::pdu::{EncodedRequest, Response, ResponseError};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Ticket(pub u64);
 
+/// What was received without a request that asked for it. Late replies are not among it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Strays {
+    /// Complete frames that match no request.
+    pub replies: u64,
+    /// The bytes of these, and all others that are no part of a reply.
+    pub bytes: u64,
+}
+
 /// A completed request.
 #[derive(Debug)]
 pub struct Done<'d> {
@@ -60,6 +69,7 @@ pub(super) struct Flights {
     pub(super) closed: Option<Closed>,
     /// The number of late replies, which were dropped.
     pub(super) late: u64,
+    pub(super) strays: Strays,
     next_ticket: u64,
     pub(super) tolerance: Tolerance,
     /// `out` waits until then: the pause after the request before.

@@ -87,11 +87,23 @@ impl Stream {
             self.surplus = surplus.unwrap_or(self.surplus);
             let invalid = match next {
                 Next::Incomplete => break,
-                Next::Foreign { protocol_id, .. } => Some(InvalidResponse::ProtocolId(protocol_id)),
-                Next::Broken { length } => Some(InvalidResponse::Length(length)),
+                Next::Foreign { protocol_id, .. } => {
+                    flights.strays.bytes += rest.len() as u64;
+                    Some(InvalidResponse::ProtocolId(protocol_id))
+                }
+                Next::Broken { length } => {
+                    flights.strays.bytes += rest.len() as u64;
+                    Some(InvalidResponse::Length(length))
+                }
                 Next::Frame { transaction_id, unit_id, pdu, len } => {
+                    let received = rest.len();
                     rest = &rest[len..];
-                    self.frame(flights, (transaction_id, unit_id, pdu), now, sink)
+                    let invalid = self.frame(flights, (transaction_id, unit_id, pdu), now, sink);
+                    if let Some(InvalidResponse::TransactionId(_)) = invalid {
+                        flights.strays.replies += 1;
+                        flights.strays.bytes += received as u64;
+                    }
+                    invalid
                 }
             };
             if let Some(invalid) = invalid {

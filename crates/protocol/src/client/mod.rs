@@ -12,6 +12,8 @@
 //!   mean the same thing.
 //! * A request that timed out is given up. Its late reply is dropped and counted where transaction
 //!   ids tell it apart; where they do not, the connection ends, and a serial line is silenced first.
+//! * What no request asked for is counted apart from late replies ([`Strays`]). Datagrams that match no
+//!   request are dropped, because their sender may be forged; a flood of them ends the connection.
 //! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
 //!   the other side may have gone without a word.
 //! * Only reads are ever sent twice: as datagrams, when the device closed a connection instead of
@@ -27,7 +29,7 @@ mod rtu_and_ascii;
 mod tolerance;
 
 pub use connection::Connection;
-pub use flights::{Done, Ticket};
+pub use flights::{Done, Strays, Ticket};
 pub use tolerance::{AcceptUnit, Attempt, BUSY_PAUSE, Tolerance};
 
 use core::time::Duration;
@@ -46,6 +48,9 @@ pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
 
 /// How many times a read is sent over UDP within its timeout.
 pub const UDP_ATTEMPTS: u32 = 3;
+
+/// The number of datagrams that match no request, since the last reply, after which a connection ends.
+pub const MAX_STRAY_DATAGRAMS: u32 = 1000;
 
 /// The time that the units of a serial line have to carry out a broadcast (Modbus over Serial Line
 /// V1.02, 2.4.1).
@@ -131,6 +136,9 @@ pub enum InvalidResponse {
     /// Bytes without a request.
     #[error("bytes without a request")]
     Unrequested,
+    /// Many more bytes without a request than a faulty device sends.
+    #[error("a flood of bytes without a request")]
+    Flood,
 }
 
 impl InvalidResponse {
@@ -151,6 +159,7 @@ impl InvalidResponse {
             InvalidResponse::Datagram => "datagram",
             InvalidResponse::TooLong => "too_long",
             InvalidResponse::Unrequested => "unrequested",
+            InvalidResponse::Flood => "flood",
         }
     }
 }

@@ -131,6 +131,7 @@ impl OneAtATime {
         sink: &mut impl FnMut(Done<'_>),
     ) {
         let State::Sent { mut echoed } = self.state else {
+            flights.strays.bytes += self.count_unrequested(flights, bytes);
             return self.unrequested(flights, now, sink);
         };
         let room = self.max_received().saturating_sub(self.received.len());
@@ -142,11 +143,24 @@ impl OneAtATime {
         };
         self.state = State::Sent { echoed };
         match found {
-            Ok(Some(Reply { unit_id, pdu })) => self.replied(flights, unit_id, &pdu, now, sink),
+            Ok(Some(Reply { unit_id, pdu, stray })) => {
+                let behind = if flights.tolerance.pad { 0 } else { surplus.len() };
+                flights.strays.bytes += (stray + behind) as u64;
+                self.replied(flights, unit_id, &pdu, now, sink);
+            }
             Ok(None) if surplus.is_empty() && room > bytes.len() => {}
-            Ok(None) => self.invalid(flights, InvalidResponse::TooLong, now, sink),
+            Ok(None) => {
+                flights.strays.bytes += (self.received.len() + surplus.len()) as u64;
+                self.invalid(flights, InvalidResponse::TooLong, now, sink);
+            }
             Err(error) => self.invalid(flights, InvalidResponse::Frame(error), now, sink),
         }
+    }
+
+    /// Bytes without a request in flight, unless the device may send surplus bytes.
+    fn count_unrequested(&self, flights: &Flights, bytes: &[u8]) -> u64 {
+        let may_be_surplus = flights.tolerance.pad && self.state == State::Idle;
+        if may_be_surplus { 0 } else { bytes.len() as u64 }
     }
 
     /// Handles bytes without a request in flight: a late reply, or data from another sender.
@@ -254,7 +268,11 @@ impl OneAtATime {
             }
             match response_len(bytes, &flight.request) {
                 Ok(Some(len)) if len <= bytes.len() => match rtu::decode(&bytes[..len]) {
-                    Ok(reply) => return Ok(Some(Reply::new(reply))),
+                    Ok(reply) => {
+                        let behind = bytes.len() - len;
+                        let stray = if flights.tolerance.pad { start } else { start + behind };
+                        return Ok(Some(Reply::new(reply, stray)));
+                    }
                     Err(error) if fits => failure = failure.or(Some(error)),
                     Err(error) => self.stray = Some(error),
                 },
@@ -277,6 +295,7 @@ impl OneAtATime {
         while let Some(end) = self.received.windows(2).position(|pair| pair == b"\r\n") {
             let line: Vec<u8> = self.received.drain(..end + 2).collect();
             let start = line.iter().rposition(|byte| *byte == b':').unwrap_or(0);
+            let behind = if flights.tolerance.pad { 0 } else { self.received.len() };
             let line = &line[start..];
             let may_be_echo = !*echoed && (self.echo || is_no_reply(flight));
             if may_be_echo && line == self.frame {
@@ -284,7 +303,8 @@ impl OneAtATime {
                 continue;
             }
             let mut body = [0; pdu::MAX_LEN + 2];
-            return ascii::decode(line, &mut body).map(|parts| Some(Reply::new(parts)));
+            return ascii::decode(line, &mut body)
+                .map(|parts| Some(Reply::new(parts, start + behind)));
         }
         Ok(None)
     }
@@ -310,11 +330,13 @@ fn is_no_reply(flight: &Flight) -> bool {
 struct Reply {
     unit_id: u8,
     pdu: Vec<u8>,
+    /// Bytes before and behind it that are no part of it.
+    stray: usize,
 }
 
 impl Reply {
-    fn new((unit_id, pdu): (u8, &[u8])) -> Reply {
-        Reply { unit_id, pdu: pdu.to_vec() }
+    fn new((unit_id, pdu): (u8, &[u8]), stray: usize) -> Reply {
+        Reply { unit_id, pdu: pdu.to_vec(), stray }
     }
 }
 
