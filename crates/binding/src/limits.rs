@@ -39,6 +39,7 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
         Fault::Unplanned,
         Fault::Unstored,
         Fault::Internal,
+        Fault::Flooded,
     ];
     for fault in all {
         if let Some(word) = word(fault) {
@@ -59,6 +60,7 @@ fn word(fault: Fault) -> Option<&'static str> {
         Fault::Unplanned => Some("no plan"),
         Fault::Unstored => Some("not stored"),
         Fault::Internal => Some("internal error"),
+        Fault::Flooded => Some("flooded"),
     }
 }
 

@@ -3,7 +3,7 @@
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use holdfast_engine::client::ClientError;
+use holdfast_engine::client::{ClientError, StrayCounters};
 use holdfast_engine::link::{
     Caller as CoreCaller, InFlight, LinkSettings, Retry, Route as CoreRoute, SharedLink, Wakes,
 };
@@ -119,8 +119,18 @@ impl Link {
             all.set_item(name, counter.get())?;
         }
         all.set_item("waiting", self.core.waiting())?;
+        tell_strays(&all, self.core.strays())?;
         Ok(all)
     }
+}
+
+/// What a connection has received without a request, or late.
+pub fn tell_strays(all: &Bound<'_, PyDict>, strays: Option<&StrayCounters>) -> PyResult<()> {
+    let count = |of: fn(&StrayCounters) -> u64| strays.map_or(0, of);
+    all.set_item("unexpected_replies", count(|strays| strays.replies.get()))?;
+    all.set_item("stray_bytes", count(|strays| strays.bytes.get()))?;
+    all.set_item("late_replies", count(|strays| strays.late.get()))?;
+    all.set_item("floods", count(|strays| strays.floods.get()))
 }
 
 /// Ticket, whether it was sent, and the result or an exception.

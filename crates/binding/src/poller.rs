@@ -411,5 +411,6 @@ fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDic
     ] {
         told.set_item(key, counter.get())?;
     }
+    link::tell_strays(&told, Some(&state.strays()))?;
     Ok(told)
 }

@@ -3,10 +3,11 @@
 //! The connection is opened on first use and kept open. [`Done::again`] decides whether a request is
 //! sent again.
 
+use std::hash::{BuildHasher, RandomState};
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -17,7 +18,7 @@ use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
 use super::interrupt::{Interrupt, SLICE};
 use super::turns::Turns;
-use super::{ClientError, Endpoint, Lost};
+use super::{ClientError, Endpoint, Lost, StrayCounters};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK: usize = 512;
@@ -31,6 +32,7 @@ pub struct BlockingClient {
     turns: Turns,
     state: Mutex<State>,
     late: AtomicU64,
+    strays: Arc<StrayCounters>,
 }
 
 /// The state of the connection.
@@ -49,6 +51,8 @@ struct Open {
     /// The zero of the clock of the connection.
     epoch: Instant,
     used: Instant,
+    /// Late replies that were counted.
+    late: u64,
 }
 
 /// A request and its attempt.
@@ -65,6 +69,7 @@ impl BlockingClient {
             turns: Turns::default(),
             state: Mutex::default(),
             late: AtomicU64::new(0),
+            strays: Arc::default(),
         }
     }
 
@@ -131,6 +136,7 @@ impl BlockingClient {
                 });
             });
             self.late.fetch_add(open.connection.late() - late, Ordering::Relaxed);
+            open.count_strays(&self.strays);
             if open.connection.closed().is_some() {
                 state.end();
             }
@@ -168,7 +174,10 @@ impl BlockingClient {
         timeout: Duration,
         interrupt: &mut Interrupt<'_>,
     ) -> Option<Result<&'s mut Open, ClientError>> {
-        if state.open.as_mut().is_some_and(|open| !open.is_usable()) {
+        if let Some(open) = &mut state.open
+            && !open.is_usable()
+        {
+            open.count_strays(&self.strays);
             state.end();
         }
         if state.open.is_none() {
@@ -245,6 +254,11 @@ impl BlockingClient {
         self.state.lock().unwrap_or_else(PoisonError::into_inner).end();
     }
 
+    /// What came without a request, or late.
+    pub fn strays(&self) -> &Arc<StrayCounters> {
+        &self.strays
+    }
+
     /// The number of replies that came after their request had ended.
     pub fn late(&self) -> u64 {
         self.late.load(Ordering::Relaxed)
@@ -271,7 +285,9 @@ impl Open {
         })?;
         let now = Instant::now();
         let connection = Connection::tolerant(transport, endpoint.tolerance, Duration::ZERO);
-        Ok(Open { stream, connection, transport, epoch: now, used: now })
+        // The keys of a hasher are random.
+        let connection = connection.unpredictable(RandomState::new().hash_one(0));
+        Ok(Open { stream, connection, transport, epoch: now, used: now, late: 0 })
     }
 
     /// Whether the connection can carry another request: the peer has not closed it, and has not
@@ -280,10 +296,19 @@ impl Open {
         match self.transport {
             Transport::Tcp => self.used.elapsed() <= IDLE || !self.stream.has_ended(),
             Transport::RtuOverTcp | Transport::AsciiOverTcp | Transport::RtuOverUdp => {
-                self.stream.is_quiet()
+                let is_quiet = self.stream.is_quiet();
+                let mut chunk = [0; CHUNK];
+                if !is_quiet && let Ok(Some(len)) = self.stream.receive_now(&mut chunk) {
+                    self.connection.receive(&chunk[..len], self.epoch.elapsed(), |_| {});
+                }
+                is_quiet
             }
             _ => true,
         }
+    }
+
+    fn count_strays(&mut self, counters: &StrayCounters) {
+        counters.take(&mut self.connection, &mut self.late);
     }
 
     /// Carries out a request. Returns the I/O error, if there was one.

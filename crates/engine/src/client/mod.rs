@@ -8,11 +8,13 @@ mod byte_stream;
 mod connect;
 mod endpoint;
 mod interrupt;
+mod strays;
 mod tls_stream;
 mod turns;
 
 pub use blocking::BlockingClient;
 pub use endpoint::{Endpoint, Place};
+pub use strays::StrayCounters;
 
 use std::io;
 use std::time::Duration;

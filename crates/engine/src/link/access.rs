@@ -2,6 +2,7 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::EncodedRequest;
@@ -13,7 +14,7 @@ use super::fault::{Answer, Exchanged, fault};
 use super::pace::{InFlight, Pace, Place as Turn};
 use super::queue::Priority;
 use super::tcp::TcpLink;
-use crate::client::{Endpoint, Place};
+use crate::client::{Endpoint, Place, StrayCounters};
 
 /// Requests of the poller, as one source beside the clients of listeners.
 const POLLER: u64 = 0;
@@ -100,6 +101,14 @@ impl Link {
             Wire::Blocking(link) => link.retry_at(),
         };
         failed.filter(|until| Instant::now() < *until)
+    }
+
+    /// What was received without a request, or late.
+    pub(crate) fn strays(&self) -> &Arc<StrayCounters> {
+        match &self.wire {
+            Wire::Tcp(link) => link.strays(),
+            Wire::Blocking(link) => link.strays(),
+        }
     }
 
     /// Closes the connection if no request is in flight. The next request opens a new one.

@@ -10,12 +10,14 @@ use tokio::sync::oneshot;
 use tokio::time::Instant;
 
 use super::backoff::Retry;
-use super::fault::{Exchanged, Fault, fault};
-use crate::client::{BlockingClient, ClientError, Endpoint, Lost};
+use super::fault::{Exchanged, FLOODED, Fault, fault};
+use super::flood::Flood;
+use crate::client::{BlockingClient, ClientError, Endpoint, Lost, Place, StrayCounters};
 
 pub(super) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
     retry_at: Cell<Option<Instant>>,
+    strays: Arc<StrayCounters>,
 }
 
 /// An endpoint that could not be opened: since how many attempts, when it is tried again, and why.
@@ -42,15 +44,26 @@ struct Call {
 impl BlockingLink {
     pub(super) fn new(endpoint: Endpoint, retry: Retry) -> BlockingLink {
         let (jobs, queue) = mpsc::channel::<Job>();
+        // Others may use a serial line too, and its speed limits what it can cost.
+        let is_line = matches!(endpoint.place, Place::Serial(_));
         let client = BlockingClient::new(endpoint);
+        let strays = Arc::clone(client.strays());
+        let counted = Arc::clone(&strays);
         let work = move || {
             let mut failed = None;
+            let flood = (!is_line).then(|| Flood::new(counted, retry));
             for job in queue {
                 match job {
                     // A stopped device no longer waits for its read.
                     Job::Call(call) if call.answer.is_closed() => {}
                     Job::Call(call) => {
                         let answer = carried_out(&client, retry, &call, &mut failed);
+                        let flooded = flood.as_ref().and_then(|flood| flood.until(Instant::now()));
+                        if let Some(until) = flooded {
+                            client.close();
+                            let error = Arc::new(FLOODED);
+                            failed = Some(Failed { attempts: 0, until, error });
+                        }
                         let retry_at = failed.as_ref().map(|failed| failed.until);
                         let _ = call.answer.send((answer, retry_at));
                     }
@@ -60,7 +73,7 @@ impl BlockingLink {
         };
         // If the thread does not start, every job fails, and the device reports the fault.
         let _ = std::thread::Builder::new().name("holdfast-line".into()).spawn(work);
-        BlockingLink { jobs, retry_at: Cell::new(None) }
+        BlockingLink { jobs, retry_at: Cell::new(None), strays }
     }
 
     pub(super) async fn exchange(
@@ -78,6 +91,10 @@ impl BlockingLink {
         let (answer, retry_at) = answered.await.unwrap_or_else(|_| (Err(ended()), None));
         self.retry_at.set(retry_at);
         answer
+    }
+
+    pub(super) fn strays(&self) -> &Arc<StrayCounters> {
+        &self.strays
     }
 
     /// The end of the pause after the last failed attempt to open the endpoint.

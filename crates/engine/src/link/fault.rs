@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use holdfast_protocol::client::InvalidResponse;
 use holdfast_protocol::pdu::ExceptionCode;
 
 use crate::client::ClientError;
@@ -23,6 +24,8 @@ pub enum Fault {
     Unstored,
     /// A task of the device has panicked.
     Internal,
+    /// The device sends so much without a request that it is left alone for a while.
+    Flooded,
 }
 
 /// Exceptions of a gateway that could not reach the unit.
@@ -54,6 +57,7 @@ impl Fault {
             Fault::Unplanned => NO_EXCEPTION + 5,
             Fault::Unstored => NO_EXCEPTION + 6,
             Fault::Internal => NO_EXCEPTION + 7,
+            Fault::Flooded => NO_EXCEPTION + 8,
         }
     }
 }
@@ -69,12 +73,16 @@ pub(crate) type Answer = Result<Vec<u8>, Fault>;
 /// As [`Answer`], with the error.
 pub(super) type Exchanged = Result<Vec<u8>, Arc<ClientError>>;
 
+/// The error of requests that are not sent because of a flood.
+pub(super) const FLOODED: ClientError = ClientError::Invalid(InvalidResponse::Flood);
+
 /// The fault that a failed request counts as.
 pub(super) fn fault(error: &ClientError) -> Fault {
     match error {
         ClientError::Exception(code) => Fault::Exception(*code),
         ClientError::Timeout(_) | ClientError::ConnectTimeout { .. } => Fault::Timeout,
         ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. } => Fault::Refused,
+        ClientError::Invalid(InvalidResponse::Flood) => Fault::Flooded,
         ClientError::Invalid(_) => Fault::Invalid,
         ClientError::Lost(_) | ClientError::Tls { .. } => Fault::Reset,
     }

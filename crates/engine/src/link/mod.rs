@@ -14,6 +14,7 @@ mod blocking;
 mod caller;
 mod coming;
 mod fault;
+mod flood;
 mod handshake;
 mod pace;
 mod queue;

@@ -1,8 +1,8 @@
 //! A link as listeners and event loops see it, from any thread.
 
 use std::net::IpAddr;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
@@ -13,7 +13,7 @@ use super::caller::{Caller, Waiting};
 use super::coming::{Coming, ReplyTo, coming};
 use super::pace::InFlight;
 use super::queue::Priority;
-use crate::client::{ClientError, Endpoint};
+use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::Counter;
 
 /// Settings of a link that listeners or event loops use.
@@ -68,6 +68,7 @@ pub struct SharedLink {
     waiting: AtomicUsize,
     /// Requests of event loops among those.
     called: AtomicUsize,
+    strays: OnceLock<Arc<StrayCounters>>,
     preferred: Vec<IpAddr>,
 }
 
@@ -130,8 +131,19 @@ impl SharedLink {
             max_waiting: settings.queue,
             waiting: AtomicUsize::new(0),
             called: AtomicUsize::new(0),
+            strays: OnceLock::new(),
             preferred: settings.preferred.clone(),
         }
+    }
+
+    /// Sets what counts the strays of its connection.
+    pub(super) fn connect_counters(&self, strays: &Arc<StrayCounters>) {
+        let _ = self.strays.set(Arc::clone(strays));
+    }
+
+    /// What its connection has received without a request, or late; `None` until the link is served.
+    pub fn strays(&self) -> Option<&StrayCounters> {
+        self.strays.get().map(|strays| &**strays)
     }
 
     /// Requests that wait or are in flight, without those of the poller.

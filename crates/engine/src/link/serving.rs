@@ -23,6 +23,9 @@ pub(crate) async fn serve(
     shared: Weak<SharedLink>,
     mut calls: mpsc::UnboundedReceiver<Call>,
 ) {
+    if let Some(shared) = shared.upgrade() {
+        shared.connect_counters(link.strays());
+    }
     let reads = SharedReads::new(settings.coalesce, settings.cache);
     let silence = Silence::new(link.retry);
     let serving = Rc::new(Serving { link, reads, silence, error: RefCell::default() });

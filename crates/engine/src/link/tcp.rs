@@ -19,10 +19,11 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff::Retry;
-use super::fault::Exchanged;
+use super::fault::{Exchanged, FLOODED};
+use super::flood::Flood;
 use super::handshake;
 use super::pace::Pace;
-use crate::client::ClientError;
+use crate::client::{ClientError, StrayCounters};
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -42,6 +43,8 @@ pub(super) struct TcpLink {
     url: String,
     connecting: Mutex<()>,
     failures: Cell<u32>,
+    strays: Arc<StrayCounters>,
+    flood: Flood,
     /// The earliest time of the next attempt after a failed one, and the error.
     failed: RefCell<Option<(Instant, Arc<ClientError>)>>,
     /// When the last connection ended.
@@ -59,6 +62,9 @@ struct Open {
     epoch: Instant,
     waiting: HashMap<Ticket, oneshot::Sender<Outcome>>,
     ended: Rc<Cell<Option<Instant>>>,
+    strays: Arc<StrayCounters>,
+    /// Late replies that were counted.
+    late: u64,
     writer: tokio::net::tcp::OwnedWriteHalf,
     tls: Option<Channel>,
     /// Bytes that the socket has not accepted yet.
@@ -73,7 +79,10 @@ impl TcpLink {
         (tolerance, retry): (Tolerance, Retry),
         url: String,
     ) -> TcpLink {
+        let strays = Arc::<StrayCounters>::default();
         TcpLink {
+            flood: Flood::new(Arc::clone(&strays), retry),
+            strays,
             host,
             port,
             tls,
@@ -151,6 +160,9 @@ impl TcpLink {
         if self.open.borrow().is_some() {
             return Ok(());
         }
+        if let Some(until) = self.flood.until(Instant::now()) {
+            self.failed.replace(Some((until, Arc::new(FLOODED))));
+        }
         if let Some((until, error)) = &*self.failed.borrow()
             && Instant::now() < *until
             && !eager
@@ -203,6 +215,8 @@ impl TcpLink {
             epoch: Instant::now(),
             waiting: HashMap::new(),
             ended: Rc::clone(&self.ended),
+            strays: Arc::clone(&self.strays),
+            late: 0,
             writer,
             tls,
             unsent: Vec::new(),
@@ -239,6 +253,10 @@ impl TcpLink {
                 Err(LOST)
             }
         }
+    }
+
+    pub(super) fn strays(&self) -> &Arc<StrayCounters> {
+        &self.strays
     }
 
     /// The end of the pause after the last failed attempt to connect.
@@ -357,7 +375,7 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
         let read = reader.read(&mut chunk).await;
         let mut open = link.borrow_mut();
         let Some(found) = open.as_mut() else { return };
-        let Open { connection, waiting, tls, unsent, .. } = found;
+        let Open { connection, waiting, tls, unsent, strays, late, .. } = found;
         let intact = match read {
             Ok(0) | Err(_) => false,
             Ok(len) => {
@@ -371,6 +389,7 @@ async fn receive(link: Rc<RefCell<Option<Open>>>, mut reader: OwnedReadHalf) {
                 };
                 let now = found.epoch.elapsed();
                 connection.receive(received, now, |done| hand_on(waiting, &done));
+                strays.take(connection, late);
                 lasts && connection.closed().is_none()
             }
         };

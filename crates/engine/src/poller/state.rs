@@ -1,11 +1,12 @@
 //! Counters and health of a device: written by its task, read from any thread.
 
 use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::health::Health;
 use super::status::Status;
+use crate::client::StrayCounters;
 use crate::counter::Counter;
 use crate::link::Fault;
 
@@ -26,6 +27,8 @@ pub struct DeviceState {
     plan_error: Mutex<Option<String>>,
     /// Whether a task of the device has panicked since the device was created or replaced.
     broken: AtomicBool,
+    /// What the connection to its address has received without a request, or late.
+    strays: Mutex<Arc<StrayCounters>>,
 }
 
 #[derive(Debug, Default)]
@@ -97,6 +100,16 @@ impl DeviceState {
         if broken {
             self.bad(Fault::Internal);
         }
+    }
+
+    /// What the connection to its address has received without a request, or late. Devices at one address
+    /// share it.
+    pub fn strays(&self) -> Arc<StrayCounters> {
+        Arc::clone(&self.strays.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    pub(super) fn set_strays(&self, strays: &Arc<StrayCounters>) {
+        *self.strays.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(strays);
     }
 
     pub fn failures(&self) -> u32 {

@@ -520,6 +520,7 @@ impl Running {
 /// Creates a device, and starts the tasks that forward its reads.
 fn made(planned: Planned, polled: Polled, to: (Rc<Link>, Rc<Turn>)) -> (Device, Vec<AbortHandle>) {
     polled.state.set_broken(false);
+    polled.state.set_strays(to.0.strays());
     let settings = &planned.settings;
     debug_assert_eq!(settings.forward.len(), polled.forwards.len());
     let forwards: Vec<_> = settings
