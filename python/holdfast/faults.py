@@ -21,6 +21,7 @@ _TEXTS = {
     FAULTS["no plan"]: "no plan to read the device",
     FAULTS["not stored"]: "memory refused the values",
     FAULTS["internal error"]: "an internal error",
+    FAULTS["flooded"]: "a flood of data that was not requested",
 }
 
 

@@ -71,6 +71,10 @@ LINK: dict[str, int] = {
     "cached": 7,
     "withdrawn": 0,
     "waiting": 8,
+    "unexpected_replies": 31,
+    "stray_bytes": 32,
+    "late_replies": 33,
+    "floods": 34,
 }
 
 METER: dict[str, Any] = {
@@ -81,6 +85,10 @@ METER: dict[str, Any] = {
     "failures": 3,
     "round_trip": 0.25,
     "requests_per_poll": 2,
+    "unexpected_replies": 41,
+    "stray_bytes": 42,
+    "late_replies": 43,
+    "floods": 44,
     "polls": 30,
     "missed": 1,
     "unplanned": 6,
@@ -217,6 +225,10 @@ def scraped(client: web.Client) -> dict[tuple[str, ...], float]:
         (("holdfast_packets_held_bytes", "replication"), 70),
         (("holdfast_packets_refused_total", "replication", "crc"), 1),
         (("holdfast_packets_refused_total", "replication", "range"), 2),
+        (("holdfast_device_unexpected_replies_total", "meter"), 41),
+        (("holdfast_device_stray_bytes_total", "meter"), 42),
+        (("holdfast_device_late_replies_total", "meter"), 43),
+        (("holdfast_device_floods_total", "meter"), 44),
         (("holdfast_device_health", "meter", "error"), 1),
         (("holdfast_device_health", "meter", "ok"), 0),
         (("holdfast_device_health", "fresh", "unknown"), 1),

@@ -34,6 +34,10 @@ NONE = dict.fromkeys(
         "cached",
         "withdrawn",
         "waiting",
+        "unexpected_replies",
+        "stray_bytes",
+        "late_replies",
+        "floods",
     ),
     0,
 )

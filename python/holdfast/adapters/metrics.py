@@ -308,6 +308,7 @@ def _of_devices(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
         "unstored": _counter(
             "device_unstored", "Reads and status blocks that memory refused.", "device"
         ),
+        **_strays("device"),
     }
     gauges = {
         "age": _gauge("device_age_seconds", "Time since the last valid response.", "device"),
@@ -344,11 +345,25 @@ def _of_links(links: Mapping[str, Mapping[str, int]]) -> Iterator[Metric]:
     requests = _counter("link_requests", "Requests of listeners, by outcome.", "link", "outcome")
     exceptions = _counter("link_exceptions", "Replies that were exceptions.", "link")
     waiting = _gauge("link_waiting", "Requests that wait for a reply.", "link")
+    strays = _strays("link")
     for name, told in links.items():
         _add(requests, name, {outcome: told[outcome] for outcome in LINK_OUTCOMES})
         exceptions.add_metric([name], told["exceptions"])
         waiting.add_metric([name], told["waiting"])
-    yield from (requests, exceptions, waiting)
+        for key, counter in strays.items():
+            counter.add_metric([name], told[key])
+    yield from (requests, exceptions, waiting, *strays.values())
+
+
+def _strays(of: str) -> dict[str, CounterMetricFamily]:
+    """What a device or a link has received without a request, by key."""
+    texts = {
+        "unexpected_replies": "Replies that no request asked for.",
+        "stray_bytes": "Bytes received that are no part of a reply to a request.",
+        "late_replies": "Replies that came after the timeout of their request.",
+        "floods": "Pauses because of too many stray bytes.",
+    }
+    return {key: _counter(f"{of}_{key}", text, of) for key, text in texts.items()}
 
 
 def _of_adapters(adapters: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:

@@ -68,6 +68,9 @@ _SHOWN = ("peer", "role", "subject", "serial")
 OUTPUT = "output/"
 """The beginning of the names of outputs among the adapters, whose names have no slash."""
 
+# Seconds without unrequested data after which more of it is logged again.
+QUIET = 600.0
+
 # Seconds between checks of the health of devices.
 HEALTH_CHECK_INTERVAL = 1.0
 
@@ -208,6 +211,7 @@ class _Running:
         self._health = dict.fromkeys(config.devices, "unknown")
         self._plan_errors: dict[str, str | None] = {}
         self._unstored: dict[str, int] = {}
+        self._strays: dict[tuple[str, str], tuple[int, float]] = {}
         self._forwarded: dict[tuple[str, int], Mapping[str, Any]] = {}
         self._unreachable: set[tuple[str, int]] = set()
         self._expiring = Expiring()
@@ -324,6 +328,10 @@ class _Running:
         if self._poller is not None:
             for name, told in configured(self._poller).items():
                 self._log_device(name, told)
+                self._log_strays("device", name, told)
+            for name, link in self.diagnostics.links.items():
+                if name not in self._health:
+                    self._log_strays("link", name, link.counters())
 
     def _heartbeats(self) -> list[ThreadHeartbeat]:
         """The heartbeats of all threads that the appliance depends on. Thread-safe."""
@@ -355,6 +363,16 @@ class _Running:
         if health == "error":
             fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
         logs.write(logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields)
+
+    def _log_strays(self, kind: str, name: str, told: Mapping[str, int]) -> None:
+        """Logs that a device has begun to send what nobody asked for."""
+        key, now, count = (kind, name), time.monotonic(), told["stray_bytes"]
+        before, since = self._strays.get(key, (0, -QUIET))
+        if count != before:
+            self._strays[key] = (count, now)
+        if count > before and now - since >= QUIET:
+            counted = {"replies": told["unexpected_replies"], "bytes": count}
+            logs.write(logging.WARNING, "unrequested_data", **{kind: name}, **counted)
 
     def _log_forwards(self, name: str, counted: Sequence[Mapping[str, Any]]) -> None:
         """Logs what happened at the receivers of a device since the last check."""

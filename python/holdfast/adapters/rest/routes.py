@@ -192,6 +192,10 @@ ROUTES = (
                         "cached": 0,
                         "withdrawn": 0,
                         "waiting": 1,
+                        "unexpected_replies": 0,
+                        "stray_bytes": 0,
+                        "late_replies": 1,
+                        "floods": 0,
                     }
                 },
                 "adapters": {

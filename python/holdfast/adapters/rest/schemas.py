@@ -134,6 +134,10 @@ DIAGNOSTICS: dict[str, Schema] = {
                         "cached": COUNTER | {"description": "Answered by an earlier reply"},
                         "withdrawn": COUNTER | {"description": "Not sent: the client had gone"},
                         "waiting": COUNTER,
+                        "unexpected_replies": COUNTER | {"description": "Without a request"},
+                        "stray_bytes": COUNTER | {"description": "Not part of an expected reply"},
+                        "late_replies": COUNTER,
+                        "floods": COUNTER | {"description": "Pauses because of stray bytes"},
                     }
                 ),
             },

@@ -1,0 +1,191 @@
+"""Devices that send what nobody requested: it is counted, logged once, and costs little."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast import logs
+from holdfast.appliance import running
+from support import web, wire
+from support.polled import (
+    Datagrams,
+    Fake,
+    configuration,
+    counters,
+    data,
+    device,
+    read,
+    reply,
+    until_polled,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from holdfast.appliance import Appliance
+    from support.running import Run
+
+FLOODED = 0x8008
+READ_TOO = read("holding_registers", 0, 1, ("holding_registers", 1))
+READS = [read("holding_registers", 0, 1, ("holding_registers", 0))]
+
+
+@pytest.fixture
+def records() -> Iterator[web.Records]:
+    handler = web.Records()
+    logs.LOGGER.addHandler(handler)
+    yield handler
+    logs.LOGGER.removeHandler(handler)
+
+
+def polled(run: Run, url: str, **more: Any) -> Appliance:
+    return run(configuration({"meter": device(url, *READS, **more)}))
+
+
+def until_counted(appliance: Appliance, key: str, least: int = 1) -> None:
+    wire.until(lambda: counters(appliance, "meter")[key] >= least, f"{key} is at least {least}")
+
+
+def guessed(request: wire.Frame) -> bytes:
+    """The reply to the request after this one, which was not sent yet."""
+    later = wire.Frame((request.transaction + 1) & 0xFFFF, request.unit, request.pdu)
+    return data(later, 666)
+
+
+@pytest.mark.parametrize(
+    ("sent", "replies"),
+    [
+        (lambda request: data(request, 7) + guessed(request), 1),
+        (lambda request: data(request, 7) * 2, 1),
+        (lambda request: data(request, 7) + b"\x00\x00\xff\xff garbage", 0),
+    ],
+    ids=["guessed", "twice", "garbage"],
+)
+def test_what_follows_a_reply_is_counted_and_reaches_no_memory(
+    sent: Callable[[wire.Frame], bytes],
+    replies: int,
+    run: Run,
+    records: web.Records,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(running, "HEALTH_CHECK_INTERVAL", 0.0)
+    with Fake(sent) as fake:
+        appliance = polled(run, fake.url)
+        until_polled(appliance, "meter", 5)
+        until_counted(appliance, "stray_bytes")
+        told = counters(appliance, "meter")
+        assert (told["unexpected_replies"] > 0) == bool(replies)
+        assert told["late_replies"] == 0
+        assert appliance.memories["mirror"].read("holding_registers", 0, 1) == [7]
+
+        def logged() -> bool:
+            appliance.log_events(timeout=0.01)
+            return bool(records.of("unrequested_data"))
+
+        wire.until(logged, "it is logged")
+        more = counters(appliance, "meter")["stray_bytes"]
+        until_counted(appliance, "stray_bytes", more + 1)
+        appliance.log_events(timeout=0)
+    [event] = records.of("unrequested_data")
+    assert event["device"] == "meter"
+    assert event["bytes"] > 0
+
+
+def test_an_unsolicited_frame_before_any_reply_fails_the_request(run: Run) -> None:
+    with Fake(lambda request: guessed(request) + data(request)) as fake:
+        appliance = polled(run, fake.url)
+        wire.until(
+            lambda: counters(appliance, "meter")["transport_errors"] > 0, "the request has failed"
+        )
+        until_counted(appliance, "unexpected_replies")
+        assert appliance.memories["mirror"].read("holding_registers", 0, 1) == [0]
+
+
+def test_a_late_reply_is_no_unexpected_one(run: Run) -> None:
+    number = itertools.count()
+    held: list[bytes] = []
+
+    def answer(request: wire.Frame) -> bytes | None:
+        if next(number) == 0:
+            held.append(data(request))
+            return None
+        return b"".join([*held, data(request)])
+
+    with Fake(answer) as fake:
+        appliance = polled(run, fake.url, timeout=0.2)
+        until_counted(appliance, "timeouts")
+        until_counted(appliance, "late_replies")
+        told = counters(appliance, "meter")
+        # Only the first reply with that id was late.
+        assert told["late_replies"] == 1
+    assert told["timeouts"] >= 1
+
+
+def test_a_good_device_has_no_strays(run: Run) -> None:
+    with Fake(data) as fake:
+        appliance = polled(run, fake.url)
+        until_polled(appliance, "meter", 10)
+        told = counters(appliance, "meter")
+    keys = ("unexpected_replies", "stray_bytes", "late_replies", "floods")
+    assert [told[key] for key in keys] == [0] * 4
+
+
+def test_a_device_that_floods_is_left_alone_for_a_while(run: Run) -> None:
+    junk = bytes(16 * 1024)
+    with Fake(lambda request: data(request) + junk) as fake, Fake(data) as good:
+        flooding = device(fake.url, *READS, retry={"first": 3600, "most": 3600})
+        appliance = run(configuration({"meter": flooding, "other": device(good.url, READ_TOO)}))
+        until_counted(appliance, "floods")
+        wire.until(lambda: counters(appliance, "meter")["health"] == "error", "it is in error")
+        connections, told = fake.connections, counters(appliance, "meter")
+        assert told["last_error"] == FLOODED
+        assert told["stray_bytes"] < 100 * len(junk), "little of the flood was read"
+        until_polled(appliance, "other", 20)
+        assert fake.connections == connections
+        assert counters(appliance, "meter")["floods"] == 1
+        assert counters(appliance, "other")["health"] == "ok"
+
+
+def test_a_device_is_polled_again_when_its_flood_is_over(run: Run) -> None:
+    flooding = threading.Event()
+    flooding.set()
+    junk = bytes(16 * 1024)
+
+    def answer(request: wire.Frame) -> bytes:
+        return data(request) + (junk if flooding.is_set() else b"")
+
+    with Fake(answer) as fake:
+        appliance = polled(run, fake.url, retry={"first": 0.05, "most": 0.05})
+        until_counted(appliance, "floods", 3)
+        flooding.clear()
+        wire.until(lambda: counters(appliance, "meter")["health"] == "ok", "it is polled")
+
+
+def test_forged_datagrams_are_counted_and_dropped(run: Run) -> None:
+    def answer(request: wire.Frame) -> bytes:
+        return reply(wire.Frame(request.transaction ^ 1, request.unit, b""), data(request)[7:])
+
+    with Datagrams(answer) as fake:
+        appliance = polled(run, fake.url, timeout=0.3)
+        until_counted(appliance, "unexpected_replies", 3)
+        until_counted(appliance, "timeouts")
+        assert appliance.memories["mirror"].read("holding_registers", 0, 1) == [0]
+
+
+def test_transaction_ids_of_datagrams_are_not_predictable(run: Run) -> None:
+    seen: list[int] = []
+
+    def answer(request: wire.Frame) -> bytes:
+        seen.append(request.transaction)
+        return data(request)
+
+    with Datagrams(answer) as fake:
+        appliance = polled(run, fake.url)
+        wire.until(lambda: len(seen) > 20, "requests have come")
+        assert counters(appliance, "meter")["stray_bytes"] == 0
+    assert any(second != (first + 1) & 0xFFFF for first, second in itertools.pairwise(seen))
+    assert len(set(seen)) > 10
