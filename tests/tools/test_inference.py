@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast import values
-from holdfast.tools.inference import guess, shortest
+from holdfast.tools.inference import guess
+from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,7 +14,7 @@ import click
 
 from holdfast import logs
 from holdfast.config.initial import extent
-from holdfast.tools.inference import shortest
+from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast.gateway.fields import malformed
-from holdfast.tools.inference import shortest
+from holdfast.values.digits import shortest
 from holdfast.values import ConversionError, WrongArea
 
 if TYPE_CHECKING:

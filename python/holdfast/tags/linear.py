@@ -25,12 +25,12 @@ class Linear:
         self._plus = self._offset.numerator * (self._over // self._offset.denominator)
         self.is_identity = scale == 1 and offset == 0
 
-    def value(self, number: float) -> int | float:
+    def value(self, number: float | Fraction) -> int | float:
         """The value of a number in the registers; an integer if everything is one."""
         if isinstance(number, int):
             scaled = number * self._times + self._plus
             return scaled if self._whole else scaled / self._over
-        if not math.isfinite(number):
+        if isinstance(number, float) and not math.isfinite(number):
             return number
         try:
             return float(Fraction(number) * self._scale + self._offset)

@@ -10,21 +10,18 @@ from __future__ import annotations
 
 import itertools
 import math
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast.values import ConversionError
+from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FLOATS = {"float16": "e", "float32": "f", "float64": "d"}
 MANTISSAS = {"float16": 10, "float32": 23, "float64": 52}
-MAX_DIGITS = 17
-LARGE = 1e16
 
 BITS_A_DIGIT = math.log2(10)
 
@@ -112,21 +109,6 @@ def guess(
         for kind, order in _candidates(rest):
             guesses += _weighed(rest, kind, order, offset, like)
     return sorted(guesses, key=lambda each: -each.score)
-
-
-def shortest(value: float, kind: str) -> str:
-    """The shortest decimal that rounds to this float in its type: `0.1` for every float type."""
-    if abs(value) < LARGE and value == int(value):
-        return f"{value:.0f}"
-    form = FLOATS.get(kind, "d")
-    for digits in range(1, MAX_DIGITS):
-        text = f"{value:.{digits}g}"
-        try:
-            if struct.pack(form, float(text)) == struct.pack(form, value):
-                return text
-        except OverflowError:
-            continue
-    return repr(value)
 
 
 def _candidates(reads: Sequence[Sequence[int]]) -> Iterator[tuple[str, str]]:

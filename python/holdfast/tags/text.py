@@ -1,0 +1,140 @@
+"""Values of tags as text and for JSON, and text as values to write.
+
+What `text_of` returns, `value_from` accepts, except for infinity.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from fractions import Fraction
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.tags.linear import Linear
+from holdfast.tags.writing import BOOLEANS, from_text
+from holdfast.values import DoesNotFit
+from holdfast.values.digits import shortest
+
+if TYPE_CHECKING:
+    from holdfast.tags.tag import Tag
+
+SWITCHED = {"on": True, "off": False}
+MOST_PLACES = 6
+"""The most decimal places of scaled integers; with more, only those that are needed."""
+
+_INTEGER = re.compile(r"[+-]?[0-9]{1,40}")
+_HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
+_DECIMAL = re.compile(r"[+-]?([0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?")
+_COMMA = re.compile(r"[+-]?[0-9]{0,40},[0-9]{1,40}([eE][+-]?[0-9]{1,3})?")
+
+
+def plain(tag: Tag, value: Any) -> Any:
+    """A value for JSON.
+
+    Floats have the digits of their type, bytes are base64; `None` for NaN, infinity and no value.
+    """
+    if isinstance(value, list | tuple):
+        return [plain(tag, item) for item in value]
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
+    if isinstance(value, float):
+        return _trimmed(tag, value) if math.isfinite(value) else None
+    return value
+
+
+def text_of(tag: Tag, value: Any, *, states: bool = True) -> str:
+    """A value as text, without its unit; empty for no value.
+
+    Values that have a name are that name, unless `states` is false. Scaled integers have the
+    decimal places of their scale. Bytes are base64, arrays are JSON.
+    """
+    if value is None or value != value:
+        return ""
+    if isinstance(value, list | tuple):
+        return msgspec.json.encode(plain(tag, value)).decode()
+    name = tag.state(value) if states else None
+    if name is not None:
+        return name
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
+    if isinstance(value, float) and math.isfinite(value):
+        places = None if tag.is_float else _places(tag.scale, tag.offset)
+        return shortest(_trimmed(tag, value), "") if places is None else f"{value:.{places}f}"
+    return str(value)
+
+
+def value_from(tag: Tag, text: str) -> Any:
+    """Parses a value of a tag, or the name of one; `Tag.raw` then checks whether it fits.
+
+    Raises `ValueError`.
+    """
+    word = text.strip()
+    if word in tag.states.values():
+        return word
+    if tag.of_type.count is not None or not tag.is_number:
+        if tag.of_type.count is None and tag.of_type.base in ("bool", "bit"):
+            return _switched(tag, word)
+        return from_text(text, tag.of_type, tag.type)
+    if _INTEGER.fullmatch(word):
+        return int(word)
+    if _HEX.fullmatch(word) and not tag.is_float and (tag.scale, tag.offset) == (1, 0):
+        return int(word, 16)
+    if _DECIMAL.fullmatch(word):
+        return float(word)
+    if _COMMA.fullmatch(word):
+        point = word.replace(",", ".")
+        raise DoesNotFit(f"{text!r} has a decimal comma, allowed: a decimal point, as in {point}")
+    if tag.states:
+        return word
+    raise DoesNotFit(f"{_shown(text)} is not a number")
+
+
+def _switched(tag: Tag, word: str) -> bool:
+    found = (BOOLEANS | SWITCHED).get(word.lower())
+    if found is None:
+        names = "".join(f"{name}, " for name in tag.states.values())
+        raise DoesNotFit(f"{_shown(word)} is not {names}true, false, on, off, 1 or 0")
+    return found
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= 40 else f"{text[:40]}…")
+
+
+def _trimmed(tag: Tag, value: float) -> float:
+    """A finite value, as if its registers held the shortest decimal that they stand for."""
+    base = tag.of_type.base
+    if base not in ("float16", "float32"):
+        return value
+    if tag.scale == 1 and tag.offset == 0:
+        return float(shortest(value, base))
+    linear = _linear(tag.scale, tag.offset)
+    try:
+        number = float(linear.number(value))
+    except OverflowError:
+        return value
+    return linear.value(Fraction(shortest(number, base)))
+
+
+@lru_cache(1024)
+def _linear(scale: float, offset: float) -> Linear:
+    return Linear(scale, offset)
+
+
+@lru_cache(1024)
+def _places(scale: float, offset: float) -> int | None:
+    """The decimal places of all scaled integers; `None` for too many."""
+    found = 0
+    for number in (scale, offset):
+        text = repr(float(number))
+        if "e" in text:
+            return None
+        places = 0 if text.endswith(".0") else len(text.partition(".")[2])
+        found = max(found, places)
+    return found if found <= MOST_PLACES else None

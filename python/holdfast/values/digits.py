@@ -1,0 +1,24 @@
+"""Floats with the digits that their type has."""
+
+from __future__ import annotations
+
+import struct
+
+FLOATS = {"float16": "e", "float32": "f", "float64": "d"}
+MAX_DIGITS = 17
+LARGE = 1e16
+
+
+def shortest(value: float, kind: str) -> str:
+    """The shortest decimal that rounds to this float in its type: `0.1` for every float type."""
+    if abs(value) < LARGE and value == int(value):
+        return f"{value:.0f}"
+    form = FLOATS.get(kind, "d")
+    for digits in range(1, MAX_DIGITS):
+        text = f"{value:.{digits}g}"
+        try:
+            if struct.pack(form, float(text)) == struct.pack(form, value):
+                return text
+        except OverflowError:
+            continue
+    return repr(value)
