@@ -186,7 +186,7 @@ def test_a_modicon_number_names_area_and_address(
         (("registers", "1"), "'registers' is not an area"),
         (("", "1"), "'' is not an area"),
         (("hr",), "Missing argument 'ADDRESS'."),
-        ((), "Missing argument 'AREA ADDRESS [COUNT]'."),
+        ((), "Missing argument 'AREA ADDRESS [COUNT]', AREA:ADDRESS or --tags."),
         (("hr", "0", "0"), "COUNT is '0', allowed: 1 to 65536."),
         (("hr", "0", "x"), "COUNT is 'x', allowed: 1 to 65536."),
         (("hr", "0", "1", "2"), "Got unexpected extra argument (2)."),

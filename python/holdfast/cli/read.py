@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import device, pace, places, showing
+from holdfast.cli import device, pace, places, showing, tag_options, tag_source, tagged_read
+from holdfast.cli.tag_options import TagFiles
 from holdfast.cli.typed import typed, typed_options
 from holdfast.errors import ModbusError, ModbusException
 from holdfast.protocol import ADDRESSES, ILLEGAL_ADDRESS, LAST_ADDRESS
@@ -18,6 +19,7 @@ from holdfast.values import ConversionError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from holdfast.cli.places import Place
     from holdfast.cli.typed import Typed
@@ -31,22 +33,28 @@ WIDEST = 14
 @click.command(
     epilog="Example: holdfast read tcp://192.168.0.10 hr 100 4 --type float32 --order CDAB"
 )
-@device.url_argument
+@tag_options.url_argument
 @click.argument(
     "words",
     nargs=-1,
-    required=True,
-    metavar="AREA ADDRESS [COUNT]",
+    metavar="[AREA ADDRESS [COUNT] | AREA:ADDRESS[:TYPE[:ORDER]]...]",
     shell_complete=places.complete,
 )
 @typed_options
-@click.option("--count", type=click.IntRange(1, ADDRESSES), metavar="N", help="Same as COUNT.")
+@click.option(
+    "--count",
+    type=click.IntRange(1, ADDRESSES),
+    metavar="N",
+    help="Same as COUNT; with AREA:ADDRESS and tags, same as --times.",
+)
 @click.option(
     "--every", type=device.seconds, metavar="SECONDS", help="Repeat the read until Ctrl-C."
 )
 @click.option(
     "--times", type=click.IntRange(1), metavar="N", help="With --every: stop after N reads."
 )
+@tag_options.tag_options
+@tag_options.output_options
 @click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as in 40001 or 4x0001.")
 @device.device_options
 @device.json_option
@@ -59,12 +67,22 @@ def read(
     count: int | None,
     every: float | None,
     times: int | None,
+    tag_file: Path | None,
+    profile: str | None,
+    config_file: Path | None,
+    only: tuple[str, ...],
+    max_gap: int,
+    as_csv: bool,
+    record: Path | None,
     modicon: bool,
     unit: int,
     timeout: float,
     as_json: bool,
 ) -> None:
     """Read COUNT values (default: 1) from AREA of the device at URL, starting at ADDRESS.
+
+    With AREA:ADDRESS, reads several values, each with a type and order of its own, as in
+    hr:0:float32 hr:10:uint32:CDAB coil:3. With --tags, reads the tags of a list.
 
     AREA is coils, discrete_inputs, holding_registers or input_registers; co, di, hr, ir, or any
     unambiguous prefix. ADDRESS counts from 0, decimal or 0x. With --modicon, it is 40001, 400001 or
@@ -78,6 +96,21 @@ def read(
     """
     if times is not None and every is None:
         raise click.UsageError("--times requires --every.")
+    files = TagFiles(tag_file, profile, config_file)
+    of = tag_options.device_of(
+        files, url, words, only, (kind, order, encoding), modicon, unit, timeout
+    )
+    if of is not None:
+        form = tagged_read.form_of(as_json, as_csv)
+        if count is not None and times is not None:
+            raise click.UsageError("--count and --times are the same: give only one.")
+        if count is not None and count > 1 and every is None:
+            raise click.UsageError("--count requires --every.")
+        with tag_source.opened(of, max_gap, record) as source:
+            sys.exit(tagged_read.read_tags(source, form, every, times or count))
+    tag_options.require_tags(as_csv=as_csv, record=record, only=only, max_gap=max_gap)
+    if not words:
+        raise click.UsageError("Missing argument 'AREA ADDRESS [COUNT]', AREA:ADDRESS or --tags.")
     place, left = places.taken(words, modicon=modicon)
     query = _query(place, _count(left, count), kind, order, encoding)
     told = {"url": url, "unit": unit, **query.told()}

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast.gateway.fields import malformed
-from holdfast.values.digits import shortest
 from holdfast.values import ConversionError, WrongArea
+from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

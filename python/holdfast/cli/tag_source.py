@@ -1,0 +1,82 @@
+"""Reads tags for a command, and records what it reads."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from holdfast.cli import device
+from holdfast.cli.recording import NotARecording, Recording
+from holdfast.tools.tag_reading import TagReader
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from holdfast.cli.tag_options import TaggedDevice
+    from holdfast.client import SyncClient
+    from holdfast.tags import Tag
+    from holdfast.tools.tag_reading import Reading
+
+
+class TagSource:
+    """A device that is read by tags."""
+
+    def __init__(
+        self,
+        of: TaggedDevice,
+        client: SyncClient,
+        reader: TagReader,
+        recording: Recording | None,
+        file: Path | None,
+    ) -> None:
+        self.where = f"{of.url}, unit {of.unit}"
+        self.url = of.url
+        self.unit = of.unit
+        self.tags: Sequence[Tag] = reader.tags
+        self._client = client
+        self._reader = reader
+        self._recording = recording
+        self._file = file
+
+    def read(self, between: Callable[[], object] = lambda: None) -> tuple[float, list[Reading]]:
+        """Reads and records all tags. Returns the time and the readings.
+
+        `between` is called after every request. Exits with 1 if the recording can't be written.
+        """
+        readings = self._reader.read(self._client, between)
+        moment = time.time()
+        if self._recording is not None:
+            try:
+                self._recording.add(moment, readings)
+            except OSError as error:
+                click.echo(f"holdfast: {self._file}: {error.strerror}", err=True)
+                sys.exit(device.FAILED)
+        return moment, readings
+
+
+@contextlib.contextmanager
+def opened(of: TaggedDevice, max_gap: int, record: Path | None) -> Iterator[TagSource]:
+    """A source, with its connection and recording. Raises `click.UsageError`."""
+    with contextlib.ExitStack() as closing:
+        recording = None
+        if record is not None:
+            recording = _recording(record, of)
+            closing.callback(recording.close)
+            if recording.removed:
+                click.echo(f"{record}: removed an incomplete last line", err=True)
+        client = closing.enter_context(device.connect(of.url, of.unit, of.timeout))
+        reader = TagReader(of.tags, max_gap=max_gap)
+        yield TagSource(of, client, reader, recording, record)
+
+
+def _recording(file: Path, of: TaggedDevice) -> Recording:
+    try:
+        return Recording(file, of.tags)
+    except (OSError, NotARecording) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise click.UsageError(f"{file}: {reason}.") from error

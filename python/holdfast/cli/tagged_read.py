@@ -1,0 +1,129 @@
+"""`holdfast read` with tags: a table, CSV or JSON, once or repeatedly."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import click
+
+from holdfast.cli import device, pace, recording, showing
+from holdfast.errors import ModbusError
+from holdfast.tags.text import plain, text_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.cli.tag_source import TagSource
+    from holdfast.tags import Tag
+    from holdfast.tools.tag_reading import Error, Reading
+
+Form: TypeAlias = Literal["text", "csv", "json"]
+
+NO_VALUE = "no value"
+
+
+def form_of(as_json: bool, as_csv: bool) -> Form:
+    """The form of `--json` and `--csv`. Raises `click.UsageError`."""
+    if as_json and as_csv:
+        raise click.UsageError("--json and --csv can't be used together.")
+    return "json" if as_json else "csv" if as_csv else "text"
+
+
+def read_tags(source: TagSource, form: Form, every: float | None, times: int | None) -> int:
+    """Reads and prints tags, once or at every tick. Returns the exit code."""
+    code = 0
+    if form == "csv":
+        click.echo(recording.head(source.tags), nl=False)
+    try:
+        for tick in pace.ticks(every or 1, 1 if every is None else times):
+            moment, readings = source.read()
+            if any(each.error is not None for each in readings):
+                code = device.FAILED
+            if form == "csv":
+                click.echo(recording.row(moment, readings), nl=False)
+                if every is None:
+                    _explain(readings)
+            elif form == "json":
+                click.echo(json.dumps(_told(source, readings, every is not None)))
+            else:
+                if tick:
+                    click.echo()
+                if every is not None:
+                    click.echo(showing.clock())
+                _show(source, readings)
+    except KeyboardInterrupt:
+        if every is None:
+            raise
+        if form == "text" and sys.stdout.isatty():
+            click.echo()
+    return code
+
+
+def _told(source: TagSource, readings: Sequence[Reading], timed: bool) -> dict[str, Any]:
+    """A reading for JSON."""
+    states = {each.tag.name: each.tag.state(each.value) for each in readings}
+    errors = {each.tag.name: problem(each.error) for each in readings if each.error is not None}
+    return {
+        **({"time": showing.timestamp()} if timed else {}),
+        "ok": not errors,
+        "url": source.url,
+        "unit": source.unit,
+        "values": {each.tag.name: plain(each.tag, each.value) for each in readings},
+        "states": {name: state for name, state in states.items() if state is not None},
+        "errors": errors,
+    }
+
+
+def problem(error: Error) -> dict[str, object]:
+    """The error of a tag for JSON."""
+    if isinstance(error, ModbusError):
+        return device.problem(error)
+    return {"reason": "undecodable", "detail": str(error)}
+
+
+def value_shown(tag: Tag, value: Any) -> str:
+    """A value for people, without its unit; a state with its number."""
+    if value is None:
+        return NO_VALUE
+    state = tag.state(value)
+    text = showing.plain(text_of(tag, value))
+    return text if state is None else f"{text} ({int(value)})"
+
+
+def _show(source: TagSource, readings: Sequence[Reading]) -> None:
+    """Prints a table; an error that all tags share is one line on standard error."""
+    errors = {str(each.error) for each in readings}
+    if len(errors) == 1 and readings[0].error is not None and len(readings) > 1:
+        click.echo(f"holdfast: {source.url}: {errors.pop()}", err=True)
+        return
+    head = ["name", "value", "unit", "address"]
+    rows = [
+        [showing.plain(each.tag.name), _cell(each), showing.plain(each.tag.unit), place(each.tag)]
+        for each in readings
+    ]
+    if not any(each.tag.unit for each in readings):
+        for line in [head, *rows]:
+            del line[2]
+    click.echo("\n".join(showing.table(head, rows, "<>")))
+
+
+def _cell(reading: Reading) -> str:
+    if reading.error is not None:
+        return showing.styled(f"? {reading.error}", fg="red")
+    return value_shown(reading.tag, reading.value)
+
+
+def place(tag: Tag) -> str:
+    """Place and type of a tag: `holding_registers 100 float32 CDAB`."""
+    plain_orders = ("ABCD", "CDAB") if tag.count == 1 else ("ABCD",)
+    order = "" if tag.order in plain_orders else f" {tag.order}"
+    return f"{tag.area} {tag.address} {tag.type}{order}"
+
+
+def _explain(readings: Sequence[Reading]) -> None:
+    """Prints why cells are empty."""
+    for each in readings:
+        if each.error is not None:
+            click.echo(f"holdfast: {showing.plain(each.tag.name)}: {each.error}", err=True)

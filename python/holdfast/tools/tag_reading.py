@@ -1,0 +1,240 @@
+"""Reads tags: neighbours in one request, and a refused block costs only its own tags."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from holdfast._core import plan_blocks
+from holdfast.errors import (
+    ConnectFailed,
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+    TlsFailed,
+)
+from holdfast.protocol import ILLEGAL_ADDRESS, ILLEGAL_VALUE, READ_LIMITS
+from holdfast.tags.decoding import Decoder, Undecoded, decoder
+from holdfast.types import BIT_AREAS
+from holdfast.values import ConversionError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from holdfast.client import SyncClient
+    from holdfast.tags import Tag
+    from holdfast.types import Area
+
+MAX_SILENT = 3
+"""Requests in a row without an answer that end a reading."""
+
+REFUSED_FOR = 60.0
+"""Seconds after which what the device refuses is tried again."""
+
+ILLEGAL = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
+"""Exceptions that depend on the request, not on the state of the device."""
+
+GATEWAY = (0x0A, 0x0B)
+"""Exceptions of a gateway whose device does not answer."""
+
+Error: TypeAlias = ModbusError | ConversionError
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was read of a tag."""
+
+    tag: Tag
+    value: Any = None
+    """The value; `None` without one, also if the device says that it has none."""
+    error: Error | None = None
+    """Why nothing was read."""
+
+
+@dataclass
+class _Block:
+    """One request, or several for an array that exceeds one. It has whole fields."""
+
+    area: Area
+    address: int
+    count: int
+    fields: list[_Field]
+    decode: Decoder
+    asked: int = 0
+    """The number of the reading that asked for it last; 0 is none."""
+    answered: bool = True
+    refused: ModbusException | None = None
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Blocks that answered come first, then new ones, then those silent for longest."""
+        if not self.asked:
+            return 1, 0
+        return (0, 0) if self.answered else (2, self.asked)
+
+
+@dataclass
+class _Field:
+    """A range of addresses, and the indexes of its tags."""
+
+    area: Area
+    address: int
+    count: int
+    tags: list[int] = field(default_factory=list)
+
+
+class TagReader:
+    """Reads tags, and remembers for a minute what the device refuses.
+
+    Gaps of up to `max_gap` registers or bits between tags are read with them.
+    """
+
+    def __init__(
+        self,
+        tags: Iterable[Tag],
+        *,
+        max_gap: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.tags = tuple(tags)
+        self._max_gap = max_gap
+        self._clock = clock
+        self._number = 0
+        self._readings: dict[int, Reading] = {}
+        self._blocks: list[_Block] = []
+        self._planned = 0.0
+        self._is_whole = False
+        """Whether the blocks are those of the plan, as nothing has been refused."""
+
+    @property
+    def requests(self) -> list[tuple[Area, int, int]]:
+        """The blocks of the next reading: area, address, count."""
+        self._plan()
+        return [(block.area, block.address, block.count) for block in self._blocks]
+
+    def read(
+        self, client: SyncClient, between: Callable[[], object] = lambda: None
+    ) -> list[Reading]:
+        """Reads all tags, in their order. `between` is called after every request.
+
+        A device that does not answer three requests in a row is not asked any further.
+        """
+        self._plan()
+        self._number += 1
+        self._readings = {}
+        silent = 0
+        ended: ModbusError | None = None
+        blocks: list[_Block] = []
+        for block in sorted(self._blocks, key=lambda each: each.rank):
+            if block.refused is not None:
+                self._fail(block, block.refused)
+                blocks.append(block)
+                continue
+            if ended is not None:
+                self._fail(block, ended)
+                blocks.append(block)
+                continue
+            made, error = self._asked(client, block, between)
+            blocks += made
+            if error is None:
+                silent = 0
+                continue
+            silent += 1
+            if silent == MAX_SILENT or isinstance(error, ConnectFailed | TlsFailed):
+                ended = error
+        self._blocks = sorted(blocks, key=lambda each: (each.area, each.address))
+        return [self._readings[index] for index in range(len(self.tags))]
+
+    def _plan(self) -> None:
+        """Makes blocks of all tags, at first and some time after a refusal."""
+        now = self._clock()
+        if self._blocks and (self._is_whole or now - self._planned < REFUSED_FOR):
+            return
+        self._planned, self._is_whole = now, True
+        fields: dict[tuple[Area, int, int], _Field] = {}
+        for index, tag in enumerate(self.tags):
+            place = tag.area, tag.address, tag.count
+            fields.setdefault(place, _Field(*place)).tags.append(index)
+        short = [each for each in fields.values() if each.count <= READ_LIMITS[each.area]]
+        planned = plan_blocks(
+            [(each.area, each.address, each.count) for each in short], max_gap=self._max_gap
+        )
+        self._blocks = [self._block([short[at] for at in inside]) for _, _, _, inside, _ in planned]
+        self._blocks += [self._block([each]) for each in fields.values() if each not in short]
+
+    def _block(self, fields: Sequence[_Field]) -> _Block:
+        found = sorted(fields, key=lambda each: each.address)
+        address = found[0].address
+        count = max(each.address + each.count for each in found) - address
+        tags = [self.tags[index] for each in found for index in each.tags]
+        return _Block(found[0].area, address, count, found, decoder(tags, address, count))
+
+    def _asked(
+        self, client: SyncClient, block: _Block, between: Callable[[], object]
+    ) -> tuple[list[_Block], ModbusError | None]:
+        """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
+        block.asked = self._number
+        try:
+            data = _fetched(client, block)
+        except ModbusError as error:
+            between()
+            if isinstance(error, ModbusException) and error.code in ILLEGAL:
+                self._is_whole = False
+                if len(block.fields) > 1:
+                    return self._halved(client, block, between)
+                block.refused = error
+            self._fail(block, error)
+            block.answered = not _is_silence(error)
+            return [block], None if block.answered else error
+        between()
+        block.answered = True
+        self._take(block, data)
+        return [block], None
+
+    def _halved(
+        self, client: SyncClient, block: _Block, between: Callable[[], object]
+    ) -> tuple[list[_Block], ModbusError | None]:
+        """Reads the halves of a refused block; the second only if the device still answers."""
+        middle = len(block.fields) // 2
+        first, second = self._block(block.fields[:middle]), self._block(block.fields[middle:])
+        blocks, error = self._asked(client, first, between)
+        if error is not None:
+            self._fail(second, error)
+            return [*blocks, second], error
+        others, error = self._asked(client, second, between)
+        return blocks + others, error
+
+    def _take(self, block: _Block, data: bytes) -> None:
+        indexes = [index for each in block.fields for index in each.tags]
+        for index, raw in zip(indexes, block.decode(data), strict=True):
+            tag = self.tags[index]
+            if isinstance(raw, Undecoded):
+                self._readings[index] = Reading(tag, error=ConversionError(raw.error))
+            else:
+                self._readings[index] = Reading(tag, tag.value(raw))
+
+    def _fail(self, block: _Block, error: ModbusError) -> None:
+        for each in block.fields:
+            for index in each.tags:
+                self._readings[index] = Reading(self.tags[index], error=error)
+
+
+def _fetched(client: SyncClient, block: _Block) -> bytes:
+    """The bytes of a block, as in a Modbus reply."""
+    area, address, count = block.area, block.address, block.count
+    if area not in BIT_AREAS:
+        registers: bytes = client.read(area, address, f"bytes:{2 * count}")
+        return registers
+    read = client.read_coils if area == "coils" else client.read_discrete_inputs
+    bits = sum(bit << at for at, bit in enumerate(read(address, count)))
+    return bits.to_bytes((count + 7) // 8, "little")
+
+
+def _is_silence(error: ModbusError) -> bool:
+    """Whether the device did not answer, so that more requests would likely wait in vain."""
+    if isinstance(error, ModbusException):
+        return error.code in GATEWAY
+    return isinstance(error, ConnectionLost | RequestTimeout | InvalidResponse)
