@@ -11,10 +11,21 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from holdfast.cli import device, pace, places, showing, sources
+from holdfast.cli import (
+    device,
+    pace,
+    places,
+    showing,
+    sources,
+    tag_options,
+    tag_source,
+    tagged_watch,
+)
 from holdfast.cli.configuration import WRONG, load_or_exit
 from holdfast.cli.progress import bar
 from holdfast.cli.sources import Unreadable, Unwatchable, WatchedRange
+from holdfast.cli.tag_options import TagFiles
+from holdfast.cli.tagged_read import form_of
 from holdfast.cli.watching import Tracker
 from holdfast.errors import ModbusError
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
@@ -33,7 +44,12 @@ TOKEN = "HOLDFAST_TOKEN"
 
 @click.command(epilog="Example: holdfast watch plant.yaml")
 @click.argument("target", metavar="URL|FILE")
-@click.argument("words", nargs=-1, metavar="[AREA ADDRESS [COUNT]]", shell_complete=places.complete)
+@click.argument(
+    "words",
+    nargs=-1,
+    metavar="[AREA ADDRESS [COUNT] | AREA:ADDRESS[:TYPE[:ORDER]]...]",
+    shell_complete=places.complete,
+)
 @click.option("--memory", metavar="NAME", help="With FILE: only this memory.")
 @click.option(
     "--every",
@@ -43,7 +59,11 @@ TOKEN = "HOLDFAST_TOKEN"
     metavar="SECONDS",
     help="Interval between readings.",
 )
-@click.option("--times", type=click.IntRange(1), metavar="N", help="Stop after N readings.")
+@click.option(
+    "--times", "--count", type=click.IntRange(1), metavar="N", help="Stop after N readings."
+)
+@tag_options.tag_options
+@tag_options.output_options
 @click.option("--modicon", is_flag=True, help="ADDRESS is a Modicon number, as in 40001 or 4x0001.")
 @device.device_options
 @device.json_option
@@ -53,6 +73,13 @@ def watch(
     memory: str | None,
     every: float,
     times: int | None,
+    tag_file: Path | None,
+    profile: str | None,
+    config_file: Path | None,
+    only: tuple[str, ...],
+    max_gap: int,
+    as_csv: bool,
+    record: Path | None,
     modicon: bool,
     unit: int,
     timeout: float,
@@ -63,15 +90,33 @@ def watch(
     With URL, reads COUNT addresses (default: 1) from AREA of the device, starting at ADDRESS.
     Without AREA, reads all addresses that `holdfast map` finds.
 
+    With AREA:ADDRESS, reads several values, each with a type and order of its own, as in
+    hr:0:float32 hr:10:uint32:CDAB coil:3. With --tags, reads the tags of a list.
+
     With FILE, the configuration of an appliance on this machine, reads its memories over its REST
     interface (with the token in HOLDFAST_TOKEN), or else over its first listener of type
     modbus-tcp.
 
     On a terminal, shows all values, with changes highlighted, and rates of change. q quits, n and p
-    turn pages. Without a terminal, or with --json, prints a line for every change.
+    turn pages. Without a terminal, or with --json, prints a line for every change; with --csv, a
+    line for every reading.
 
     Exit codes: 0 ended by q or Ctrl-C, 1 the first reading failed, 2 wrong usage.
     """
+    files = TagFiles(tag_file, profile, config_file)
+    if device.is_url(target) or config_file is not None:
+        untyped = (None, "ABCD", None)
+        of = tag_options.device_of(files, target, words, only, untyped, modicon, unit, timeout)
+        if of is not None:
+            device.checked_url(of.url)
+            if memory is not None:
+                raise click.UsageError("--memory requires FILE.")
+            form = form_of(as_json, as_csv)
+            with tag_source.opened(of, max_gap, record) as tagged:
+                sys.exit(tagged_watch.watch_tags(tagged, form, every, times))
+    elif files.given or tag_options.are_items(words):
+        raise click.UsageError("AREA:ADDRESS and --tags require URL, not FILE.")
+    tag_options.require_tags(as_csv=as_csv, record=record, only=only, max_gap=max_gap)
     url = device.is_url(target)
     if url and memory is not None:
         raise click.UsageError("--memory requires FILE.")
@@ -91,7 +136,7 @@ def watch(
         if sys.stdout.isatty() and not as_json:
             from holdfast.cli.live import View
 
-            View(source, every, note).run(first, times)
+            View(source, first, every, note).run(times)
         else:
             click.echo(f"watching {source.where}{f'; {note}' if note else ''}", err=True)
             _lines(source, first, every, times, as_json)
