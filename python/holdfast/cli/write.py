@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast import values
-from holdfast.cli import device, places, showing
+from holdfast.cli import device, places, showing, tag_options, tagged_write
+from holdfast.cli.tag_options import TagFiles
 from holdfast.cli.typed import typed, typed_options
 from holdfast.client import requests
 from holdfast.errors import ModbusError, ModbusException
@@ -20,6 +21,7 @@ from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from holdfast._core import Request
     from holdfast.cli.places import Place
@@ -36,15 +38,15 @@ NEGATIVE = re.compile(r"-(\.?[0-9]|inf|nan)", re.I)
     # Otherwise -5 would be an unknown option.
     context_settings={"ignore_unknown_options": True},
 )
-@device.url_argument
+@tag_options.url_argument
 @click.argument(
     "words",
     nargs=-1,
-    required=True,
-    metavar="AREA ADDRESS VALUE...",
+    metavar="[AREA ADDRESS VALUE... | NAME=VALUE...]",
     shell_complete=places.complete,
 )
 @typed_options
+@tag_options.tag_file_options
 @click.option("--split", is_flag=True, help="Allow several requests if one is not enough.")
 @click.option("--verify", is_flag=True, help="Read the values back and compare.")
 @click.option("--dry-run", is_flag=True, help="Print the requests (PDU) in hex and send nothing.")
@@ -57,6 +59,9 @@ def write(
     kind: str | None,
     order: str,
     encoding: str | None,
+    tag_file: Path | None,
+    profile: str | None,
+    config_file: Path | None,
     split: bool,
     verify: bool,
     dry_run: bool,
@@ -75,11 +80,25 @@ def write(
     VALUEs are of that type: text for a string, hex for bytes. bit:N writes one bit of a register
     with function 22, which keeps the other bits.
 
+    With --tags, writes NAME=VALUE: values are scaled, states have names, and only tags that are
+    writable are written. If a value does not fit, nothing is sent.
+
     One coil or register is written with function 5 or 6, several with 15 or 16.
 
     Exit codes: 0 written, 1 not written, possibly not written or read back different, 2 wrong
     usage.
     """
+    files = TagFiles(tag_file, profile, config_file)
+    if files.given:
+        if kind is not None or order != "ABCD" or encoding is not None or split or modicon:
+            raise click.UsageError(
+                "--type, --order, --encoding, --split and --modicon can't be used with tags."
+            )
+        of = files.device(url, unit, timeout)
+        tagged_write.write_tags(of, words, verify=verify, dry_run=dry_run, as_json=as_json)
+        return
+    if not words:
+        raise click.UsageError("Missing argument 'AREA ADDRESS VALUE...'.")
     place, left = places.taken(words, modicon=modicon)
     for word in left:
         if word.startswith("--") or (word.startswith("-") and not NEGATIVE.match(word)):

@@ -1,0 +1,125 @@
+"""`holdfast write` with tags: NAME=VALUE, checked by the tag list."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from holdfast.cli import device, showing
+from holdfast.cli.tagged_read import value_shown
+from holdfast.config.words import guess, listing
+from holdfast.errors import ModbusError, ModbusException
+from holdfast.tools.tag_writing import prepared
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.cli.tag_options import TaggedDevice
+    from holdfast.client import SyncClient
+    from holdfast.tools.tag_writing import TagWrite
+
+
+def write_tags(
+    of: TaggedDevice, words: Sequence[str], *, verify: bool, dry_run: bool, as_json: bool
+) -> None:
+    """Checks all values, then writes them in their order, until the first error."""
+    writes = _prepared(of, words)
+    if dry_run:
+        pdus = [write.request.pdu.hex() for write in writes]
+        click.echo(json.dumps({"requests": pdus}) if as_json else "\n".join(pdus))
+        return
+    with device.connect(of.url, of.unit, of.timeout) as client:
+        for at, write in enumerate(writes):
+            try:
+                write.send(client)
+            except ModbusError as error:
+                _fail(of, writes, at, error, as_json)
+            if not as_json:
+                click.echo(f"Written: {_said(write)}")
+        differing = _differing(of, client, writes, as_json) if verify else {}
+    if as_json:
+        verified = {"verified": not differing} if verify else {}
+        names = [write.tag.name for write in writes]
+        answer = {"ok": not differing, "url": of.url, "unit": of.unit, "written": names}
+        click.echo(json.dumps(answer | verified))
+    elif verify and not differing:
+        click.echo("Read back alike.")
+    if differing:
+        if not as_json:
+            for name, now in differing.items():
+                click.echo(f"holdfast: {name}: read back {now}", err=True)
+        sys.exit(device.FAILED)
+
+
+def _prepared(of: TaggedDevice, words: Sequence[str]) -> list[TagWrite]:
+    texts = [(name, text) for name, sign, text in (word.partition("=") for word in words) if sign]
+    if len(texts) < len(words):
+        wrong = next(word for word in words if "=" not in word)
+        if wrong.startswith("-"):
+            raise click.NoSuchOption(wrong)
+        raise click.UsageError(f"{wrong!r} is not NAME=VALUE, as in setpoint=21.5.")
+    if not texts:
+        raise click.UsageError("Missing argument 'NAME=VALUE...'.")
+    try:
+        return prepared(of.tags, texts)
+    except KeyError as error:
+        [name] = error.args
+        writable = [tag.name for tag in of.tags if tag.writable]
+        known = listing(writable) or "none, no tag is writable"
+        raise click.UsageError(
+            f"No tag has the name {name!r}, allowed: {known}{guess(name, writable) or '.'}"
+        ) from None
+    except ValueError as error:
+        raise click.UsageError(f"{error}.") from None
+
+
+def _said(write: TagWrite) -> str:
+    tag = write.tag
+    unit = f" {tag.unit}" if tag.unit else ""
+    return showing.plain(f"{tag.name} = {value_shown(tag, tag.value(write.raw))}{unit}")
+
+
+def _differing(
+    of: TaggedDevice, client: SyncClient, writes: Sequence[TagWrite], as_json: bool
+) -> dict[str, str]:
+    """The values that were read back and differ, by name."""
+    try:
+        found = {write.tag.name: (write, write.read_back(client)) for write in writes}
+    except ModbusError as error:
+        names = [write.tag.name for write in writes]
+        told = {"url": of.url, "unit": of.unit, "written": names, "maybe_written": True}
+        if not as_json:
+            click.echo("Could not be read back.", err=True)
+        device.fail(error, of.url, told if as_json else None)
+    return {
+        name: value_shown(write.tag, now)
+        for name, (write, (is_alike, now)) in found.items()
+        if not is_alike
+    }
+
+
+def _fail(
+    of: TaggedDevice, writes: Sequence[TagWrite], at: int, error: ModbusError, as_json: bool
+) -> NoReturn:
+    """Prints which tag failed, and which ones were written and not sent."""
+    names = [write.tag.name for write in writes]
+    maybe = not isinstance(error, ModbusException)
+    if as_json:
+        told = {
+            "url": of.url,
+            "unit": of.unit,
+            "written": names[:at],
+            "failed": names[at],
+            "not_written": names[at + 1 :],
+            "maybe_written": maybe,
+        }
+        device.fail(error, of.url, told)
+    click.echo(f"holdfast: {of.url}: {names[at]}: {error}", err=True)
+    if maybe:
+        click.echo(f"hint: {names[at]} was possibly written", err=True)
+    if names[at + 1 :]:
+        click.echo(f"Not written: {', '.join(names[at + 1 :])}", err=True)
+    sys.exit(device.FAILED)
