@@ -32,6 +32,7 @@ COMMANDS = {
     "scan": "holdfast.cli.scan:scan",
     "schema": "holdfast.cli.schema:schema",
     "sessions": "holdfast.cli.sessions:sessions",
+    "simulate": "holdfast.cli.simulate:simulate",
     "token": "holdfast.cli.token:token",
     "watch": "holdfast.cli.watch:watch",
     "write": "holdfast.cli.write:write",

@@ -1,0 +1,156 @@
+"""Faults of a simulated device: a front that delays, drops and refuses requests."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from holdfast.net.addresses import holds, parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from random import Random
+
+    from holdfast.net.addresses import Network
+
+HEADER = 7
+MAX_LENGTH = 254
+MAX_CONNECTIONS = 64
+IDLE = 300.0
+REPLY = 5.0
+"""Seconds for which the device behind the front may take."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What happens to requests, and how often, from 0 to 1."""
+
+    latency: tuple[float, float] = (0, 0)
+    """The least and the largest delay of a reply, in seconds."""
+    drop: float = 0
+    """The share of requests without a reply."""
+    refuse: float = 0
+    """The share of requests that an exception answers."""
+    code: int = 4
+    """The code of this exception."""
+
+    @property
+    def any(self) -> bool:
+        """Whether anything happens at all."""
+        return self.latency[1] > 0 or self.drop > 0 or self.refuse > 0
+
+
+class Front:
+    """Serves Modbus TCP at `address`, and asks the device at `behind`, from `start` to `stop`.
+
+    Peers that are in none of the networks `sources` are disconnected. The requests of a connection
+    are answered one after another.
+    """
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        behind: tuple[str, int],
+        faults: Faults,
+        random: Random,
+        sources: Sequence[Network],
+    ) -> None:
+        self.address = address
+        self._behind = behind
+        self._faults = faults
+        self._random = random
+        self._sources = sources
+        self._loop = asyncio.new_event_loop()
+        self._server: asyncio.Server | None = None
+        self._connections: set[asyncio.Task[None]] = set()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="faults", daemon=True)
+
+    def start(self) -> Self:
+        """Listens. Raises `OSError`."""
+        self._thread.start()
+        host, port = self.address
+        opening = asyncio.start_server(self._accept, host, port)
+        try:
+            self._server = asyncio.run_coroutine_threadsafe(opening, self._loop).result()
+        except BaseException:
+            self._end()
+            raise
+        self.address = self._server.sockets[0].getsockname()[:2]
+        return self
+
+    def stop(self) -> None:
+        """Closes all connections and stops listening."""
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._end()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _close(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        for task in self._connections:
+            task.cancel()
+        await asyncio.gather(*self._connections, return_exceptions=True)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._connections.add(task)
+        try:
+            peer = parse_address(writer.get_extra_info("peername")[0].partition("%")[0])
+            if holds(self._sources, peer) and len(self._connections) <= MAX_CONNECTIONS:
+                with contextlib.suppress(OSError, EOFError, TimeoutError, asyncio.CancelledError):
+                    await self._serve(reader, writer)
+        finally:
+            self._connections.discard(task)
+            writer.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        behind, to_behind = await asyncio.open_connection(*self._behind)
+        try:
+            while True:
+                request = await asyncio.wait_for(_frame(reader), IDLE)
+                reply = await self._reply(request, behind, to_behind)
+                if reply is not None:
+                    writer.write(reply)
+                    await asyncio.wait_for(writer.drain(), IDLE)
+        finally:
+            to_behind.close()
+
+    async def _reply(
+        self, request: bytes, behind: asyncio.StreamReader, to_behind: asyncio.StreamWriter
+    ) -> bytes | None:
+        """The reply to a request; `None` if it is dropped."""
+        faults, chance = self._faults, self._random.random()
+        least, most = faults.latency
+        await asyncio.sleep(self._random.uniform(least, most))
+        if chance < faults.drop:
+            return None
+        if chance < faults.drop + faults.refuse:
+            length = struct.pack(">H", 3)
+            code = bytes([request[HEADER] | 0x80, faults.code])
+            return request[:4] + length + request[6:7] + code
+        to_behind.write(request)
+        return await asyncio.wait_for(_frame(behind), REPLY)
+
+
+async def _frame(reader: asyncio.StreamReader) -> bytes:
+    """The next frame. Raises `EOFError` at the end, and for bytes that are no frame."""
+    head = await reader.readexactly(HEADER)
+    protocol, length = struct.unpack(">HH", head[2:6])
+    if protocol != 0 or not 2 <= length <= MAX_LENGTH:
+        raise EOFError
+    return head + await reader.readexactly(length - 1)

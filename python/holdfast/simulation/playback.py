@@ -1,0 +1,74 @@
+"""Values from a CSV file: a column for each tag, as `holdfast read --record` writes it."""
+
+from __future__ import annotations
+
+import csv
+from typing import TYPE_CHECKING, Any
+
+from holdfast.tags.text import value_from
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from holdfast.tags import TagList
+
+MAX_ROWS = 1_000_000
+TIME = "time"
+"""The column that is ignored: each row is one step."""
+
+
+class Unplayable(ValueError):
+    """The file can't be played back."""
+
+
+def load(path: Path, tags: TagList) -> dict[str, list[Any]]:
+    """Reads the values of each tag. An empty cell repeats the value before.
+
+    Raises `Unplayable`, which names file and line, and `OSError`.
+    """
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        try:
+            return _columns(csv.reader(file), str(path), tags)
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise Unplayable(f"{path}: not CSV: {error}") from error
+
+
+def _columns(rows: Any, file: str, tags: TagList) -> dict[str, list[Any]]:
+    names = next(rows, None)
+    if names is None:
+        raise Unplayable(f"{file}: the file is empty")
+    for name in names:
+        if name != TIME and name not in tags:
+            raise Unplayable(f"{file}:1: found the column {name!r}, allowed: names of tags")
+    found: dict[str, list[Any]] = {name: [] for name in names if name != TIME}
+    if len(found) < len(names) - names.count(TIME):
+        raise Unplayable(f"{file}:1: two columns have the same name")
+    for row in rows:
+        if not row:
+            continue
+        where = f"{file}:{rows.line_num}"
+        if len(row) != len(names):
+            raise Unplayable(f"{where}: found {len(row)} cells, allowed: {len(names)}")
+        if len(next(iter(found.values()), ())) == MAX_ROWS:
+            raise Unplayable(f"{where}: more than {MAX_ROWS} rows")
+        _take(found, zip(names, row, strict=True), where, tags)
+    if not any(found.values()):
+        raise Unplayable(f"{file}: no values")
+    return found
+
+
+def _take(
+    found: dict[str, list[Any]], cells: Iterable[tuple[str, str]], where: str, tags: TagList
+) -> None:
+    for name, cell in cells:
+        if name == TIME:
+            continue
+        before = found[name]
+        if not cell:
+            before.append(before[-1] if before else None)
+            continue
+        try:
+            before.append(value_from(tags[name], cell))
+        except ValueError as error:
+            raise Unplayable(f"{where}: {name}: {error}") from error

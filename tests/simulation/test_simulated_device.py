@@ -1,0 +1,249 @@
+"""A simulated device: what its values do, what it keeps, and what exists."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast.errors import ModbusException
+from holdfast.simulation import generators, playback
+from holdfast.simulation.device import Refused, SimulatedDevice
+from holdfast.tags import Tag, TagList
+from holdfast.tools.tag_reading import TagReader
+from support import cli
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+EVERYTHING = TagList(
+    [
+        Tag("voltage", "input_registers", 0, "float32", "CDAB", unit="V"),
+        Tag("scaled", "input_registers", 2, "int16", scale=0.001, unit="V"),
+        Tag("energy", "input_registers", 3, "uint32", scale=0.01, unit="kWh"),
+        Tag("half", "input_registers", 5, "float16", unit="MW"),
+        Tag("bcd", "input_registers", 6, "bcd16"),
+        Tag("big", "input_registers", 7, "uint64", "BADCFEHG"),
+        Tag("state", "input_registers", 11, states={0: "off", 5: "on", 9: "fault"}),
+        Tag("name", "input_registers", 12, "string:5"),
+        Tag("blob", "input_registers", 15, "bytes:3"),
+        Tag("many", "input_registers", 17, "int16[3]", unit="A"),
+        Tag("bit_0", "input_registers", 20, "bit:0"),
+        Tag("bit_9", "input_registers", 20, "bit:9"),
+        Tag("limited", "input_registers", 21, min=40, max=50),
+        Tag("door", "discrete_inputs", 9, "bool"),
+        Tag("doors", "discrete_inputs", 10, "bool[3]"),
+        Tag("flag", "input_registers", 30, "bool"),
+        Tag("setpoint", "holding_registers", 0, "int16", scale=0.1, writable=True, min=5, max=30),
+        Tag("mode", "holding_registers", 1, states={3: "off", 4: "on"}, writable=True),
+        Tag("run", "holding_registers", 2, "bit:1", writable=True),
+        Tag("ready", "holding_registers", 2, "bit:0"),
+        Tag("label", "holding_registers", 3, "string:4", writable=True),
+        Tag("pump", "coils", 3, "bool", writable=True),
+        Tag("pumps", "coils", 4, "bool[2]", writable=True),
+        Tag("gains", "holding_registers", 8, "float32[2]", writable=True),
+    ]
+)
+
+
+@pytest.fixture
+def serve_simulated() -> Iterator[Any]:
+    servers = []
+
+    def start(device: SimulatedDevice) -> holdfast.SyncClient:
+        rule = device.rule(1, ["127.0.0.1"])
+        server = holdfast.Server(rules=[rule], bind="127.0.0.1:0").start()
+        client = holdfast.SyncClient(cli.url(server), timeout=5)
+        servers.append((server, client))
+        return client
+
+    yield start
+    for server, client in servers:
+        client.close()
+        server.stop()
+
+
+def read(client: holdfast.SyncClient, tags: TagList) -> dict[str, Any]:
+    return {each.tag.name: each.error or each.value for each in TagReader(tags).read(client)}
+
+
+def test_every_type_of_tag_has_values_that_change_and_can_be_read(serve_simulated: Any) -> None:
+    device = SimulatedDevice(EVERYTHING, seed="1")
+    client = serve_simulated(device)
+    found = []
+    for _ in range(25):
+        found.append(read(client, EVERYTHING))
+        device.step()
+    assert not [each for each in found[0].values() if isinstance(each, Exception)]
+    changing = {name for name in found[0] if len({str(each[name]) for each in found}) > 1}
+    still = {tag.name for tag in EVERYTHING if tag.writable} | {"ready", "name", "blob"}
+    assert changing == {tag.name for tag in EVERYTHING} - still
+    assert all(225 <= each["voltage"] <= 235 for each in found)
+    assert all(-32.8 < each["scaled"] < 32.8 for each in found)
+    assert all(40 <= each["limited"] <= 50 for each in found)
+    assert [each["energy"] for each in found[:3]] == [0.0, 0.5, 1.0]
+    assert {each["state"] for each in found} == {0, 5, 9}
+    first = found[0]
+    assert (first["name"], first["blob"], first["setpoint"]) == ("name", bytes(3), 17.5)
+    assert (first["mode"], first["run"], first["pump"]) == (3, False, False)
+
+
+def test_the_same_seed_gives_the_same_values() -> None:
+    def values(seed: str) -> list[list[int]]:
+        device = SimulatedDevice(EVERYTHING, seed=seed)
+        found = []
+        for _ in range(20):
+            found.append(device.memory.read("input_registers", 0, 31))
+            device.step()
+        return found
+
+    assert values("a") == values("a")
+    assert values("a") != values("b")
+
+
+def test_what_is_written_stays(serve_simulated: Any) -> None:
+    device = SimulatedDevice(EVERYTHING, seed="1")
+    client = serve_simulated(device)
+    client.write("holding_registers", 0, 215, "int16")
+    client.write("holding_registers", 2, True, "bit:1")
+    client.write_coil(3, True)
+    for _ in range(30):
+        device.step()
+    found = read(client, EVERYTHING)
+    assert (found["setpoint"], found["run"], found["pump"]) == (21.5, True, True)
+
+
+@pytest.mark.parametrize(
+    ("area", "address"),
+    [("input_registers", 22), ("holding_registers", 7), ("coils", 2), ("discrete_inputs", 8)],
+)
+def test_only_addresses_of_tags_exist(serve_simulated: Any, area: Any, address: int) -> None:
+    client = serve_simulated(SimulatedDevice(EVERYTHING))
+    kind = "bool" if area in holdfast.types.BIT_AREAS else "uint16"
+    with pytest.raises(ModbusException, match="exception 02"):
+        client.read(area, address, kind)
+
+
+def test_only_writable_tags_can_be_written(serve_simulated: Any) -> None:
+    tags = TagList(
+        [Tag("a", "holding_registers", 0, writable=True), Tag("b", "holding_registers", 1)]
+    )
+    client = serve_simulated(SimulatedDevice(tags))
+    client.write_register(0, 7)
+    with pytest.raises(ModbusException):
+        client.write_register(1, 7)
+    other = serve_simulated(SimulatedDevice(TagList([Tag("b", "coils", 1)])))
+    with pytest.raises(ModbusException):
+        other.write_coil(1, True)
+
+
+def numbers(text: str, count: int, step: float = 1, **more: Any) -> list[Any]:
+    tag = Tag("t", "holding_registers", 0, "float64", **more)
+    device = SimulatedDevice(
+        TagList([tag]), step=step, seed="1", chosen={"t": generators.parsed(tag, text)}
+    )
+    found = []
+    for _ in range(count):
+        raw = device.memory.read("holding_registers", 0, 4)
+        found.append(holdfast.values.decode(raw, "float64"))
+        device.step()
+    return found
+
+
+def test_generators_do_what_they_are_called() -> None:
+    assert numbers("constant:21.5", 3) == [21.5] * 3
+    assert numbers("ramp:0:8:4", 6) == [0, 2, 4, 6, 0, 2]
+    assert numbers("counter:2.5", 3, step=0.5) == [0, 1.25, 2.5]
+    sine = numbers("sine:10:20:8", 17)
+    assert all(10 <= each <= 20 for each in sine)
+    assert sine[:8] == pytest.approx(sine[8:16])
+    assert max(sine) - min(sine) > 9
+    walk = numbers("walk:-1:1:0.5", 200)
+    assert all(-1 <= each <= 1 for each in walk)
+    assert all(abs(one - other) <= 0.5 for one, other in itertools.pairwise(walk))
+    assert len(set(walk)) > 100
+
+
+@pytest.mark.parametrize(
+    ("tag", "text", "message"),
+    [
+        (Tag("t", "coils", 0), "sine:0:1:5", "bool is not a number, allowed: constant:VALUE"),
+        (Tag("t", "coils", 0), "noise:1", "'noise' is not a generator, allowed: constant:VALUE, "),
+        (Tag("t", "input_registers", 0), "sine:0:1", "'sine:0:1' is not sine:LOW:HIGH:SECONDS"),
+        (Tag("t", "input_registers", 0), "sine:5:1:9", "sine: 5 is not less than 1"),
+        (Tag("t", "input_registers", 0), "sine:0:1:0", "sine: 0 is not more than 0"),
+        (Tag("t", "input_registers", 0), "ramp:0:nan:1", "is not ramp:"),
+        (Tag("t", "input_registers", 0), "constant:1,5", "decimal comma"),
+        (Tag("t", "input_registers", 0), "constant:1.5", "between two values"),
+        (Tag("t", "input_registers", 0), "cycle:5", "cycle requires states, or a tag with one bit"),
+        (Tag("t", "input_registers", 0), "counter", "is not counter:PER_SECOND"),
+    ],
+)
+def test_a_generator_that_a_tag_can_not_have_is_refused(tag: Tag, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        generators.parsed(tag, text)
+
+
+def test_a_tag_that_keeps_what_is_written_only_has_a_first_value() -> None:
+    tag = Tag("t", "holding_registers", 0, writable=True)
+    shared = Tag("shared", "holding_registers", 0, "bit:3")
+    device = SimulatedDevice(TagList([tag]), chosen={"t": generators.parsed(tag, "constant:7")})
+    assert device.memory.read("holding_registers", 0, 1) == [7]
+    for name in ("t", "shared"):
+        generator = generators.Generator("cycle", (1,), (False, True))
+        with pytest.raises(Refused, match=f"{name} keeps what is written to its registers"):
+            SimulatedDevice(TagList([tag, shared]), chosen={name: generator})
+    with pytest.raises(Refused):
+        SimulatedDevice(TagList([tag]), played={"t": [1]})
+
+
+def test_a_value_that_the_registers_can_not_hold_becomes_the_nearest() -> None:
+    tag = Tag("t", "holding_registers", 0, "int16", scale=0.1, null=frozenset([32767, 32766]))
+    chosen = {"t": generators.parsed(tag, "ramp:0:100000:2")}
+    device = SimulatedDevice(TagList([tag]), chosen=chosen)
+    device.step()
+    assert device.memory.read("holding_registers", 0, 1) == [32765]
+
+
+def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
+    tags = TagList(
+        [
+            Tag("t", "holding_registers", 0, "int16", scale=0.1),
+            Tag("door", "coils", 0),
+            Tag("pair", "holding_registers", 1, "uint16[2]"),
+        ]
+    )
+    file = tmp_path / "values.csv"
+    file.write_text('time,t,door,pair\n1,21.5,true,"[1,2]"\n2,,false,"[3,4]"\n')
+    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    found = []
+    for _ in range(3):
+        found.append(device.memory.read("holding_registers", 0, 3))
+        found[-1] += device.memory.read("coils", 0, 1)
+        device.step()
+    assert found == [[215, 1, 2, 1], [215, 3, 4, 0], [215, 1, 2, 1]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty"),
+        ("time,t\n", "no values"),
+        ("time,x\n1,2\n", ":1: found the column 'x', allowed: names of tags"),
+        ("t,t\n1,2\n", ":1: two columns have the same name"),
+        ("t\n1\nmuch\n", ":3: t: 'much' is not a number"),
+        ("time,t\n1\n", ":2: found 1 cells, allowed: 2"),
+        ('t\n"1,5"\n', ":2: t: '1,5' has a decimal comma"),
+    ],
+)
+def test_a_file_that_can_not_be_played_back_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    file = tmp_path / "values.csv"
+    file.write_text(text)
+    tags = TagList([Tag("t", "holding_registers", 0)])
+    with pytest.raises(playback.Unplayable, match=message):
+        playback.load(file, tags)
