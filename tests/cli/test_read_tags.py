@@ -141,7 +141,9 @@ def test_a_refused_register_costs_only_its_tag() -> None:
         result = invoke("read", device.url, "hr:0", "hr:1", "hr:2")
         assert (result.exit_code, result.stderr) == (1, "")
         assert [line.split()[1] for line in result.stdout.splitlines()[1:]] == ["7", "?", "7"]
-        assert "? exception 02 (Illegal Data Address)" in result.stdout
+        assert result.stdout.splitlines()[2] == (
+            "hr:1      ?  holding_registers 1 uint16  exception 02 (Illegal Data Address)"
+        )
         found = answer("read", device.url, "hr:0", "hr:1", code=1)
         assert (found["ok"], found["values"]) == (False, {"hr:0": 7, "hr:1": None})
         detail = "exception 02 (Illegal Data Address)"

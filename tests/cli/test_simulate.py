@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-HEATER = str(ROOT / "examples" / "heater.yaml")
+HEATER = str(ROOT / "examples" / "tags" / "heater.yaml")
 
 
 @pytest.fixture

@@ -98,21 +98,26 @@ def _show(source: TagSource, readings: Sequence[Reading]) -> None:
     if len(errors) == 1 and readings[0].error is not None and len(readings) > 1:
         click.echo(f"holdfast: {source.url}: {errors.pop()}", err=True)
         return
-    head = ["name", "value", "unit", "address"]
-    rows = [
-        [showing.plain(each.tag.name), _cell(each), showing.plain(each.tag.unit), place(each.tag)]
-        for each in readings
-    ]
-    if not any(each.tag.unit for each in readings):
-        for line in [head, *rows]:
-            del line[2]
-    click.echo("\n".join(showing.table(head, rows, "<>")))
+    columns = {
+        "name": [showing.plain(each.tag.name) for each in readings],
+        "value": [_cell(each) for each in readings],
+        "unit": [showing.plain(each.tag.unit) for each in readings],
+        "address": [place(each.tag) for each in readings],
+        "error": [_error(each) for each in readings],
+    }
+    for name in ("unit", "error"):
+        if not any(columns[name]):
+            del columns[name]
+    rows = zip(*columns.values(), strict=True)
+    click.echo("\n".join(showing.table(list(columns), rows, "<>")))
 
 
 def _cell(reading: Reading) -> str:
-    if reading.error is not None:
-        return showing.styled(f"? {reading.error}", fg="red")
-    return value_shown(reading.tag, reading.value)
+    return "?" if reading.error is not None else value_shown(reading.tag, reading.value)
+
+
+def _error(reading: Reading) -> str:
+    return "" if reading.error is None else showing.styled(str(reading.error), fg="red")
 
 
 def place(tag: Tag) -> str:
