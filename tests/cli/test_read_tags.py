@@ -219,6 +219,26 @@ def test_a_full_disk_ends_the_reading(server: holdfast.Server) -> None:
     assert wrong == "Error: /dev/full: No space left on device."
 
 
+def test_a_recording_that_can_not_be_continued_ends_the_command(
+    server: holdfast.Server, tmp_path: Path
+) -> None:
+    limit = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (200, 200))"
+    code = f"{limit}; from holdfast.cli import main; main()"
+    record = tmp_path / "values.csv"
+    arguments = ["read", cli.url(server), "hr:0", "--every", "0.001", "--record", str(record)]
+    process = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=wire.DEADLINE,
+    )
+    assert (process.returncode, process.stderr) == (1, f"holdfast: {record}: File too large\n")
+    rows = record.read_text().splitlines()[1:]
+    assert {row.partition("Z,")[2] for row in rows} == {"0"}
+    assert record.read_text().endswith("\n")
+
+
 def test_ctrl_c_leaves_a_whole_recording(server: holdfast.Server, tmp_path: Path) -> None:
     record = tmp_path / "values.csv"
     arguments = ["read", cli.url(server), "hr:0", "--every", "0.001", "--record", str(record)]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,6 +20,16 @@ if TYPE_CHECKING:
     from holdfast.client import SyncClient
     from holdfast.tags import Tag
     from holdfast.tools.tag_reading import Reading
+
+
+class RecordingFailed(click.ClickException):
+    """The recording can't be written. Ends the command, when its screen is closed."""
+
+    exit_code = device.FAILED
+
+    def show(self, file: Any = None) -> None:
+        """Prints the error."""
+        click.echo(f"holdfast: {self.message}", err=True, file=file)
 
 
 class TagSource:
@@ -46,7 +55,7 @@ class TagSource:
     def read(self, between: Callable[[], object] = lambda: None) -> tuple[float, list[Reading]]:
         """Reads and records all tags. Returns the time and the readings.
 
-        `between` is called after every request. Exits with 1 if the recording can't be written.
+        `between` is called after every request. Raises `RecordingFailed`.
         """
         readings = self._reader.read(self._client, between)
         moment = time.time()
@@ -54,8 +63,7 @@ class TagSource:
             try:
                 self._recording.add(moment, readings)
             except OSError as error:
-                click.echo(f"holdfast: {self._file}: {error.strerror}", err=True)
-                sys.exit(device.FAILED)
+                raise RecordingFailed(f"{self._file}: {error.strerror}") from error
         return moment, readings
 
 

@@ -109,7 +109,7 @@ def _sine(of: Generator, step: float, random: Random) -> Series:
 
 def _walk(of: Generator, step: float, random: Random) -> Series:
     low, high, most = of.numbers
-    most *= math.sqrt(step)
+    most *= step
     value = (low + high) / 2
     while True:
         yield value
