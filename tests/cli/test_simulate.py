@@ -77,12 +77,15 @@ def test_a_recording_is_played_back(
 ) -> None:
     _, url = simulate(HEATER)
     record = tmp_path / "values.csv"
-    only = ("--only", "voltage", "--only", "state", "--tags", HEATER)
+    tags = ("--tags", HEATER)
+    assert done("write", url, "setpoint=21.5", *tags)
     often = ("--every", "0.01", "--times", "3", "--record", str(record))
-    assert invoke("read", url, *only, *often).exit_code == 0
+    assert invoke("read", url, *tags, *often).exit_code == 0
     _, url = simulate(HEATER, "--play", str(record))
     played = {line.split(",")[1] for line in record.read_text().splitlines()[1:]}
-    assert str(answer("read", url, *only)["values"]["voltage"]).removesuffix(".0") in played
+    found = answer("read", url, *tags)["values"]
+    assert str(found["voltage"]).removesuffix(".0") in played
+    assert found["setpoint"] == 21.5
 
 
 def test_a_profile_of_a_configuration_is_simulated(

@@ -196,8 +196,9 @@ def test_a_tag_that_keeps_what_is_written_only_has_a_first_value() -> None:
         generator = generators.Generator("cycle", (1,), (False, True))
         with pytest.raises(Refused, match=f"{name} keeps what is written to its registers"):
             SimulatedDevice(TagList([tag, shared]), chosen={name: generator})
-    with pytest.raises(Refused):
-        SimulatedDevice(TagList([tag]), played={"t": [1]})
+    device = SimulatedDevice(TagList([tag]), played={"t": [5, 6]})
+    device.step()
+    assert device.memory.read("holding_registers", 0, 1) == [5]
 
 
 def test_a_value_that_the_registers_can_not_hold_becomes_the_nearest() -> None:

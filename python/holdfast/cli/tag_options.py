@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -238,11 +239,9 @@ def items(words: Sequence[str], *, modicon: bool, encoding: str | None) -> TagLi
         found += _item(word, modicon, encoding)
         if len(found) > MAX_TAGS:
             raise click.UsageError(f"{word!r}: more than {MAX_TAGS} values.")
-    names = [tag.name for tag, _ in found]
+    names = Counter(tag.name for tag, _ in found)
     try:
-        return TagList(
-            _renamed(tag, full) if names.count(tag.name) > 1 else tag for tag, full in found
-        )
+        return TagList(_renamed(tag, full) if names[tag.name] > 1 else tag for tag, full in found)
     except TagError as error:
         raise click.UsageError(f"{error}.") from error
 

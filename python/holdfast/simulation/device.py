@@ -27,8 +27,9 @@ class Refused(ValueError):
 class SimulatedDevice:
     """A device with the addresses of its tags. `step` gives them their next values.
 
-    A writable tag keeps what is written to it, as do tags in the same registers. `chosen` are
-    generators by name, `played` are whole series of values; other tags have a usual one. The same
+    A writable tag keeps what is written to it, as do tags in the same registers: they only have a
+    first value. `chosen` are generators by name, `played` are whole series of values, which take
+    precedence; other tags have a usual generator. The same
     seed gives the same values. Raises `Refused`.
     """
 
@@ -43,6 +44,7 @@ class SimulatedDevice:
     ) -> None:
         chosen, played = chosen or {}, played or {}
         writable = [tag for tag in tags if tag.writable]
+        kept = {place for tag in writable for place in _places(tag)}
         extents = _extents(tags)
         self.memory = Memory(
             coils=extents.get("coils"),
@@ -55,8 +57,8 @@ class SimulatedDevice:
         self._readable = _spans(tags)
         self._series: list[tuple[Tag, list[Series]]] = []
         for tag in tags:
-            if any(_overlap(tag, other) for other in writable):
-                self._keep(tag, chosen.get(tag.name), tag.name in played)
+            if not kept.isdisjoint(_places(tag)):
+                self._keep(tag, chosen.get(tag.name), played.get(tag.name))
             else:
                 generator = chosen.get(tag.name) or generators.usual(tag)
                 self._series.append(
@@ -82,12 +84,13 @@ class SimulatedDevice:
             self._put(tag, numbers if tag.of_type.count is not None else numbers[0])
         self._write()
 
-    def _keep(self, tag: Tag, generator: Generator | None, is_played: bool) -> None:
-        if is_played or (generator is not None and generator.kind != "constant"):
+    def _keep(self, tag: Tag, generator: Generator | None, played: Sequence[Any] | None) -> None:
+        """Gives a tag its first value."""
+        if generator is not None and generator.kind != "constant":
             raise Refused(
                 f"{tag.name} keeps what is written to its registers, allowed: constant:VALUE"
             )
-        value = (generator or generators.still(tag)).items[0]
+        value = (generator or generators.still(tag)).items[0] if played is None else played[0]
         whole = tag.of_type.count is None or isinstance(value, list)
         self._put(tag, value if whole else [value] * (tag.of_type.count or 1))
 
@@ -143,8 +146,8 @@ def _played(values: Sequence[Any], at: int | None) -> Iterator[Any]:
             yield value if at is None or value is None else value[at]
 
 
-def _overlap(one: Tag, other: Tag) -> bool:
-    return one.area == other.area and one.address < other.end and other.address < one.end
+def _places(tag: Tag) -> set[tuple[Area, int]]:
+    return {(tag.area, address) for address in range(tag.address, tag.end)}
 
 
 def _extents(tags: TagList) -> dict[Area, tuple[int, int]]:

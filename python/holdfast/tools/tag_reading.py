@@ -158,12 +158,15 @@ class TagReader:
         for index, tag in enumerate(self.tags):
             place = tag.area, tag.address, tag.count
             fields.setdefault(place, _Field(*place)).tags.append(index)
-        short = [each for each in fields.values() if each.count <= READ_LIMITS[each.area]]
+        short: list[_Field] = []
+        long: list[_Field] = []
+        for each in fields.values():
+            (short if each.count <= READ_LIMITS[each.area] else long).append(each)
         planned = plan_blocks(
             [(each.area, each.address, each.count) for each in short], max_gap=self._max_gap
         )
         self._blocks = [self._block([short[at] for at in inside]) for _, _, _, inside, _ in planned]
-        self._blocks += [self._block([each]) for each in fields.values() if each not in short]
+        self._blocks += [self._block([each]) for each in long]
 
     def _block(self, fields: Sequence[_Field]) -> _Block:
         found = sorted(fields, key=lambda each: each.address)
