@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from typing import TYPE_CHECKING
 
 import click
@@ -80,8 +81,8 @@ def guess(
     """Guess the type and the byte order of the value at ADDRESS in AREA of the device at URL.
 
     AREA is holding_registers or input_registers (hr, ir). Reads the registers several times and
-    ranks every type in every order, by how plausible its values are and how smoothly they change.
-    The best guess is first. Compare the values with what you expect.
+    ranks every type in every order. The score is the probability, from how common a type is, how
+    plausible its values are, and how they change. Compare the values with what you expect.
 
     With --like 21.5, ranks guesses by their distance to that value and omits those that are more
     than 10 % off. Integers are also scaled by 0.1, 0.01, 0.001 and 10.
@@ -111,7 +112,7 @@ def guess(
             device.fail(error, url, told if as_json else None)
         except ValueError as error:
             raise click.UsageError(f"{error}.") from error
-    guesses = inference.guess(found, like=like, anywhere=anywhere)
+    guesses = inference.guess(found, like=like, anywhere=anywhere, now=time.time())
     if as_json:
         answer = {"ok": True, **told, "reads": found, "guesses": [_told(each) for each in guesses]}
         click.echo(json.dumps(answer))
