@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
+from holdfast.tools import discovery
+from holdfast.types import AREAS
 from support import cli, wire
 from support.cli import answer, done, failure, usage_error
 from support.fake_device import FakeDevice, exception, registers
-from support.terminal import Terminal
+from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
     from support.running import Serve
@@ -37,13 +39,22 @@ def test_ranges_are_a_picture_and_a_table(url: str) -> None:
     assert re.fullmatch(r"holding registers +[▁-▇]█{14}[▁-▇]·{44}", holding)
     assert re.fullmatch(r"input registers +·{59}▁", registers)
     assert scale.split() == ["0", "16384", "32768", "49152", "65535"]
-    assert [line.split() for line in table] == [
+    assert [line.split() for line in table[:6]] == [
         [],
         ["area", "first", "last", "count"],
         ["coils", "0", "63", "64"],
         ["holding_registers", "1000", "17383", "16384"],
         ["input_registers", "65000", "65009", "10"],
+        [],
     ]
+    rows = [line.split() for line in table[6:11]]
+    assert rows[0] == ["area", "searched", "exist", "absent", "not", "asked"]
+    for area, searched, *counts in rows[1:]:
+        assert (area in AREAS, searched) == (True, "yes")
+        assert sum(map(int, counts)) == 65536
+    assert table[12] == (
+        "Nothing is known about addresses that were not asked: a range without a sample is missed."
+    )
 
 
 def test_a_program_gets_the_same(url: str) -> None:
@@ -62,15 +73,18 @@ def test_a_program_gets_the_same(url: str) -> None:
 def test_exact_finds_what_samples_miss() -> None:
     def hidden(pdu: bytes) -> bytes:
         address, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
-        inside = address >= 1011 and address + count <= 1014
+        inside = address >= 1012 and address + count <= 1015
         return registers(pdu) if inside else exception(pdu, 2)
 
     with FakeDevice(hidden) as device:
         options = ("--areas", "hr", "--range", "900-1099")
         fast = answer("map", device.url, *options)["areas"]["holding_registers"]
         exact = answer("map", device.url, *options, "--exact")["areas"]["holding_registers"]
-    assert (fast["ranges"], exact["ranges"]) == ([], [[1011, 1013]])
-    assert fast["requests"] < 10 < exact["requests"] < 220
+    assert (fast["ranges"], exact["ranges"]) == ([], [[1012, 1014]])
+    assert (fast["absent"][0], fast["absent"][-1]) == ([900, 901], [1099, 1099])
+    assert fast["not_asked"] == 200 - fast["requests"]
+    assert (exact["absent"], exact["not_asked"]) == ([[900, 1011], [1015, 1099]], 0)
+    assert fast["requests"] < 30 < exact["requests"] < 220
 
 
 def test_reads_stay_within_what_is_allowed() -> None:
@@ -112,7 +126,7 @@ def test_failures_are_told_apart() -> None:
 
 def test_a_device_without_addresses_is_no_failure() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
-        assert done("map", device.url, "--range", "0-99")[-1] == "No address was found."
+        assert "No address was found." in done("map", device.url, "--range", "0-99")
 
 
 def test_a_device_that_does_not_answer_is_a_failure() -> None:
@@ -144,6 +158,16 @@ def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
     assert told in usage_error("map", "tcp://127.0.0.1:1", *arguments)
 
 
+def test_the_requests_are_announced_and_the_progress_fits_a_narrow_terminal(url: str) -> None:
+    with Terminal("map", url, columns=40) as terminal:
+        shown = terminal.until("Nothing is known")
+        assert terminal.end() == 0
+    assert "At least 8592 requests" in shown.replace("\n", " ")
+    bars = [line for line in re.split("[\r\n]", terminal.shown) if "Mapping" in line]
+    assert bars
+    assert all(len(plain(line)) <= 40 for line in bars)
+
+
 def test_progress_is_shown_on_a_terminal_and_the_picture_has_its_width(url: str) -> None:
     with Terminal("map", url, columns=60) as terminal:
         shown = terminal.until("Mapping", "input_registers")
@@ -169,5 +193,64 @@ def test_what_was_found_is_shown_when_it_is_interrupted() -> None:
             terminal.process.send_signal(signal.SIGINT)
             go_on.set()
             assert terminal.end() == 1
-    assert re.search(r"holding_registers +0 +\d+", terminal.shown)
-    assert "interrupted" in terminal.shown
+    shown = plain(terminal.shown)
+    assert re.search(r"holding_registers +0 +\d+", shown)
+    assert f"holdfast: {device.url}: interrupted" in shown
+    assert "every address read" not in shown
+    [(reached, exist, unknown)] = re.findall(
+        r"holding_registers +to (\d+) +(\d+) +0 +(\d+)$", shown, re.M
+    )
+    assert (int(exist), int(unknown)) == (int(reached) + 1, 65535 - int(reached))
+
+
+def test_a_search_ends_after_its_requests_and_says_what_was_not_asked() -> None:
+    def answers(pdu: bytes) -> bytes:
+        address, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return registers(pdu) if address + count <= 5 else exception(pdu, 2)
+
+    with FakeDevice(answers) as device:
+        options = ("--areas", "hr,ir", "--max-requests", "30")
+        found = answer("map", device.url, *options, code=1)
+        result = cli.invoke("map", device.url, *options)
+    assert (found["ok"], found["complete"], found["requests"]) == (False, False, 30)
+    assert found["detail"] == "stopped after 30 requests; --max-requests sets the limit"
+    holding, inputs = found["areas"].values()
+    assert (holding["state"], holding["ranges"]) == ("partly", [[0, 4]])
+    assert holding["not_asked"] == 65536 - 5 - sum(b - a + 1 for a, b in holding["absent"])
+    assert (inputs["state"], inputs["searched_to"], inputs["not_asked"]) == (
+        "not_asked",
+        None,
+        65536,
+    )
+    assert result.exit_code == 1
+    assert "incomplete, 30 requests" in result.stdout
+    assert re.search(r"^input_registers +no +0 +0 +65536$", result.stdout, re.M)
+
+
+def test_requests_can_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+    monkeypatch.setattr(discovery.time, "sleep", pauses.append)
+    with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
+        options = ("--areas", "hr", "--range", "0-9", "--exact", "--delay", "0.25")
+        assert answer("map", device.url, *options)["requests"] == 10
+    assert pauses == [0.25] * 9
+
+
+def test_short_ranges_at_usual_places_are_found() -> None:
+    layout = [
+        *((0, 2), (100, 4), (210, 3), (350, 2), (501, 2), (1000, 2), (2001, 4), (4096, 2)),
+        *((5020, 2), (8000, 1), (12300, 2), (20000, 5), (30001, 6), (40001, 100)),
+        *((40230, 4), (50000, 2)),
+    ]
+    memory = {address for first, count in layout for address in range(first, first + count)}
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return (
+            registers(pdu) if memory.issuperset(range(first, first + count)) else exception(pdu, 2)
+        )
+
+    with FakeDevice(answers) as device:
+        found = answer("map", device.url, "--areas", "hr")["areas"]["holding_registers"]
+    assert found["ranges"] == [[first, first + count - 1] for first, count in layout]
+    assert found["requests"] < 2700

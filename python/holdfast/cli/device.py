@@ -50,6 +50,11 @@ def seconds(text: str) -> float:
     return number
 
 
+def pause(text: str) -> float:
+    """Parses the seconds of an option that may be 0."""
+    return 0.0 if text in ("0", "0.0") else seconds(text)
+
+
 def is_url(text: str) -> bool:
     """Whether an argument is a URL, not a file."""
     return "://" in text

@@ -16,7 +16,7 @@ from holdfast.cli.progress import bar
 from holdfast.errors import ModbusError
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.tools import discovery
-from holdfast.tools.discovery import Survey
+from holdfast.tools.discovery import FAR_STEP, NEAR, NEAR_STEP, LimitReached, Survey
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -26,9 +26,21 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 BLOCKS = "▁▂▃▄▅▆▇█"
-NOTHING = "·"
+ABSENT = "·"
 ASCII = ("-" * 7 + "#", ".")
 """The same for an output that can only show ASCII."""
+
+NOT_ASKED = " "
+
+MOST_REQUESTS = 20_000
+"""The default of `--max-requests`, without `--exact`."""
+
+STATES = {
+    "searched": "yes",
+    "partly": "to {at}",
+    "given_up": "skipped",
+    "not_asked": "no",
+}
 
 WIDEST = 100
 
@@ -74,6 +86,20 @@ def _span(text: str) -> range:
     metavar="FIRST-LAST",
     help="Addresses to search.",
 )
+@click.option(
+    "--max-requests",
+    type=click.IntRange(1),
+    metavar="N",
+    help=f"Send at most N requests.  [default: {MOST_REQUESTS}, no limit with --exact]",
+)
+@click.option(
+    "--delay",
+    type=device.pause,
+    default="0",
+    show_default=True,
+    metavar="SECONDS",
+    help="Wait between two requests.",
+)
 @device.device_options
 @device.json_option
 def map_(
@@ -83,34 +109,53 @@ def map_(
     max_quantity: int | None,
     step: int,
     span: range,
+    max_requests: int | None,
+    delay: float,
     unit: int,
     timeout: float,
     as_json: bool,
 ) -> None:
     """Find the addresses of the device at URL by reading; nothing is written.
 
-    An address does not exist if reading it returns exception 02. Other exceptions, timeouts and
-    invalid replies are listed separately.
+    An address exists if reading it succeeds, and is absent if reading it returns exception 02.
+    Other exceptions, timeouts and invalid replies are listed separately. Addresses that were not
+    asked are counted: nothing is known about them.
 
-    Without --exact, reads samples: every 256th address (--step) and common start addresses, then
-    the whole range around each existing sample. All reported addresses were read, and gaps between
-    them are found. A range that lies between two samples is missed. This takes some hundred
-    requests per area, more for large ranges.
+    Without --exact, reads samples: multiples of 10 below 10000, multiples of 100 above, the
+    addresses after them (101, 1001), multiples of 10 from 30000 and 40000 to 1000 addresses later,
+    every 256th address (--step); then the whole range around each existing sample. All reported
+    addresses were read. A range without a sample is missed. This takes about 2200 requests per
+    area, more for large ranges.
 
     With --exact, reads every address: in blocks where addresses exist, in halves where a block
     fails, and one by one elsewhere. Nothing is missed, but each missing address takes a request, up
     to 65536 per area: minutes over TCP, hours on a serial line. --range and --areas limit the
     search.
 
-    Exit codes: 0 done, 1 the device did not answer or the search was interrupted, 2 wrong usage.
+    Ctrl-C prints the results so far.
+
+    Exit codes: 0 done; 1 the device did not answer, or the search ended early; 2 wrong usage.
     """
-    survey = Survey(areas or AREAS, exact=exact, max_quantity=max_quantity, step=step, span=span)
+    limit = max_requests if max_requests or exact else MOST_REQUESTS
+    survey = Survey(
+        areas or AREAS,
+        exact=exact,
+        max_quantity=max_quantity,
+        step=step,
+        span=span,
+        max_requests=limit,
+    )
+    if sys.stderr.isatty():
+        click.echo(_announced(survey), err=True)
     began = time.monotonic()
     why = None
     with device.connect(url, unit, timeout) as client:
         try:
             with bar("Mapping", survey.total, lambda: _requests(survey)) as advance:
-                discovery.run_sync(survey, client, advance and (lambda survey: advance(survey.at)))
+                shown = advance and (lambda survey: advance(survey.at))
+                discovery.run_sync(survey, client, shown, delay=delay)
+        except LimitReached as error:
+            why = f"{error}; --max-requests sets the limit"
         except ModbusError as error:
             why = str(error)
         except KeyboardInterrupt:
@@ -122,15 +167,29 @@ def map_(
     else:
         if why is None or any(each.ranges or each.failures for each in survey.areas):
             found = showing.counted(sum(each.addresses for each in survey.areas), "address")
-            how = "every address read" if exact else "samples read"
             click.echo(
-                f"{url}, unit {unit}: {found}; {how}, {_requests(survey)} in {seconds:.1f} s\n"
+                f"{url}, unit {unit}: {found}; {_how(survey)}, "
+                f"{_requests(survey)} in {seconds:.1f} s\n"
             )
-            click.echo("\n".join([*_picture(survey), "", *_ranges(survey), *_others(survey)]))
+            lines = [*_picture(survey), "", *_ranges(survey), *_others(survey), *_unknown(survey)]
+            click.echo("\n".join(lines))
         if why is not None:
             click.echo(f"holdfast: {url}: {why}", err=True)
     if why is not None:
         sys.exit(device.FAILED)
+
+
+def _announced(survey: Survey) -> str:
+    """How many requests the search takes, before it starts."""
+    limit = "" if survey.max_requests is None else f", at most {survey.max_requests}"
+    return f"At least {survey.absent_costs} requests if nothing exists{limit}. Ctrl-C stops."
+
+
+def _how(survey: Survey) -> str:
+    """What was read."""
+    if not survey.is_done:
+        return "incomplete"
+    return "every address read" if survey.exact else "samples read"
 
 
 def _requests(survey: Survey) -> str:
@@ -157,8 +216,12 @@ def _picture(survey: Survey) -> list[str]:
 
 
 def _line(found: AreaMap, span: range, cells: int) -> str:
-    """One area: the height of a block shows the share of existing addresses in a cell."""
-    blocks, nothing = (BLOCKS, NOTHING) if showing.fits(BLOCKS + NOTHING) else ASCII
+    """One area: the height of a block shows the share of existing addresses in a cell.
+
+    A cell is empty if none of its addresses was asked.
+    """
+    blocks, absent = (BLOCKS, ABSENT) if showing.fits(BLOCKS + ABSENT) else ASCII
+    asked = _counts(found.absent, span, cells)
     there = _counts(found.ranges, span, cells)
     failed = _counts((each for some in found.failures.values() for each in some), span, cells)
     line = []
@@ -169,8 +232,9 @@ def _line(found: AreaMap, span: range, cells: int) -> str:
             level = len(blocks) - 1 if full else there[cell] * (len(blocks) - 1) // (stop - first)
             line.append(showing.styled(blocks[level], fg="green"))
         else:
+            nothing = absent if asked[cell] else NOT_ASKED
             line.append(showing.styled("!", fg="red") if failed[cell] else nothing)
-    return "".join(line)
+    return "".join(line).rstrip()
 
 
 def _counts(ranges: Iterable[range], span: range, cells: int) -> list[int]:
@@ -221,6 +285,36 @@ def _others(survey: Survey) -> list[str]:
     return ["", *lines] if lines else []
 
 
+def _unknown(survey: Survey) -> list[str]:
+    """What the search can't know; nothing if every address was asked."""
+    if survey.is_done and survey.exact:
+        return []
+    size = len(survey.span)
+    rows = [
+        (
+            found.area,
+            STATES[found.state].format(at=(found.reached or 0) - 1),
+            str(found.addresses),
+            str(sum(map(len, found.absent))),
+            str(size - found.asked),
+        )
+        for found in survey.areas
+    ]
+    lines = [
+        "",
+        *showing.table(("area", "searched", "exist", "absent", "not asked"), rows, "<<>>>"),
+    ]
+    if survey.exact:
+        return lines
+    return [
+        *lines,
+        "",
+        "Nothing is known about addresses that were not asked: a range without a sample is missed.",
+        f"Samples are {NEAR_STEP} apart below {NEAR}, {FAR_STEP} above. --exact reads every"
+        " address, --range limits it.",
+    ]
+
+
 def _words(survey: Survey, failure: Failure) -> str:
     text = survey.texts.get(failure, str(failure))
     return showing.styled(re.sub(r"\s+", " ", text), fg="red")
@@ -231,6 +325,8 @@ def _told(survey: Survey, seconds: float, why: str | None) -> dict[str, object]:
     return {
         **({} if why is None else {"detail": why}),
         "exact": survey.exact,
+        "complete": survey.is_done,
+        "max_requests": survey.max_requests,
         "first": survey.span.start,
         "last": survey.span.stop - 1,
         "requests": survey.requests,
@@ -241,8 +337,12 @@ def _told(survey: Survey, seconds: float, why: str | None) -> dict[str, object]:
 
 def _area(survey: Survey, found: AreaMap) -> dict[str, object]:
     return {
+        "state": found.state,
+        "searched_to": None if found.reached is None else found.reached - 1,
         "ranges": _pairs(found.ranges),
         "addresses": found.addresses,
+        "absent": _pairs(found.absent),
+        "not_asked": len(survey.span) - found.asked,
         "failures": [
             {**_reason(survey, failure), "ranges": _pairs(ranges)}
             for failure, ranges in found.failures.items()

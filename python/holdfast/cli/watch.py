@@ -170,7 +170,7 @@ def _device(
         return sources.DeviceSource(
             where, client, [WatchedRange(None, unit, place.area, place.address, count)]
         )
-    survey = discovery.Survey()
+    survey = discovery.Survey(dense=False)
     click.echo(f"{where}: searching for addresses", err=True)
     try:
         with bar("Mapping", survey.total, lambda: f"{survey.requests} requests") as advance:

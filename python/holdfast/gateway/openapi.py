@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from holdfast.gateway import surveying, watching
 from holdfast.gateway.endpoint import EXAMPLE, never
@@ -20,6 +20,7 @@ from holdfast.gateway.refusals import (
 )
 from holdfast.net.addresses import LAST_PORT
 from holdfast.protocol import READ_BITS
+from holdfast.tools.discovery import State
 from holdfast.types import AREAS
 from holdfast.web.openapi import (
     DOCUMENT,
@@ -298,6 +299,16 @@ def _schemas_of_maps() -> dict[str, Schema]:
                     object_of(
                         {
                             **found,
+                            "state": {
+                                "enum": list(get_args(State)),
+                                "description": "`partly`: it ended early; `given_up`: the device "
+                                "can't read the area",
+                            },
+                            "absent": {**COUNT, "description": "Addresses that do not exist"},
+                            "notAsked": {
+                                **COUNT,
+                                "description": "Addresses that were not read: unknown",
+                            },
                             "failures": failures,
                             "givenUp": {"type": ["integer", "string", "null"]},
                             "largest": {

@@ -176,15 +176,18 @@ def _result(survey: Survey, failure: Failed | None) -> dict[str, Any]:
         "exact": survey.exact,
         "first": survey.span.start,
         "last": survey.span.stop - 1,
-        "areas": [_area(found) for found in _ordered(survey)],
+        "areas": [_area(found, len(survey.span)) for found in _ordered(survey)],
     }
 
 
-def _area(found: AreaMap) -> dict[str, Any]:
+def _area(found: AreaMap, size: int) -> dict[str, Any]:
     return {
         "area": found.area,
+        "state": found.state,
         "addresses": found.addresses,
         "ranges": _pairs(found.ranges),
+        "absent": sum(map(len, found.absent)),
+        "notAsked": size - found.asked,
         "failures": {str(kind): _pairs(ranges) for kind, ranges in found.failures.items()},
         "givenUp": found.given_up,
         "largest": found.largest,

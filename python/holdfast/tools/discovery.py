@@ -1,12 +1,13 @@
 """Finds the addresses of a device by reading, with few requests.
 
-An address exists if a read that covers it succeeds, and does not exist if a read of it alone
-returns exception 02. Other exceptions, timeouts and invalid replies are listed separately.
+An address exists if a read that covers it succeeds, and is absent if a read of it alone returns
+exception 02. Other exceptions, timeouts and invalid replies are listed separately. About all other
+addresses nothing is known: they were not asked.
 
-The fast search reads samples, then the range around each existing sample to both ends, in blocks
-that double after a success and are halved after a failure. It reads every address of a range that
-it reports; it misses a range without a sample. The exact search reads every address, in blocks
-where addresses exist, one by one elsewhere.
+The fast search reads samples (`sample_places`), then the range around each existing sample to both
+ends, in blocks that double after a success and are halved after a failure. It reads every address
+of a range that it reports; it misses a range without a sample. The exact search reads every
+address, in blocks where addresses exist, one by one elsewhere.
 
 If a block fails, but all its parts can be read, it was too large: blocks then stay smaller.
 """
@@ -14,6 +15,7 @@ If a block fails, but all its parts can be read, it was too large: blocks then s
 from __future__ import annotations
 
 import bisect
+import time
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
@@ -36,7 +38,13 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 STEP = 256
-"""Distance between two samples."""
+"""Distance between two samples where nothing is usual."""
+
+NEAR, NEAR_STEP, FAR_STEP = 10_000, 10, 100
+"""Samples are `NEAR_STEP` apart below `NEAR`, and `FAR_STEP` apart above."""
+
+NUMBERED = (range(30_000, 31_000), range(40_000, 41_000))
+"""Where devices have maps at the numbers of their manuals; samples are `NEAR_STEP` apart."""
 
 CLOSER = (1, 2, 4, 8, 16, 32, 64)
 """Distances after the end of a range at which to search for the next range."""
@@ -56,6 +64,8 @@ Failure: TypeAlias = int | Literal["timeout", "connection", "invalid"]
 Outcome: TypeAlias = Failure | None
 """The result of a read; `None` is success."""
 
+State: TypeAlias = Literal["searched", "partly", "given_up", "not_asked"]
+
 Result = TypeVar("Result")
 
 
@@ -71,8 +81,16 @@ class Probe:
 Steps: TypeAlias = Generator[Probe, Outcome, Result]
 
 
-class DeviceSilent(ModbusError):
-    """The device has stopped answering; the survey has the results so far."""
+class Unfinished(ModbusError):
+    """The survey ended early; it has the results so far."""
+
+
+class DeviceSilent(Unfinished):
+    """The device has stopped answering."""
+
+
+class LimitReached(Unfinished):
+    """The survey has sent as many requests as it may."""
 
 
 @dataclass
@@ -82,9 +100,15 @@ class AreaMap:
     area: Area
     ranges: list[range] = field(default_factory=list)
     """The existing addresses, sorted; ranges are never adjacent."""
+    absent: list[range] = field(default_factory=list)
+    """The addresses that were read alone and returned exception 02, sorted."""
     failures: dict[Failure, list[range]] = field(default_factory=dict)
     """The addresses that failed other than with exception 02, by failure."""
     requests: int = 0
+    reached: int | None = None
+    """The address below which the area was searched; `None` before its search."""
+    is_done: bool = False
+    """Whether the search of the area is complete."""
     given_up: Failure | None = None
     """Why the rest of the area was skipped; `None` if it was not."""
     largest: int = 0
@@ -95,22 +119,38 @@ class AreaMap:
         """How many addresses exist."""
         return sum(map(len, self.ranges))
 
+    @property
+    def asked(self) -> int:
+        """How many addresses were read alone, or exist."""
+        refused = [self.absent, *self.failures.values()]
+        return self.addresses + sum(len(each) for ranges in refused for each in ranges)
+
+    @property
+    def state(self) -> State:
+        """How far the search of the area came."""
+        if self.reached is None or not self.requests:
+            return "not_asked"
+        if self.given_up is not None:
+            return "given_up"
+        return "searched" if self.is_done else "partly"
+
     def found(self, first: int, count: int) -> None:
         """Records existing addresses."""
         _add(self.ranges, first, count)
 
     def failed(self, address: int, failure: Failure) -> None:
         """Records an address that could not be read, and why."""
-        if failure != ILLEGAL_ADDRESS:
-            _add(self.failures.setdefault(failure, []), address, 1)
+        absent = failure == ILLEGAL_ADDRESS
+        _add(self.absent if absent else self.failures.setdefault(failure, []), address, 1)
 
 
 class Survey:
     """A search for the addresses of a device. Run it with `run` or `run_sync`.
 
     Searches `areas` within `span`. With `exact`, reads every address; otherwise, reads samples at
-    every `step` addresses and at common start addresses. One read is for at most `max_quantity`
-    bits or registers, and never more than the standard allows.
+    every `step` addresses and at usual start addresses; fewer of them if not `dense`. One read is
+    for at most `max_quantity` bits or registers, and never more than the standard allows. Sends at
+    most `max_requests`.
     """
 
     def __init__(
@@ -121,11 +161,15 @@ class Survey:
         max_quantity: int | None = None,
         step: int = STEP,
         span: range = range(ADDRESSES),
+        dense: bool = True,
+        max_requests: int | None = None,
     ) -> None:
         if max_quantity is not None and max_quantity < 1:
             raise ValueError(f"max_quantity is {max_quantity}, allowed: 1 or more")
         if step < 1:
             raise ValueError(f"step is {step}, allowed: 1 or more")
+        if max_requests is not None and max_requests < 1:
+            raise ValueError(f"max_requests is {max_requests}, allowed: 1 or more")
         if span.step != 1 or not 0 <= span.start < span.stop <= ADDRESSES:
             raise ValueError(f"span is {span}, allowed: inside 0 to {LAST_ADDRESS}")
         self.span = span
@@ -136,7 +180,9 @@ class Survey:
         self.texts: dict[Failure, str] = {}
         """The first error message of each failure."""
         self.max_quantity = max_quantity
-        self._step = step
+        self.max_requests = max_requests
+        self.samples = [] if exact else sample_places(span, step, dense=dense)
+        """The addresses that a fast search reads in each area."""
         self._answered: Probe | None = None
         self._unanswered = 0
 
@@ -150,20 +196,30 @@ class Survey:
         """How many requests were sent."""
         return sum(found.requests for found in self.areas)
 
+    @property
+    def is_done(self) -> bool:
+        """Whether the search is complete."""
+        return all(found.is_done for found in self.areas)
+
+    @property
+    def absent_costs(self) -> int:
+        """How many requests the search takes on a device without any address."""
+        return len(self.areas) * (len(self.span) if self.exact else len(self.samples))
+
     def steps(self) -> Steps[None]:
         """Yields the reads one by one; send the outcome of each."""
         for index, found in enumerate(self.areas):
             search = _Search(self, found, index * len(self.span))
-            yield from search.exact() if self.exact else search.fast(self._samples())
+            yield from search.exact() if self.exact else search.fast(self.samples)
             self.at = (index + 1) * len(self.span)
+            found.reached = self.span.stop
+            found.is_done = True
 
     def read(self, found: AreaMap, probe: Probe) -> Steps[Outcome]:
         """Runs a read; repeats it once if there was no reply or the device was busy."""
-        outcome = yield probe
-        found.requests += 1
+        outcome = yield from self._ask(found, probe)
         if outcome == BUSY or isinstance(outcome, str):
-            outcome = yield probe
-            found.requests += 1
+            outcome = yield from self._ask(found, probe)
         if not isinstance(outcome, str):
             self._answered, self._unanswered = probe, 0
         else:
@@ -176,22 +232,39 @@ class Survey:
             found.largest = max(found.largest, probe.count)
         return outcome
 
+    def _ask(self, found: AreaMap, probe: Probe) -> Steps[Outcome]:
+        """Sends a request, if that is allowed."""
+        if self.requests == self.max_requests:
+            raise LimitReached(f"stopped after {self.requests} requests")
+        outcome = yield probe
+        found.requests += 1
+        return outcome
+
     def _look_whether_it_is_there(self, found: AreaMap) -> Steps[None]:
         assert self._answered is not None
         for _ in range(2):
-            outcome = yield self._answered
-            found.requests += 1
+            outcome = yield from self._ask(found, self._answered)
             if not isinstance(outcome, str):
                 return
         raise DeviceSilent("the device stopped answering")
 
-    def _samples(self) -> list[int]:
-        """The addresses of samples: evenly spaced, and common start addresses."""
-        thousands = range(1000, ADDRESSES, 1000)
-        likely = {1, 10, 20, *range(0, 10000, 50), *thousands, *(each + 1 for each in thousands)}
-        first, stop = self.span.start, self.span.stop
-        spread = set(range(first, stop, self._step))
-        return sorted(spread | {stop - 1} | {each for each in likely if first <= each < stop})
+
+def sample_places(span: range, step: int = STEP, *, dense: bool = True) -> list[int]:
+    """The addresses of samples: usual start addresses, and every `step` addresses.
+
+    Usual are multiples of 10 and 100, the addresses after a multiple of 100 for maps that count
+    from 1, and maps at the numbers of manuals (30001, 40001). Without `dense`, fewer of them.
+    """
+    near, far = (NEAR_STEP, FAR_STEP) if dense else (50, 1000)
+    ones = range(1, NEAR, FAR_STEP if dense else 1000)
+    usual = {*range(0, NEAR, near), *ones, 10, 20}
+    usual.update(range(NEAR, ADDRESSES, far), range(NEAR + 1, ADDRESSES, 1000))
+    if dense:
+        for numbered in NUMBERED:
+            usual.update(range(numbered.start, numbered.stop, NEAR_STEP))
+            usual.update(range(numbered.start + 1, numbered.stop, FAR_STEP))
+    spread = range(span.start, span.stop, step)
+    return sorted({*spread, span.stop - 1, *(each for each in usual if each in span)})
 
 
 class _Search:
@@ -214,7 +287,7 @@ class _Search:
         """Reads every address: ranges in blocks, other addresses one by one."""
         at = self._first
         while at < self._stop:
-            self._survey.at = self._base + at
+            self._reached(at)
             at = yield from self._follow(at, self._stop)
             if at == self._first and self._failures.get(at) == ILLEGAL_FUNCTION:
                 self._found.given_up = ILLEGAL_FUNCTION
@@ -225,7 +298,7 @@ class _Search:
         """Finds the ranges around samples, and ranges close after another range."""
         end = self._first
         for sample in samples:
-            self._survey.at = self._base + max(sample, end)
+            self._reached(max(sample, end))
             if sample < end or sample in self._failures:
                 continue
             hit = yield from self._first_hit([sample])
@@ -237,6 +310,10 @@ class _Search:
                 yield from self._follow_back(hit - 1, self._floor(hit))
                 end = yield from self._follow(hit + 1, self._stop)
                 hit = yield from self._first_hit([end + far for far in CLOSER])
+
+    def _reached(self, address: int) -> None:
+        self._found.reached = address
+        self._survey.at = self._base + address
 
     def _hopeless(self, samples: Sequence[int]) -> Steps[Outcome]:
         """The failure of the whole area, if distant samples fail like the first; else `None`."""
@@ -272,7 +349,7 @@ class _Search:
             outcome = yield from self._read(at, count)
             if outcome is None:
                 at += count
-                self._survey.at = self._base + at
+                self._reached(at)
             elif count == 1:
                 break
             self._limit = pace.changed(count, outcome)
@@ -333,15 +410,24 @@ class _Pace:
 
 
 def run_sync(
-    survey: Survey, client: SyncClient, progress: Callable[[Survey], object] | None = None
+    survey: Survey,
+    client: SyncClient,
+    progress: Callable[[Survey], object] | None = None,
+    *,
+    delay: float = 0.0,
 ) -> None:
-    """Runs a survey; calls `progress` before every read. Raises `DeviceSilent`."""
+    """Runs a survey; calls `progress` before every read, and waits `delay` seconds between two.
+
+    Raises `Unfinished`.
+    """
     steps = survey.steps()
     try:
         probe = next(steps)
         while True:
             if progress is not None:
                 progress(survey)
+            if delay and survey.requests:
+                time.sleep(delay)
             try:
                 client.read(probe.area, probe.address, _kind(probe))
             except ModbusError as error:
@@ -355,7 +441,7 @@ def run_sync(
 async def run(
     survey: Survey, client: Client, progress: Callable[[Survey], object] | None = None
 ) -> None:
-    """Runs a survey; calls `progress` before every read. Raises `DeviceSilent`."""
+    """Runs a survey; calls `progress` before every read. Raises `Unfinished`."""
     steps = survey.steps()
     try:
         probe = next(steps)

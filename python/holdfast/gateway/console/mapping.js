@@ -80,13 +80,14 @@ export class Map_ {
       return;
     }
     this.pictures.forEach((each) => each.list());
-    if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`, data.exact ? null : this.sampled(data.step));
+    if (data.success) say($("survey-state"), `Done in ${data.seconds.toFixed(1)} s: ${counted}.`, data.exact ? null : this.sampled(data.areas));
     else say($("survey-state"), notice(Object.assign(new Error(data.error), { reason: data.reason ?? "timeout" })), `Until then: ${counted}.`);
   }
 
   /** Explains that not every address was read, and offers to read them all. */
-  sampled(step) {
-    return h("p", { class: "offer" }, `Read at least every ${step} addresses; gaps may contain more. `,
+  sampled(areas) {
+    const unread = areas.reduce((sum, area) => sum + area.notAsked, 0);
+    return h("p", { class: "offer" }, `${unread.toLocaleString("en")} addresses between samples were not read; short ranges may be among them. `,
       h("button", { type: "button", onclick: () => this.startExact() }, "Read every address (slow)"));
   }
 
