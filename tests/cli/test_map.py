@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import signal
 import threading
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 
 import holdfast
-from holdfast.tools import discovery
 from holdfast.types import AREAS
 from support import cli, wire
 from support.cli import answer, done, failure, usage_error
@@ -229,7 +229,7 @@ def test_a_search_ends_after_its_requests_and_says_what_was_not_asked() -> None:
 
 def test_requests_can_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     pauses: list[float] = []
-    monkeypatch.setattr(discovery.time, "sleep", pauses.append)
+    monkeypatch.setattr(time, "sleep", pauses.append)
     with FakeDevice(lambda pdu: exception(pdu, 2)) as device:
         options = ("--areas", "hr", "--range", "0-9", "--exact", "--delay", "0.25")
         assert answer("map", device.url, *options)["requests"] == 10

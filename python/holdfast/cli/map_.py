@@ -152,8 +152,9 @@ def map_(
     with device.connect(url, unit, timeout) as client:
         try:
             with bar("Mapping", survey.total, lambda: _requests(survey)) as advance:
-                shown = advance and (lambda survey: advance(survey.at))
-                discovery.run_sync(survey, client, shown, delay=delay)
+                discovery.run_sync(
+                    survey, client, advance and (lambda survey: advance(survey.at)), delay=delay
+                )
         except LimitReached as error:
             why = f"{error}; --max-requests sets the limit"
         except ModbusError as error:

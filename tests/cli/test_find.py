@@ -1,0 +1,222 @@
+"""`holdfast find`, as people and programs use it."""
+
+from __future__ import annotations
+
+import fcntl
+import re
+import signal
+import socket
+import sys
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+import holdfast
+from holdfast.server import Identity
+from holdfast.tools import finding
+from support import cli, lines, wire
+from support.cli import answer, done, failure, usage_error
+from support.fake_device import FakeDevice, Serial, Stream, exception, registers, silent
+from support.terminal import Terminal, plain
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.fake_device import Asked
+    from support.running import Serve
+
+
+TCGETS2 = 0x802C542A
+"""Linux: reads the settings of a line, with the speed as a number."""
+
+
+def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None:
+    identity = Identity(vendor_name="Acme", product_code="PLANT", revision="1.0")
+    server = serve({1: holdfast.Memory(coils=8)}, identity=identity)
+    port = server.address[1]
+    with socket.create_server(("127.0.0.2", port)):
+        options = ("--port", str(port), "--timeout", "0.2")
+        [head, modbus, other, empty, counts] = done("find", "127.0.0.0/29", *options)
+        found = answer("find", "127.0.0.1", "127.0.0.2", *options)
+    assert head.split() == ["url", "unit", "answer", "identification"]
+    assert re.fullmatch(
+        rf"tcp://127.0.0.1:{port} +1 +exception 02 \(Illegal Data Address\) +Acme PLANT 1.0", modbus
+    )
+    assert re.fullmatch(rf"tcp://127.0.0.2:{port} +no Modbus: .*", other)
+    assert empty == ""
+    assert counts == (
+        "6 addresses: 1 answer Modbus, 1 accept connections but do not answer Modbus, "
+        "4 refuse them, 0 do not respond"
+    )
+    assert (found["ok"], found["complete"], found["asked"]) == (True, True, 2)
+    assert found["counts"] == {"modbus": 1, "open": 1, "refused": 0, "silent": 0}
+    assert found["hosts"][0]["identification"]["vendor_name"] == "Acme"
+    assert (found["hosts"][0]["url"], found["hosts"][0]["unit"]) == (cli.url(server), 1)
+
+
+def test_a_host_that_answers_only_another_unit_id_is_found() -> None:
+    def behave(asked: Asked) -> None:
+        if asked.unit == 255:
+            asked.answer(exception(asked.pdu, 2))
+
+    with Stream("tcp", then=behave) as host:
+        found = answer("find", "127.0.0.1", "--port", str(host.port), "--timeout", "0.1")
+    assert found["hosts"][0]["unit"] == 255
+
+
+def test_a_gateway_without_its_device_is_found() -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 0x0B)) as host:
+        found = answer("find", "127.0.0.1", "--port", str(host.port))
+    assert (found["hosts"][0]["modbus"], found["hosts"][0]["unit"]) == (True, None)
+
+
+def test_nothing_is_a_failure() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    result = cli.invoke("find", "127.0.0.1", "--port", str(port))
+    assert (result.exit_code, result.stderr) == (1, "")
+    assert result.stdout.startswith("1 address: 0 answer Modbus")
+
+
+def test_connections_begin_at_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        waits.append(seconds)
+
+    monkeypatch.setattr(finding, "sleep", sleep)
+    monkeypatch.setattr(finding, "monotonic", lambda: 100.0)
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    cli.invoke("find", "127.0.0.0/29", "--port", str(port), "--rate", "4")
+    assert waits == [0.0, 0.25, 0.5, 0.75, 1.0, 1.25]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("10.0.0.0/8",), "16777216 addresses, allowed: 1024; --large allows more."),
+        (("10.0.0.0/8", "--large"), "16777216 addresses, allowed: 65536."),
+        (("fd00::/64",), "allowed: 1024; --large"),
+        (("10.0.0.1/24",), "has host bits set: the network is 10.0.0.0/24"),
+        (("plc1",), "type: holdfast find tcp://plc1"),
+        (("tcp://a", "10.0.0.1"), "Give one URL or one serial line, or several networks."),
+        (("10.0.0.1", "--units", "1-300"), "'1-300' is not a unit id or FIRST-LAST"),
+        (("10.0.0.1", "--rate", "0"), "0 is not in the range"),
+        (("/dev/ttyX", "--baud", "fast"), "'fast' is not a list of bauds, as in 9600,19200."),
+        (("/dev/ttyX", "--parity", "mark"), "'mark' is not a list of none, even, odd."),
+        (("/dev/ttyX", "--units", "0-3"), "Unit id 0 is the broadcast on a serial line"),
+    ],
+)
+def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("find", *arguments)
+
+
+def behind_gateway(asked: Asked) -> None:
+    """A gateway with devices 3 and 17; unit 20 never answers."""
+    if asked.unit in (3, 17):
+        asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
+    elif asked.unit != 20:
+        asked.answer(exception(asked.pdu, 0x0B))
+
+
+def test_unit_ids_behind_a_gateway_are_found() -> None:
+    with Stream("tcp", then=behind_gateway) as host:
+        options = ("--units", "1-5,17,20", "--timeout", "0.1")
+        shown = done("find", host.url, *options)
+        found = answer("find", host.url, *options)
+    assert [line.split() for line in shown] == [
+        ["unit", "answer", "identification"],
+        ["3", "answers"],
+        ["17", "answers"],
+        [],
+        f"{host.url}: 2 unit ids of 7 asked answer".split(),
+        ["no", "device:", "1-2,", "4-5,", "20"],
+    ]
+    assert [each["unit"] for each in found["units"]] == [3, 17]
+    assert (found["asked"], found["not_asked"]) == ([1, 2, 3, 4, 5, 17, 20], [])
+    assert found["ignores_unit"] is False
+
+
+def test_a_device_that_ignores_unit_ids_is_told() -> None:
+    with FakeDevice(registers) as device:
+        shown = done("find", device.url, "--units", "1-3")
+    assert shown[-1] == "The device answers every unit id: it probably ignores them."
+
+
+def test_no_unit_id_is_a_failure() -> None:
+    with Stream("tcp", then=silent) as host:
+        result = cli.invoke("find", host.url, "--units", "1-2", "--timeout", "0.05")
+        assert (result.exit_code, result.stdout.splitlines()[-1]) == (1, "no device: 1-2")
+    [told] = failure("find", host.url, "--units", "1-2")
+    assert told.startswith(f"holdfast: {host.url}: can't connect")
+
+
+def test_unit_ids_so_far_are_shown_when_it_is_interrupted() -> None:
+    reached = threading.Event()
+
+    def behave(asked: Asked) -> None:
+        if asked.unit == 3:
+            reached.set()
+        elif asked.unit < 3:
+            asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
+
+    with (
+        Stream("tcp", then=behave) as host,
+        Terminal("find", host.url, "--timeout", "60") as terminal,
+    ):
+        assert reached.wait(wire.DEADLINE)
+        terminal.process.send_signal(signal.SIGINT)
+        assert terminal.end() == 1
+    shown = plain(terminal.shown)
+    assert f"{host.url}: 2 unit ids of 2 asked answer" in shown
+    assert "not asked: 3-247" in shown
+    assert "interrupted" in shown
+
+
+def baud(terminal: lines.Terminal) -> int:
+    """The speed that the opener of a pseudo-terminal has set."""
+    settings = fcntl.ioctl(terminal.end, TCGETS2, bytes(44))
+    return int.from_bytes(settings[-4:], sys.byteorder)
+
+
+def test_the_baud_of_a_line_is_found(tmp_path: Path) -> None:
+    def behave(asked: Asked) -> None:
+        if baud(device.terminal) == 57600 and asked.unit == 2:
+            asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
+
+    with Serial(lines.RTU, tmp_path / "line", then=behave) as device:
+        url = f"rtu://{tmp_path / 'line'}"
+        options = ("--baud", "9600,57600,1200", "--parity", "none", "--units", "1-3")
+        shown = done("find", url, *options, "--timeout", "0.5")
+        found = answer("find", url, *options, "--timeout", "0.5")
+    line = f"{url}?baud=57600&parity=none&stop_bits=1"
+    assert shown[1].split() == ["2", line, "answers"]
+    assert shown[-1] == (
+        f"{tmp_path / 'line'}: 1 unit id found; unit ids asked: 1-3, 3 settings tried"
+    )
+    assert found["units"] == [
+        {"url": line, "unit": 2, "detail": "answers", "identification": {}},
+    ]
+
+
+def test_invalid_bytes_on_a_line_are_told(tmp_path: Path) -> None:
+    with Serial(
+        lines.RTU,
+        tmp_path / "line",
+        then=lambda asked: asked.send(lines.RTU.damaged(registers(asked.pdu), asked.unit)),
+    ):
+        url = f"rtu://{tmp_path / 'line'}"
+        options = ("--baud", "9600", "--parity", "none", "--units", "1", "--timeout", "0.2")
+        result = cli.invoke("find", url, *options)
+    assert result.exit_code == 1
+    assert result.stdout.splitlines()[-1] == (
+        "Invalid bytes came at 9600 none: a device with other settings, or noise on the line."
+    )
+
+
+def test_a_line_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "missing"
+    [told] = failure("find", f"rtu://{path}")
+    assert told.startswith(f"holdfast: {path}: can't connect")
