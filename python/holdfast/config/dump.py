@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,28 @@ def to_yaml(data: dict[str, Any]) -> str:
     out = io.StringIO()
     yaml.dump({key: _styled(value, depth=1) for key, value in data.items()}, out)
     return out.getvalue()
+
+
+def on_one_line(data: dict[str, Any]) -> str:
+    """The YAML text of a mapping on one line: `{area: coils, address: 3}`."""
+    yaml = YAML()
+    yaml.Representer = _Representer
+    yaml.width = sys.maxsize
+    out = io.StringIO()
+    yaml.dump(_flowing(data), out)
+    return out.getvalue().strip()
+
+
+def _flowing(value: object) -> object:
+    if isinstance(value, dict):
+        mapping = CommentedMap((_styled(k, 0), _flowing(v)) for k, v in value.items())
+        mapping.fa.set_flow_style()
+        return mapping
+    if isinstance(value, list):
+        items = CommentedSeq(map(_flowing, value))
+        items.fa.set_flow_style()
+        return items
+    return _styled(value, 0)
 
 
 class _Representer(RoundTripRepresenter):

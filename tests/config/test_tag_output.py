@@ -1,0 +1,57 @@
+"""A tag list that is written is read as the same tag list."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.config.tag_files import load_tags
+from holdfast.config.tag_output import tags_as_csv, tags_as_yaml
+from holdfast.tags import Tag, TagList
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+TAGS = [
+    Tag("on", "coils", 3),
+    Tag("voltage", "input_registers", 0, "float32", "CDAB", unit="V", description="a: b, c"),
+    Tag("energy", "input_registers", 2, "uint32", "CDAB", scale=0.1, null=frozenset({0xFFFFFFFF})),
+    Tag("name", "holding_registers", 10, "string:16"),
+    Tag("mixed", "holding_registers", 40, "uint32", "ABCD", description='"quoted"'),
+    Tag("raw", "holding_registers", 50, "uint16[3]", description="confidence 0.30: always 0"),
+    Tag("setpoint", "holding_registers", 30, "int16", offset=-5, unit="°C", writable=True),
+]
+STATE = Tag("state", "holding_registers", 31, states={0: "off", 1: "running"})
+
+
+def meaning(tags: TagList) -> list[Tag]:
+    """Tags without the order of single registers, in which the usual orders are the same."""
+    return [replace(tag, order=tag.order if tag.count > 1 else "ABCD") for tag in tags]
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "csv"])
+def test_tags_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None:
+    write = {"yaml": tags_as_yaml, "csv": tags_as_csv}[suffix]
+    file = tmp_path / f"device.{suffix}"
+    file.write_text(write(TAGS), encoding="utf-8")
+    assert meaning(load_tags(file)) == TAGS
+
+
+def test_yaml_has_a_tag_a_line_and_states() -> None:
+    lines = tags_as_yaml([*TAGS, STATE]).splitlines()
+    assert lines[:3] == ["order: CDAB", "tags:", "  on: {area: coils, address: 3}"]
+    assert len(lines) == 2 + len(TAGS) + 1
+    assert lines[-1].endswith("states: {0: off, 1: running}}")
+
+
+def test_csv_has_the_states_in_the_description() -> None:
+    assert "states: 0 off, 1 running" in tags_as_csv([STATE])
+
+
+def test_swapped_bytes_of_a_single_register_are_kept(tmp_path: Path) -> None:
+    tags = [Tag("wide", "holding_registers", 0, "uint32", "BADC"), Tag("n", "holding_registers", 2)]
+    file = tmp_path / "device.yaml"
+    file.write_text(tags_as_yaml(tags))
+    assert [tag.order for tag in load_tags(file)] == ["BADC", "ABCD"]
