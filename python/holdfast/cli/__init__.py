@@ -18,6 +18,7 @@ COMMANDS = {
     "cert": "holdfast.cli.cert:cert",
     "check": "holdfast.cli.check:check",
     "completion": "holdfast.cli.completion:completion",
+    "describe": "holdfast.cli.describe:describe",
     "find": "holdfast.cli.find:find",
     "gateway": "holdfast.cli.gateway:gateway",
     "guess": "holdfast.cli.guess:guess",

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import device, places, showing
+from holdfast.cli import coverage, device, showing
 from holdfast.cli.progress import bar
+from holdfast.cli.surveying import announced, limited, planned, survey_options
 from holdfast.errors import ModbusError
-from holdfast.protocol import LAST_ADDRESS
 from holdfast.tools import discovery
-from holdfast.tools.discovery import FAR_STEP, NEAR, NEAR_STEP, LimitReached, Survey
-from holdfast.types import AREAS
+from holdfast.tools.discovery import LimitReached, Survey
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from typing import Unpack
 
+    from holdfast.cli.surveying import Settings
     from holdfast.tools.discovery import AreaMap, Failure
-    from holdfast.types import Area
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 ABSENT = "·"
@@ -32,88 +32,20 @@ ASCII = ("-" * 7 + "#", ".")
 
 NOT_ASKED = " "
 
-MOST_REQUESTS = 20_000
-"""The default of `--max-requests`, without `--exact`."""
-
-STATES = {
-    "searched": "yes",
-    "partly": "to {at}",
-    "given_up": "skipped",
-    "not_asked": "no",
-}
-
 WIDEST = 100
-
-
-def _areas(text: str) -> tuple[Area, ...]:
-    return places.areas_of(text)
-
-
-def _span(text: str) -> range:
-    first, dash, last = text.partition("-")
-    numbers = places.number(first), places.number(last if dash else first)
-    if None in numbers or not 0 <= (numbers[0] or 0) <= (numbers[1] or 0) <= LAST_ADDRESS:
-        raise click.BadParameter(f"{text!r} is not FIRST-LAST, as in 0-999, up to {LAST_ADDRESS}.")
-    return range(numbers[0] or 0, (numbers[1] or 0) + 1)
 
 
 @click.command("map", epilog="Example: holdfast map tcp://192.168.0.10 --areas hr,ir")
 @device.url_argument
-@click.option(
-    "--areas", type=_areas, metavar="AREA,...", help="Areas to search.  [default: all four]"
-)
-@click.option("--exact", is_flag=True, help="Read every address instead of samples.")
-@click.option(
-    "--max-quantity",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Read at most N bits or registers per request.",
-)
-@click.option(
-    "--step",
-    type=click.IntRange(1),
-    default=discovery.STEP,
-    show_default=True,
-    metavar="N",
-    help="Distance between samples.",
-)
-@click.option(
-    "--range",
-    "span",
-    type=_span,
-    default=f"0-{LAST_ADDRESS}",
-    show_default=True,
-    metavar="FIRST-LAST",
-    help="Addresses to search.",
-)
-@click.option(
-    "--max-requests",
-    type=click.IntRange(1),
-    metavar="N",
-    help=f"Send at most N requests.  [default: {MOST_REQUESTS}, no limit with --exact]",
-)
-@click.option(
-    "--delay",
-    type=device.pause,
-    default="0",
-    show_default=True,
-    metavar="SECONDS",
-    help="Wait between two requests.",
-)
+@survey_options
 @device.device_options
 @device.json_option
 def map_(
     url: str,
-    areas: tuple[Area, ...] | None,
-    exact: bool,
-    max_quantity: int | None,
-    step: int,
-    span: range,
-    max_requests: int | None,
-    delay: float,
     unit: int,
     timeout: float,
     as_json: bool,
+    **settings: Unpack[Settings],
 ) -> None:
     """Find the addresses of the device at URL by reading; nothing is written.
 
@@ -121,7 +53,7 @@ def map_(
     Other exceptions, timeouts and invalid replies are listed separately. Addresses that were not
     asked are counted: nothing is known about them.
 
-    Without --exact, reads samples: multiples of 10 below 10000, multiples of 100 above, the
+    Without --exact, reads samples: the first 16, multiples of 10 below 10000 and of 100 above, the
     addresses after them (101, 1001), multiples of 10 from 30000 and 40000 to 1000 addresses later,
     every 256th address (--step); then the whole range around each existing sample. All reported
     addresses were read. A range without a sample is missed. This takes about 2200 requests per
@@ -136,27 +68,22 @@ def map_(
 
     Exit codes: 0 done; 1 the device did not answer, or the search ended early; 2 wrong usage.
     """
-    limit = max_requests if max_requests or exact else MOST_REQUESTS
-    survey = Survey(
-        areas or AREAS,
-        exact=exact,
-        max_quantity=max_quantity,
-        step=step,
-        span=span,
-        max_requests=limit,
-    )
+    survey = planned(settings)
     if sys.stderr.isatty():
-        click.echo(_announced(survey), err=True)
+        click.echo(announced(survey), err=True)
     began = time.monotonic()
     why = None
     with device.connect(url, unit, timeout) as client:
         try:
             with bar("Mapping", survey.total, lambda: _requests(survey)) as advance:
                 discovery.run_sync(
-                    survey, client, advance and (lambda survey: advance(survey.at)), delay=delay
+                    survey,
+                    client,
+                    advance and (lambda survey: advance(survey.at)),
+                    delay=settings["delay"],
                 )
         except LimitReached as error:
-            why = f"{error}; --max-requests sets the limit"
+            why = limited(error)
         except ModbusError as error:
             why = str(error)
         except KeyboardInterrupt:
@@ -178,12 +105,6 @@ def map_(
             click.echo(f"holdfast: {url}: {why}", err=True)
     if why is not None:
         sys.exit(device.FAILED)
-
-
-def _announced(survey: Survey) -> str:
-    """How many requests the search takes, before it starts."""
-    limit = "" if survey.max_requests is None else f", at most {survey.max_requests}"
-    return f"At least {survey.absent_costs} requests if nothing exists{limit}. Ctrl-C stops."
 
 
 def _how(survey: Survey) -> str:
@@ -290,30 +211,7 @@ def _unknown(survey: Survey) -> list[str]:
     """What the search can't know; nothing if every address was asked."""
     if survey.is_done and survey.exact:
         return []
-    size = len(survey.span)
-    rows = [
-        (
-            found.area,
-            STATES[found.state].format(at=(found.reached or 0) - 1),
-            str(found.addresses),
-            str(sum(map(len, found.absent))),
-            str(size - found.asked),
-        )
-        for found in survey.areas
-    ]
-    lines = [
-        "",
-        *showing.table(("area", "searched", "exist", "absent", "not asked"), rows, "<<>>>"),
-    ]
-    if survey.exact:
-        return lines
-    return [
-        *lines,
-        "",
-        "Nothing is known about addresses that were not asked: a range without a sample is missed.",
-        f"Samples are {NEAR_STEP} apart below {NEAR}, {FAR_STEP} above. --exact reads every"
-        " address, --range limits it.",
-    ]
+    return ["", *coverage.counts(survey), *([] if survey.exact else ["", *coverage.UNKNOWN])]
 
 
 def _words(survey: Survey, failure: Failure) -> str:

@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 STEP = 256
 """Distance between two samples where nothing is usual."""
 
+FIRST = 16
+"""All of the first addresses are samples."""
+
 NEAR, NEAR_STEP, FAR_STEP = 10_000, 10, 100
 """Samples are `NEAR_STEP` apart below `NEAR`, and `FAR_STEP` apart above."""
 
@@ -252,12 +255,12 @@ class Survey:
 def sample_places(span: range, step: int = STEP, *, dense: bool = True) -> list[int]:
     """The addresses of samples: usual start addresses, and every `step` addresses.
 
-    Usual are multiples of 10 and 100, the addresses after a multiple of 100 for maps that count
-    from 1, and maps at the numbers of manuals (30001, 40001). Without `dense`, fewer of them.
+    Usual are the first 16, multiples of 10 and 100, the addresses after a multiple of 100 for maps
+    that count from 1, and maps at the numbers of manuals (30001, 40001). Without `dense`, fewer.
     """
     near, far = (NEAR_STEP, FAR_STEP) if dense else (50, 1000)
     ones = range(1, NEAR, FAR_STEP if dense else 1000)
-    usual = {*range(0, NEAR, near), *ones, 10, 20}
+    usual = {*range(0, NEAR, near), *ones, *range(FIRST if dense else 2), 10, 20}
     usual.update(range(NEAR, ADDRESSES, far), range(NEAR + 1, ADDRESSES, 1000))
     if dense:
         for numbered in NUMBERED:

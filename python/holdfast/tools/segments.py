@@ -143,6 +143,11 @@ def divide(
     )
 
 
+def order_weights(reads: Sequence[Sequence[int]], *, now: float | None = None) -> dict[str, float]:
+    """The weight of each order, without how rare it is, as a logarithm in bits."""
+    return {order: _Lattice(reads, order, now).total for order in ORDERS}
+
+
 def _ranked(found: Iterable[tuple[Value, float]]) -> tuple[tuple[Value, float], ...]:
     """Values by their probability among each other."""
     ranked = sorted(found, key=lambda each: (-each[1], each[0].bits))

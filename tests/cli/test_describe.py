@@ -1,0 +1,144 @@
+"""`holdfast describe`, as people and programs use it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+import holdfast
+from holdfast import values
+from holdfast.config.tag_files import load_tags
+from support import cli, sunspec_device, wire
+from support.cli import answer, done, usage_error
+from support.fake_device import FakeDevice, Stream, exception, registers, silent
+from support.terminal import Terminal, plain
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.running import Serve
+
+QUICK = ("--reads", "1", "--areas", "hr,co")
+
+
+@pytest.fixture
+def plant(serve: Serve) -> str:
+    memory = holdfast.Memory(coils=20, holding_registers=(100, 12))
+    volts = [each for v in (230.1, 231.4) for each in values.encode(v, "float32", "CDAB")]
+    memory.write("holding_registers", 100, [*volts, 455, 65481])
+    inverter = holdfast.Memory(holding_registers=(40000, 130))
+    content = sunspec_device.registers(sunspec_device.common(), sunspec_device.inverter())
+    inverter.write("holding_registers", 40000, content)
+    return cli.url(serve({1: memory, 4: inverter}))
+
+
+def test_a_device_is_a_table_and_a_file_that_is_read_again(plant: str, tmp_path: Path) -> None:
+    file = tmp_path / "device.yaml"
+    lines = done("describe", plant, "--units", "1", *QUICK, "--output", str(file))
+    assert lines[0] == f"{plant}: unit ids that answer: 1; not asked: all others"
+    rows = [re.split(r" {2,}", line) for line in lines]
+    assert ["co_0 … co_19", "coils", "0-19", "20 bool", "0000000000000000…", "1.00"] in rows
+    assert rows[7][:5] == ["hr_100", "holding_registers", "100-101", "float32", "CDAB"]
+    assert "Byte order: probably CDAB" in lines[3]
+    assert any(line.startswith("Nothing is known about addresses") for line in lines)
+    assert lines[-1] == f"Written: {file}"
+    tags = load_tags(file)
+    assert (tags["hr_100"].type, tags["hr_100"].order) == ("float32", "CDAB")
+    assert tags["hr_105"].type == "int16"
+    assert "confidence" in tags["hr_100"].description
+
+
+def test_every_unit_id_has_a_file(plant: str, tmp_path: Path) -> None:
+    file = tmp_path / "device.csv"
+    found = answer("describe", plant, "--units", "1-4", *QUICK, "--output", str(file))
+    assert (found["answering"], found["silent"], found["ok"]) == ([1, 4], [2, 3], True)
+    assert found["files"] == [str(tmp_path / f"device-unit{unit}.csv") for unit in (1, 4)]
+    first, second = found["units"]
+    assert first["sunspec"] is None
+    assert [model["id"] for model in second["sunspec"]["models"]] == [1, 103]
+    assert second["areas"]["holding_registers"]["exist"] == 130
+    current = next(tag for tag in second["tags"] if tag["name"] == "inverter_three_phase_A")
+    assert (current["values"], current["scale"], current["confidence"]) == ([215], 0.1, 1.0)
+    tags = load_tags(tmp_path / "device-unit4.csv")
+    assert tags["inverter_three_phase_A"].scale == 0.1
+
+
+def test_nothing_is_written_to_the_device() -> None:
+    def answers(pdu: bytes) -> bytes:
+        if pdu[0] not in (3, 4, 1, 2):
+            return exception(pdu, 1)
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return registers(pdu) if pdu[0] == 3 and first + count <= 9 else exception(pdu, 2)
+
+    with FakeDevice(answers) as device:
+        assert cli.invoke("describe", device.url, "--units", "1", "--reads", "1").exit_code == 0
+        assert {pdu[0] for pdu in device.asked} == {1, 2, 3, 4, 17, 43}
+
+
+def test_a_device_that_ignores_unit_ids_is_described_once() -> None:
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return registers(pdu) if pdu[0] == 3 and first + count <= 9 else exception(pdu, 2)
+
+    with FakeDevice(answers) as device:
+        found = answer("describe", device.url, "--units", "1-3", *QUICK)
+    assert (found["ignores_unit"], found["answering"]) == (True, [1, 2, 3])
+    assert [each["unit"] for each in found["units"]] == [1]
+
+
+def test_a_silent_device_is_a_failure() -> None:
+    with Stream("tcp", then=silent) as device:
+        options = ("--units", "1-2", "--timeout", "0.05")
+        found = answer("describe", device.url, *options, code=1)
+        result = cli.invoke("describe", device.url, *options)
+    assert (found["detail"], found["silent"]) == ("no unit id answered", [1, 2])
+    assert result.stderr == f"holdfast: {device.url}: no unit id answered\n"
+
+
+def test_the_description_so_far_is_written_when_it_is_interrupted(tmp_path: Path) -> None:
+    reached = threading.Event()
+
+    def answers(pdu: bytes) -> bytes | None:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] == 3 and first == 500:
+            reached.set()
+            return None
+        return registers(pdu, 455) if pdu[0] == 3 and first + count <= 9 else exception(pdu, 2)
+
+    file = tmp_path / "device.yaml"
+    with FakeDevice(answers) as device:
+        options = ("--units", "1", "--areas", "hr", "--timeout", "60", "--output", str(file))
+        with Terminal("describe", device.url, *options) as terminal:
+            assert reached.wait(wire.DEADLINE)
+            terminal.process.send_signal(signal.SIGINT)
+            assert terminal.end() == 1
+    shown = plain(terminal.shown)
+    assert re.search(r"holding_registers +to 499 +9", shown)
+    assert f"holdfast: {device.url}: interrupted" in shown
+    assert len(load_tags(file)) == 9
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--output", "device.txt"), "'device.txt' ends with none of .yaml, .yml, .csv."),
+        (("--output", "/nowhere/device.yaml"), "the folder of '/nowhere/device.yaml' does not"),
+        (("--units", "x"), "'x' is not a unit id or FIRST-LAST"),
+    ],
+)
+def test_wrong_usage_is_told(options: tuple[str, ...], told: str) -> None:
+    assert told in usage_error("describe", "tcp://127.0.0.1:1", *options)
+
+
+def test_a_file_is_not_replaced_without_force(plant: str, tmp_path: Path) -> None:
+    file = tmp_path / "device.yaml"
+    file.write_text("mine")
+    options = ("--units", "1", *QUICK, "--output", str(file))
+    assert f"{file} exists; --force replaces it." in usage_error("describe", plant, *options)
+    assert file.read_text() == "mine"
+    assert cli.invoke("describe", plant, *options, "--force").exit_code == 0
+    assert len(load_tags(file)) > 20
