@@ -6,39 +6,69 @@ Commands contain no logic that another caller could need.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 
 import click
 
 from holdfast import __version__
 
-COMMANDS = {
-    "audit": "holdfast.cli.audit:audit",
-    "bench": "holdfast.cli.bench:bench",
-    "cert": "holdfast.cli.cert:cert",
-    "check": "holdfast.cli.check:check",
-    "completion": "holdfast.cli.completion:completion",
-    "describe": "holdfast.cli.describe:describe",
-    "find": "holdfast.cli.find:find",
-    "gateway": "holdfast.cli.gateway:gateway",
-    "guess": "holdfast.cli.guess:guess",
-    "identify": "holdfast.cli.identify:identify",
-    "import": "holdfast.cli.import_:import_",
-    "map": "holdfast.cli.map_:map_",
-    "plan": "holdfast.cli.plan:plan",
-    "proxy": "holdfast.cli.proxy:proxy",
-    "raw-send": "holdfast.cli.raw_send:raw_send",
-    "read": "holdfast.cli.read:read",
-    "reload": "holdfast.cli.reload:reload",
-    "run": "holdfast.cli.run:run",
-    "scan": "holdfast.cli.scan:scan",
-    "schema": "holdfast.cli.schema:schema",
-    "sessions": "holdfast.cli.sessions:sessions",
-    "simulate": "holdfast.cli.simulate:simulate",
-    "token": "holdfast.cli.token:token",
-    "watch": "holdfast.cli.watch:watch",
-    "write": "holdfast.cli.write:write",
+GROUPS = {
+    "Devices": {
+        "read": ("holdfast.cli.read:read", "Read values of a device, once or repeatedly."),
+        "write": ("holdfast.cli.write:write", "Write values to a device."),
+        "watch": ("holdfast.cli.watch:watch", "Show values of a device or an appliance live."),
+        "find": (
+            "holdfast.cli.find:find",
+            "Find devices: in a network, behind a gateway, on a serial line.",
+        ),
+        "describe": (
+            "holdfast.cli.describe:describe",
+            "Describe an undocumented device, as a tag list.",
+        ),
+        "map": ("holdfast.cli.map_:map_", "Find the addresses of a device."),
+        "guess": ("holdfast.cli.guess:guess", "Guess the type and byte order of a value."),
+        "identify": ("holdfast.cli.identify:identify", "Print the identification of a device."),
+        "simulate": ("holdfast.cli.simulate:simulate", "Run a simulated device from a tag list."),
+        "plan": ("holdfast.cli.plan:plan", "Print the requests that read a device."),
+    },
+    "Services": {
+        "run": ("holdfast.cli.run:run", "Run an appliance: the services of a configuration file."),
+        "scan": (
+            "holdfast.cli.scan:scan",
+            "Run the NATS service, which polls devices for subscribers.",
+        ),
+        "gateway": ("holdfast.cli.gateway:gateway", "Run the HTTP service, with the web console."),
+        "proxy": ("holdfast.cli.proxy:proxy", "Serve one device to many Modbus clients."),
+    },
+    "Appliance": {
+        "check": ("holdfast.cli.check:check", "Check a configuration file."),
+        "reload": (
+            "holdfast.cli.reload:reload",
+            "Have a running appliance reread its configuration.",
+        ),
+        "sessions": (
+            "holdfast.cli.sessions:sessions",
+            "List the connections of a running appliance.",
+        ),
+        "audit": ("holdfast.cli.audit:audit", "Verify audit logs."),
+        "schema": ("holdfast.cli.schema:schema", "Print the JSON Schema of a configuration."),
+        "import": ("holdfast.cli.import_:import_", "Convert the configuration of another program."),
+        "cert": ("holdfast.cli.cert:cert", "Make, revoke and show TLS certificates."),
+        "token": ("holdfast.cli.token:token", "Create a secret for a client of REST."),
+    },
+    "More": {
+        "raw-send": ("holdfast.cli.raw_send:raw_send", "Write values with one Raw Ingest packet."),
+        "completion": (
+            "holdfast.cli.completion:completion",
+            "Print a script for shell completion.",
+        ),
+        "bench": ("holdfast.cli.bench:bench", "Load test of a Modbus server."),
+    },
 }
+"""The commands, in the order of the help: the module and function of each, and a summary."""
+
+COMMANDS = {name: place for group in GROUPS.values() for name, (place, _) in group.items()}
 
 
 class LazyGroup(click.Group):
@@ -46,7 +76,7 @@ class LazyGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The names of all commands."""
-        return sorted(COMMANDS)
+        return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
         """The command with that name, or `None`."""
@@ -56,10 +86,36 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(importlib.import_module(module), name)
         return command
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Writes the commands in their groups, without importing them."""
+        width = max(map(len, COMMANDS))
+        for title, group in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(f"{name:{width}}", summary) for name, (_, summary) in group.items()]
+                )
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of the arguments. An unknown one is an error that suggests another."""
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            ctx.fail(f"No such command {name!r}.{_suggestion(name)}")
+        return super().resolve_command(ctx, args)
+
+
+def _suggestion(name: str) -> str:
+    """What was probably meant, as the end of a message."""
+    if "://" in name:
+        return f" Did you mean 'holdfast read {name}'?"
+    close = difflib.get_close_matches(name.lower(), COMMANDS, n=3, cutoff=0.6)
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+
 
 @click.group(
     cls=LazyGroup,
-    epilog="Example: holdfast run plant.yaml",
+    epilog="Example: holdfast read tcp://192.168.0.10 holding_registers 0 4",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name="holdfast", message="%(prog)s %(version)s")

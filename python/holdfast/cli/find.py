@@ -32,8 +32,6 @@ MOST = 65_536
 UNITS = tuple(range(1, 248))
 LINE_TIMEOUT = 0.5
 
-SERIAL_DEVICE = re.compile(r"(/dev/.+|COM[0-9]+|\\\\\.\\.+)")
-
 
 def _bauds(text: str) -> tuple[int, ...]:
     found = tuple(int(part) for part in text.split(",") if re.fullmatch("[0-9]{2,7}", part))
@@ -137,7 +135,7 @@ def find(
 
     Exit codes: 0 a device was found; 1 none was, or the search ended early; 2 wrong usage.
     """
-    if any("://" in each or SERIAL_DEVICE.fullmatch(each) for each in targets):
+    if any("://" in each or device.SERIAL_DEVICE.fullmatch(each) for each in targets):
         if len(targets) > 1:
             raise click.UsageError("Give one URL or one serial line, or several networks.")
         [target] = targets

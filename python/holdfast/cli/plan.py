@@ -181,7 +181,7 @@ class _Shown:
 def _of_url(
     url: str, names: Sequence[str], reads: Sequence[Field], given: dict[str, Any]
 ) -> _Shown:
-    device.checked_url(url)
+    url = device.checked_url(url)
     if names:
         raise click.UsageError("--device requires FILE.")
     if not reads:

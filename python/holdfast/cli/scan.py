@@ -247,7 +247,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     help="Print the JSON Schema of all messages and exit.",
 )
 def scan(nats: tuple[list[str], ...], embedded: bool, store: Path | None, **options: Any) -> None:
-    """Poll Modbus devices for NATS subscribers.
+    """Run the NATS service, which polls Modbus devices for subscribers.
 
     Connects to a device when a client subscribes to its tags, and disconnects after the last
     subscriber leaves. Runs until Ctrl-C, SIGTERM or a message to PREFIX.shutdown. On SIGHUP, the

@@ -25,7 +25,12 @@ def typed_options(command: Command) -> Command:
     """Adds `--type`, `--order` and `--encoding`."""
     kind = click.option("--type", "kind", metavar="TYPE", help=f"{TYPES}.")
     order = click.option(
-        "--order", default="ABCD", show_default=True, metavar="ORDER", help=f"Byte order: {ORDERS}."
+        "--order",
+        type=str.upper,
+        default="ABCD",
+        show_default=True,
+        metavar="ORDER",
+        help=f"Byte order: {ORDERS}.",
     )
     encoding = click.option(
         "--encoding", metavar="NAME", help="Encoding of strings, such as utf-8.  [default: ascii]"

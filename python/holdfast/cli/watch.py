@@ -122,8 +122,7 @@ def watch(
         raise click.UsageError("--memory requires FILE.")
     chosen = _chosen(words, modicon)
     if url:
-        device.checked_url(target)
-        source = _device(target, chosen, unit, timeout, as_json)
+        source = _device(device.checked_url(target), chosen, unit, timeout, as_json)
     else:
         source = _appliance(Path(target), memory, chosen, timeout)
     source.blocks, missing = sources.cut(source.blocks)
