@@ -41,7 +41,7 @@ def test_a_device_is_a_table_and_a_file_that_is_read_again(plant: str, tmp_path:
     lines = done("describe", plant, "--units", "1", *QUICK, "--output", str(file))
     assert lines[0] == f"{plant}: unit ids that answer: 1; not asked: all others"
     rows = [re.split(r" {2,}", line) for line in lines]
-    assert ["co_0 … co_19", "coils", "0-19", "20 bool", "0000000000000000…", "1.00"] in rows
+    assert ["co_0 … co_19", "coils", "0-19", "bool[20]", "0000000000000000…", "1.00"] in rows
     assert rows[7][:5] == ["hr_100", "holding_registers", "100-101", "float32", "CDAB"]
     assert "Byte order: probably CDAB" in lines[3]
     assert any(line.startswith("Nothing is known about addresses") for line in lines)

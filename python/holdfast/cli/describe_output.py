@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.cli import coverage, showing
 from holdfast.cli.unit_ids import listed
+from holdfast.tools.segments import FILL_REASONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from holdfast.tools.description import Described, Description
     from holdfast.tools.finding import Unit
 
+NOTHING = tuple(FILL_REASONS.values())
 BITS = 16
 """The most bits in a cell."""
 
@@ -69,31 +71,49 @@ def _device(found: Description, most: int | None) -> list[str]:
 
 
 def _rows(tags: Sequence[Described]) -> Iterator[tuple[str, ...]]:
-    """A row for each tag; neighbouring bits share one."""
-    for of_bits, group in itertools.groupby(enumerate(tags), key=_neighbours):
+    """A row for each tag. Neighbouring bits share one, and neighbours that contain nothing."""
+    for kind, group in itertools.groupby(_runs(tags), key=lambda each: each[0]):
         own = [tag for _, tag in group]
-        if of_bits[0] is None or len(own) == 1:
+        first, last = own[0], own[-1]
+        if kind[1] is None or len(own) == 1:
             yield from map(_row, own)
             continue
-        first, last = own[0], own[-1]
+        is_bit = first.tag.type == "bool"
+        count = sum(each.tag.count for each in own)
+        changed = is_bit and any(each.reasons for each in own)
         yield (
             f"{first.tag.name} … {last.tag.name}" if showing.fits("…") else first.tag.name,
             first.tag.area,
-            f"{first.tag.address}-{last.tag.address}",
-            f"{len(own)} bool",
+            f"{first.tag.address}-{last.tag.end - 1}",
+            f"bool[{count}]" if is_bit else f"uint16[{count}]",
             "",
-            _bits([bool(each.values[-1]) for each in own]),
+            _bits([bool(each.values[-1]) for each in own]) if is_bit else _value(first),
             "",
-            "1.00",
-            "some change" if any(each.reasons for each in own) else "",
+            f"{first.confidence:.2f}",
+            "some change" if changed else ", ".join(first.reasons),
         )
 
 
-def _neighbours(numbered: tuple[int, Described]) -> tuple[object, int]:
-    """A key that is the same for bits with consecutive addresses, and differs for others."""
-    index, each = numbered
-    is_bit = each.tag.type == "bool"
-    return (each.tag.area, each.tag.address - index) if is_bit else (None, index)
+def _runs(tags: Sequence[Described]) -> Iterator[tuple[tuple[int, str | None], Described]]:
+    """Tags, each with the number and kind of its run; the kind is `None` for a run of one."""
+    number, before, kind_before = 0, None, None
+    for each in tags:
+        kind = _kind(each)
+        follows = before is not None and (before.area, before.end) == (
+            each.tag.area,
+            each.tag.address,
+        )
+        if kind is None or kind != kind_before or not follows:
+            number += 1
+        yield (number, kind), each
+        before, kind_before = each.tag, kind
+
+
+def _kind(each: Described) -> str | None:
+    """What neighbours must have in common to share a row."""
+    if each.tag.type == "bool":
+        return "bits"
+    return each.reasons[0] if each.reasons and each.reasons[0] in NOTHING else None
 
 
 def _bits(bits: Sequence[bool]) -> str:

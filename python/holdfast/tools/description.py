@@ -40,7 +40,7 @@ SINGLE_BITS = 64
 """Ranges of more bits become tags of many bits each."""
 
 BITS_A_TAG = 256
-REGISTERS_A_TAG = 64
+REGISTERS_A_TAG = READ_LIMITS["holding_registers"]
 
 EMPTY = 8
 """So many registers that contain nothing separate the values before them from those behind."""
@@ -50,6 +50,9 @@ NOTHING_KNOWN = 0.3
 
 SUREST = 0.99
 """The highest confidence of a guess."""
+
+IMPROBABLE = 0.01
+"""The probability up to which an order is not considered."""
 
 VOTES = 400
 """Registers from which the order of a device is inferred; more would cost time only."""
@@ -233,32 +236,24 @@ def _empty(reads: list[list[int]]) -> Iterator[tuple[int, int]]:
 
 def _orders(pieces: Sequence[_Piece], now: float | None) -> dict[str, float]:
     """The probability of each order, from the first pieces with content."""
-    weights = {order: -bits for order, bits in segments.ORDERS.items()}
+    parts: list[list[list[int]]] = []
     seen = 0
     for piece in pieces:
-        if piece.is_empty or seen >= VOTES:
-            continue
-        reads = [read[: VOTES - seen] for read in piece.reads]
-        seen += len(reads[0])
-        for order, weight in segments.order_weights(reads, now=now).items():
-            weights[order] += weight
-    if not seen:
+        if not piece.is_empty and seen < VOTES:
+            parts.append([read[: VOTES - seen] for read in piece.reads])
+            seen += len(parts[-1][0])
+    if not parts:
         return {}
-    most = max(weights.values())
-    shares = {order: 2 ** (weight - most) for order, weight in weights.items()}
-    whole = sum(shares.values())
-    return {order: share / whole for order, share in shares.items()}
+    shares = segments.order_shares(parts, now=now)
+    return {order: share for order, share in shares.items() if share > IMPROBABLE}
 
 
 def _values(piece: _Piece, orders: Mapping[str, float], now: float | None) -> Iterator[Described]:
     if piece.is_empty:
         yield from _filled(piece)
         return
-    order = max(orders, key=lambda each: orders[each])
-    for value, chance in segments.divide(piece.reads, now=now, orders={order: 0.0}).best:
-        if value.registers > 1 and value.order == order:
-            chance *= orders[order]
-        if value.bits and not any(value.found):
+    for value, chance in segments.divide(piece.reads, now=now, shares=orders).best:
+        if not any(value.found):
             chance = min(chance, NOTHING_KNOWN)
         yield _described(piece, value, min(chance, SUREST))
 

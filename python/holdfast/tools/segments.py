@@ -50,8 +50,15 @@ SIZES = {kind: values.register_count(kind) for kind in RARE if kind not in ("str
 ORDERS = {"ABCD": 0.6, "CDAB": 1.8, "DCBA": 6.0, "BADC": 6.0}
 """How rare an order is among devices, in bits."""
 
+COMMON = ("ABCD", "CDAB")
+MIXED = 4.0
+"""The common orders, and how rare it is that a value has one that is not that of its device."""
+
 SWAPPED_BYTES = ("BADC", "DCBA")
 """The orders of devices that may also swap the bytes of single registers."""
+
+NEGLIGIBLE = 1e-6
+"""The probability up to which an order is not considered."""
 
 SWAPPED_TEXT = 3.0
 SWAPPED_REGISTER = 5.0
@@ -110,42 +117,48 @@ class Division:
     """For each register, the values that can start there, most probable first; their probabilities
     are those if a value starts there.
     """
-    weights: Mapping[str, float]
-    """The weight of each order, as a logarithm, in bits."""
+    shares: Mapping[str, float]
+    """The probability of each order of the device."""
 
 
 def divide(
     reads: Sequence[Sequence[int]],
     *,
     now: float | None = None,
-    orders: Mapping[str, float] = ORDERS,
+    shares: Mapping[str, float] | None = None,
 ) -> Division:
     """Divides registers. Every read has the same number of registers, at least one.
 
-    `now` is the time of the last read in seconds of Unix time, `orders` how rare each order is.
+    `now` is the time of the last read in seconds of Unix time. `shares` is the probability of each
+    order of the device; without it, the registers themselves decide.
     """
-    lattices = [_Lattice(reads, order, now) for order in orders]
-    weights = {each.order: each.total - orders[each.order] for each in lattices}
-    whole = _sum(weights.values())
+    shares = order_shares([reads], now=now) if shares is None else shares
+    lattices = [_Lattice(reads, order, now) for order in shares if shares[order] > NEGLIGIBLE]
     chances: list[dict[Key, tuple[Value, float]]] = [{} for _ in reads[0]]
     for lattice in lattices:
-        share = 2 ** (weights[lattice.order] - whole)
         for value in lattice.values():
             at = chances[value.offset]
             _, before = at.get((value.type, value.order), (value, 0.0))
-            chance = before + share * lattice.chance(value)
+            chance = before + shares[lattice.order] * lattice.chance(value)
             at[value.type, value.order] = value, chance
-    best = max(lattices, key=lambda each: weights[each.order]).best()
+    best = max(lattices, key=lambda each: shares[each.order]).best()
     return Division(
         tuple((each, min(1.0, chances[each.offset][each.type, each.order][1])) for each in best),
         tuple(_ranked(each.values()) for each in chances),
-        weights,
+        shares,
     )
 
 
-def order_weights(reads: Sequence[Sequence[int]], *, now: float | None = None) -> dict[str, float]:
-    """The weight of each order, without how rare it is, as a logarithm in bits."""
-    return {order: _Lattice(reads, order, now).total for order in ORDERS}
+def order_shares(
+    parts: Iterable[Sequence[Sequence[int]]], *, now: float | None = None
+) -> dict[str, float]:
+    """The probability of each order of a device, from the reads of several parts."""
+    weights = {order: -rare for order, rare in ORDERS.items()}
+    for reads in parts:
+        for order in weights:
+            weights[order] += _Lattice(reads, order, now).total
+    whole = _sum(weights.values())
+    return {order: 2 ** (weight - whole) for order, weight in weights.items()}
 
 
 def _ranked(found: Iterable[tuple[Value, float]]) -> tuple[tuple[Value, float], ...]:
@@ -276,7 +289,9 @@ def _rarity(value: Value, order: str) -> float:
     rare = RARE[value.kind]
     if value.kind == "string":
         return rare + (SWAPPED_TEXT if (value.order == "BADC") != (order in SWAPPED_BYTES) else 0)
-    return rare + (SWAPPED_REGISTER if value.order == "BADC" and value.registers == 1 else 0)
+    if value.registers == 1:
+        return rare + (SWAPPED_REGISTER if value.order == "BADC" else 0)
+    return rare + (MIXED if value.order != order else 0)
 
 
 def _values(
@@ -307,7 +322,7 @@ def _values(
 
 def _orders(registers: int, order: str) -> tuple[str, ...]:
     if registers > 1:
-        return (order,)
+        return (order, *(each for each in COMMON if each != order))
     return ("ABCD", "BADC") if order in SWAPPED_BYTES else ("ABCD",)
 
 
