@@ -46,6 +46,16 @@ def test_values_of_several_types_are_told_from_each_other(order: str) -> None:
     assert division.shares[order] > 0.9
 
 
+def test_a_value_of_the_other_common_order_is_recognised() -> None:
+    reads = []
+    for volts, energy in ((230.1369, 1234567), (230.4122, 1234571), (229.9817, 1234579)):
+        behind = [value for each in (4.9, 5.1) for value in values.encode(each, "float32", "CDAB")]
+        own = values.encode(volts, "float32", "CDAB")
+        reads.append([*own, *behind, *[0] * 9, *values.encode(energy, "uint32")])
+    found = {value.offset: (value.type, value.order) for value, _ in divide(reads).best}
+    assert (found[0], found[15]) == (("float32", "CDAB"), ("uint32", "ABCD"))
+
+
 def test_registers_that_contain_nothing_are_one_value() -> None:
     [(value, _), (one, _)] = divide([[0] * 20 + [455]]).best
     assert (value.type, value.registers, value.reasons) == ("uint16", 20, ("always 0",))

@@ -21,7 +21,8 @@ MANTISSAS = {"float16": 10, "float32": 23, "float64": 52}
 
 BITS_A_DIGIT = math.log2(10)
 SAME = 0.5
-"""Bits for a value that equals the one before."""
+ANEW = 3.0
+"""Bits for a value that equals the one before, and for one that has nothing to do with it."""
 
 SPREAD = {16: 3.5, 32: 4.5, 64: 5.5}
 """Bits for the size of an integer, by its width."""
@@ -49,6 +50,9 @@ FAR = 1000
 JUMP = 3.0
 """The change of an integer that is unusual between two reads, and its additional bits."""
 
+SHARED = 0.5
+"""A float that changes by more than this share is described anew."""
+
 THIS_ERA = (1_262_304_000, 2_208_988_800)
 """The seconds of Unix time from 2010 to 2039."""
 
@@ -72,7 +76,7 @@ def description(
             continue
         change, is_smooth = _change(before, after, kind)
         smooth.append(is_smooth)
-        total += min(1 + _value(after, kind, bits, now, []), change)
+        total += min(ANEW + _value(after, kind, bits, now, []), change)
     if smooth:
         if isinstance(found[0], str):
             reasons.append("changes")
@@ -174,8 +178,10 @@ def _change(before: Any, after: Any, kind: str) -> tuple[float, bool]:
     change = abs(after - before)
     share = change / max(abs(before), abs(after))
     if isinstance(before, float):
+        if share > SHARED:
+            return math.inf, False
         steps = max(1.0, share * 2.0 ** (MANTISSAS[kind] - _unused(before, after, kind)))
-        return 4 + math.log2(steps) + (JUMP if share > 0.5 else 0), share < SMOOTH
+        return 4 + math.log2(steps), share < SMOOTH
     jump = JUMP if change > FAR else 0.0
     return 4.5 + math.log2(change) + jump, share < SMOOTH or change <= 2
 
