@@ -93,6 +93,24 @@ def test_connections_begin_at_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     assert waits == [0.0, 0.25, 0.5, 0.75, 1.0, 1.25]
 
 
+def test_hosts_so_far_are_shown_when_it_is_interrupted(serve: Serve) -> None:
+    server = serve({1: holdfast.Memory(holding_registers=8)})
+    port = server.address[1]
+    with socket.create_server(("127.0.0.2", port)) as deaf:
+        networks = ("127.0.0.1", "127.0.0.2")
+        with Terminal("find", *networks, "--port", str(port), "--timeout", "60") as terminal:
+            waiting, _ = deaf.accept()
+            with waiting:
+                terminal.until("1 found")
+                terminal.process.send_signal(signal.SIGINT)
+                assert terminal.end() == 1
+    shown = plain(terminal.shown)
+    assert f"tcp://127.0.0.1:{port}" in shown
+    assert "2 addresses: 1 answer Modbus" in shown
+    assert ", 1 were not asked" in shown
+    assert "interrupted" in shown
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -38,6 +38,7 @@ def test_the_help_imports_no_command() -> None:
     [
         (("raed",), "No such command 'raed'. Did you mean 'read'"),
         (("Describe",), "Did you mean 'describe'?"),
+        (("import", "mmaa"), "No such command 'mmaa'. Did you mean 'mma'?"),
         (("xyzzy",), "No such command 'xyzzy'."),
         (("tcp://plc",), "Did you mean 'holdfast read tcp://plc'?"),
         (("read", "tcp://plc", "hr", "0", "--ordr", "CDAB"), "Did you mean '--order'?"),

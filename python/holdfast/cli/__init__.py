@@ -6,12 +6,12 @@ Commands contain no logic that another caller could need.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 
 import click
 
 from holdfast import __version__
+from holdfast.cli.suggesting import SuggestingGroup
 
 GROUPS = {
     "Devices": {
@@ -71,7 +71,7 @@ GROUPS = {
 COMMANDS = {name: place for group in GROUPS.values() for name, (place, _) in group.items()}
 
 
-class LazyGroup(click.Group):
+class LazyGroup(SuggestingGroup):
     """A group that imports each command on first use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
@@ -94,23 +94,6 @@ class LazyGroup(click.Group):
                 formatter.write_dl(
                     [(f"{name:{width}}", summary) for name, (_, summary) in group.items()]
                 )
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command of the arguments. An unknown one is an error that suggests another."""
-        name = args[0]
-        if name not in COMMANDS and not name.startswith("-"):
-            ctx.fail(f"No such command {name!r}.{_suggestion(name)}")
-        return super().resolve_command(ctx, args)
-
-
-def _suggestion(name: str) -> str:
-    """What was probably meant, as the end of a message."""
-    if "://" in name:
-        return f" Did you mean 'holdfast read {name}'?"
-    close = difflib.get_close_matches(name.lower(), COMMANDS, n=3, cutoff=0.6)
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 @click.group(

@@ -11,6 +11,7 @@ import click
 
 from holdfast.audit import verify as verified
 from holdfast.cli.configuration import WRONG
+from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.config.scalars import parse_sha256
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ CHANGED = 1
 GAPS = 3
 
 
-@click.group(epilog="Example: holdfast audit verify audit.log*")
+@click.group(cls=SuggestingGroup, epilog="Example: holdfast audit verify audit.log*")
 def audit() -> None:
     """Verify audit logs."""
 

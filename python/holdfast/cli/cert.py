@@ -17,6 +17,7 @@ from holdfast.certificates import files, inspection
 from holdfast.certificates.pem import UnusableFile, certificates, content, is_locked, passphrase
 from holdfast.cli.cert_text import as_text
 from holdfast.cli.configuration import WRONG
+from holdfast.cli.suggesting import SuggestingGroup
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,7 +38,7 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 
-@click.group(epilog='Example: holdfast cert ca "Plant authority"')
+@click.group(cls=SuggestingGroup, epilog='Example: holdfast cert ca "Plant authority"')
 def cert() -> None:
     """Make certificates for TLS, revoke them, and show what is in a file.
 

@@ -148,6 +148,8 @@ def describe(
             why = str(error)
         except KeyboardInterrupt:
             why = "interrupted"
+    if found and sys.stderr.isatty():
+        click.echo("Inferring types.", err=True)
     for each in found:
         description.conclude(each, now=time.time())
     if not any(unit.answers for unit in seen) and why is None:

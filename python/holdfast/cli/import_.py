@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli.configuration import WRONG, show_problems
+from holdfast.cli.suggesting import SuggestingGroup
 from holdfast.config import ConfigError
 from holdfast.importing import ORDINALS, NotImportable, read_mma, read_replicator
 
@@ -36,7 +37,11 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-@click.group("import", epilog="Example: holdfast import mma config.yaml --output plant.yaml")
+@click.group(
+    "import",
+    cls=SuggestingGroup,
+    epilog="Example: holdfast import mma config.yaml --output plant.yaml",
+)
 def import_() -> None:
     """Convert the configuration of another program."""
 

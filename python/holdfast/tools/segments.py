@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import values
@@ -46,6 +47,9 @@ RARE = {
 
 SIZES = {kind: values.register_count(kind) for kind in RARE if kind not in ("string", PART)}
 """The registers of a value of each type."""
+
+NARROW = {PART, *(kind for kind, size in SIZES.items() if size == 1)}
+"""The types of one register, in which words have no order."""
 
 ORDERS = {"ABCD": 0.6, "CDAB": 1.8, "DCBA": 6.0, "BADC": 6.0}
 """How rare an order is among devices, in bits."""
@@ -85,7 +89,7 @@ TEXT_SIZE = 16
 """Text is padded up to a multiple of so many bytes at most."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Value:
     """A value in registers: a possible one, or one of a division."""
 
@@ -101,10 +105,20 @@ class Value:
     also: str | None = None
     """Another type that decodes to the same values in all reads."""
 
+    @cached_property
+    def key(self) -> Key:
+        """The type without its length, and the order."""
+        return self.type.partition(":")[0], self.order
+
     @property
     def kind(self) -> str:
         """The type without its length."""
-        return self.type.partition(":")[0]
+        return self.key[0]
+
+    @property
+    def stop(self) -> int:
+        """The register after the value."""
+        return self.offset + self.registers
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +146,13 @@ def divide(
     `now` is the time of the last read in seconds of Unix time. `shares` is the probability of each
     order of the device; without it, the registers themselves decide.
     """
-    shares = order_shares([reads], now=now) if shares is None else shares
-    lattices = [_Lattice(reads, order, now) for order in shares if shares[order] > NEGLIGIBLE]
+    possible = _possible(reads, now)
+    if shares is None:
+        lattices = [_Lattice(possible, order) for order in ORDERS]
+        shares = _shares({each.order: each.total - ORDERS[each.order] for each in lattices})
+    else:
+        lattices = [_Lattice(possible, order) for order in shares]
+    lattices = [each for each in lattices if shares[each.order] > NEGLIGIBLE]
     chances: list[dict[Key, tuple[Value, float]]] = [{} for _ in reads[0]]
     for lattice in lattices:
         for value in lattice.values():
@@ -155,8 +174,14 @@ def order_shares(
     """The probability of each order of a device, from the reads of several parts."""
     weights = {order: -rare for order, rare in ORDERS.items()}
     for reads in parts:
+        possible = _possible(reads, now)
         for order in weights:
-            weights[order] += _Lattice(reads, order, now).total
+            weights[order] += _Lattice(possible, order).total
+    return _shares(weights)
+
+
+def _shares(weights: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities from their logarithms."""
     whole = _sum(weights.values())
     return {order: 2 ** (weight - whole) for order, weight in weights.items()}
 
@@ -171,10 +196,10 @@ def _ranked(found: Iterable[tuple[Value, float]]) -> tuple[tuple[Value, float], 
 class _Lattice:
     """All divisions with one order of the device."""
 
-    def __init__(self, reads: Sequence[Sequence[int]], order: str, now: float | None) -> None:
+    def __init__(self, possible: Sequence[Sequence[Value]], order: str) -> None:
         self.order = order
-        self._size = len(reads[0])
-        self._from = [list(_values(reads, at, order, now)) for at in range(self._size)]
+        self._size = len(possible)
+        self._from = [[each for each in found if _fits(each, order)] for found in possible]
         # Sums over all divisions of the registers before a place; and of those ending with a kind.
         self._before: list[float] = [0.0]
         self._ending: list[dict[Key, float]] = [{} for _ in range(self._size + 1)]
@@ -189,11 +214,11 @@ class _Lattice:
 
     def chance(self, value: Value) -> float:
         """The probability that a value is one, with this order."""
-        stop = value.offset + value.registers
+        stop = value.stop
         ahead = _sum(
             (
                 self._after[stop] - OTHER_TYPE,
-                self._beginning[stop].get(_key(value), -math.inf) - SAME_TYPE,
+                self._beginning[stop].get(value.key, -math.inf) - SAME_TYPE,
             )
         )
         if stop == self._size:
@@ -210,9 +235,9 @@ class _Lattice:
         for stop in range(1, self._size + 1):
             for value in incoming[stop]:
                 weight = self._entering(value, before, ending, max) - value.bits
-                if weight > ending[stop].get(_key(value), -math.inf):
-                    ending[stop][_key(value)] = weight
-                    last[stop][_key(value)] = value
+                if weight > ending[stop].get(value.key, -math.inf):
+                    ending[stop][value.key] = weight
+                    last[stop][value.key] = value
             before.append(max(ending[stop].values(), default=-math.inf))
         chosen: list[Value] = []
         stop = self._size
@@ -239,14 +264,14 @@ class _Lattice:
         any_type = before[at] - _rarity(value, self.order)
         if at == 0:
             return any_type
-        same = ending[at].get(_key(value), -math.inf) - SAME_TYPE
+        same = ending[at].get(value.key, -math.inf) - SAME_TYPE
         return joined((any_type - OTHER_TYPE, same))
 
     def _incoming(self) -> list[list[Value]]:
         """The values that end before each place."""
         incoming: list[list[Value]] = [[] for _ in range(self._size + 1)]
         for value in self.values():
-            incoming[value.offset + value.registers].append(value)
+            incoming[value.stop].append(value)
         return incoming
 
     def _forward(self) -> None:
@@ -255,7 +280,7 @@ class _Lattice:
             ending = self._ending[stop]
             for value in incoming[stop]:
                 weight = self._entering(value, self._before, self._ending, _sum) - value.bits
-                ending[_key(value)] = _sum((ending.get(_key(value), -math.inf), weight))
+                ending[value.key] = _sum((ending.get(value.key, -math.inf), weight))
             self._before.append(_sum(ending.values()))
 
     def _backward(self) -> tuple[list[float], list[dict[Key, float]]]:
@@ -267,21 +292,17 @@ class _Lattice:
         for at in range(self._size - 1, -1, -1):
             each: list[float] = []
             for value in self._from[at]:
-                stop = value.offset + value.registers
+                stop = value.stop
                 ahead = 0.0
                 if stop < self._size:
-                    same = beginning[stop].get(_key(value), -math.inf) - SAME_TYPE
+                    same = beginning[stop].get(value.key, -math.inf) - SAME_TYPE
                     ahead = _sum((after[stop] - OTHER_TYPE, same))
                 weight = ahead - value.bits
-                known = beginning[at].get(_key(value), -math.inf)
-                beginning[at][_key(value)] = _sum((known, weight))
+                known = beginning[at].get(value.key, -math.inf)
+                beginning[at][value.key] = _sum((known, weight))
                 each.append(weight - _rarity(value, self.order))
             after[at] = _sum(each)
         return after, beginning
-
-
-def _key(value: Value) -> Key:
-    return value.kind, value.order
 
 
 def _rarity(value: Value, order: str) -> float:
@@ -289,15 +310,27 @@ def _rarity(value: Value, order: str) -> float:
     rare = RARE[value.kind]
     if value.kind == "string":
         return rare + (SWAPPED_TEXT if (value.order == "BADC") != (order in SWAPPED_BYTES) else 0)
-    if value.registers == 1:
+    if value.kind in NARROW:
         return rare + (SWAPPED_REGISTER if value.order == "BADC" else 0)
     return rare + (MIXED if value.order != order else 0)
 
 
-def _values(
-    reads: Sequence[Sequence[int]], at: int, order: str, now: float | None
-) -> Iterator[Value]:
-    """The values that can start at a register."""
+def _fits(value: Value, order: str) -> bool:
+    """Whether a device with this order may have the value."""
+    if value.kind == "string":
+        return True
+    if value.kind in NARROW:
+        return value.order == "ABCD" or order in SWAPPED_BYTES
+    return value.order == order or value.order in COMMON
+
+
+def _possible(reads: Sequence[Sequence[int]], now: float | None) -> list[list[Value]]:
+    """The values that can start at each register, in any order."""
+    return [list(_values(reads, at, now)) for at in range(len(reads[0]))]
+
+
+def _values(reads: Sequence[Sequence[int]], at: int, now: float | None) -> Iterator[Value]:
+    """The values that can start at a register, in any order."""
     left = len(reads[0]) - at
     fill = _fill(reads, at)
     if fill is not None:
@@ -306,7 +339,7 @@ def _values(
     for kind, registers in SIZES.items():
         if registers > left:
             continue
-        for each in _orders(registers, order):
+        for each in ORDERS if registers > 1 else ("ABCD", "BADC"):
             value = _value(reads, at, kind, each, registers, now)
             if value is not None:
                 yield value
@@ -318,12 +351,6 @@ def _values(
         found = tuple(read[at] for read in reads)
         bits = CUT_OFF + CUT_OFF_CHANGE * _changes(found)
         yield Value(PART, "ABCD", at, 1, found, bits, ())
-
-
-def _orders(registers: int, order: str) -> tuple[str, ...]:
-    if registers > 1:
-        return (order, *(each for each in COMMON if each != order))
-    return ("ABCD", "BADC") if order in SWAPPED_BYTES else ("ABCD",)
 
 
 def _value(
@@ -410,8 +437,8 @@ def _prefix(data: Sequence[int], belongs: Callable[[int], bool]) -> int:
 
 def _sum(weights: Iterable[float]) -> float:
     """The sum of numbers whose logarithms are given, as a logarithm."""
-    known = [each for each in weights if each > -math.inf]
-    if not known:
-        return -math.inf
-    most = max(known)
-    return most + math.log2(sum(2 ** (each - most) for each in known))
+    known = list(weights)
+    most = max(known, default=-math.inf)
+    if most == -math.inf:
+        return most
+    return most + math.log2(sum([2.0 ** (each - most) for each in known]))
