@@ -25,7 +25,7 @@ AT = 1_700_000_000_250_000_000
         (2**63, "9.223372036854776e+18"),
         (True, "true"),
         ('a "b" \\ c', r'"a \"b\" \\ c"'),
-        (b"\0\xff", '"00ff"'),
+        (b"\0\xff", '"AP8="'),
     ],
 )
 def test_a_value_is_written_in_its_kind(value: Any, written: str) -> None:
@@ -49,6 +49,16 @@ def test_the_values_of_one_time_share_a_line() -> None:
         f"modbus,device=pump,site=north a=2i {AT + 10**9}",
         f"modbus,device=fan,site=north a=3i {AT}",
     ]
+
+
+def test_floats_have_their_digits_and_wide_integers_are_floats() -> None:
+    readings = [
+        reading(230.10000610351562, tag=tag("v", type="float32")),
+        reading(7, tag=tag("n", type="uint64")),
+        reading(None, tag=tag("m", type="uint64")),
+    ]
+    expected = f"modbus,device=pump v=230.1,n=7.0 {AT}\n"
+    assert lines(readings, "modbus", {}).decode() == expected
 
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0\n\r"), min_size=1).filter(

@@ -51,7 +51,7 @@ def test_csv_has_a_head_and_one_line_for_each_value(tmp_path: Path) -> None:
         [TIME, "pump", "on", "true", "", ""],
         [TIME, "pump", "a", "[1,2]", "", ""],
         [TIME, "pump", "s", 'x,"y"\nz', "", ""],
-        [TIME, "pump", "b", "01ff", "", ""],
+        [TIME, "pump", "b", "Af8=", "", ""],
         [TIME, "pump", "n", "", "", "exception 02 (Illegal Data Address)"],
         first,
     ]
@@ -62,7 +62,7 @@ def test_json_lines_have_one_object_for_each_value(tmp_path: Path) -> None:
     file.send(READINGS)
     file.close()
     found = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text("utf-8").splitlines()]
-    assert [each["value"] for each in found] == [21.5, True, [1, 2], 'x,"y"\nz', "01ff", None]
+    assert [each["value"] for each in found] == [21.5, True, [1, 2], 'x,"y"\nz', "Af8=", None]
     assert found[0] == {
         "time": TIME,
         "device": "pump",
@@ -85,7 +85,7 @@ def test_line_protocol_can_be_written_to_a_file(tmp_path: Path) -> None:
         "a[0]": 1,
         "a[1]": 2,
         "s": 'x,"y"\nz',
-        "b": "01ff",
+        "b": "Af8=",
     }
 
 
@@ -168,7 +168,7 @@ def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
     rows = database._db.execute("SELECT * FROM readings").fetchall()
     database.close()
     assert rows[0] == (TIME, "pump", "t", 21.5, "°C", None)
-    values = [21.5, 1, "[1,2]", 'x,"y"\nz', "01ff", None, float(2**64 - 1)]
+    values = [21.5, 1, "[1,2]", 'x,"y"\nz', "Af8=", None, float(2**64 - 1)]
     assert [row[3] for row in rows] == values
     assert rows[5][5] == "exception 02 (Illegal Data Address)"
 

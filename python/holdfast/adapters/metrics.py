@@ -14,6 +14,7 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from holdfast import __version__
+from holdfast.tags.text import plain
 from holdfast.web.admission import ConnectionLimits
 from holdfast.web.host import SAFE, Host, rejection, respond
 
@@ -210,7 +211,7 @@ class TagFigures(Collector):
         ages = _gauge("tag_age_seconds", "The age of the value of a tag.", "device", "tag")
         now = time.time()
         for reading in self._diagnostics.tag_values():
-            for name, value in _numbers(reading.name, reading.value):
+            for name, value in _numbers(reading.name, plain(reading.tag, reading.value)):
                 values.add_metric([reading.device, name, reading.tag.unit], value)
                 ages.add_metric([reading.device, name], max(0.0, now - reading.time))
         yield from (values, ages)

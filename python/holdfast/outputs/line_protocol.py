@@ -6,13 +6,15 @@ field.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
+
+from holdfast.tags.text import plain
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from holdfast.polling import Reading
+    from holdfast.tags import Tag
 
 MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 """Integers of the protocol have 64 bits. Others become floats."""
@@ -28,7 +30,8 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
     for device, tag, value, time, _, _ in readings:
         at = round(time * 1_000_000) * 1000
         fields = points.setdefault((device, at), [])
-        fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, value)]
+        shown = plain(tag, float(value) if _is_wide(tag) and value is not None else value)
+        fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, shown)]
     name = measurement.translate(_NAME)
     more = "".join(f",{key.translate(_KEY)}={_tag(value)}" for key, value in tags.items())
     return "".join(
@@ -36,6 +39,11 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
         for (device, at), fields in points.items()
         if fields
     ).encode()
+
+
+def _is_wide(tag: Tag) -> bool:
+    """Whether some integers of a tag do not fit, so that all are floats: a field has one kind."""
+    return tag.type == "uint64"
 
 
 def _tag(value: str) -> str:
@@ -57,12 +65,9 @@ def _written(value: Any) -> str | None:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):
-        inside = MIN_INTEGER <= value <= MAX_INTEGER
-        return f"{value}i" if inside else repr(float(value))
+        return f"{value}i" if MIN_INTEGER <= value <= MAX_INTEGER else repr(float(value))
     if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else None
-    if isinstance(value, bytes):
-        return f'"{value.hex()}"'
+        return repr(value)
     if isinstance(value, str):
         return f'"{value.translate(_TEXT)}"'
     return None

@@ -12,6 +12,7 @@ import msgspec
 
 from holdfast.config.outputs import MEASUREMENT
 from holdfast.outputs.line_protocol import lines
+from holdfast.tags.text import plain, text_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -107,12 +108,11 @@ def _end_line(file: io.FileIO, path: Path) -> None:
 
 def row(reading: Reading) -> tuple[Any, ...]:
     """The columns of a reading."""
-    value = reading.value.hex() if isinstance(reading.value, bytes) else reading.value
     return (
         f"{datetime.fromtimestamp(reading.time, UTC):%Y-%m-%dT%H:%M:%S.%fZ}",
         reading.device,
         reading.tag.name,
-        value,
+        plain(reading.tag, reading.value),
         reading.tag.unit,
         reading.error,
     )
@@ -122,11 +122,8 @@ def _csv(readings: list[Reading]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for reading in readings:
-        time, device, tag, value, unit, error = row(reading)
-        if isinstance(value, bool):
-            value = "true" if value else "false"
-        elif isinstance(value, list):
-            value = msgspec.json.encode(value).decode()
+        time, device, tag, _, unit, error = row(reading)
+        value = text_of(reading.tag, reading.value, states=False)
         writer.writerow((time, device, tag, value, unit, error))
     return text.getvalue().encode()
 
