@@ -41,7 +41,7 @@ def test_the_help_imports_no_command() -> None:
         (("import", "mmaa"), "No such command 'mmaa'. Did you mean 'mma'?"),
         (("xyzzy",), "No such command 'xyzzy'."),
         (("tcp://plc",), "Did you mean 'holdfast read tcp://plc'?"),
-        (("read", "tcp://plc", "hr", "0", "--ordr", "CDAB"), "Did you mean '--order'?"),
+        (("read", "tcp://plc", "hr", "0", "--modcon"), "'--modicon'?)"),
         (("read", "plc", "hr", "0"), "for a host of that name, type tcp://plc."),
         (("read", "/dev/ttyUSB0", "hr", "0"), "type rtu:///dev/ttyUSB0?baud=19200&parity=even"),
         (("read", "COM3", "hr", "0"), "'holdfast find COM3' finds them."),
@@ -59,8 +59,8 @@ def test_a_host_without_a_scheme_is_one_over_tcp(
     host, port = server.address
     for url in (f"{host}:{port}", f"localhost:{port}"):
         assert cli.answer("read", url, "hr", "0")["registers"] == [7]
-    lines = cli.invoke("watch", f"{host}:{port}", "hr", "0", "--times", "1")
-    assert lines.exit_code == 0
+    for words in (("hr", "0"), ("hr:0",)):
+        assert cli.invoke("watch", f"{host}:{port}", *words, "--times", "1").exit_code == 0
 
 
 @pytest.mark.parametrize("host", ["::1", "[::1]:1", "127.0.0.1:1"])

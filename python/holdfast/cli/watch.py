@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -108,7 +109,7 @@ def watch(
         untyped = (None, "ABCD", None)
         of = tag_options.device_of(files, target, words, only, untyped, modicon, unit, timeout)
         if of is not None:
-            device.checked_url(of.url)
+            of = replace(of, url=device.checked_url(of.url))
             if memory is not None:
                 raise click.UsageError("--memory requires FILE.")
             form = form_of(as_json, as_csv)
