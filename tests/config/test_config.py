@@ -717,6 +717,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "NatsConfig": ["servers", "devices"],
         "NatsDefaultsConfig": None,
         "NatsLimitsConfig": None,
+        "NatsOutputConfig": ["servers", "type"],
         "NatsPingConfig": None,
         "RawIngestListener": ["type", "bind", "rules"],
         "OffsetsConfig": None,

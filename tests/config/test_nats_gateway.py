@@ -185,6 +185,7 @@ def test_the_effective_configuration_shows_every_default(folder: Folder) -> None
         "  tokens:\n"
         f"    - {{name: panel, sha256: {HASH}}}\n"
         "  in_flight: 1\n"
+        "outputs: {}\n"
     )
     assert folder.config(dump) == folder.config(NATS + GATEWAY)
 
@@ -291,7 +292,7 @@ def test_everything_else_needs_memories(
         ("  devices", "  limits: {tag: 1}\n  devices",
          "3: limits.tag: unknown key, allowed: devices, tags; did you mean 'tags'?"),
         ("  devices", "  embedded: true\n  devices", "3: embedded: unknown key, allowed: servers, "
-         "devices, username, password_file, token_file, credentials_file, tls, device_tls, prefix, "
+         "username, password_file, token_file, credentials_file, tls, devices, device_tls, prefix, "
          "dialect, defaults, writes, strict, ping, publish_logs, keep_subscriptions, limits"),
         ("  devices", "  defaults: {timeout: 3}\n  devices",
          "3: defaults.timeout: found 3, allowed: an integer from 10 to 30000"),

@@ -37,6 +37,13 @@ DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, inte
             "{type: influx, url: 'http://h/w', token_file: t}",
             "o.token_file: found 't', which can't be read",
         ),
+        ("{type: nats, servers: []}", "o.servers: found an empty list"),
+        ("{type: nats, servers: ['http://a']}", "o.servers[0]: "),
+        ("{type: nats, servers: ['nats://a'], tls: {}}", "o.tls: found with servers that begin"),
+        (
+            "{type: nats, servers: ['nats://a'], password_file: p.yaml}",
+            "o.password_file: found without username",
+        ),
         (
             "{type: file, file: a, format: csv, buffer: {max_bytes: 1}}",
             "o.buffer.max_bytes: found 1, allowed",

@@ -53,8 +53,10 @@ if TYPE_CHECKING:
     )
     from holdfast.config.devices import BlockConfig, ForwardConfig, StatusConfig
     from holdfast.config.rights import UnitRights
+    from holdfast.config.services import NatsServersConfig
     from holdfast.gateway import Settings as GatewaySettings
     from holdfast.net.tls import Tls
+    from holdfast.scanner import Servers
     from holdfast.scanner import Settings as ScannerSettings
     from holdfast.types import Area, Forward, NarrowedRights, StatusBlock
     from holdfast.web.https import Https
@@ -386,11 +388,11 @@ def https(settings: HttpsConfig) -> Https:
     )
 
 
-def scanner(settings: NatsConfig) -> ScannerSettings:
-    """Returns the settings of the scanner."""
-    from holdfast.scanner import Defaults, Ping, ScannerLimits, Servers, Settings
+def nats_servers(settings: NatsServersConfig) -> Servers:
+    """Returns NATS servers and credentials."""
+    from holdfast.scanner import Servers
 
-    servers = Servers(
+    return Servers(
         settings.servers,
         settings.username,
         settings.password_file,
@@ -398,11 +400,17 @@ def scanner(settings: NatsConfig) -> ScannerSettings:
         settings.credentials_file,
         NO_FILES if settings.tls is None else settings.tls.files,
     )
+
+
+def scanner(settings: NatsConfig) -> ScannerSettings:
+    """Returns the settings of the scanner."""
+    from holdfast.scanner import Defaults, Ping, ScannerLimits, Settings
+
     limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
     trust = NO_FILES if settings.device_tls is None else settings.device_tls.files
     given = settings.defaults
     return Settings(
-        servers,
+        nats_servers(settings),
         settings.prefix,
         settings.devices,
         limits,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, assert_never
 
-from holdfast.config.outputs import FileConfig, InfluxConfig
+from holdfast.appliance import assembly
+from holdfast.config.outputs import FileConfig, InfluxConfig, NatsOutputConfig
 
 if TYPE_CHECKING:
     from holdfast.config.outputs import Output
@@ -18,6 +19,11 @@ def receiver(settings: Output) -> Receiver:
             from holdfast.outputs.influx import Influx
 
             return Influx(settings)
+        case NatsOutputConfig():
+            from holdfast.scanner.output import NatsOutput
+
+            servers = assembly.nats_servers(settings)
+            return NatsOutput(servers, settings.prefix, settings.dialect)
         case FileConfig(format="sqlite"):
             from holdfast.outputs.database import Database
 

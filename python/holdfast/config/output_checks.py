@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.files import check_readable
 from holdfast.config.http_url import parse_http
 from holdfast.config.lenient import entries, mapping, parsed
+from holdfast.config.nats_checks import check_nats
 from holdfast.config.tls_checks import check_client_tls
 from holdfast.config.words import guess, listing, show
 
@@ -42,8 +43,11 @@ class OutputChecks:
                     near = guess(device, [str(each) for each in devices])
                     message = f"found {show(device)}, {words}{near}"
                     self.report.add((*path, "devices", index), message)
-            if mapping(output).get("type") == "influx":
+            kind = mapping(output).get("type")
+            if kind == "influx":
                 self._influx(path, output)
+            elif kind == "nats":
+                check_nats(path, output, self.folder, self.report)
 
     def _influx(self, path: KeyPath, output: dict[Any, Any]) -> None:
         target = parsed(parse_http, output.get("url"))

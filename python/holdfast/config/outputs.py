@@ -8,8 +8,9 @@ from pydantic import Field, Strict
 
 from holdfast.config.base import Model
 from holdfast.config.http_url import HttpTarget, parse_http
-from holdfast.config.scalars import Duration, FilePath, HttpUrl, Name, NotNull
-from holdfast.config.services import ClientTlsConfig
+from holdfast.config.scalars import Duration, FilePath, HttpUrl, Name, NotNull, SubjectPrefix
+from holdfast.config.scanning import PREFIX, Dialect
+from holdfast.config.services import ClientTlsConfig, NatsServersConfig
 
 MOST_VALUES = 1_000_000
 MEASUREMENT = "modbus"
@@ -94,7 +95,18 @@ class FileConfig(OutputConfig):
     """How many rotated files of text to keep."""
 
 
-OUTPUT_TYPES = ("influx", "file")
+class NatsOutputConfig(NatsServersConfig, OutputConfig):
+    """NATS: the messages that the scanner publishes for subscribers."""
+
+    type: Literal["nats"]
+    """The type of the output."""
+    prefix: SubjectPrefix = PREFIX
+    """The first part of all subjects."""
+    dialect: Dialect = "tentacle"
+    """The programs that read the messages: those of tentacle-modbus, or of tentacle-next."""
+
+
+OUTPUT_TYPES = ("influx", "file", "nats")
 """All values of `type`."""
 
-Output: TypeAlias = InfluxConfig | FileConfig
+Output: TypeAlias = InfluxConfig | FileConfig | NatsOutputConfig

@@ -11,12 +11,12 @@ from holdfast.config.connection_checks import doubt_source_limit
 from holdfast.config.files import check_readable
 from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
+from holdfast.config.nats_checks import check_nats
 from holdfast.config.scalars import parse_sha256
-from holdfast.config.scanning import check_dialect, parse_server
 from holdfast.config.services import HTTP_SERVICES, RestConfig
 from holdfast.config.tls_checks import check_client_tls, check_https
 from holdfast.config.unique import Owners
-from holdfast.config.words import choice, listing, show
+from holdfast.config.words import choice, show
 
 if TYPE_CHECKING:
     from holdfast.config.grant_checks import GrantChecks
@@ -27,8 +27,6 @@ _USERS_OF_MEMORIES = ("rest", "mqtt", "adapters")
 _USERS_OF_NONE = {"nats", "gateway", "links", "devices"}
 _INSTEAD_OF_LISTENERS = ("rest", "mqtt", "nats", "gateway", "devices")
 _REST_CONNECTIONS = RestConfig.model_fields["max_connections"].default
-_IDENTITIES = ("username", "token_file", "credentials_file")
-"""Keys that authenticate the scanner at the NATS server; only one of them is allowed."""
 
 
 @dataclass
@@ -117,28 +115,12 @@ class ServiceChecks:
                 topics.claim((*path, "topic"), topic, show(topic), path)
 
     def _nats(self, nats: dict[Any, Any]) -> None:
-        self._password("nats", nats)
-        for key in ("token_file", "credentials_file"):
-            self._readable(("nats", key), nats.get(key))
-        first, *others = [key for key in _IDENTITIES if key in nats] or [""]
-        for key in others:
-            message = f"found together with {first}, allowed: only one of {listing(_IDENTITIES)}"
-            self.report.add(("nats", key), message, of_key=True)
-        servers = [parsed(parse_server, url) for url in entries(nats.get("servers"))]
-        if "tls" in nats and servers and all(each and each.scheme == "nats" for each in servers):
-            message = "found with servers that begin with nats://, allowed: only with tls://"
-            self.report.add(("nats", "tls"), message, of_key=True)
-        self._tls(("nats", "tls"), nats.get("tls"))
+        check_nats(("nats",), nats, self.folder, self.report)
         self._tls(("nats", "device_tls"), nats.get("device_tls"))
         defaults = mapping(nats.get("defaults"))
         if defaults.get("deadband") and defaults.get("publish") != "change":
             message = "found without publish: change, allowed: only with it"
             self.report.add(("nats", "defaults", "deadband"), message, of_key=True)
-        if nats.get("dialect") == "tentacle-next" and isinstance(nats.get("prefix"), str):
-            try:
-                check_dialect("tentacle-next", nats["prefix"])
-            except ValueError as error:
-                self.report.add(("nats", "prefix"), str(error))
 
     def _password(self, section: str, settings: dict[Any, Any]) -> None:
         if "password_file" in settings and "username" not in settings:

@@ -234,13 +234,11 @@ class NatsPingConfig(Model):
     """Pings without an answer after which the scanner reconnects."""
 
 
-class NatsConfig(Model):
-    """The scanner: polls devices for NATS subscribers."""
+class NatsServersConfig(Model):
+    """NATS servers, and the credentials for them."""
 
     servers: Annotated[tuple[NatsUrl, ...], Strict(False), Field(min_length=1)]
     """The NATS servers: nats://host:port or tls://host:port. Default port: 4222."""
-    devices: Annotated[tuple[PollableEntry, ...], Strict(False), Field(min_length=1)]
-    """Devices that subscribers may poll and write to: networks, addresses, serial devices."""
     username: Annotated[MqttText | None, NotNull()] = None
     """The user name for the server."""
     password_file: Annotated[FilePath | None, NotNull()] = None
@@ -251,6 +249,13 @@ class NatsConfig(Model):
     """A file that contains a JWT and the seed of its key, instead of a user name."""
     tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates for the NATS servers; requires tls://."""
+
+
+class NatsConfig(NatsServersConfig):
+    """The scanner: polls devices for NATS subscribers."""
+
+    devices: Annotated[tuple[PollableEntry, ...], Strict(False), Field(min_length=1)]
+    """Devices that subscribers may poll and write to: networks, addresses, serial devices."""
     device_tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates for TLS connections to devices."""
     prefix: SubjectPrefix = PREFIX

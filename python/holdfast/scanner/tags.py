@@ -74,8 +74,7 @@ class Tag:
     @property
     def datatype(self) -> DataType:
         """The `datatype` in messages."""
-        type = parsed(self.type)
-        return "array" if type.count is not None else KINDS.get(type.base, "number")
+        return datatype(parsed(self.type))
 
     @property
     def unwritable(self) -> str | None:
@@ -103,6 +102,11 @@ def clean(value: Any, tag: Tag) -> Any:
     if tag.null and type(value) is not Undecoded and value in tag.null:
         return None
     return value
+
+
+def datatype(type: Type) -> DataType:
+    """Returns the `datatype` in messages."""
+    return "array" if type.count is not None else KINDS.get(type.base, "number")
 
 
 def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules: Rules) -> Tag:

@@ -1,0 +1,117 @@
+"""An output to NATS, with a real server: messages, states, and outages."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.faults import NO_CONNECTION
+from holdfast.outputs import Buffer, Sending
+from holdfast.outputs import sending as module
+from holdfast.scanner import Servers
+from holdfast.scanner.output import NatsOutput
+from holdfast.stop import Stop
+from support import wire
+from support.nats_bus import Caller
+from support.readings import TIME, numbered, reading, tag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from support.brokers import NatsServer
+
+STAMP = int(TIME * 1000)
+
+
+@pytest.fixture
+def output(own_nats: NatsServer) -> Iterator[NatsOutput]:
+    made = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
+    yield made
+    made.close()
+
+
+def test_values_come_as_messages_of_the_scanner(output: NatsOutput, own_caller: Caller) -> None:
+    inbox = own_caller.listen("modbus.>")
+    output.send(
+        [
+            reading(230.10000610351562, tag=tag("v", type="float32")),
+            reading(True, tag=tag("on", area="coils", type="bool")),
+            reading(None, tag=tag("marked")),
+            reading([1, 2], tag=tag("both", type="uint16[2]")),
+            reading(None, tag=tag("bad"), fault=2),
+        ]
+    )
+    state = inbox.next()
+    assert state == {"deviceId": "pump", "state": "online", "failures": 0, "timestamp": STAMP}
+    common = {"moduleId": "modbus", "deviceId": "pump", "timestamp": STAMP}
+    assert [inbox.next() for _ in range(4)] == [
+        {**common, "variableId": "v", "value": 230.1, "datatype": "number"},
+        {**common, "variableId": "on", "value": True, "datatype": "boolean"},
+        {**common, "variableId": "marked", "value": None, "datatype": "number"},
+        {**common, "variableId": "both", "value": [1, 2], "datatype": "array"},
+    ]
+
+
+def test_states_are_published_when_they_change(output: NatsOutput, own_caller: Caller) -> None:
+    inbox = own_caller.listen("modbus.status.pump")
+    down = reading(None, fault=NO_CONNECTION)
+    output.send([reading(1), reading(2), down, down])
+    output.send([down, reading(None, fault=2), reading(3)])
+    states = [inbox.next() for _ in range(3)]
+    assert [(each["state"], each.get("error")) for each in states] == [
+        ("online", None),
+        ("offline", "no connection"),
+        ("online", None),
+    ]
+
+
+def test_tentacle_next_has_a_subject_for_each_tag(own_nats: NatsServer, own_caller: Caller) -> None:
+    inbox = own_caller.listen("line1.data.pump.t")
+    output = NatsOutput(Servers((own_nats.url,)), "line1", "tentacle-next")
+    output.send([reading(7)])
+    output.close()
+    assert inbox.next()["value"] == 7
+
+
+def test_nothing_is_lost_when_the_server_is_away(
+    own_nats: NatsServer, output: NatsOutput, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+        monkeypatch.setattr(module, name, 0.05)
+    buffer, stop = Buffer(), Stop()
+    sending = Sending("nats", output, buffer)
+    thread = threading.Thread(target=sending.run, args=[stop])
+    thread.start()
+    try:
+        with Caller(own_nats.url) as caller:
+            inbox = caller.listen("modbus.data.pump")
+            buffer.offer(numbered(3))
+            assert [inbox.next()["value"] for _ in range(3)] == [0, 1, 2]
+        own_nats.kill()
+        buffer.offer(numbered(2000, 3))
+        wire.until(lambda: sending.status()["connected"] is False, "the server is missed")
+        own_nats.start()
+        with Caller(own_nats.url) as caller:
+            inbox = caller.listen("modbus.data.pump")
+            buffer.offer(numbered(1, 2003))
+            wire.until(lambda: not len(buffer), "all is sent")
+            found = [inbox.next()["value"]]
+            while found[-1] != 2003:
+                found.append(inbox.next()["value"])
+    finally:
+        stop.set()
+        thread.join(wire.DEADLINE)
+    # What came before the listener is not seen: NATS keeps nothing without a stream.
+    assert found == list(range(found[0], 2004))
+    assert sending.status()["readings"] == {"sent": 2004, "refused": 0, "dropped": 0}
+
+
+def test_a_server_that_can_not_be_reached_is_an_error(own_nats: NatsServer) -> None:
+    own_nats.kill()
+    output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
+    with pytest.raises(OSError, match=r"refused|no servers"):
+        output.send(numbered(1))
+    output.idle()
+    output.close()
