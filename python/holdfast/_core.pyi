@@ -47,6 +47,7 @@ __all__ = [
     "Poller",
     "RawRule",
     "Request",
+    "Results",
     "Route",
     "Rule",
     "ServerTls",
@@ -828,6 +829,7 @@ class Results:
     def dropped(self) -> int:
         """Polls that are missing because the queue was full; the oldest are dropped."""
 
+@final
 class Poller:
     """Polls devices on a native thread, from construction to `stop`.
 
