@@ -40,3 +40,9 @@ class Stop:
                 self._then.append(callback)
                 return
         callback()
+
+    def forget(self, callback: Callable[[], object]) -> None:
+        """Does not call `callback` any more."""
+        with self._lock:
+            if callback in self._then:
+                self._then.remove(callback)

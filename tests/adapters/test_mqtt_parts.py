@@ -9,7 +9,7 @@ from paho.mqtt.client import topic_matches_sub
 
 from holdfast.adapters.mqtt.backoff import Backoff
 from holdfast.adapters.mqtt.filters import Filters
-from holdfast.adapters.mqtt.packets import parse_publish
+from holdfast.mqtt.packets import parse_publish
 from support import mqtt_peer as mqtt
 from support.mqtt_rig import settings, subscription
 

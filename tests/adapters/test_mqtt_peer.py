@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import adapter, backoff, dialing, inbox, link
+from holdfast.adapters.mqtt import adapter, backoff, inbox, link
 from holdfast.ingest import MemoryAccess
+from holdfast.mqtt import dialing
 from support import mqtt_peer as mqtt
 from support import wire
 from support.mqtt_peer import FakeBroker, publish

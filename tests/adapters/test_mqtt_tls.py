@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import backoff, dialing
+from holdfast.adapters.mqtt import backoff
+from holdfast.mqtt import dialing
 from holdfast.net.tls import NO_FILES, broker_context
 from support import wire
 from support.certificates import Certificates

@@ -43,6 +43,9 @@ VARIABLES = {
 }
 """What variables hold that a file takes private names of, by their names."""
 
+DERIVED = {"BrokerClient": "paho.mqtt.client.Client"}
+"""Classes of the product that others derive from, and what they are derived from themselves."""
+
 
 class Use(NamedTuple):
     file: str
@@ -76,7 +79,11 @@ def uses(file: str, tree: ast.Module, own: frozenset[str]) -> Iterator[Use]:
                 if is_foreign(alias.name) and is_private(alias.name):
                     module, _, name = alias.name.rpartition(".")
                     yield Use(file, module, name)
-        if not isinstance(node, ast.ImportFrom) or not is_foreign(node.module):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        derived = [alias.name for alias in node.names if alias.name in DERIVED]
+        imported |= {name: DERIVED[name] for name in derived}
+        if not is_foreign(node.module):
             continue
         for alias in node.names:
             imported[alias.asname or alias.name] = f"{node.module}.{alias.name}"

@@ -160,8 +160,8 @@ class SubscriptionConfig(Model):
     """The areas that messages may write."""
 
 
-class MqttConfig(Model):
-    """The MQTT client: receives JSON commands from topics of a broker."""
+class BrokerConfig(Model):
+    """A connection to an MQTT broker."""
 
     url: BrokerUrl
     """The broker: mqtt://host:port, or mqtts:// for TLS. Default port: 1883 or 8883."""
@@ -169,16 +169,12 @@ class MqttConfig(Model):
     """The user name for the broker."""
     password_file: Annotated[FilePath | None, NotNull()] = None
     """A file that contains the password; requires username."""
-    client_id: MqttText
-    """The client identifier; unique among the clients of the broker."""
     version: MqttVersion = "5"
     """The version of MQTT."""
     keep_alive: Annotated[int, Field(ge=1, le=65535)] = 60
     """Seconds without a message after which the client sends a ping."""
     tls: Annotated[ClientTlsConfig | None, NotNull()] = None
     """Certificates; requires mqtts://."""
-    subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
-    """The topics to subscribe to."""
 
     @property
     def broker(self) -> Broker:
@@ -199,6 +195,15 @@ class MqttConfig(Model):
     def secure(self) -> bool:
         """Whether the connection uses TLS."""
         return self.broker.secure
+
+
+class MqttConfig(BrokerConfig):
+    """The MQTT client: receives JSON commands from topics of a broker."""
+
+    client_id: MqttText
+    """The client identifier; unique among the clients of the broker."""
+    subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
+    """The topics to subscribe to."""
 
 
 class NatsLimitsConfig(Model):

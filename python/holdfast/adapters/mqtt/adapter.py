@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING
 from holdfast import logs
 from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.backoff import Backoff
-from holdfast.adapters.mqtt.dialing import dial
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
 from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
-from holdfast.adapters.mqtt.waiting import Ended, Waiter
-from holdfast.config.broker import MAX_TEXT
+from holdfast.mqtt.dialing import dial
+from holdfast.mqtt.password import read_password
+from holdfast.mqtt.waiting import Ended, Waiter
 from holdfast.net.addresses import joined
 from holdfast.net.tls import NO_FILES, broker_context
 
 if TYPE_CHECKING:
     import socket
-    from pathlib import Path
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
     from paho.mqtt.properties import Properties
@@ -36,8 +35,6 @@ WELCOME = 10.0
 
 SILENCE = 600.0
 """Seconds before a failure to connect with the same reason is logged again."""
-
-MAX_PASSWORD = MAX_TEXT
 
 _TICK = 1.0
 """Seconds between checks of the keep-alive."""
@@ -91,7 +88,7 @@ class Mqtt:
         link: BrokerConnection | None = None
         try:
             link = self._link(waiter)
-            link.open(self._settings)
+            link.open()
             self._serve(link, waiter)
         except Ended:
             self._ending = "stopped"
@@ -117,7 +114,7 @@ class Mqtt:
         def open_socket() -> socket.socket:
             return dial(settings.host, settings.port, context, waiter)
 
-        password = _password(settings.password_file)
+        password = read_password(settings.password_file)
         link = BrokerConnection(
             settings, password, open_socket, self._unreleased, self._inbox, self._answers.send
         )
@@ -292,16 +289,3 @@ class _Failures:
     def forget(self) -> None:
         """Records a successful attempt."""
         self._reason, self._attempts = None, 0
-
-
-def _password(file: Path | None) -> bytes | None:
-    """Reads the password at each attempt, so that a new password needs no restart."""
-    if file is None:
-        return None
-    with file.open("rb") as opened:
-        content = opened.read(MAX_PASSWORD + 3)
-    newline = b"\r\n" if content.endswith(b"\r\n") else b"\n"
-    password = content.removesuffix(newline)
-    if len(password) > MAX_PASSWORD:
-        raise ValueError(f"{file} holds more than {MAX_PASSWORD} bytes")
-    return password

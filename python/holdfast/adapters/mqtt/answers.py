@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from holdfast.adapters.mqtt.filters import Filters
     from holdfast.adapters.mqtt.link import BrokerConnection
-    from holdfast.adapters.mqtt.packets import Publish
+    from holdfast.mqtt.packets import Publish
 
 
 class Answers:

@@ -9,8 +9,8 @@ from holdfast.ingest import Grant, Refused
 
 if TYPE_CHECKING:
     from holdfast.adapters.mqtt.filters import Filters
-    from holdfast.adapters.mqtt.packets import Publish
     from holdfast.ingest import MemoryAccess
+    from holdfast.mqtt.packets import Publish
 
 MAX_BYTES = 8 * 2**20
 """The largest accepted payload, in bytes."""

@@ -1,8 +1,7 @@
-"""One connection to a broker: paho's client with four changes.
+"""One connection to a broker: paho's client with three changes.
 
 - A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
   sends PUBREC before it delivers the message, so a crash between the two would lose the message.
-- Connecting can be interrupted: `dial` opens the socket.
 - The properties of a message are parsed here, in linear time.
 - A packet over the size limit is not kept in memory while it arrives.
 
@@ -11,24 +10,24 @@ Methods that begin with an underscore override methods of paho.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTErrorCode, MQTTProtocolVersion
-from paho.mqtt.packettypes import PacketTypes
-from paho.mqtt.properties import Properties
+from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from holdfast.adapters.mqtt.inbox import MAX_BYTES
-from holdfast.adapters.mqtt.packets import MAX_PROPERTIES, parse_publish
+from holdfast.mqtt.client import BrokerClient
+from holdfast.mqtt.packets import MAX_PROPERTIES, parse_publish
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, Mapping
 
+    from paho.mqtt.properties import Properties
+
     from holdfast.adapters.mqtt.inbox import Inbox
-    from holdfast.adapters.mqtt.packets import Publish
     from holdfast.config import MqttConfig, SubscriptionConfig
+    from holdfast.mqtt.packets import Publish
 
 SESSION_EXPIRY = 3600
 """Seconds that the broker keeps the session while this client is disconnected. MQTT 5 only."""
@@ -48,7 +47,7 @@ _KEPT = MAX_PROPERTIES + 2**17
 _LARGEST = MAX_BYTES + _KEPT
 
 
-class BrokerConnection(Client):
+class BrokerConnection(BrokerClient):
     """One connection, from dialing to its end. A reconnect creates a new object."""
 
     def __init__(
@@ -64,41 +63,16 @@ class BrokerConnection(Client):
 
         `answer` is called for each message, after its acknowledgement.
         """
-        self._five = settings.version == "5"
         super().__init__(
-            CallbackAPIVersion.VERSION2,
-            client_id=settings.client_id,
-            clean_session=None if self._five else False,
-            protocol=MQTTProtocolVersion.MQTTv5 if self._five else MQTTProtocolVersion.MQTTv311,
-            reconnect_on_failure=False,
+            settings, settings.client_id, password, dial, session_expiry=SESSION_EXPIRY
         )
-        self._dial = dial
         self._unreleased = unreleased
         self._inbox = inbox
         self._answer = answer
         self._largest_sent: int | None = None
         self.most_qos = 1
         """The highest quality of service that the broker accepts, at most 1."""
-        self.trouble: str | None = None
-        """The last error that paho logged."""
-        self.on_log = self._note
         self.max_queued_messages = MAX_WAITING
-        self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
-
-    def open(self, settings: MqttConfig) -> None:
-        """Dials and sends CONNECT. Raises the exceptions of `dial`."""
-        if not self._five:
-            self.connect(settings.host, settings.port, settings.keep_alive)
-            return
-        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-        properties.SessionExpiryInterval = SESSION_EXPIRY
-        self.connect(
-            settings.host,
-            settings.port,
-            settings.keep_alive,
-            clean_start=False,
-            properties=properties,
-        )
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
@@ -128,22 +102,6 @@ class BrokerConnection(Client):
     def takes(self, size: int) -> bool:
         """Returns whether the broker accepts a message of this size, plus packet overhead."""
         return self._largest_sent is None or size + 64 <= self._largest_sent
-
-    @property
-    def unsent(self) -> int:
-        """The number of unsent packets."""
-        return len(self._out_packet)
-
-    def close(self) -> None:
-        """Closes the socket, if it is open."""
-        self._sock_close()
-
-    def _note(self, _client: Client, _data: object, level: int, text: str) -> None:
-        if level == LogLevel.MQTT_LOG_ERR or "malformed" in text:
-            self.trouble = text
-
-    def _create_socket(self) -> Any:
-        return self._dial()
 
     def _packet_read(self) -> MQTTErrorCode:
         code = super()._packet_read()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.net.resolver import Resolver
 
 if TYPE_CHECKING:
-    from holdfast.adapters.mqtt.waiting import Waiter
+    from holdfast.mqtt.waiting import Waiter
     from holdfast.net.resolver import SocketAddress
 
 CONNECT_TIMEOUT = 10.0

@@ -30,7 +30,8 @@ class Waiter:
         self._stop = stop
         self._bell, self._rope = socket.socketpair()
         self._rope.setblocking(False)
-        stop.then(self._ring)
+        self._bell.setblocking(False)
+        stop.then(self.wake)
 
     def __enter__(self) -> Self:
         return self
@@ -41,10 +42,16 @@ class Waiter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the use of this waiter."""
+        self._stop.forget(self.wake)
         self._bell.close()
         self._rope.close()
 
-    def _ring(self) -> None:
+    def wake(self) -> None:
+        """Ends the current or the next wait. Thread-safe."""
         with contextlib.suppress(OSError):
             self._rope.send(b"\0")
 
@@ -65,5 +72,8 @@ class Waiter:
                 selector.register(for_this, wanted)
             ready = {key.fileobj: events for key, events in selector.select(max(0.0, seconds))}
         self.check()
+        if self._bell in ready:
+            with contextlib.suppress(BlockingIOError):
+                self._bell.recv(4096)
         events = ready.get(for_this, 0)
         return bool(events & selectors.EVENT_READ), bool(events & selectors.EVENT_WRITE)

@@ -1,0 +1,1 @@
+"""What all connections to MQTT brokers have in common: opening them, waiting, parsing messages."""
