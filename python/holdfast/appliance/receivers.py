@@ -5,14 +5,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, assert_never
 
 from holdfast.appliance import assembly
-from holdfast.config.outputs import FileConfig, InfluxConfig, NatsOutputConfig
+from holdfast.config.outputs import (
+    FileConfig,
+    InfluxConfig,
+    MqttOutputConfig,
+    NatsOutputConfig,
+)
 
 if TYPE_CHECKING:
     from holdfast.config.outputs import Output
     from holdfast.outputs import Receiver
+    from holdfast.outputs.site import Site
 
 
-def receiver(settings: Output) -> Receiver:
+def receiver(name: str, settings: Output, site: Site) -> Receiver:
     """The receiver that the settings describe."""
     match settings:
         case InfluxConfig():
@@ -24,6 +30,10 @@ def receiver(settings: Output) -> Receiver:
 
             servers = assembly.nats_servers(settings)
             return NatsOutput(servers, settings.prefix, settings.dialect)
+        case MqttOutputConfig():
+            from holdfast.outputs.mqtt import MqttOutput
+
+            return MqttOutput(name, settings, site)
         case FileConfig(format="sqlite"):
             from holdfast.outputs.database import Database
 

@@ -17,8 +17,10 @@ from holdfast.appliance import assembly, auditing, changes, configured_certifica
 from holdfast.appliance.diagnostics import Diagnostics, configured
 from holdfast.appliance.expiring import Expiring
 from holdfast.appliance.liveness import Liveness
+from holdfast.appliance.output_site import OutputSite
 from holdfast.appliance.supervision import STOP_TIMEOUT, Supervisor
 from holdfast.appliance.tag_values import TagValues
+from holdfast.appliance.tag_writes import TagWrites
 from holdfast.client.endpoint import check_files
 from holdfast.config import (
     HTTP_SERVICES,
@@ -232,6 +234,7 @@ class _Running:
             # The links of listeners come first: the first use of an address decides its settings.
             self._poller: _core.Poller | None = None
             self._values: TagValues | None = None
+            self._writes: TagWrites | None = None
             links, devices = assembly.Links(), list[_core.PolledDevice]()
             if _requires_poller(config):
                 self._poller = _core.Poller([])
@@ -285,6 +288,8 @@ class _Running:
             self._poller.stop()
         if self._values is not None:
             self._values.join(STOP_TIMEOUT)
+        if self._writes is not None:
+            self._writes.join(STOP_TIMEOUT)
         for port in self._ports.values():
             port.close()
         if self._recorder is not None:
@@ -689,9 +694,12 @@ class _Running:
             parts[name] = replace(part, access=own)
         return parts
 
-    @staticmethod
-    def _output(values: TagValues, name: str, settings: Output) -> Callable[[], Adapter]:
-        return lambda: values.sending(name, receivers.receiver(settings))
+    def _output(self, values: TagValues, name: str, settings: Output) -> Callable[[], Adapter]:
+        if self._writes is None:
+            assert self._poller is not None, "values come from a poller"
+            self._writes = TagWrites(self._poller, self._audit, values.find)
+        site = OutputSite(name, settings.devices, values, self._writes)
+        return lambda: values.sending(name, receivers.receiver(name, settings, site))
 
     def _memory_access(self, name: str) -> MemoryAccess:
         """The way to memory of an adapter. It keeps its counters over reloads."""

@@ -13,7 +13,7 @@ from holdfast.polling import Reading
 from holdfast.polling.reader import Reader
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from holdfast._core import Results
     from holdfast.config import Config
@@ -52,6 +52,11 @@ class TagValues:
         self._readers: dict[str, Reader] = {}
         self._outputs: dict[str, _Output] = {}
         self._latest: dict[str, list[Reading]] = {}
+        self._answering: dict[str, bool] = {}
+        self.revision = 0
+        """Changes with the tags of any device."""
+        self.answers = 0
+        """Changes when a device stops to answer, or answers again."""
         self._heartbeat = Heartbeat()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="holdfast-tags", daemon=True)
@@ -79,6 +84,10 @@ class TagValues:
                 if name not in readers
                 or name not in self._readers
                 or readers[name].tags != self._readers[name].tags
+            }
+            self.revision += bool(changed)
+            self._answering = {
+                name: answers for name, answers in self._answering.items() if name in readers
             }
             self._readers = {
                 name: reader if name in changed else self._readers[name]
@@ -125,6 +134,26 @@ class TagValues:
         with self._lock:
             return [reading for readings in self._latest.values() for reading in readings]
 
+    def tags(self, only: Collection[str] | None) -> dict[str, tuple[Tag, ...]]:
+        """The tags of each device, or only of some. Thread-safe."""
+        with self._lock:
+            readers = self._readers
+        return {
+            name: reader.tags for name, reader in readers.items() if only is None or name in only
+        }
+
+    def answering(self, only: Collection[str] | None) -> dict[str, bool]:
+        """Whether each device answers, or only some, as far as it is known. Thread-safe."""
+        with self._lock:
+            found = dict(self._answering)
+        return {name: answers for name, answers in found.items() if only is None or name in only}
+
+    def refresh(self, output: str) -> None:
+        """Publishes the next value of each tag to an output, also if unchanged. Thread-safe."""
+        with self._lock:
+            if output in self._outputs:
+                self._outputs[output].changes.forget(self._readers)
+
     def heartbeat(self) -> ThreadHeartbeat | None:
         """The heartbeat of the thread; `None` before the start."""
         if self._thread.ident is None:
@@ -155,6 +184,10 @@ class TagValues:
     def _hand_out(self, polls: Iterable[DevicePoll]) -> None:
         for poll in polls:
             self._latest[poll.device] = poll.readings
+            answers = poll.has_answered
+            if self._answering.get(poll.device) is not answers:
+                self._answering[poll.device] = answers
+                self.answers += 1
         for output in self._outputs.values():
             only = output.settings.devices
             readings = [

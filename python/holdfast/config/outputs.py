@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, Strict
+from pydantic import BeforeValidator, Field, Strict
 
 from holdfast.config.base import Model
 from holdfast.config.http_url import HttpTarget, parse_http
-from holdfast.config.scalars import Duration, FilePath, HttpUrl, Name, NotNull, SubjectPrefix
+from holdfast.config.scalars import (
+    Duration,
+    FilePath,
+    HttpUrl,
+    MqttText,
+    Name,
+    NotNull,
+    SubjectPrefix,
+    TopicName,
+    TopicTemplate,
+    integral,
+)
 from holdfast.config.scanning import PREFIX, Dialect
-from holdfast.config.services import ClientTlsConfig, NatsServersConfig
+from holdfast.config.services import BrokerConfig, ClientTlsConfig, NatsServersConfig
+from holdfast.config.topics import TopicNames
 
 MOST_VALUES = 1_000_000
 MEASUREMENT = "modbus"
@@ -106,7 +118,37 @@ class NatsOutputConfig(NatsServersConfig, OutputConfig):
     """The programs that read the messages: those of tentacle-modbus, or of tentacle-next."""
 
 
-OUTPUT_TYPES = ("influx", "file", "nats")
+class MqttOutputConfig(OutputConfig, BrokerConfig):
+    """Topics of an MQTT broker, and commands from there."""
+
+    type: Literal["mqtt"]
+    """The type of the output."""
+    client_id: Annotated[MqttText | None, NotNull()] = None
+    """The client identifier. Default: holdfast, the name of the output, and that of the host."""
+    topic: Annotated[TopicTemplate | None, NotNull()] = None
+    """The topics of values. Default: plant/{device}/{tag}, with payload: device plant/{device}."""
+    payload: Literal["plain", "json", "device"] = "plain"
+    """plain: text; json: an object with value, time and unit; device: one object for each poll."""
+    retain: bool = True
+    """Whether the broker keeps the last message of each topic for new subscribers."""
+    qos: Annotated[Literal[0, 1], BeforeValidator(integral)] = 1
+    """The quality of service. 0: a message may be lost with the connection."""
+    status: Annotated[TopicName | None, NotNull()] = None
+    """The topic that is online or offline. Default: the begin of topic, then holdfast/status."""
+    writes: bool = False
+    """Whether messages to the set topics of writable tags are written to their devices."""
+    discovery: Annotated[Literal["homeassistant"] | None, NotNull()] = None
+    """Whose discovery messages are published. Default: none."""
+    discovery_prefix: TopicName = "homeassistant"
+    """The begin of the topics of Home Assistant."""
+
+    @property
+    def topics(self) -> TopicNames:
+        """The names of all topics."""
+        return TopicNames(self.topic, self.status, whole_device=self.payload == "device")
+
+
+OUTPUT_TYPES = ("influx", "mqtt", "file", "nats")
 """All values of `type`."""
 
-Output: TypeAlias = InfluxConfig | FileConfig | NatsOutputConfig
+Output: TypeAlias = InfluxConfig | MqttOutputConfig | FileConfig | NatsOutputConfig

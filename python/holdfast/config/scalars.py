@@ -47,6 +47,7 @@ from holdfast.config.scanning import (
     written_pollable,
 )
 from holdfast.config.syslog import parse_syslog
+from holdfast.config.topics import parse_topic_name, parse_topic_template
 from holdfast.config.unit_keys import EXAMPLE, UnitKey, parse_unit_key
 from holdfast.config.words import choice, shape, show
 from holdfast.net.addresses import Network
@@ -167,7 +168,7 @@ def _receiver_url(value: object, info: ValidationInfo) -> str:
     return receiver_in_folder(str(value), _folder(info))
 
 
-def _integral(value: object) -> object:
+def integral(value: object) -> object:
     """Refuses `true` and `1.0`, which pydantic's literals accept as 1."""
     if type(value) is not int:
         raise PydanticCustomError("integral", "not an integer")
@@ -393,14 +394,24 @@ TopicFilter = Annotated[
     PlainValidator(parse_topic_filter),
     WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_TEXT}),
 ]
+TopicName = Annotated[
+    str,
+    PlainValidator(parse_topic_name),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_TEXT}),
+]
+TopicTemplate = Annotated[
+    str,
+    PlainValidator(parse_topic_template),
+    WithJsonSchema({"type": "string", "examples": ["plant/{device}/{tag}"]}),
+]
 MqttVersion = Annotated[
     Literal["5", "3.1.1"],
     BeforeValidator(_version, json_schema_input_type=Literal["5", "3.1.1", 5]),
 ]
-QualityOfService = Annotated[Literal[0, 1, 2], BeforeValidator(_integral)]
-StopBits = Annotated[Literal[1, 2], BeforeValidator(_integral)]
-DataBits = Annotated[Literal[7, 8], BeforeValidator(_integral)]
-EightBits = Annotated[Literal[8], BeforeValidator(_integral)]
+QualityOfService = Annotated[Literal[0, 1, 2], BeforeValidator(integral)]
+StopBits = Annotated[Literal[1, 2], BeforeValidator(integral)]
+DataBits = Annotated[Literal[7, 8], BeforeValidator(integral)]
+EightBits = Annotated[Literal[8], BeforeValidator(integral)]
 Connections = Annotated[int, Field(ge=1, le=MAX_CONNECTIONS)]
 Rate = Annotated[int, Field(ge=1, le=MAX_RATE)]
 Source = Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from holdfast import logs
 
@@ -53,6 +53,14 @@ class Receiver(Protocol):
         """Plain data for diagnostics, without secrets. Called from any thread."""
 
 
+@runtime_checkable
+class Interruptible(Protocol):
+    """A receiver whose waiting ends with the output."""
+
+    def until(self, stop: Stop) -> None:
+        """Takes the stop of the output. Called before all else."""
+
+
 class Sending:
     """An adapter that sends what is in a buffer to a receiver."""
 
@@ -73,6 +81,8 @@ class Sending:
     def run(self, stop: Stop) -> None:
         """Sends until `stop` is set. What is left is sent too if that is quick, or kept."""
         stop.then(self._buffer.wake)
+        if isinstance(self._receiver, Interruptible):
+            self._receiver.until(stop)
         try:
             while not stop.is_set():
                 self._use_file()

@@ -1,0 +1,68 @@
+"""The names of the topics that an MQTT output uses."""
+
+from __future__ import annotations
+
+import re
+
+from holdfast.config.broker import parse_topic_filter
+from holdfast.config.words import show
+
+BASE = "plant"
+DEVICE, TAG = "{device}", "{tag}"
+
+SET, REPLY = "set", "reply"
+"""The levels after the topic of a tag for commands, and for replies to them."""
+
+
+def parse_topic_name(text: object) -> str:
+    """Checks the name of a topic to publish to. Raises `ValueError`."""
+    name = parse_topic_filter(text)
+    if "+" in name or "#" in name or name.startswith("$"):
+        raise ValueError(f"found {show(name)}, allowed: a topic without +, # and $ at its begin")
+    return name
+
+
+def parse_topic_template(text: object) -> str:
+    """Checks a topic with placeholders. Raises `ValueError`.
+
+    A placeholder is a whole level, so that no two tags share a topic.
+    """
+    template = parse_topic_name(text)
+    levels = template.split("/")
+    for level in levels:
+        if level not in (DEVICE, TAG) and ("{" in level or "}" in level):
+            known = re.fullmatch(r"\{[^{}]*\}", level) is None and (DEVICE in level or TAG in level)
+            words = "each alone in its level" if known else f"only {DEVICE} and {TAG}"
+            raise ValueError(f"found {show(template)}, allowed as placeholders: {words}")
+    if levels.count(DEVICE) != 1 or levels.count(TAG) > 1:
+        raise ValueError(f"found {show(template)}, allowed: {DEVICE} once, {TAG} at most once")
+    return template
+
+
+class TopicNames:
+    """The names of topics, from a template. Names of devices and tags are safe in topics."""
+
+    def __init__(self, template: str | None, status: str | None, *, whole_device: bool) -> None:
+        if template is None:
+            template = f"{BASE}/{DEVICE}" if whole_device else f"{BASE}/{DEVICE}/{TAG}"
+        self.template = template
+        first = template.partition("{")[0].rstrip("/")
+        self.status = status or "/".join([*([first] if first else []), "holdfast", "status"])
+        """The topic of the output itself."""
+
+    def of_device(self, device: str) -> str:
+        """The topic of a device, for templates without tag."""
+        return self.template.replace(DEVICE, device)
+
+    def of_tag(self, device: str, tag: str) -> str:
+        """The topic of a tag."""
+        topic = self.of_device(device)
+        return topic.replace(TAG, tag) if TAG in self.template else f"{topic}/{tag}"
+
+    def of_commands(self, device: str, tag: str) -> str:
+        """The topic that commands for a tag are sent to."""
+        return f"{self.of_tag(device, tag)}/{SET}"
+
+    def of_availability(self, device: str) -> str:
+        """The topic that is online while a device answers."""
+        return f"{self.status}/{device}"

@@ -1,0 +1,133 @@
+"""Commands: messages to the set topics of tags, and the replies to them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from functools import partial
+from typing import TYPE_CHECKING
+
+import msgspec
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from holdfast import logs
+from holdfast.config.topics import REPLY
+from holdfast.outputs.mqtt.messages import NO_PROPERTIES, Message, packed_topic
+from holdfast.outputs.site import NotWritten
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from holdfast.config.topics import TopicNames
+    from holdfast.mqtt.packets import Publish
+    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.outputs.mqtt.session import Session
+    from holdfast.outputs.site import Site
+    from holdfast.tags import Tag
+
+MOST_REPLIES = 1000
+"""The most replies that the broker has not confirmed; more are dropped and counted."""
+
+
+class Commands:
+    """The set topics of writable tags. A stale command must never be carried out: retained
+    messages are ignored, and the broker keeps no session.
+    """
+
+    def __init__(self, output: str, broker: str, names: TopicNames, site: Site) -> None:
+        self._output, self._broker = output, broker
+        self._names, self._site = names, site
+        self._tags: dict[str, tuple[str, str]] = {}
+        self._lock = threading.Lock()
+        self._replies: list[Delivery] = []
+        self.written = self.refused = self.ignored = self.replies_dropped = 0
+
+    def adopt(self, tags: Mapping[str, Sequence[Tag]]) -> list[str]:
+        """Takes over the tags. Returns the topics to subscribe to."""
+        self._tags = {
+            self._names.of_commands(device, tag.name): (device, tag.name)
+            for device, some in tags.items()
+            for tag in some
+            if tag.writable
+        }
+        return list(self._tags)
+
+    def take(self, message: Publish, session: Session, *, is_retained: bool) -> bool:
+        """Carries out a message, if its topic is one of a writable tag."""
+        found = self._tags.get(message.topic)
+        if found is None:
+            return False
+        if is_retained:
+            self.ignored += 1
+            logs.refused(
+                "output_command_ignored",
+                kind=self._output,
+                output=self._output,
+                topic=message.topic,
+                reason="retained",
+            )
+        elif message.payload:
+            self._write(message, session, *found)
+        return True
+
+    def _write(self, message: Publish, session: Session, device: str, tag: str) -> None:
+        done = partial(self._done, message, session, device, tag)
+        try:
+            try:
+                text = bytes(message.payload).decode()
+            except UnicodeDecodeError:
+                raise NotWritten("invalid_value", "the payload is not UTF-8") from None
+            if message.problem is not None:
+                raise NotWritten("malformed", message.problem)
+            peer = f"{self._broker} {message.topic}"
+            self._site.write(device, tag, text, peer, done)
+        except NotWritten as refused:
+            done(refused)
+
+    def _done(
+        self,
+        message: Publish,
+        session: Session,
+        device: str,
+        tag: str,
+        refused: NotWritten | None,
+    ) -> None:
+        """Logs and counts an outcome, and replies. Called by any thread."""
+        fields = {"output": self._output, "device": device, "tag": tag}
+        with self._lock:
+            self.written += refused is None
+            self.refused += refused is not None
+        if refused is None:
+            logs.write(logging.INFO, "output_command_written", **fields)
+            reply = {"status": "accepted", "device": device, "tag": tag}
+        else:
+            logs.refused(
+                "output_command_refused", kind=self._output, **fields, reason=refused.reason
+            )
+            reply = {"status": "rejected", "device": device, "tag": tag}
+            reply |= {"reason": refused.reason, "detail": refused.detail}
+        answer = self._answer(message, msgspec.json.encode(reply))
+        with self._lock:
+            self._replies = [each for each in self._replies if not each.is_done]
+            if answer is None or len(self._replies) >= MOST_REPLIES or session.error is not None:
+                self.replies_dropped += 1
+                return
+            self._replies.append(session.publish([answer]))
+
+    def _answer(self, message: Publish, payload: bytes) -> Message | None:
+        """The reply: to the response topic of MQTT 5, or beside the command."""
+        properties = NO_PROPERTIES
+        topic = f"{message.topic}/{REPLY}"
+        if message.response_topic is not None:
+            try:
+                topic = message.response_topic.decode()
+            except UnicodeDecodeError:
+                return None
+            if not topic or set(topic) & set("+#\0") or topic in self._tags:
+                return None
+            if message.correlation is not None:
+                packed = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+                packed.CorrelationData = message.correlation
+                properties = packed.pack()  # type: ignore[no-untyped-call]
+        return Message(packed_topic(topic), payload, properties=properties)

@@ -1,0 +1,232 @@
+"""One connection to a broker, for many messages: paho's client with two changes.
+
+- Many messages are sent with one call, and many confirmations read with one.
+- A packet over the size limit is skipped.
+
+All methods are for the thread that serves the connection.
+"""
+
+from __future__ import annotations
+
+import ssl
+from collections import deque
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from holdfast.mqtt.client import BrokerClient
+from holdfast.mqtt.packets import parse_publish
+from holdfast.outputs.mqtt.messages import Message, packed, size_of
+from holdfast.outputs.mqtt.packets import MAX_PACKET, Packets
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable, Iterator, Sequence
+
+    from paho.mqtt.properties import Properties
+
+    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.mqtt.packets import Publish
+    from holdfast.outputs.mqtt.messages import Delivery
+
+WINDOW = {"5": 1000, "3.1.1": 100}
+"""Messages that are sent and not confirmed, unless the broker allows fewer. MQTT 3.1.1 has no way
+to tell."""
+
+FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
+"""Packet identifiers of messages. paho counts those of subscriptions from 1."""
+
+TOPICS = 100
+"""Topics in one SUBSCRIBE packet."""
+
+PUBLISH, PUBACK = 0x30, 0x40
+QUOTA_EXCEEDED = 0x97
+READ = 262_144
+
+
+class Connection(BrokerClient):
+    """One connection. `on_command` is called for each message, with whether it was retained."""
+
+    def __init__(
+        self,
+        settings: MqttOutputConfig,
+        client_id: str,
+        password: bytes | None,
+        dial: Callable[[], socket.socket],
+        on_command: Callable[[Publish, bool], None],
+    ) -> None:
+        super().__init__(settings, client_id, password, dial, session_expiry=0)
+        self._on_command = on_command
+        self._qos = settings.qos
+        self._window = WINDOW[settings.version]
+        self._largest: int | None = None
+        self._retains = True
+        self._packets = Packets()
+        self._waiting: deque[Delivery] = deque()
+        self._in_flight: dict[int, tuple[Delivery, int]] = {}
+        self._written: list[Delivery] = []
+        self._next = FIRST_IDENTIFIER
+
+    def greet(self) -> None:
+        """Dials and sends CONNECT."""
+        self.open(MaximumPacketSize=MAX_PACKET)
+
+    def accepted(self, properties: Properties | None) -> None:
+        """Applies the limits from the broker's CONNACK."""
+        self.on_log = None
+        self._window = min(getattr(properties, "ReceiveMaximum", self._window), self._window)
+        self._largest = getattr(properties, "MaximumPacketSize", None)
+        self._retains = bool(getattr(properties, "RetainAvailable", 1))
+        self._qos = min(getattr(properties, "MaximumQoS", self._qos), self._qos)
+
+    @property
+    def skipped(self) -> int:
+        """Packets of the broker that were too large."""
+        return self._packets.skipped
+
+    def publish_all(self, delivery: Delivery) -> None:
+        """Publishes messages after those that wait."""
+        self._waiting.append(delivery)
+
+    def ask_for(self, topics: Sequence[str], *, retained: bool) -> None:
+        """Subscribes to topics. With MQTT 5, retained messages come only if they are wanted, and
+        those of this client never.
+        """
+        for at in range(0, len(topics), TOPICS):
+            some = topics[at : at + TOPICS]
+            if not self._five:
+                self.subscribe([(topic, 1) for topic in some])
+                continue
+            handling = (
+                SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+                if retained
+                else SubscribeOptions.RETAIN_DO_NOT_SEND
+            )
+            options = SubscribeOptions(qos=1, noLocal=True, retainHandling=handling)
+            self.subscribe([(topic, options) for topic in some])
+
+    def send_more(self) -> bool:
+        """Sends waiting messages, as many as the broker may have. Returns whether some are done."""
+        news = False
+        while self._waiting and len(self._in_flight) < self._window:
+            delivery = self._waiting[0]
+            news |= self._send(delivery, self._window - len(self._in_flight))
+            if delivery.sent == len(delivery.messages):
+                self._waiting.popleft()
+        if self._written and not self.want_write():
+            for delivery in self._written:
+                delivery.confirmed = len(delivery.messages)
+            self._written.clear()
+            news = True
+        return news
+
+    def _send(self, delivery: Delivery, room: int) -> bool:
+        """Sends the next messages. Returns whether some were refused."""
+        first = delivery.sent
+        some = delivery.messages[first : first + room]
+        delivery.sent += len(some)
+        if not self._retains:
+            some = [Message(topic, payload, False, more) for topic, payload, _, more in some]
+        places = list(range(first, delivery.sent))
+        large = [place for place in places if not self._fits(delivery.messages[place])]
+        for place in large:
+            delivery.refuse(place, f"it has more than the {self._largest} bytes that are allowed")
+        if large:
+            places = [place for place in places if place not in large]
+            some = [some[place - first] for place in places]
+        identifiers = [0] * len(some)
+        if self._qos:
+            identifiers = list(islice(self._identifiers(), len(some)))
+            self._in_flight.update(
+                zip(identifiers, [(delivery, place) for place in places], strict=True)
+            )
+        elif delivery.sent == len(delivery.messages):
+            self._written.append(delivery)
+        if some:
+            data = packed(some, identifiers, qos=self._qos, five=self._five)
+            self._packet_queue(PUBLISH, data, 0, 1)
+        return bool(large)
+
+    def _fits(self, message: Message) -> bool:
+        return self._largest is None or size_of(message) <= self._largest
+
+    def _identifiers(self) -> Iterator[int]:
+        while True:
+            identifier = self._next
+            self._next = identifier + 1 if identifier < LAST_IDENTIFIER else FIRST_IDENTIFIER
+            if identifier not in self._in_flight:
+                yield identifier
+
+    def read_more(self) -> bool:
+        """Reads what has arrived. Returns whether some deliveries are done."""
+        connection = self.socket()
+        if connection is None:
+            return False
+        try:
+            data = connection.recv(READ)
+        except (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError):
+            return False
+        except OSError as error:
+            self._end(f"the connection was lost: {error}")
+            return False
+        if not data:
+            self._end("the broker closed the connection")
+            return False
+        news = False
+        for first, body in self._packets.feed(data):
+            if first == PUBACK:
+                news |= self._confirmed(body)
+            elif first & 0xF0 == PUBLISH:
+                self._received(first, body)
+            elif self._passed(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
+                self._end(self.trouble or "the broker sent a malformed packet")
+            if self.socket() is None:
+                break
+        return news
+
+    def _passed(self, first: int, body: bytes) -> MQTTErrorCode:
+        """Passes a packet to paho."""
+        self._in_packet = {
+            "command": first,
+            "have_remaining": 1,
+            "remaining_count": [],
+            "remaining_mult": 1,
+            "remaining_length": len(body),
+            "packet": bytearray(body),
+            "to_process": 0,
+            "pos": 0,
+        }
+        return self._packet_handle()
+
+    def _confirmed(self, body: bytes) -> bool:
+        """Notes a confirmation. Returns whether the delivery is done."""
+        known = self._in_flight.pop(int.from_bytes(body[:2]), None)
+        if known is None:
+            return False
+        delivery, index = known
+        code = body[2] if len(body) > 2 else 0
+        if code < 128:
+            delivery.confirm(index)
+            return delivery.is_done
+        reason = str(ReasonCode(PacketTypes.PUBACK, identifier=code))
+        if code == QUOTA_EXCEEDED:
+            self._end(f"the broker did not accept a message: {reason}")
+            return False
+        delivery.refuse(index, reason)
+        return delivery.is_done
+
+    def _received(self, first: int, body: bytes) -> None:
+        message = parse_publish(first, body, len(body), five=self._five)
+        if message.qos == 1:
+            self._send_puback(message.identifier)
+        elif message.qos == 2:
+            raise ValueError("a message with a quality of service that was not requested")
+        self._on_command(message, bool(first & 1))
+
+    def _end(self, reason: str) -> None:
+        self.trouble = reason
+        self._sock_close()

@@ -1,0 +1,240 @@
+"""The receiver of an MQTT output: its connection, and what is published besides values."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections import deque
+from typing import TYPE_CHECKING
+
+from holdfast import logs
+from holdfast.net.addresses import joined
+from holdfast.outputs.mqtt.commands import Commands
+from holdfast.outputs.mqtt.home_assistant import Discovery
+from holdfast.outputs.mqtt.messages import Message, packed_topic
+from holdfast.outputs.mqtt.payloads import Payloads
+from holdfast.outputs.mqtt.session import Session
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.mqtt.packets import Publish
+    from holdfast.outputs.mqtt.messages import Delivery
+    from holdfast.outputs.site import Site
+    from holdfast.polling import Reading
+    from holdfast.stop import Stop
+    from holdfast.tags import Tag
+
+ONLINE, OFFLINE = b"online", b"offline"
+
+
+class MqttOutput:
+    """Publishes readings. Reconnects when it is asked to send, and after an idle second."""
+
+    def __init__(self, name: str, settings: MqttOutputConfig, site: Site) -> None:
+        self._name, self._settings, self._site = name, settings, site
+        self._topics = settings.topics
+        self._client_id = settings.client_id or f"holdfast-{name}-{socket.gethostname()}"
+        self._payloads = Payloads(settings)
+        self._session: Session | None = None
+        self._stop: Stop | None = None
+        self._taken: list[Reading] = []
+        self._messages: Sequence[Message] = ()
+        self._broker = joined(settings.host, settings.port)
+        self._commands = Commands(name, self._broker, self._topics, site)
+        self._tags: dict[str, set[str]] = {}
+        self._answering: dict[str, bool] = {}
+        self._answers = self._revision = -1
+        self._discovery = None if settings.discovery is None else Discovery(name, settings)
+        self._entities: dict[str, bytes] = {}
+        self._found: deque[str] = deque()
+        self._is_born = threading.Event()
+        self._connects = self._not_accepted = 0
+
+    def until(self, stop: Stop) -> None:
+        """Takes the stop that ends all waiting. Called before all else."""
+        self._stop = stop
+
+    def send(self, readings: list[Reading]) -> None:
+        """Publishes readings, and waits until the broker has confirmed them.
+
+        If it fails and is called with the same readings, it goes on where it was.
+        """
+        session = self._connected()
+        self._keep_up(session)
+        if readings is not self._taken:
+            self._payloads.settle(sent=False)
+            self._taken, self._messages = readings, self._payloads.messages(readings)
+        delivery = session.publish(self._messages)
+        try:
+            session.wait(delivery)
+        except OSError:
+            self._disconnect()
+            self._messages = self._messages[delivery.confirmed :]
+            raise
+        finally:
+            self._tell_refused(delivery)
+        self._payloads.settle(sent=True)
+        self._taken, self._messages = [], ()
+        self._tell_availability(session, answering=True)
+
+    def idle(self) -> None:
+        """Keeps the connection, and publishes what has changed besides values."""
+        session = self._connected()
+        self._keep_up(session)
+        self._tell_availability(session, answering=True)
+
+    def close(self) -> None:
+        """Publishes that this output is offline, and ends the connection."""
+        self._disconnect(self._status(OFFLINE))
+
+    def status(self) -> dict[str, object]:
+        """The broker and the connection."""
+        return {
+            "broker": self._broker,
+            "client_id": self._client_id,
+            "version": self._settings.version,
+            "reconnects": max(0, self._connects - 1),
+            "not_accepted": self._not_accepted,
+            "commands_written": self._commands.written,
+            "commands_refused": self._commands.refused,
+            "commands_ignored": self._commands.ignored,
+            "replies_dropped": self._commands.replies_dropped,
+        }
+
+    def _connected(self) -> Session:
+        """The session; a new one if there is none. Raises `OSError`."""
+        if self._session is not None and (error := self._session.error) is not None:
+            self._disconnect()
+            raise ConnectionError(error)
+        if self._session is None:
+            assert self._stop is not None, "until comes first"
+            self._session = Session(
+                self._settings, self._client_id, self._status(OFFLINE), self._on_message, self._stop
+            )
+            self._connects += 1
+            self._greet(self._session)
+        return self._session
+
+    def _greet(self, session: Session) -> None:
+        """Publishes what a broker may have lost, or has never had."""
+        self._answering, self._answers, self._revision = {}, -1, -1
+        self._entities = {}
+        session.publish([self._status(ONLINE)])
+        if self._connects > 1:
+            self._site.refresh()
+
+    def _keep_up(self, session: Session) -> None:
+        """Publishes what has to be known before values."""
+        revision = self._site.revision
+        if revision != self._revision:
+            self._revision = revision
+            self._adopt(session, self._site.tags())
+        if self._discovery is not None:
+            if self._is_born.is_set():
+                self._is_born.clear()
+                self._publish(session, self._entities)
+            self._remove_stale(session)
+        self._tell_availability(session, answering=False)
+
+    def _adopt(self, session: Session, tags: Mapping[str, Sequence[Tag]]) -> None:
+        """Takes over the tags: of the first configuration, and after each reload."""
+        if self._settings.writes:
+            session.subscribe(self._commands.adopt(tags), retained=False)
+        names = {device: {tag.name for tag in some} for device, some in tags.items()}
+        self._payloads.forget(names)
+        gone = dict.fromkeys(self._topics_of(self._tags) - self._topics_of(names), b"")
+        self._tags = names
+        self._publish(session, gone)
+        for device in self._answering.keys() - names:
+            del self._answering[device]
+        if self._discovery is None:
+            return
+        if not self._entities:
+            session.subscribe([self._discovery.birth_topic], retained=False)
+        before, self._entities = self._entities, self._discovery.entities(tags)
+        changed = {
+            topic: entity for topic, entity in self._entities.items() if before.get(topic) != entity
+        }
+        self._publish(session, {**dict.fromkeys(before.keys() - self._entities, b""), **changed})
+        if not before:
+            session.subscribe([self._discovery.filter], retained=True)
+
+    def _topics_of(self, tags: Mapping[str, set[str]]) -> set[str]:
+        """The retained topics of devices and tags."""
+        names = self._topics
+        found = {names.of_availability(device) for device in tags}
+        if not self._settings.retain:
+            return found
+        if self._settings.payload == "device":
+            return found | {names.of_device(device) for device in tags}
+        return found | {names.of_tag(device, tag) for device, some in tags.items() for tag in some}
+
+    def _remove_stale(self, session: Session) -> None:
+        """Removes entities of an earlier configuration, which the broker has kept."""
+        stale: dict[str, bytes] = {}
+        while self._found:
+            topic = self._found.popleft()
+            if topic not in self._entities:
+                stale[topic] = b""
+        self._publish(session, stale)
+
+    @staticmethod
+    def _publish(session: Session, retained: Mapping[str, bytes]) -> None:
+        if retained:
+            messages = retained.items()
+            session.publish([Message(packed_topic(key), text, True) for key, text in messages])
+
+    def _disconnect(self, *last: Message) -> None:
+        session, self._session = self._session, None
+        if session is not None:
+            session.close(last)
+
+    def _tell_availability(self, session: Session, *, answering: bool) -> None:
+        """Publishes devices that stopped answering before values, the others after them."""
+        now = self._site.answers
+        if now == self._answers:
+            return
+        if answering:
+            self._answers = now
+        found = self._site.answering()
+        changed = [
+            device
+            for device, answers in found.items()
+            if answers is answering and self._answering.get(device) is not answers
+        ]
+        self._answering.update(dict.fromkeys(changed, answering))
+        payload = ONLINE if answering else OFFLINE
+        topics = [self._topics.of_availability(device) for device in changed]
+        if topics:
+            session.publish([Message(packed_topic(topic), payload, True) for topic in topics])
+
+    def _status(self, payload: bytes) -> Message:
+        return Message(packed_topic(self._topics.status), payload, True)
+
+    def _tell_refused(self, delivery: Delivery) -> None:
+        self._not_accepted += len(delivery.refused)
+        for message, reason in delivery.refused[:1]:
+            topic = message.topic[2:].decode()
+            logs.refused(
+                "output_not_accepted",
+                kind=self._name,
+                output=self._name,
+                topic=topic,
+                reason=reason,
+                count=len(delivery.refused),
+            )
+
+    def _on_message(self, message: Publish, is_retained: bool) -> None:
+        """Takes a message of the broker. Called by the thread of the connection."""
+        session = self._session
+        if session is None or self._commands.take(message, session, is_retained=is_retained):
+            return
+        if self._discovery is None:
+            return
+        if message.topic == self._discovery.birth_topic:
+            if message.payload == ONLINE and not is_retained:
+                self._is_born.set()
+        elif is_retained and message.payload and self._discovery.owns(message.topic):
+            self._found.append(message.topic)

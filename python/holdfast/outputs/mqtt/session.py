@@ -1,0 +1,240 @@
+"""A connection to a broker with a thread of its own, from connecting to its end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from holdfast import logs
+from holdfast.mqtt.dialing import dial
+from holdfast.mqtt.password import read_password
+from holdfast.mqtt.waiting import Ended, Waiter
+from holdfast.net.tls import NO_FILES, broker_context
+from holdfast.outputs.mqtt.connection import Connection
+from holdfast.outputs.mqtt.messages import Delivery, Message
+from holdfast.stop import Stop
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable, Sequence
+
+    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
+    from paho.mqtt.properties import Properties
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.mqtt.packets import Publish
+
+WELCOME = 10.0
+"""Seconds to wait for the broker's CONNACK."""
+
+PROGRESS = 10.0
+"""Seconds without any confirmation after which the connection is given up."""
+
+SLICE = 0.2
+"""Seconds of one wait, between which a stop is noticed."""
+
+LAST = 1.0
+"""Seconds for what is published at the end."""
+
+TICK = 1.0
+"""Seconds between checks of the keep-alive."""
+
+
+class Session:
+    """A connection. Raises `OSError` if it can't be opened. Methods are thread-safe."""
+
+    def __init__(
+        self,
+        settings: MqttOutputConfig,
+        client_id: str,
+        will: Message | None,
+        on_command: Callable[[Publish, bool], None],
+        stop: Stop,
+    ) -> None:
+        self._settings = settings
+        self._stop, self._end = stop, Stop()
+        self._lock = threading.Lock()
+        self._news = threading.Condition(self._lock)
+        self._new: list[Delivery] = []
+        self._topics: list[tuple[Sequence[str], bool]] = []
+        self._is_accepted = False
+        self._reason: str | None = None
+        self._is_over = False
+        self._waiter = Waiter(self._end)
+        try:
+            self._connection = self._opened(client_id, will, on_command)
+        except BaseException:
+            self._waiter.close()
+            raise
+        self._thread = threading.Thread(
+            target=self._serve, name=f"{threading.current_thread().name}-link", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def error(self) -> str | None:
+        """Why the connection is over; `None` if it is not."""
+        return (self._reason or "the connection was lost") if self._is_over else None
+
+    def publish(self, messages: Sequence[Message]) -> Delivery:
+        """Publishes messages after those before."""
+        delivery = Delivery(messages)
+        with self._lock:
+            self._new.append(delivery)
+        self._waiter.wake()
+        return delivery
+
+    def subscribe(self, topics: Sequence[str], *, retained: bool) -> None:
+        """Subscribes to topics."""
+        with self._lock:
+            self._topics.append((topics, retained))
+        self._waiter.wake()
+
+    def wait(self, delivery: Delivery) -> None:
+        """Waits until the broker has confirmed all messages. Raises `OSError`.
+
+        After a stop, it waits only a short time.
+        """
+        confirmed, since = delivery.confirmed, time.monotonic()
+        with self._news:
+            while not delivery.is_done:
+                if self._is_over:
+                    raise ConnectionError(self.error)
+                self._news.wait(SLICE)
+                now = time.monotonic()
+                if delivery.confirmed != confirmed:
+                    confirmed, since = delivery.confirmed, now
+                elif now - since > (LAST if self._stop.is_set() else PROGRESS):
+                    raise TimeoutError("the broker confirmed no message in time")
+
+    def close(self, last: Sequence[Message] = ()) -> None:
+        """Publishes the last messages, and ends the connection."""
+        if last and not self._is_over:
+            delivery = self.publish(last)
+            with self._news:
+                self._news.wait_for(lambda: delivery.is_done or self._is_over, LAST)
+        self._end.set()
+        self._thread.join()
+
+    def _opened(
+        self,
+        client_id: str,
+        will: Message | None,
+        on_command: Callable[[Publish, bool], None],
+    ) -> Connection:
+        """Connects, and waits for the broker's consent. A stop interrupts it."""
+        settings = self._settings
+        tls = NO_FILES if settings.tls is None else settings.tls.files
+        context = broker_context(tls) if settings.secure else None
+        with Waiter(self._stop) as waiter:
+
+            def open_socket() -> socket.socket:
+                return dial(settings.host, settings.port, context, waiter)
+
+            password = read_password(settings.password_file)
+            connection = Connection(settings, client_id, password, open_socket, on_command)
+            connection.on_connect = self._on_connect
+            connection.on_disconnect = self._on_disconnect
+            if will is not None:
+                connection.will_set(
+                    will.topic[2:].decode(), will.payload, settings.qos, will.retain
+                )
+            try:
+                connection.greet()
+                end = time.monotonic() + WELCOME
+                while not self._is_accepted and connection.socket() is not None:
+                    if time.monotonic() > end:
+                        raise TimeoutError(f"the broker did not answer within {WELCOME:g} s")
+                    self._step(connection, waiter)
+                if not self._is_accepted:
+                    reason = self._reason or connection.trouble
+                    raise ConnectionError(reason or "the broker closed the connection")
+            except Ended:
+                connection.close()
+                raise ConnectionError("stopped") from None
+            except ValueError as error:
+                connection.close()
+                raise ConnectionError(f"the broker sent a malformed packet: {error}") from error
+            except BaseException:
+                connection.close()
+                raise
+        return connection
+
+    def _serve(self) -> None:
+        """Serves the connection to its end."""
+        connection = self._connection
+        try:
+            while connection.socket() is not None:
+                with self._lock:
+                    new, self._new = self._new, []
+                    topics, self._topics = self._topics, []
+                for some, retained in topics:
+                    connection.ask_for(some, retained=retained)
+                for delivery in new:
+                    connection.publish_all(delivery)
+                if connection.send_more():
+                    self._tell()
+                self._step(connection, self._waiter)
+        except Ended:
+            connection.disconnect()
+        except (OSError, ValueError) as error:
+            self._reason = str(error)
+        except Exception as error:  # Nothing that a broker sends may end the output.
+            logs.problem("mqtt_failed", broker=self._settings.url)
+            self._reason = type(error).__name__
+        finally:
+            connection.close()
+            self._reason = connection.trouble or self._reason
+            self._waiter.close()
+            with self._news:
+                self._is_over = True
+                self._news.notify_all()
+
+    def _step(self, connection: Connection, waiter: Waiter) -> None:
+        """Waits once, then reads and writes."""
+        open_socket = connection.socket()
+        assert open_socket is not None, "called only while it is open"
+        pending = getattr(open_socket, "pending", int)() > 0
+        readable, writable = waiter.wait(
+            open_socket,  # type: ignore[arg-type]
+            read=True,
+            write=connection.want_write(),
+            seconds=0.0 if pending else min(TICK, self._settings.keep_alive / 2),
+        )
+        if writable:
+            connection.loop_write()
+        if (readable or pending) and connection.read_more():
+            self._tell()
+        connection.loop_misc()
+
+    def _tell(self) -> None:
+        with self._news:
+            self._news.notify_all()
+
+    def _on_connect(
+        self,
+        connection: Client,
+        _data: object,
+        _flags: ConnectFlags,
+        reason: ReasonCode,
+        properties: Properties | None,
+    ) -> None:
+        assert isinstance(connection, Connection)
+        if reason.is_failure:
+            self._reason = f"the broker refused the connection: {reason}"
+            return
+        connection.accepted(properties)
+        self._is_accepted = True
+
+    def _on_disconnect(
+        self,
+        _connection: Client,
+        _data: object,
+        flags: DisconnectFlags,
+        reason: ReasonCode,
+        _properties: Properties | None,
+    ) -> None:
+        if self._reason is None and flags.is_disconnect_packet_from_server:
+            self._reason = f"the broker ended the connection: {reason}"

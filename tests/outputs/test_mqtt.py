@@ -1,0 +1,228 @@
+"""MQTT outputs with a real broker: what is published, and what an outage costs."""
+
+from __future__ import annotations
+
+import subprocess
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.outputs import sending
+from holdfast.outputs.mqtt import session
+from support import wire
+from support.machine import tool
+from support.mqtt_plant import Plant, texts
+from support.polled import until_polled
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+        monkeypatch.setattr(sending, name, 0.05)
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    with Plant(tmp_path) as started:
+        yield started
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_values_are_published_as_plain_text(plant: Plant, version: str) -> None:
+    device = plant.device()
+    device.set(215)
+    probe = plant.probe("plant/#")
+    plant.run(version=version)
+    probe.until("plant/pump/temperature", "21.5")
+    device.set(216)
+    probe.until("plant/pump/temperature", "21.6")
+
+
+def test_values_are_retained(plant: Plant) -> None:
+    plant.device().set(215)
+    first = plant.probe("plant/#")
+    plant.run()
+    first.until("plant/pump/valve", "false")
+    late = plant.probe("plant/#")
+    seen = late.until("plant/pump/valve", "false")
+    assert texts(seen, "plant/pump/state") in (["off"], [])
+
+
+def test_status_is_online_then_offline(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("plant/holdfast/#")
+    plant.run()
+    probe.until("plant/holdfast/status", "online")
+    probe.until("plant/holdfast/status/pump", "online")
+    plant.stop()
+    probe.until("plant/holdfast/status", "offline")
+
+
+def test_a_device_that_does_not_answer_is_offline(plant: Plant) -> None:
+    device = plant.device()
+    probe = plant.probe("plant/#")
+    plant.run()
+    probe.until("plant/holdfast/status/pump", "online")
+    device.stop()
+    seen = probe.until("plant/holdfast/status/pump", "offline")
+    assert "" not in texts(seen, "plant/pump/temperature")
+    probe.until("plant/pump/temperature", "")
+    device.set(100)
+    device.start()
+    seen = probe.until("plant/holdfast/status/pump", "online")
+    assert texts(seen, "plant/pump/temperature")[-1] == "10.0"
+
+
+def test_json_has_value_time_unit_and_state(plant: Plant) -> None:
+    device = plant.device()
+    device.set(215)
+    device.set(1, address=1)
+    probe = plant.probe("plant/#")
+    plant.run(payload="json")
+    temperature = probe.json("plant/pump/temperature")
+    assert (temperature["value"], temperature["unit"]) == (21.5, "°C")
+    assert datetime.fromisoformat(temperature["time"]).tzinfo is not None
+    state = probe.json("plant/pump/state")
+    assert (state["value"], state["state"]) == (1, "running")
+    device.stop()
+    without = probe.json("plant/pump/temperature")
+    assert without["value"] is None
+    assert without["error"]
+
+
+def test_one_object_for_a_device_has_the_last_value_of_every_tag(plant: Plant) -> None:
+    device = plant.device()
+    device.set(215)
+    probe = plant.probe("plant/#")
+    plant.run(payload="device")
+    first = probe.json("plant/pump")
+    assert first["values"]["temperature"] == 21.5
+    assert first["states"] == {"state": "off"}
+    device.set(1, address=1)
+    second = probe.json("plant/pump")
+    assert second["values"] == first["values"] | {"state": 1}
+    assert second["states"] == {"state": "running"}
+    assert second["time"] > first["time"]
+
+
+def test_qos_0_and_no_retain(plant: Plant) -> None:
+    plant.device().set(215)
+    probe = plant.probe("plant/#")
+    plant.run(qos=0, retain=False)
+    probe.until("plant/pump/valve", "false")
+    wire.until(lambda: plant.status()["sent"] >= 4, "sent")
+    late = plant.probe("plant/#")
+    seen = late.until("plant/holdfast/status", "online")
+    assert texts(seen, "plant/pump/temperature") == []
+
+
+COUNTED = {"n": {"area": "holding_registers", "address": 0}}
+
+
+def test_nothing_is_lost_or_out_of_order_if_the_broker_is_killed(plant: Plant) -> None:
+    """Each value is published once or again, never after a newer one was confirmed."""
+    device = plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(COUNTED, payload="json")
+    seen = [probe.json("plant/pump/n")]
+    for number in range(1, 200):
+        device.set(number)
+        polled(plant)
+        if number == 60:
+            plant.broker.kill()
+        if number == 120:
+            plant.broker.start()
+            probe = plant.probe("plant/pump/n")
+    while seen[-1]["value"] != 199:
+        seen.append(probe.json("plant/pump/n"))
+    values = [each["value"] for each in seen]
+    times = [each["time"] for each in seen if each["value"] >= 60]
+    assert set(range(61, 120)) <= set(values)
+    fresh = [value for at, value in enumerate(values) if value not in values[:at]]
+    assert fresh == sorted(fresh)
+    assert times[0] < times[-1]
+    assert plant.probe("plant/pump/n").json("plant/pump/n")["value"] == 199
+    assert plant.status()["dropped"] == 0
+
+
+def polled(plant: Plant) -> None:
+    """Waits for two polls, one of which has begun after the call."""
+    assert plant.appliance is not None
+    until_polled(plant.appliance, "pump", 2)
+
+
+def test_values_wait_in_a_file_over_a_restart(plant: Plant) -> None:
+    device = plant.device()
+    options = {"payload": "json", "buffer": {"file": "kept.db"}}
+    probe = plant.probe("plant/#")
+    plant.run(COUNTED, **options)
+    probe.json("plant/pump/n")
+    plant.broker.kill()
+    wire.until(lambda: not plant.status()["connected"], "the connection is over")
+    for number in (1, 2, 3):
+        device.set(number)
+        polled(plant)
+    plant.stop()
+    plant.broker.start()
+    probe = plant.probe("plant/#")
+    plant.run(COUNTED, **options)
+    seen = [probe.json("plant/pump/n")["value"] for _ in range(3)]
+    assert seen == [1, 2, 3]
+
+
+def test_a_broker_that_has_lost_its_memory_gets_all_values_again(plant: Plant) -> None:
+    device = plant.device()
+    device.set(215)
+    probe = plant.probe("plant/#")
+    plant.run()
+    probe.until("plant/pump/valve", "false")
+    plant.broker.kill()
+    plant.broker.start()
+    probe = plant.probe("plant/#")
+    probe.until("plant/pump/temperature", "21.5")
+    assert plant.status()["reconnects"] == 1
+
+
+def test_a_frozen_broker_delays_no_poll(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "PROGRESS", 0.5)
+    device = plant.device()
+    probe = plant.probe("plant/pump/n")
+    plant.run(COUNTED)
+    probe.until("plant/pump/n", "0")
+    plant.broker.freeze()
+    device.set(1)
+    wire.until(lambda: not plant.status()["connected"], "given up")
+    polled(plant)
+    plant.broker.thaw()
+    probe.until("plant/pump/n", "1")
+
+
+def test_a_refused_message_is_counted_and_the_others_are_published(tmp_path: Path) -> None:
+    rules = tmp_path / "acl"
+    rules.write_text("topic read #\ntopic write plant/holdfast/#\ntopic write plant/pump/valve\n")
+    with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
+        plant.device()
+        probe = plant.probe("plant/#")
+        plant.run()
+        probe.until("plant/pump/valve", "false")
+        wire.until(lambda: plant.status()["not_accepted"] == 3, "counted")
+
+
+def test_a_broker_that_wants_a_password_gets_it(tmp_path: Path) -> None:
+    users = tmp_path / "users"
+    subprocess.run(
+        [tool("mosquitto_passwd"), "-b", "-c", str(users), "plant", "secret"], check=True
+    )
+    (tmp_path / "password").write_text("wrong\n")
+    with Plant(tmp_path, "allow_anonymous false", f"password_file {users}") as plant:
+        plant.device()
+        plant.run(username="plant", password_file="password")
+        wire.until(lambda: plant.status()["last_error"] is not None, "an error")
+        assert "Not authorized" in plant.status()["last_error"]
+        (tmp_path / "password").write_text("secret\n")
+        wire.until(lambda: plant.status()["sent"] >= 4, "values are sent")
