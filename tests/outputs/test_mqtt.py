@@ -115,7 +115,7 @@ def test_qos_0_and_no_retain(plant: Plant) -> None:
     probe = plant.probe("plant/#")
     plant.run(qos=0, retain=False)
     probe.until("plant/pump/valve", "false")
-    wire.until(lambda: plant.status()["sent"] >= 4, "sent")
+    wire.until(lambda: plant.count("sent") >= 4, "sent")
     late = plant.probe("plant/#")
     seen = late.until("plant/holdfast/status", "online")
     assert texts(seen, "plant/pump/temperature") == []
@@ -130,24 +130,24 @@ def test_nothing_is_lost_or_out_of_order_if_the_broker_is_killed(plant: Plant) -
     probe = plant.probe("plant/#")
     plant.run(COUNTED, payload="json")
     seen = [probe.json("plant/pump/n")]
-    for number in range(1, 200):
+    for number in range(1, 90):
         device.set(number)
         polled(plant)
-        if number == 60:
+        if number == 30:
             plant.broker.kill()
-        if number == 120:
+        if number == 60:
             plant.broker.start()
             probe = plant.probe("plant/pump/n")
-    while seen[-1]["value"] != 199:
+    while seen[-1]["value"] != 89:
         seen.append(probe.json("plant/pump/n"))
     values = [each["value"] for each in seen]
-    times = [each["time"] for each in seen if each["value"] >= 60]
-    assert set(range(61, 120)) <= set(values)
+    times = [each["time"] for each in seen if each["value"] >= 30]
+    assert set(range(31, 60)) <= set(values)
     fresh = [value for at, value in enumerate(values) if value not in values[:at]]
     assert fresh == sorted(fresh)
     assert times[0] < times[-1]
-    assert plant.probe("plant/pump/n").json("plant/pump/n")["value"] == 199
-    assert plant.status()["dropped"] == 0
+    assert plant.probe("plant/pump/n").json("plant/pump/n")["value"] == 89
+    assert plant.count("dropped") == 0
 
 
 def polled(plant: Plant) -> None:
@@ -225,4 +225,4 @@ def test_a_broker_that_wants_a_password_gets_it(tmp_path: Path) -> None:
         wire.until(lambda: plant.status()["last_error"] is not None, "an error")
         assert "Not authorized" in plant.status()["last_error"]
         (tmp_path / "password").write_text("secret\n")
-        wire.until(lambda: plant.status()["sent"] >= 4, "values are sent")
+        wire.until(lambda: plant.count("sent") >= 4, "values are sent")

@@ -133,6 +133,10 @@ class Plant:
         assert found is not None
         return found
 
+    def count(self, outcome: str) -> int:
+        """The readings with an outcome: sent, refused or dropped."""
+        return int(self.status().get("readings", {}).get(outcome, 0))
+
     def probe(self, *topics: str) -> Client:
         """A client that has subscribed to these topics."""
         made = self._running.enter_context(Client(self.broker.port))

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from holdfast.config.broker_checks import check_broker
 from holdfast.config.files import check_readable
 from holdfast.config.http_url import parse_http
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.nats_checks import check_nats
 from holdfast.config.tls_checks import check_client_tls
+from holdfast.config.topics import TAG, TopicNames, parse_topic_name, parse_topic_template
 from holdfast.config.words import guess, listing, show
 
 if TYPE_CHECKING:
@@ -48,6 +50,8 @@ class OutputChecks:
                 self._influx(path, output)
             elif kind == "nats":
                 check_nats(path, output, self.folder, self.report)
+            elif kind == "mqtt":
+                self._mqtt(path, output, devices)
 
     def _influx(self, path: KeyPath, output: dict[Any, Any]) -> None:
         target = parsed(parse_http, output.get("url"))
@@ -70,3 +74,27 @@ class OutputChecks:
         for key in ("token_file", "password_file"):
             check_readable((*path, key), output.get(key), self.folder, self.report)
         check_client_tls((*path, "tls"), mapping(output.get("tls")), self.folder, self.report)
+
+    def _mqtt(self, path: KeyPath, output: dict[Any, Any], devices: dict[Any, Any]) -> None:
+        check_broker(path, output, self.folder, self.report)
+        template = parsed(parse_topic_template, output.get("topic"))
+        whole = output.get("payload") == "device"
+        if template is not None and whole and TAG in template:
+            message = f"found {show(template)} with payload: device, allowed: without {TAG}"
+            self.report.add((*path, "topic"), message)
+        if template is not None and not whole and TAG not in template:
+            message = f"found {show(template)}, allowed: with {TAG} (optional with payload: device)"
+            self.report.add((*path, "topic"), message)
+        status = parsed(parse_topic_name, output.get("status"))
+        names = TopicNames(template, status, whole_device=whole)
+        clash = next(
+            (str(name) for name in devices if names.is_of_device(names.status, str(name))), ""
+        )
+        if clash:
+            message = f"found {show(names.status)}, which is a topic of the device {clash}"
+            self.report.add((*path, "status"), f"{message}, allowed: another topic", of_key=True)
+        if "discovery_prefix" in output and "discovery" not in output:
+            self.report.doubt((*path, "discovery_prefix"), "has no effect without discovery")
+        if "discovery" in output and output.get("retain") is False:
+            message = "with it, Home Assistant has no value after a start until one changes"
+            self.report.doubt((*path, "retain"), message)

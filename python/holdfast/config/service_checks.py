@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.broker import parse_broker, parse_topic_filter
+from holdfast.config.broker import parse_topic_filter
+from holdfast.config.broker_checks import check_broker
 from holdfast.config.connection_checks import doubt_source_limit
 from holdfast.config.files import check_readable
 from holdfast.config.ip_addresses import parse_bind, parse_source
@@ -100,12 +101,7 @@ class ServiceChecks:
                 hashes.claim((*path, "sha256"), digest, "a hash", path)
 
     def _mqtt(self, mqtt: dict[Any, Any]) -> None:
-        self._password("mqtt", mqtt)
-        broker = parsed(parse_broker, mqtt.get("url"))
-        if "tls" in mqtt and broker is not None and not broker.secure:
-            message = "found with a url that begins with mqtt://, allowed: only with mqtts://"
-            self.report.add(("mqtt", "tls"), message, of_key=True)
-        self._tls(("mqtt", "tls"), mqtt.get("tls"))
+        check_broker(("mqtt",), mqtt, self.folder, self.report)
         topics = Owners(self.report, "topic")
         for index, subscription in enumerate(entries(mqtt.get("subscriptions"))):
             path: KeyPath = ("mqtt", "subscriptions", index)

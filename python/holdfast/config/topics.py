@@ -66,3 +66,8 @@ class TopicNames:
     def of_availability(self, device: str) -> str:
         """The topic that is online while a device answers."""
         return f"{self.status}/{device}"
+
+    def is_of_device(self, topic: str, device: str) -> bool:
+        """Whether a topic can be one of the values of a device."""
+        own = re.escape(self.of_device(device)).replace(re.escape(TAG), "[^/]+")
+        return re.fullmatch(own, topic) is not None

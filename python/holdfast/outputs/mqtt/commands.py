@@ -43,6 +43,15 @@ class Commands:
         self._replies: list[Delivery] = []
         self.written = self.refused = self.ignored = self.replies_dropped = 0
 
+    def counts(self) -> dict[str, int]:
+        """The outcomes of commands, and the replies that could not be sent."""
+        return {
+            "written": self.written,
+            "refused": self.refused,
+            "ignored": self.ignored,
+            "replies_dropped": self.replies_dropped,
+        }
+
     def adopt(self, tags: Mapping[str, Sequence[Tag]]) -> list[str]:
         """Takes over the tags. Returns the topics to subscribe to."""
         self._tags = {

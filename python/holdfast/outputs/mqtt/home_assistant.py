@@ -34,7 +34,7 @@ class Discovery:
     def __init__(self, output: str, settings: MqttOutputConfig) -> None:
         self._settings, self._names = settings, settings.topics
         self._prefix = settings.discovery_prefix
-        self._node = f"holdfast_{_safe(output)}"
+        self._node = f"holdfast_{_escaped(output)}"
         try:
             self._version = version("holdfast")
         except PackageNotFoundError:
@@ -66,7 +66,7 @@ class Discovery:
                 if tag.of_type.count is not None or tag.of_type.base in _NOT_SHOWN:
                     continue
                 component, own = self._entity(device, tag)
-                unique = f"{_safe(device)}_{_safe(tag.name)}"
+                unique = f"{_escaped(device)}--{_escaped(tag.name)}"
                 entity = {
                     "name": tag.description or tag.name,
                     "unique_id": f"{self._node}_{unique}",
@@ -82,7 +82,7 @@ class Discovery:
         return {
             "availability": [{"topic": topic} for topic in topics],
             "availability_mode": "all",
-            "device": {"identifiers": [f"{self._node}_{_safe(device)}"], "name": device},
+            "device": {"identifiers": [f"{self._node}_{_escaped(device)}"], "name": device},
             "origin": {"name": "Holdfast", "sw_version": self._version},
         }
 
@@ -163,6 +163,6 @@ def _listed(names: Any) -> str:
     return f"['{joined}']"
 
 
-def _safe(name: str) -> str:
-    """A name in a discovery topic, which allows no dot."""
-    return name.replace(".", "-")
+def _escaped(name: str) -> str:
+    """A name in a discovery topic, which allows no dot. No two names become one."""
+    return name.replace("-", "-m").replace(".", "-d")

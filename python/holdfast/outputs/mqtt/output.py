@@ -97,10 +97,7 @@ class MqttOutput:
             "version": self._settings.version,
             "reconnects": max(0, self._connects - 1),
             "not_accepted": self._not_accepted,
-            "commands_written": self._commands.written,
-            "commands_refused": self._commands.refused,
-            "commands_ignored": self._commands.ignored,
-            "replies_dropped": self._commands.replies_dropped,
+            "commands": self._commands.counts(),
         }
 
     def _connected(self) -> Session:

@@ -22,7 +22,7 @@ _DEVICE_CLASSES = {
     "temperature": ("°C", "°F", "K"),
     "voltage": ("V", "mV", "kV"),
     "volume_flow_rate": ("m³/h", "L/min"),
-    "weight": ("kg", "g", "t"),
+    "weight": ("kg", "g"),
 }
 _OF_UNIT = {unit: name for name, units in _DEVICE_CLASSES.items() for unit in units}
 

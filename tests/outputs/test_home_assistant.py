@@ -1,0 +1,180 @@
+"""Discovery: entities that Home Assistant takes, with states, commands and availability."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.config.outputs import MqttOutputConfig
+from holdfast.outputs import sending
+from holdfast.outputs.mqtt.home_assistant import Discovery
+from holdfast.outputs.mqtt.payloads import Payloads
+from support import wire
+from support.home_assistant import UNITS, Entity, entity
+from support.mqtt_plant import TAGS, Plant
+from support.readings import reading, tag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from holdfast.tags import Tag
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+        monkeypatch.setattr(sending, name, 0.05)
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    with Plant(tmp_path) as started:
+        yield started
+
+
+def settings(**more: Any) -> MqttOutputConfig:
+    fields = {"type": "mqtt", "url": "mqtt://127.0.0.1", "discovery": "homeassistant"}
+    return MqttOutputConfig.model_validate(fields | {"writes": True} | more)
+
+
+def found(of: Tag, device: str = "pump", **more: Any) -> Entity:
+    """The only entity of a tag."""
+    [(topic, payload)] = Discovery("home", settings(**more)).entities({device: [of]}).items()
+    return entity(topic, payload)
+
+
+STATES = {0: "off", 1: "it's on"}
+
+COMPONENTS = [
+    (tag(unit="W"), "sensor"),
+    (tag(type="string:4"), "sensor"),
+    (tag(type="uint16", states=STATES), "sensor"),
+    (tag(area="coils", type="bool"), "binary_sensor"),
+    (tag(type="bit:3"), "binary_sensor"),
+    (tag(area="holding_registers", type="int16", scale=0.1, writable=True), "number"),
+    (tag(area="holding_registers", type="float32", writable=True), "number"),
+    (tag(area="holding_registers", type="bcd16", writable=True), "number"),
+    (tag(area="holding_registers", type="uint16", states=STATES, writable=True), "select"),
+    (tag(area="coils", type="bool", writable=True), "switch"),
+    (tag(area="coils", type="bool", writable=True, states=STATES), "switch"),
+]
+
+
+@pytest.mark.parametrize(("of", "component"), COMPONENTS)
+def test_each_kind_of_tag_is_a_valid_entity(of: Tag, component: str) -> None:
+    assert found(of).component == component
+
+
+@pytest.mark.parametrize("unit", [*(unit for units in UNITS.values() for unit in units), "%", ""])
+def test_units_have_a_class_that_takes_them(unit: str) -> None:
+    """The parser checks the combination."""
+    assert found(tag(unit=unit)).config.get("unit_of_measurement", "") == unit
+
+
+def test_without_writes_everything_is_read_only() -> None:
+    for of, _ in COMPONENTS:
+        assert "command_topic" not in found(of, writes=False).config
+
+
+def test_numbers_have_the_bounds_of_the_tag_or_of_its_registers() -> None:
+    shared: dict[str, Any] = {"area": "holding_registers", "writable": True}
+    given = found(tag(type="int16", scale=0.1, min=5, max=30, **shared)).config
+    assert (given["min"], given["max"], given["step"]) == (5, 30, 0.1)
+    own = found(tag(type="uint16", scale=2, offset=10, **shared)).config
+    assert (own["min"], own["max"], own["step"]) == (10, 131080, 2)
+
+
+def test_no_two_tags_have_one_id() -> None:
+    names = {"a": ["b_c", "b-c", "b.c"], "a_b": ["c"], "a-b": ["c"], "a.b": ["c"], "a-": ["-b"]}
+    tags = {device: [tag(name) for name in some] for device, some in names.items()}
+    entities = Discovery("home", settings()).entities(tags)
+    assert len({entity(*each).config["unique_id"] for each in entities.items()}) == 7
+
+
+@pytest.mark.parametrize("form", ["plain", "json", "device"])
+@pytest.mark.parametrize(
+    ("of", "value", "shown"),
+    [
+        (tag(), 1.5, "1.5"),
+        (tag(), None, "None"),
+        (tag(type="uint16", states=STATES), 1, "it's on"),
+        (tag(type="uint16", states=STATES), 7, "None"),
+        (tag(type="uint16", states=STATES), None, "None"),
+        (tag(area="coils", type="bool"), True, "true"),
+        (tag(area="coils", type="bool"), False, "false"),
+        (tag(area="coils", type="bool"), None, "None"),
+        (tag(area="coils", type="bool", states=STATES), True, "it's on"),
+    ],
+)
+def test_a_published_value_is_what_is_shown(form: str, of: Tag, value: Any, shown: str) -> None:
+    made = found(of, payload=form)
+    [message] = Payloads(settings(payload=form)).messages([reading(value, tag=of)])
+    assert message.topic[2:].decode() == made.config["state_topic"]
+    assert made.shown(message.payload) == shown
+
+
+def test_entities_appear_with_their_availability(plant: Plant) -> None:
+    plant.device().set(215)
+    probe = plant.probe("#")
+    plant.run(discovery="homeassistant", writes=True)
+    seen = probe.until("plant/holdfast/status/pump", "online")
+    entities = [
+        entity(message.topic, message.payload)
+        for message in seen
+        if message.topic.startswith("homeassistant/")
+    ]
+    assert sorted(each.component for each in entities) == ["number", "select", "sensor", "switch"]
+    topics = {message.topic for message in seen}
+    for each in entities:
+        assert each.config["state_topic"] in topics
+        assert {of["topic"] for of in each.config["availability"]} <= topics
+        assert each.config["device"]["name"] == "pump"
+
+
+def configs(plant: Plant) -> set[str]:
+    """The retained discovery topics of the broker."""
+    probe = plant.probe("homeassistant/#")
+    probe.publish("homeassistant/end", "end")
+    seen = probe.until("homeassistant/end", "end")
+    return {message.topic for message in seen if message.topic.endswith("/config")}
+
+
+def test_a_start_of_home_assistant_has_entities_published_again(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    plant.run(discovery="homeassistant")
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("homeassistant/status", "online")
+    topic = "homeassistant/binary_sensor/holdfast_home/pump--valve/config"
+    assert entity(topic, probe.next_of(topic).payload)
+
+
+def test_removed_entities_disappear_with_a_reload(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    appliance = plant.run(discovery="homeassistant")
+    probe.until("plant/holdfast/status/pump", "online")
+    tags = {name: of for name, of in TAGS.items() if name != "valve"}
+    appliance.reload(plant.config({"discovery": "homeassistant"}, tags))
+    probe.until("plant/pump/valve", "")
+    probe.until("homeassistant/binary_sensor/holdfast_home/pump--valve/config", "")
+    assert len(configs(plant)) == 3
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_entities_that_were_removed_while_it_was_stopped_disappear(
+    plant: Plant, version: str
+) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    plant.run(discovery="homeassistant", version=version)
+    probe.until("plant/holdfast/status/pump", "online")
+    plant.stop()
+    foreign = "homeassistant/sensor/other/pump/config"
+    probe.publish(foreign, "{}", retain=True)
+    tags = {name: of for name, of in TAGS.items() if name != "valve"}
+    plant.run(tags, discovery="homeassistant", version=version)
+    wire.until(lambda: len(configs(plant)) == 4, "one of ours is gone")
+    assert foreign in configs(plant)

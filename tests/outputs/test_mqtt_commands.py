@@ -1,0 +1,200 @@
+"""Set topics: values from a broker are written to devices, with a reply for each."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.appliance import Appliance
+from holdfast.outputs import sending
+from support import wire
+from support.mqtt_plant import TAGS, Client, Plant
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_PAUSE", "MAX_PAUSE", "TICK"):
+        monkeypatch.setattr(sending, name, 0.05)
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    with Plant(tmp_path) as started:
+        yield started
+
+
+def reply(probe: Client, tag: str) -> dict[str, Any]:
+    found: dict[str, Any] = probe.json(f"plant/pump/{tag}/set/reply")
+    return found
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_a_value_is_written_and_confirmed(plant: Plant, version: str) -> None:
+    device = plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(writes=True, version=version)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("plant/pump/temperature/set", "21.5")
+    assert reply(probe, "temperature") == {
+        "status": "accepted",
+        "device": "pump",
+        "tag": "temperature",
+    }
+    assert device.memory.read("holding_registers", 0, 1) == [215]
+    probe.until("plant/pump/temperature", "21.5")
+
+
+@pytest.mark.parametrize(
+    ("tag", "text", "written"),
+    [("state", "running", ("holding_registers", 1, 1)), ("valve", "on", ("coils", 0, 1))],
+)
+def test_names_of_states_and_switches_are_written(
+    plant: Plant, tag: str, text: str, written: tuple[Any, int, int]
+) -> None:
+    device = plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish(f"plant/pump/{tag}/set", text)
+    assert reply(probe, tag)["status"] == "accepted"
+    area, address, value = written
+    assert device.memory.read(area, address, 1) == [value]
+
+
+@pytest.mark.parametrize(
+    ("text", "detail"),
+    [
+        ("31", "31 is outside 5.0 to 30.0"),
+        ("21.55", "21.55 is between two values of the registers, allowed: steps of 0.1"),
+        ("21,5", "'21,5' has a decimal comma, allowed: a decimal point, as in 21.5"),
+        ("warm", "'warm' is not a number"),
+        (b"\xff", "the payload is not UTF-8"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_refused(plant: Plant, text: str | bytes, detail: str) -> None:
+    device = plant.device()
+    device.set(77)
+    probe = plant.probe("plant/#")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("plant/pump/temperature/set", text)
+    answer = reply(probe, "temperature")
+    assert (answer["reason"], answer["detail"]) == ("invalid_value", detail)
+    assert device.memory.read("holding_registers", 0, 1) == [77]
+    assert plant.status()["commands"]["refused"] == 1
+
+
+def test_the_reply_goes_to_the_response_topic(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("plant/#", "answers")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish(
+        "plant/pump/temperature/set", "21.5", ResponseTopic="answers", CorrelationData=b"17"
+    )
+    message = probe.next_of("answers")
+    assert json.loads(message.payload)["status"] == "accepted"
+    assert message.properties is not None
+    assert vars(message.properties)["CorrelationData"] == b"17"
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_a_retained_command_moves_nothing(plant: Plant, version: str) -> None:
+    device = plant.device()
+    device.set(77)
+    probe = plant.probe("plant/#")
+    probe.publish("plant/pump/temperature/set", "21.5", retain=True)
+    plant.run(writes=True, version=version)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("plant/pump/valve/set", "true")
+    assert reply(probe, "valve")["status"] == "accepted"
+    assert device.memory.read("holding_registers", 0, 1) == [77]
+    assert plant.status()["commands"]["written"] == 1
+
+
+def test_commands_during_an_outage_are_not_carried_out_later(plant: Plant) -> None:
+    """The broker keeps no session, so it queues no commands."""
+    device = plant.device()
+    device.set(77)
+    probe = plant.probe("plant/#")
+    plant.run(writes=True, client_id="fixed")
+    probe.until("plant/holdfast/status/pump", "online")
+    plant.stop()
+    probe.publish("plant/pump/temperature/set", "21.5")
+    plant.run(writes=True, client_id="fixed")
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("plant/pump/valve/set", "true")
+    assert reply(probe, "valve")["status"] == "accepted"
+    assert device.memory.read("holding_registers", 0, 1) == [77]
+
+
+def test_without_writes_nothing_is_subscribed_to(plant: Plant) -> None:
+    plant.device()
+    plant.run()
+    wire.until(lambda: plant.count("sent") >= 4, "values")
+    assert "/set" not in plant.broker.log
+
+
+def test_a_tag_that_is_not_writable_has_no_set_topic(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    wire.until(lambda: "plant/pump/valve/set" in plant.broker.log, "subscribed")
+    assert "plant/pump/flow/set" not in plant.broker.log
+
+
+def test_a_device_that_does_not_answer_is_named(plant: Plant) -> None:
+    device = plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    device.stop()
+    probe.until("plant/holdfast/status/pump", "offline")
+    probe.publish("plant/pump/temperature/set", "21.5")
+    answer = reply(probe, "temperature")
+    assert answer["status"] == "rejected"
+    assert answer["detail"]
+
+
+def test_writes_are_in_the_audit_log(plant: Plant, tmp_path: Path) -> None:
+    plant.device()
+    probe = plant.probe("plant/#")
+    output = {"writes": True}
+    config = plant.config(output, audit={"file": "audit.log"})
+    plant.appliance = Appliance(config).start()
+    probe.until("plant/holdfast/status/pump", "online")
+    for text in ("21.5", "99"):
+        probe.publish("plant/pump/temperature/set", text)
+        reply(probe, "temperature")
+    plant.stop()
+    lines = [json.loads(line) for line in (tmp_path / "audit.log").read_text().splitlines()]
+    written = [line for line in lines if line.get("function") == "write"]
+    assert [line["outcome"] for line in written] == ["done", "invalid_value"]
+    first = written[0]
+    assert (first["listener"], first["device"], first["tag"]) == (
+        "output/home",
+        "pump",
+        "temperature",
+    )
+    assert (first["area"], first["address"], first["values"]) == ("holding_registers", 0, [215])
+    assert first["peer"].endswith("plant/pump/temperature/set")
+
+
+def test_a_reload_brings_new_set_topics(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("plant/#")
+    tags = {name: tag for name, tag in TAGS.items() if name != "valve"}
+    appliance = plant.run(tags, writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    appliance.reload(plant.config({"writes": True}))
+    probe.until("plant/pump/valve", "false")
+    wire.until(lambda: "plant/pump/valve/set" in plant.broker.log, "subscribed")
+    probe.publish("plant/pump/valve/set", "true")
+    assert reply(probe, "valve")["status"] == "accepted"
