@@ -28,10 +28,12 @@ from support.brokers import Mosquitto
 from support.running import content
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
     from types import TracebackType
     from typing import Self
 
+    from holdfast.config import MappedTag
     from holdfast.types import Area
 
 
@@ -182,8 +184,13 @@ def text(*commands: dict[str, Any]) -> str:
 class Running:
     """An adapter in a thread, until the test ends."""
 
-    def __init__(self, config: MqttConfig, memory_access: MemoryAccess) -> None:
-        self.adapter = Mqtt(config, memory_access)
+    def __init__(
+        self,
+        config: MqttConfig,
+        memory_access: MemoryAccess,
+        mapped: Mapping[str, MappedTag] | None = None,
+    ) -> None:
+        self.adapter = Mqtt(config, memory_access, mapped)
         self.memory_access = memory_access
         self._stop = Stop()
         self._failure: BaseException | None = None
@@ -262,9 +269,14 @@ class Rig:
         self._running.callback(started.kill)
         return started
 
-    def run(self, config: MqttConfig, memory_access: MemoryAccess | None = None) -> Running:
+    def run(
+        self,
+        config: MqttConfig,
+        memory_access: MemoryAccess | None = None,
+        mapped: Mapping[str, MappedTag] | None = None,
+    ) -> Running:
         """Starts an adapter without waiting for its connection."""
-        running = Running(config, memory_access or self.memory_access)
+        running = Running(config, memory_access or self.memory_access, mapped)
         self._running.callback(running.stop)
         return running
 

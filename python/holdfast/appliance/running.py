@@ -654,8 +654,10 @@ class _Running:
         if config.mqtt is not None:
             from holdfast.adapters.mqtt import Mqtt
 
-            mqtt, to_mqtt = config.mqtt, self._memory_access("mqtt")
-            parts["mqtt"] = replace(add("mqtt", lambda: Mqtt(mqtt, to_mqtt), mqtt), access=to_mqtt)
+            mqtt, to_mqtt, mapped = config.mqtt, self._memory_access("mqtt"), config.mapped()
+            tags = list(mapped.items())
+            part = add("mqtt", lambda: Mqtt(mqtt, to_mqtt, mapped), mqtt, tags)
+            parts["mqtt"] = replace(part, access=to_mqtt)
         if config.nats is not None:
             from holdfast.scanner.adapter import ScannerAdapter
 

@@ -45,7 +45,7 @@ from holdfast.config.listeners import (
 )
 from holdfast.config.load import load
 from holdfast.config.memories import MemoryConfig, Seal, Span
-from holdfast.config.model import Config, IdentityConfig, LogConfig
+from holdfast.config.model import Config, IdentityConfig, LogConfig, MappedTag
 from holdfast.config.problems import ConfigError, Problem
 from holdfast.config.schema import json_schema
 from holdfast.config.services import (
@@ -57,6 +57,7 @@ from holdfast.config.services import (
     GatewayConfig,
     GatewayTokenConfig,
     HttpsConfig,
+    MappingConfig,
     MetricsConfig,
     MqttConfig,
     NatsConfig,
@@ -92,6 +93,8 @@ __all__ = [
     "LinkConfig",
     "Listener",
     "LogConfig",
+    "MappedTag",
+    "MappingConfig",
     "MemoryConfig",
     "MetricsConfig",
     "ModbusAsciiListener",

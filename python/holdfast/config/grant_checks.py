@@ -80,6 +80,9 @@ def grants(config: Config) -> Iterator[WriterGrant]:
         for index, topic in enumerate(config.mqtt.subscriptions):
             path = ("mqtt", "subscriptions", index)
             yield WriterGrant(path, topic.memories, topic.areas, writes=True)
+        for index, mapped in enumerate(config.mapped().values()):
+            path = ("mqtt", "map", index)
+            yield WriterGrant(path, [mapped.memory], [mapped.tag.area], writes=True)
     for name, adapter in config.adapters.items():
         writes = adapter.access == "read-write"
         yield WriterGrant(("adapters", name), adapter.memories, adapter.areas, writes)

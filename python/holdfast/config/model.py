@@ -8,7 +8,7 @@ of the keys, by way of the JSON Schema.
 from __future__ import annotations
 
 import importlib.metadata
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr
 
@@ -35,13 +35,14 @@ from holdfast.config.services import (
     AdapterConfig,
     AuditConfig,
     GatewayConfig,
+    MappingConfig,
     MetricsConfig,
     MqttConfig,
     NatsConfig,
     RestConfig,
 )
 from holdfast.config.tags import ProfileConfig
-from holdfast.tags import TagList
+from holdfast.tags import Tag, TagList
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -79,6 +80,13 @@ class IdentityConfig(Model):
     """Names of single units, by unit id: the server id of function 17, and object 6."""
     objects: dict[ObjectId, Text] = Field(default={}, json_schema_extra=OBJECT_KEYS)
     """Private objects by id, 128 to 255."""
+
+
+class MappedTag(NamedTuple):
+    """A tag in a memory."""
+
+    memory: str
+    tag: Tag
 
 
 class LogConfig(Model):
@@ -157,6 +165,18 @@ class Config(Model):
         order = "ABCD" if profile is None else profile.order
         own = {name: tag.tag(name, order) for name, tag in settings.tags.items()}
         return TagList({**({} if profile is None else profile.named()), **own}.values())
+
+    def mapped(self) -> dict[str, MappedTag]:
+        """What the topics of the MQTT client write that have plain values."""
+        entries = () if self.mqtt is None else self.mqtt.map
+        return {entry.topic: MappedTag(entry.memory, self._mapped(entry)) for entry in entries}
+
+    def _mapped(self, entry: MappingConfig) -> Tag:
+        if entry.tag is not None:
+            return entry.tag.tag(entry.topic, "ABCD")
+        assert entry.profile is not None, "checked before"
+        assert entry.name is not None, "checked before"
+        return self.profiles[entry.profile].named()[entry.name]
 
     @property
     def profile_files(self) -> tuple[Path, ...]:

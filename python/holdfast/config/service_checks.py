@@ -13,6 +13,7 @@ from holdfast.config.files import check_readable
 from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
 from holdfast.config.nats_checks import check_nats
+from holdfast.config.map_checks import check_map
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.services import HTTP_SERVICES, RestConfig
 from holdfast.config.tls_checks import check_client_tls, check_https
@@ -42,7 +43,7 @@ class ServiceChecks:
         """Reports what is wrong."""
         self._served(data)
         self._rest(mapping(data.get("rest")))
-        self._mqtt(mapping(data.get("mqtt")))
+        self._mqtt(data, mapping(data.get("mqtt")))
         self._nats(mapping(data.get("nats")))
         self._gateway(mapping(data.get("gateway")))
         for name, adapter in mapping(data.get("adapters")).items():
@@ -100,7 +101,7 @@ class ServiceChecks:
             if digest is not None:
                 hashes.claim((*path, "sha256"), digest, "a hash", path)
 
-    def _mqtt(self, mqtt: dict[Any, Any]) -> None:
+    def _mqtt(self, data: dict[Any, Any], mqtt: dict[Any, Any]) -> None:
         check_broker(("mqtt",), mqtt, self.folder, self.report)
         topics = Owners(self.report, "topic")
         for index, subscription in enumerate(entries(mqtt.get("subscriptions"))):
@@ -109,6 +110,10 @@ class ServiceChecks:
             topic = parsed(parse_topic_filter, mapping(subscription).get("topic"))
             if topic is not None:
                 topics.claim((*path, "topic"), topic, show(topic), path)
+        check_map(data, self.report, self.grants)
+        if mqtt and not mqtt.get("subscriptions") and not mqtt.get("map"):
+            message = "missing, allowed: a list with at least one entry (optional with map)"
+            self.report.add(("mqtt", "subscriptions"), message, of_key=True)
 
     def _nats(self, nats: dict[Any, Any]) -> None:
         check_nats(("nats",), nats, self.folder, self.report)

@@ -30,6 +30,7 @@ from holdfast.config.scalars import (
     SubjectPrefix,
     SyslogUrl,
     TopicFilter,
+    TopicName,
     whole_number,
 )
 from holdfast.config.scanning import (
@@ -53,6 +54,7 @@ from holdfast.config.scanning import (
     Writes,
 )
 from holdfast.config.syslog import Facility
+from holdfast.config.tags import TagConfig
 from holdfast.net.addresses import LOOPBACK
 from holdfast.net.tls import Tls
 from holdfast.types import Access
@@ -197,13 +199,32 @@ class BrokerConfig(Model):
         return self.broker.secure
 
 
+class MappingConfig(Model):
+    """A topic whose messages are the values of one tag."""
+
+    topic: TopicName
+    """The topic, without wildcards."""
+    qos: QualityOfService = 0
+    """The requested quality of service."""
+    memory: Name
+    """The memory that is written."""
+    tag: Annotated[TagConfig | None, NotNull()] = None
+    """The area, the address and the type of the values."""
+    profile: Annotated[Name | None, NotNull()] = None
+    """The profile that has the tag, instead of tag."""
+    name: Annotated[Name | None, NotNull()] = None
+    """The name of the tag in the profile."""
+
+
 class MqttConfig(BrokerConfig):
-    """The MQTT client: receives JSON commands from topics of a broker."""
+    """The MQTT client: receives JSON commands and plain values from topics of a broker."""
 
     client_id: MqttText
     """The client identifier; unique among the clients of the broker."""
-    subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False), Field(min_length=1)]
-    """The topics to subscribe to."""
+    subscriptions: Annotated[tuple[SubscriptionConfig, ...], Strict(False)] = ()
+    """The topics of JSON commands; optional with map."""
+    map: Annotated[tuple[MappingConfig, ...], Strict(False)] = ()
+    """The topics of plain values, such as 21.5."""
 
 
 class NatsLimitsConfig(Model):

@@ -13,6 +13,7 @@ from holdfast.adapters.mqtt.backoff import Backoff
 from holdfast.adapters.mqtt.filters import Filters
 from holdfast.adapters.mqtt.inbox import Inbox
 from holdfast.adapters.mqtt.link import MAX_UNSENT, BrokerConnection
+from holdfast.adapters.mqtt.values import Values
 from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
 from holdfast.mqtt.waiting import Ended, Waiter
@@ -21,12 +22,13 @@ from holdfast.net.tls import NO_FILES, broker_context
 
 if TYPE_CHECKING:
     import socket
+    from collections.abc import Mapping
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.config import MqttConfig, SubscriptionConfig
+    from holdfast.config import MappedTag, MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.ingest import MemoryAccess
     from holdfast.stop import Stop
 
@@ -43,13 +45,21 @@ _TICK = 1.0
 class Mqtt:
     """Receives messages from a broker and passes them to the memory access."""
 
-    def __init__(self, settings: MqttConfig, memory_access: MemoryAccess) -> None:
+    def __init__(
+        self,
+        settings: MqttConfig,
+        memory_access: MemoryAccess,
+        mapped: Mapping[str, MappedTag] | None = None,
+    ) -> None:
+        """`mapped` are the tags of topics with plain values."""
         self._settings = settings
         self._broker = joined(settings.host, settings.port)
         filters = Filters(settings.subscriptions)
-        self._inbox = Inbox(memory_access, filters, self._broker)
-        self._answers = Answers(filters)
+        values = Values(mapped or {})
+        self._inbox = Inbox(memory_access, filters, values, self._broker)
+        self._answers = Answers(filters, values)
         self._topics = [_Topic(entry) for entry in settings.subscriptions]
+        self._topics += [_Topic(entry) for entry in settings.map]
         self._asked: dict[int, _Topic] = {}
         self._unreleased: set[int] = set()
         self._failures = _Failures(self._broker)
@@ -254,7 +264,7 @@ class Mqtt:
 class _Topic:
     """A subscription and the quality of service that the broker granted."""
 
-    def __init__(self, entry: SubscriptionConfig) -> None:
+    def __init__(self, entry: SubscriptionConfig | MappingConfig) -> None:
         self.entry = entry
         self.granted: int | None = None
         """In this connection."""

@@ -21,14 +21,15 @@ if TYPE_CHECKING:
 
     from holdfast.adapters.mqtt.filters import Filters
     from holdfast.adapters.mqtt.link import BrokerConnection
+    from holdfast.adapters.mqtt.values import Values
     from holdfast.mqtt.packets import Publish
 
 
 class Answers:
     """Sends and counts answers."""
 
-    def __init__(self, filters: Filters) -> None:
-        self._filters = filters
+    def __init__(self, filters: Filters, values: Values) -> None:
+        self._filters, self._values = filters, values
         self.sent = 0
         self.dropped = 0
 
@@ -41,6 +42,10 @@ class Answers:
         else:
             self.dropped += 1
 
+    def _is_ours(self, topic: str) -> bool:
+        """Whether an answer would come back as a message."""
+        return topic in self._values or self._filters.grant(topic) is not None
+
     def _sent(
         self,
         link: BrokerConnection,
@@ -52,7 +57,7 @@ class Answers:
             topic = response_topic.decode()
         except UnicodeDecodeError:
             return False
-        if not topic or set(topic) & set("+#\0") or self._filters.grant(topic) is not None:
+        if not topic or set(topic) & set("+#\0") or self._is_ours(topic):
             return False
         payload = msgspec.json.encode(answer)
         size = len(payload) + len(response_topic) + len(message.correlation or b"")

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast import logs
+from holdfast.adapters.mqtt.values import BadValue
 from holdfast.ingest import Grant, Refused
 
 if TYPE_CHECKING:
     from holdfast.adapters.mqtt.filters import Filters
+    from holdfast.adapters.mqtt.values import Values
     from holdfast.ingest import MemoryAccess
     from holdfast.mqtt.packets import Publish
 
@@ -24,9 +26,11 @@ _NOBODY = Grant("no subscription", (), (), writes=False)
 class Inbox:
     """Handles messages one by one. An error in one does not affect the next."""
 
-    def __init__(self, memory_access: MemoryAccess, filters: Filters, broker: str) -> None:
+    def __init__(
+        self, memory_access: MemoryAccess, filters: Filters, values: Values, broker: str
+    ) -> None:
         self._memory_access = memory_access
-        self._filters = filters
+        self._filters, self._values = filters, values
         self._broker = broker
         self.received = 0
 
@@ -36,11 +40,18 @@ class Inbox:
         topic = message.topic
         shown = topic if len(topic) <= MAX_TOPIC else f"{topic[:MAX_TOPIC]}…"
         peer = f"{self._broker} {shown}"
-        grant = self._filters.grant(topic) or _NOBODY
+        value = self._values.get(topic)
+        grant = value.grant if value else self._filters.grant(topic) or _NOBODY
         try:
             refused = _refused_unread(message, grant)
+            if refused is None and value is not None:
+                command = value.command(message.payload)
+                return self._memory_access.write([command], grant, peer).answer()
             if refused is None:
                 return self._memory_access.ingest(message.payload, grant, peer).answer()
+            self._memory_access.refuse(refused, grant.name, peer)
+        except BadValue as error:
+            refused = Refused("invalid_value", str(error), **error.where)
             self._memory_access.refuse(refused, grant.name, peer)
         except Refused as error:
             refused = error

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
 
     from holdfast.adapters.mqtt.inbox import Inbox
-    from holdfast.config import MqttConfig, SubscriptionConfig
+    from holdfast.config import MappingConfig, MqttConfig, SubscriptionConfig
     from holdfast.mqtt.packets import Publish
 
 SESSION_EXPIRY = 3600
@@ -82,7 +82,9 @@ class BrokerConnection(BrokerClient):
         self._largest_sent = getattr(properties, "MaximumPacketSize", None)
         self.most_qos = min(getattr(properties, "MaximumQoS", 1), 1)
 
-    def ask_for(self, subscription: SubscriptionConfig, *, again: bool) -> int | None:
+    def ask_for(
+        self, subscription: SubscriptionConfig | MappingConfig, *, again: bool
+    ) -> int | None:
         """Sends SUBSCRIBE and returns its packet identifier, `None` when it could not be sent.
 
         With `again`, the broker does not send retained messages a second time (MQTT 5).
