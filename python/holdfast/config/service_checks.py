@@ -12,8 +12,8 @@ from holdfast.config.connection_checks import doubt_source_limit
 from holdfast.config.files import check_readable
 from holdfast.config.ip_addresses import parse_bind, parse_source
 from holdfast.config.lenient import entries, mapping, parsed
-from holdfast.config.nats_checks import check_nats
 from holdfast.config.map_checks import check_map
+from holdfast.config.nats_checks import check_nats
 from holdfast.config.scalars import parse_sha256
 from holdfast.config.services import HTTP_SERVICES, RestConfig
 from holdfast.config.tls_checks import check_client_tls, check_https
