@@ -102,6 +102,12 @@ class Prometheus(Database):
             f"--web.listen-address={self.host}:{self.port}",
         ]
 
+    def _listens(self) -> bool:
+        try:
+            return bool(super()._listens() and self.get("/-/ready"))
+        except OSError:
+            return False
+
     def samples(self, query: str) -> dict[tuple[str, ...], float]:
         """The current values of a query, by device and tag."""
         found = json.loads(self.get("/api/v1/query", query=query))["data"]["result"]
