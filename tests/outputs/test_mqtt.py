@@ -124,32 +124,6 @@ def test_qos_0_and_no_retain(plant: Plant) -> None:
 COUNTED = {"n": {"area": "holding_registers", "address": 0}}
 
 
-def test_nothing_is_lost_or_out_of_order_if_the_broker_is_killed(plant: Plant) -> None:
-    """Each value is published once or again, never after a newer one was confirmed."""
-    device = plant.device()
-    probe = plant.probe("plant/#")
-    plant.run(COUNTED, payload="json")
-    seen = [probe.json("plant/pump/n")]
-    for number in range(1, 90):
-        device.set(number)
-        polled(plant)
-        if number == 30:
-            plant.broker.kill()
-        if number == 60:
-            plant.broker.start()
-            probe = plant.probe("plant/pump/n")
-    while seen[-1]["value"] != 89:
-        seen.append(probe.json("plant/pump/n"))
-    values = [each["value"] for each in seen]
-    times = [each["time"] for each in seen if each["value"] >= 30]
-    assert set(range(31, 60)) <= set(values)
-    fresh = [value for at, value in enumerate(values) if value not in values[:at]]
-    assert fresh == sorted(fresh)
-    assert times[0] < times[-1]
-    assert plant.probe("plant/pump/n").json("plant/pump/n")["value"] == 89
-    assert plant.count("dropped") == 0
-
-
 def polled(plant: Plant) -> None:
     """Waits for two polls, one of which has begun after the call."""
     assert plant.appliance is not None

@@ -12,7 +12,7 @@ from holdfast.appliance import Appliance
 from support import wire
 from support.brokers import Mosquitto
 from support.config_folder import Folder, written
-from support.mqtt_rig import Message, Probe
+from support.mqtt_rig import Message, Probe, Proxy
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,9 +44,9 @@ TAGS: dict[str, Any] = {
 class Device:
     """A Modbus device. It can stop answering."""
 
-    def __init__(self) -> None:
+    def __init__(self, registers: int = 100) -> None:
         self.memory = holdfast.Memory(
-            holding_registers=100, input_registers=100, coils=100, discrete_inputs=100
+            holding_registers=registers, input_registers=100, coils=100, discrete_inputs=100
         )
         self._server: holdfast.Server | None = None
         self._address = "127.0.0.1:0"
@@ -67,8 +67,8 @@ class Device:
             self._server.stop()
             self._server = None
 
-    def set(self, value: int, address: int = 0) -> None:
-        self.memory.write("holding_registers", address, [value])
+    def set(self, value: int, address: int = 0, count: int = 1) -> None:
+        self.memory.write("holding_registers", address, [value] * count)
 
 
 class Plant:
@@ -79,6 +79,8 @@ class Plant:
         self._running = ExitStack()
         self.broker = Mosquitto(folder, *options)
         self._running.callback(self.broker.kill)
+        self.url = self.broker.url
+        self.interval = 0.05
         self.devices: dict[str, Device] = {}
         self.appliance: Appliance | None = None
 
@@ -95,9 +97,16 @@ class Plant:
             self.appliance.stop()
         self._running.close()
 
-    def device(self, name: str = "pump") -> Device:
-        made = self.devices[name] = Device()
+    def device(self, name: str = "pump", registers: int = 100) -> Device:
+        made = self.devices[name] = Device(registers)
         self._running.callback(made.stop)
+        return made
+
+    def proxy(self) -> Proxy:
+        """A way to the broker that can be closed, for the appliance."""
+        made = Proxy(self.broker.port)
+        self._running.callback(made.close)
+        self.url = made.url
         return made
 
     def config(
@@ -107,14 +116,14 @@ class Plant:
         devices = {
             name: {
                 "url": device.url,
-                "interval": 0.05,
+                "interval": self.interval,
                 "timeout": 0.3,
                 "retry": {"first": 0.05, "most": 0.1},
                 "tags": TAGS if tags is None else tags,
             }
             for name, device in self.devices.items()
         }
-        outputs = {"home": {"type": "mqtt", "url": self.broker.url} | output}
+        outputs = {"home": {"type": "mqtt", "url": self.url} | output}
         return Folder(self.folder).config(written({"devices": devices, "outputs": outputs} | more))
 
     def run(self, tags: dict[str, Any] | None = None, **output: Any) -> Appliance:

@@ -42,6 +42,7 @@ class Proxy:
 
     def __init__(self, port: int) -> None:
         self._to = port
+        self._is_down = False
         self._server = socket.create_server(("127.0.0.1", 0))
         self.url = f"mqtt://127.0.0.1:{self._server.getsockname()[1]}"
         self._lock = threading.Lock()
@@ -55,6 +56,9 @@ class Proxy:
                 near = self._server.accept()[0]
             except OSError:
                 return
+            if self._is_down:
+                near.close()
+                continue
             try:
                 far = socket.create_connection(("127.0.0.1", self._to))
             except OSError:
@@ -75,6 +79,15 @@ class Proxy:
         for end in (here, there):
             with contextlib.suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
+
+    def down(self) -> None:
+        """Closes every connection, and each new one, until `up`."""
+        self._is_down = True
+        self.cut()
+
+    def up(self) -> None:
+        """Lets connections through again."""
+        self._is_down = False
 
     def cut(self) -> None:
         """Closes every connection."""

@@ -111,8 +111,9 @@ class ServiceChecks:
             if topic is not None:
                 topics.claim((*path, "topic"), topic, show(topic), path)
         check_map(data, self.report, self.grants)
-        if mqtt and not mqtt.get("subscriptions") and not mqtt.get("map"):
-            message = "missing, allowed: a list with at least one entry (optional with map)"
+        if mqtt and not mqtt.get("subscriptions", []) and not mqtt.get("map", []):
+            found = "found an empty list" if mqtt.get("subscriptions") == [] else "missing"
+            message = f"{found}, allowed: a list with at least one entry (optional with map)"
             self.report.add(("mqtt", "subscriptions"), message, of_key=True)
 
     def _nats(self, nats: dict[Any, Any]) -> None:
