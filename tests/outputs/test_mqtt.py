@@ -11,6 +11,7 @@ import pytest
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import session
 from support import wire
+from support.certificates import Certificates
 from support.machine import tool
 from support.mqtt_plant import Plant, texts
 from support.polled import until_polled
@@ -199,4 +200,21 @@ def test_a_broker_that_wants_a_password_gets_it(tmp_path: Path) -> None:
         wire.until(lambda: plant.status()["last_error"] is not None, "an error")
         assert "Not authorized" in plant.status()["last_error"]
         (tmp_path / "password").write_text("secret\n")
+        wire.until(lambda: plant.count("sent") >= 4, "values are sent")
+
+
+def test_a_broker_with_tls_is_trusted_by_its_authority(tmp_path: Path) -> None:
+    folder = tmp_path / "authority"
+    folder.mkdir()
+    authority = Certificates(folder)
+    certificate, key = authority.issue("broker", "IP:127.0.0.1")
+    options = (f"cafile {authority.ca}", f"certfile {certificate}", f"keyfile {key}")
+    with Plant(tmp_path, "allow_anonymous true", *options) as plant:
+        plant.device()
+        plant.url = plant.url.replace("mqtt:", "mqtts:")
+        plant.run()
+        wire.until(lambda: plant.status().get("last_error") is not None, "an error")
+        assert "certificate verify failed" in plant.status()["last_error"]
+        plant.stop()
+        plant.run(tls={"ca_file": str(authority.ca)})
         wire.until(lambda: plant.count("sent") >= 4, "values are sent")

@@ -1,0 +1,127 @@
+"""Parts of MQTT outputs: packets from the network, packets to it, confirmations, topics."""
+
+from __future__ import annotations
+
+import random
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.config.topics import TopicNames
+from holdfast.mqtt.packets import parse_publish
+from holdfast.mqtt.waiting import Waiter
+from holdfast.outputs.mqtt.messages import Delivery, Message, packed, packed_topic
+from holdfast.outputs.mqtt.packets import MAX_PACKET, Packets
+from holdfast.stop import Stop
+from support.config_folder import Folder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def message(payload: bytes = b"1", *, retain: bool = False) -> Message:
+    return Message(packed_topic("plant/pump/n"), payload, retain)
+
+
+@pytest.mark.parametrize("five", [True, False])
+@pytest.mark.parametrize("size", [0, 1, 100, 127, 128, 16_384, 60_000])
+def test_what_is_sent_is_what_is_parsed(size: int, five: bool) -> None:
+    sent = [message(bytes([at]) * size, retain=at == 1) for at in range(3)]
+    data = packed(sent, [7, 8, 9], qos=1, five=five)
+    found = list(Packets().feed(data))
+    assert [first & 1 for first, _ in found] == [0, 1, 0]
+    parsed = [parse_publish(first, body, len(body), five=five) for first, body in found]
+    assert [each.identifier for each in parsed] == [7, 8, 9]
+    assert [bytes(each.payload) for each in parsed] == [each.payload for each in sent]
+    assert {each.topic for each in parsed} == {"plant/pump/n"}
+
+
+def test_packets_are_found_in_pieces_of_any_size() -> None:
+    chance = random.Random(7)
+    sent = [message(bytes(chance.randrange(300))) for _ in range(50)]
+    data = packed(sent, range(1, 51), qos=1, five=True)
+    whole = list(Packets().feed(data))
+    packets, found = Packets(), []
+    while data:
+        size = chance.randrange(1, 40)
+        found += list(packets.feed(data[:size]))
+        data = data[size:]
+    assert found == whole
+
+
+def test_a_packet_that_is_too_large_is_skipped_and_not_kept() -> None:
+    packets = Packets()
+    data = packed([message(bytes(10 * MAX_PACKET)), message(b"next")], [1, 2], qos=1, five=True)
+    found = []
+    for at in range(0, len(data), 1000):
+        found += list(packets.feed(data[at : at + 1000]))
+        assert len(packets._left) <= MAX_PACKET
+    assert [body[-4:] for _, body in found] == [b"next"]
+    assert packets.skipped == 1
+
+
+def test_a_length_of_five_bytes_is_malformed() -> None:
+    with pytest.raises(ValueError, match="more than 4 bytes"):
+        list(Packets().feed(b"\x30\xff\xff\xff\xff\x01"))
+
+
+def test_confirmations_count_without_a_gap() -> None:
+    delivery = Delivery([message() for _ in range(4)])
+    for index, confirmed in ((1, 0), (3, 0), (0, 2), (2, 4)):
+        delivery.confirm(index)
+        assert delivery.confirmed == confirmed
+    assert delivery.is_done
+
+
+def test_a_closed_waiter_leaves_nothing_at_its_stop() -> None:
+    """Each attempt to connect has a waiter, and an outage may have many."""
+    stop = Stop()
+    for _ in range(3):
+        with Waiter(stop):
+            pass
+    assert stop._then == []
+
+
+@pytest.mark.parametrize(
+    ("template", "status"),
+    [
+        (None, "plant/holdfast/status"),
+        ("site/7/{device}/{tag}", "site/7/holdfast/status"),
+        ("{device}/{tag}", "holdfast/status"),
+    ],
+)
+def test_the_status_topic_begins_as_the_others(template: str | None, status: str) -> None:
+    assert TopicNames(template, None, whole_device=False).status == status
+
+
+def test_with_an_object_for_a_device_commands_have_the_tag_in_their_topic() -> None:
+    names = TopicNames("a/{device}/b", None, whole_device=True)
+    assert names.of_device("pump") == "a/pump/b"
+    assert names.of_commands("pump", "n") == "a/pump/b/n/set"
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        ("topic: 'a/{dev}/{tag}'", "topic: found 'a/{dev}/{tag}', allowed as placeholders: only"),
+        ("topic: 'a/{device}-{tag}'", "each alone in its level"),
+        ("topic: 'a/#/{device}/{tag}'", "'#' only alone in the last level"),
+        ("topic: 'a/{tag}'", "allowed: {device} once, {tag} at most once"),
+        ("topic: 'a/{device}'", "topic: found 'a/{device}', allowed: with {tag}"),
+        ("topic: 'a/{device}/{tag}', payload: device", "payload: device, allowed: without {tag}"),
+        ("status: plant/pump/x", "which is a topic of the device pump"),
+        ("qos: 2", "qos: found 2, allowed: 0 or 1"),
+        ("tls: {}", "tls: found with a url that begins with mqtt://"),
+        ("password_file: none", "password_file: found without username"),
+        ("discovery: hass", "discovery: found 'hass', allowed: homeassistant"),
+    ],
+)  # fmt: skip
+def test_errors_are_named(tmp_path: Path, given: str, problem: str) -> None:
+    text = (
+        "devices: {pump: {url: 'tcp://127.0.0.1', interval: 1, "
+        "tags: {n: {area: coils, address: 0}}}}\n"
+        "outputs: {home: {type: mqtt, url: 'mqtt://127.0.0.1', " + given + "}}\n"
+    )
+    found = Folder(tmp_path).problems(text)
+    assert found
+    assert any(problem in each for each in found), found
