@@ -132,6 +132,9 @@ def test_commands_during_an_outage_are_not_carried_out_later(plant: Plant) -> No
     probe.publish("plant/pump/valve/set", "true")
     assert reply(probe, "valve")["status"] == "accepted"
     assert device.memory.read("holding_registers", 0, 1) == [77]
+    clean = [line for line in plant.broker.log.splitlines() if " as fixed (" in line]
+    assert len(clean) == 2
+    assert all(", c1, " in line for line in clean)
 
 
 def test_without_writes_nothing_is_subscribed_to(plant: Plant) -> None:
