@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LIST = "examples/tags/heater.yaml"
-PAGES = ("tags.md", "cli.md")
+PAGES = ("tags.md", "cli.md", "compare.md")
 URL = "tcp://127.0.0.1:5020"
 SIMULATE = f"holdfast simulate {LIST}"
 
