@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from paho.mqtt.properties import Properties
 
-    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.config import BrokerConfig
     from holdfast.mqtt.packets import Publish
     from holdfast.outputs.mqtt.messages import Delivery
 
@@ -43,7 +43,7 @@ FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
 TOPICS = 100
 """Topics in one SUBSCRIBE packet."""
 
-PUBLISH, PUBACK = 0x30, 0x40
+PUBLISH, PUBACK, PINGREQ, PINGRESP = 0x30, 0x40, 0xC0, 0xD0
 QUOTA_EXCEEDED = 0x97
 READ = 262_144
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
@@ -55,15 +55,21 @@ class Connection(BrokerClient):
 
     def __init__(
         self,
-        settings: MqttOutputConfig,
+        settings: BrokerConfig,
         client_id: str,
         password: bytes | None,
         dial: Callable[[], socket.socket],
         on_command: Callable[[Publish, bool], None],
+        *,
+        qos: int,
+        proves: bool,
     ) -> None:
+        """`proves`: with a quality of service of 0, messages count as confirmed when the broker
+        has answered a ping that follows them; otherwise, when they are written.
+        """
         super().__init__(settings, client_id, password, dial, session_expiry=0)
         self._on_command = on_command
-        self._qos = settings.qos
+        self._qos, self._proves = qos, proves
         self._window = WINDOW[settings.version]
         self._largest: int | None = None
         self._retains = True
@@ -71,6 +77,7 @@ class Connection(BrokerClient):
         self._waiting: deque[Delivery] = deque()
         self._in_flight: dict[int, tuple[Delivery, int]] = {}
         self._written: list[Delivery] = []
+        self._pinged: list[Delivery] = []
         self._next = FIRST_IDENTIFIER
 
     def greet(self) -> None:
@@ -119,12 +126,22 @@ class Connection(BrokerClient):
             news |= self._send(delivery, self._window - len(self._in_flight))
             if delivery.sent == len(delivery.messages):
                 self._waiting.popleft()
-        if self._written and not self.want_write():
-            for delivery in self._written:
-                delivery.confirmed = len(delivery.messages)
-            self._written.clear()
-            news = True
+        if self._written and self._proves:
+            if not self._pinged:
+                self._pinged, self._written = self._written, []
+                self._packet_queue(PINGREQ, bytes((PINGREQ, 0)), 0, 0)
+        elif self._written and not self.want_write():
+            news = self._confirm(self._written)
         return news
+
+    @staticmethod
+    def _confirm(deliveries: list[Delivery]) -> bool:
+        """Confirms and removes whole deliveries. Returns whether there were some."""
+        for delivery in deliveries:
+            delivery.confirmed = len(delivery.messages)
+        found = bool(deliveries)
+        deliveries.clear()
+        return found
 
     def _send(self, delivery: Delivery, room: int) -> bool:
         """Sends the next messages. Returns whether some were refused."""
@@ -188,6 +205,8 @@ class Connection(BrokerClient):
                 news |= self._confirmed(body)
             elif first & 0xF0 == PUBLISH:
                 self._received(first, body)
+            elif first == PINGRESP and self._pinged:
+                news |= self._confirm(self._pinged)
             elif self._passed(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
                 self._end(self.trouble or "the broker sent a malformed packet")
             if self.socket() is None:

@@ -108,7 +108,12 @@ class MqttOutput:
         if self._session is None:
             assert self._stop is not None, "until comes first"
             self._session = Session(
-                self._settings, self._client_id, self._status(OFFLINE), self._on_message, self._stop
+                self._settings,
+                self._client_id,
+                self._status(OFFLINE),
+                self._on_message,
+                self._stop,
+                qos=self._settings.qos,
             )
             self._connects += 1
             self._greet(self._session)

@@ -6,6 +6,9 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
+
 from holdfast import logs
 from holdfast.mqtt.dialing import dial
 from holdfast.mqtt.password import read_password
@@ -21,9 +24,8 @@ if TYPE_CHECKING:
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags
     from paho.mqtt.properties import Properties
-    from paho.mqtt.reasoncodes import ReasonCode
 
-    from holdfast.config.outputs import MqttOutputConfig
+    from holdfast.config import BrokerConfig
     from holdfast.mqtt.packets import Publish
 
 WELCOME = 10.0
@@ -47,13 +49,22 @@ class Session:
 
     def __init__(
         self,
-        settings: MqttOutputConfig,
+        settings: BrokerConfig,
         client_id: str,
         will: Message | None,
         on_command: Callable[[Publish, bool], None],
         stop: Stop,
+        *,
+        qos: int,
+        will_qos: int | None = None,
+        proves: bool = False,
     ) -> None:
-        self._settings = settings
+        """`qos` is of all messages, and of the will unless it has its own. For `proves`, see
+        `Connection`.
+        """
+        self._settings, self._qos, self._proves = settings, qos, proves
+        self._will_qos = qos if will_qos is None else will_qos
+        self._ends_with_will = False
         self._stop, self._end = stop, Stop()
         self._lock = threading.Lock()
         self._news = threading.Condition(self._lock)
@@ -109,8 +120,12 @@ class Session:
                 elif now - since > (LAST if self._stop.is_set() else PROGRESS):
                     raise TimeoutError("the broker confirmed no message in time")
 
-    def close(self, last: Sequence[Message] = ()) -> None:
-        """Publishes the last messages, and ends the connection."""
+    def close(self, last: Sequence[Message] = (), *, with_will: bool = False) -> None:
+        """Publishes the last messages, and ends the connection.
+
+        `with_will`: the broker publishes the will too. MQTT 3.1.1 has no way to ask for it.
+        """
+        self._ends_with_will = with_will
         if last and not self._is_over:
             delivery = self.publish(last)
             with self._news:
@@ -134,12 +149,20 @@ class Session:
                 return dial(settings.host, settings.port, context, waiter)
 
             password = read_password(settings.password_file)
-            connection = Connection(settings, client_id, password, open_socket, on_command)
+            connection = Connection(
+                settings,
+                client_id,
+                password,
+                open_socket,
+                on_command,
+                qos=self._qos,
+                proves=self._proves,
+            )
             connection.on_connect = self._on_connect
             connection.on_disconnect = self._on_disconnect
             if will is not None:
                 connection.will_set(
-                    will.topic[2:].decode(), will.payload, settings.qos, will.retain
+                    will.topic[2:].decode(), will.payload, self._will_qos, will.retain
                 )
             try:
                 connection.greet()
@@ -178,7 +201,11 @@ class Session:
                     self._tell()
                 self._step(connection, self._waiter)
         except Ended:
-            connection.disconnect()
+            if self._ends_with_will and self._settings.version == "5":
+                packet, reason = PacketTypes.DISCONNECT, "Disconnect with will message"
+                connection.disconnect(ReasonCode(packet, reason))
+            else:
+                connection.disconnect()
         except (OSError, ValueError) as error:
             self._reason = str(error)
         except Exception as error:  # Nothing that a broker sends may end the output.
