@@ -1,0 +1,120 @@
+"""The metrics of a device: what births and data of its tags are."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from holdfast.outputs.sparkplug.datatypes import INT32, STRING, Datatype, datatype_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from holdfast.polling import Reading
+    from holdfast.tags import Tag
+
+GOOD, BAD = 192, 0
+"""Quality codes of the specification."""
+
+
+class Entry(NamedTuple):
+    """A metric: a tag, or one item of it."""
+
+    device: str
+    tag: Tag
+    item: int | None
+    name: str
+    alias: int
+    datatype: Datatype
+
+
+class DeviceMetrics:
+    """The metrics of one device, and what a host knows of them. For one thread."""
+
+    def __init__(self, device: str, tags: Sequence[Tag]) -> None:
+        self.device = device
+        self._tags = tags
+        self._entries: dict[str, list[Entry]] = {}
+        self.by_name: dict[str, Entry] = {}
+        """The metrics by name. This and `by_alias` are for all threads."""
+        self.by_alias: dict[int, Entry] = {}
+        self._born: dict[str, float] = {}
+        self._bad: set[str] = set()
+
+    def birth(self, payload: Any, latest: Mapping[str, Reading], aliases: Iterator[int]) -> None:
+        """Adds all metrics with their current values, and with new aliases."""
+        self._bad.clear()
+        self._entries = {tag.name: _entries(self.device, tag, aliases) for tag in self._tags}
+        every = [entry for entries in self._entries.values() for entry in entries]
+        self.by_name = {entry.name: entry for entry in every}
+        self.by_alias = {entry.alias: entry for entry in every}
+        for name, entries in self._entries.items():
+            reading = latest.get(name)
+            at = time.time() if reading is None else reading.time
+            self._born[name] = at
+            for entry in entries:
+                metric = payload.metrics.add(
+                    name=entry.name,
+                    alias=entry.alias,
+                    timestamp=int(at * 1000),
+                    datatype=entry.datatype.number,
+                )
+                has_value = _fill(metric, entry, None if reading is None else reading.value)
+                if not has_value:
+                    self._bad.add(entry.name)
+                _property(metric, "Quality", INT32, GOOD if has_value else BAD)
+                if entry.tag.unit:
+                    _property(metric, "engUnit", STRING, entry.tag.unit)
+
+    def is_known(self, reading: Reading) -> bool:
+        """Whether the birth had this reading, or there is no metric for it any more."""
+        name = reading.tag.name
+        return name not in self._entries or reading.time == self._born.get(name)
+
+    def add(self, payload: Any, reading: Reading) -> None:
+        """Adds the metrics of a reading. It is historical if the birth had a newer one."""
+        name = reading.tag.name
+        is_historical = reading.time < self._born[name]
+        for entry in self._entries[name]:
+            metric = payload.metrics.add(alias=entry.alias, timestamp=int(reading.time * 1000))
+            if is_historical:
+                metric.is_historical = True
+            has_value = _fill(metric, entry, reading.value)
+            if is_historical:
+                if not has_value:
+                    _property(metric, "Quality", INT32, BAD)
+            elif has_value is (entry.name in self._bad):
+                _property(metric, "Quality", INT32, GOOD if has_value else BAD)
+                (self._bad.discard if has_value else self._bad.add)(entry.name)
+
+
+def _entries(device: str, tag: Tag, aliases: Iterator[int]) -> list[Entry]:
+    datatype, by_item = datatype_of(tag)
+    items: list[int | None] = [None]
+    if by_item:
+        items = list(range(tag.of_type.count or 0))
+    names = [tag.name if item is None else f"{tag.name}/{item}" for item in items]
+    return [
+        Entry(device, tag, item, name, next(aliases), datatype)
+        for item, name in zip(items, names, strict=True)
+    ]
+
+
+def _fill(metric: Any, entry: Entry, value: Any) -> bool:
+    """Puts a value into a metric. Returns whether there is one."""
+    if entry.item is not None and value is not None:
+        value = value[entry.item]
+    if value is None:
+        metric.is_null = True
+        return False
+    setattr(metric, entry.datatype.field, entry.datatype.packed(value))
+    return True
+
+
+def _property(metric: Any, key: str, kind: int, value: int | str) -> None:
+    metric.properties.keys.append(key)
+    made = metric.properties.values.add(type=kind)
+    if isinstance(value, str):
+        made.string_value = value
+    else:
+        made.int_value = value

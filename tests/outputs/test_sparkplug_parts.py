@@ -1,0 +1,251 @@
+"""Parts of Sparkplug outputs: types, sequence numbers, and the order of messages."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.faults import FAULTS
+from holdfast.outputs.sparkplug.datatypes import datatype_of, value_of
+from holdfast.outputs.sparkplug.definition import Metric, parsed
+from holdfast.outputs.sparkplug.names import Names
+from holdfast.outputs.sparkplug.node import EdgeNode
+from holdfast.outputs.sparkplug.primary_host import PrimaryHost
+from holdfast.polling import Reading
+from holdfast.tags import Tag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from holdfast.outputs.mqtt.messages import Message
+
+SPEED = Tag("speed", "input_registers", 0)
+LEVEL = Tag("level", "input_registers", 1)
+
+
+def reading(
+    value: Any, time: float, tag: Tag = SPEED, device: str = "pump", fault: int = 0
+) -> Reading:
+    return Reading(device, tag, value, time, fault)
+
+
+def latest(*readings: Reading) -> dict[str, dict[str, Reading]]:
+    found: dict[str, dict[str, Reading]] = {}
+    for each in readings:
+        found.setdefault(each.device, {})[each.tag.name] = each
+    return found
+
+
+def node(*readings: Reading) -> EdgeNode:
+    """A node in a session, with a device of these current values."""
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [SPEED, LEVEL]})
+    list(made.births({"pump": True}, lambda: latest(*readings)))
+    return made
+
+
+def kinds(messages: Iterable[Message]) -> list[str]:
+    return [message.topic[2:].decode().split("/")[2] for message in messages]
+
+
+def payload(message: Message) -> Any:
+    return parsed(message.payload)
+
+
+@pytest.mark.parametrize(
+    ("type", "values", "number", "data"),
+    [  # The examples of the specification, except for floats, which it shows in another order.
+        ("int16[2]", [-30000, 30000], 23, "D08A3075"),
+        ("int32[2]", [-1, 315338746], 24, "FFFFFFFFFAAFCB12"),
+        (
+            "int64[2]",
+            [-4270929666821191986, -3601064768563266876],
+            25,
+            "CE0672AC189CBAC4C4BA9C18AC7206CE",
+        ),
+        ("uint16[2]", [30, 52360], 27, "1E0088CC"),
+        ("uint32[2]", [52, 3293969225], 28, "3400000049FB55C4"),
+        ("uint64[2]", [52, 16444743074749521625], 29, "3400000000000000D99E02D1B27637E4"),
+        ("float32[2]", [1.5, None], 30, "0000C03F0000C07F"),
+        ("float64[1]", [1.5], 31, "000000000000F83F"),
+        ("string:6[2]", ["ABC", "hello"], 33, "4142430068656C6C6F00"),
+    ],
+)
+def test_arrays_are_those_of_the_specification(
+    type: str, values: list[Any], number: int, data: str
+) -> None:
+    datatype, by_item = datatype_of(Tag("x", "holding_registers", 0, type))
+    assert (datatype.number, by_item) == (number, False)
+    packed = datatype.packed(values)
+    assert packed.hex().upper() == data
+    if None not in values:
+        assert value_of(Metric(bytes_value=packed), datatype) == values
+
+
+def test_an_integer_that_is_too_large_for_a_double_is_infinite() -> None:
+    tag = Tag("x", "holding_registers", 0, "uint16[2]", scale=1e308)
+    datatype, _ = datatype_of(tag)
+    assert datatype.packed(tag.value([65535, 0])) == struct.pack("<2d", math.inf, 0)
+
+
+TAGS = [
+    Tag("x", "holding_registers", 0, type)
+    for type in ("int16", "uint64", "float32", "float64[2]", "string:4", "string:4[2]", "bytes:4")
+]
+
+
+@given(
+    fields=st.fixed_dictionaries(
+        {},
+        optional={
+            "datatype": st.integers(0, 40),
+            "is_null": st.booleans(),
+            "int_value": st.integers(0, 2**32 - 1),
+            "long_value": st.integers(0, 2**64 - 1),
+            "float_value": st.floats(width=32),
+            "double_value": st.floats(),
+            "boolean_value": st.booleans(),
+            "string_value": st.text(st.characters(exclude_categories=["Cs"])),
+            "bytes_value": st.binary(max_size=40),
+        },
+    ),
+    tag=st.sampled_from([*TAGS, Tag("x", "coils", 0, "bool[3]"), Tag("x", "coils", 0)]),
+)
+def test_any_metric_has_a_value_or_an_error(fields: dict[str, Any], tag: Tag) -> None:
+    with contextlib.suppress(ValueError):
+        value_of(Metric(**fields), datatype_of(tag)[0])
+
+
+def test_bits_begin_with_the_most_significant_one() -> None:
+    values = [False, False, True, True, False, True, False, False, True, True, False, True]
+    datatype, _ = datatype_of(Tag("x", "coils", 0, "bool[12]"))
+    packed = datatype.packed(values)
+    assert packed == bytes([12, 0, 0, 0, 0x34, 0xD0])
+    assert value_of(Metric(bytes_value=packed), datatype) == values
+
+
+@pytest.mark.parametrize(
+    ("tag", "expected"),
+    [
+        (Tag("x", "holding_registers", 0, "bcd16"), "UInt16"),
+        (Tag("x", "holding_registers", 0, "bcd32"), "UInt32"),
+        (Tag("x", "holding_registers", 0, "float16"), "Float"),
+        (Tag("x", "holding_registers", 0, "int16", scale=10), "Double"),
+        (Tag("x", "holding_registers", 0, "float32", offset=1), "Double"),
+        (Tag("x", "holding_registers", 0, "uint16[2]", scale=0.1), "DoubleArray"),
+        (Tag("x", "holding_registers", 0, "bytes:4"), "Bytes"),
+        (Tag("x", "holding_registers", 0, "bytes:4[2]"), "Bytes by item"),
+        (Tag("x", "holding_registers", 0, "int16[2]", null=frozenset({-1})), "Int16 by item"),
+        (
+            Tag("x", "holding_registers", 0, "int16[2]", scale=0.1, null=frozenset({-1})),
+            "DoubleArray",
+        ),
+    ],
+)
+def test_types_of_metrics(tag: Tag, expected: str) -> None:
+    datatype, by_item = datatype_of(tag)
+    assert f"{datatype.name}{' by item' if by_item else ''}" == expected
+
+
+def test_sequence_numbers_begin_again_after_255() -> None:
+    made = node(reading(0, 1.0))
+    found = [
+        payload(message).seq
+        for time in range(300)
+        for message in made.data([reading(time, 2.0 + time)], latest)
+    ]
+    assert found == [number % 256 for number in range(2, 302)]
+
+
+def test_session_numbers_begin_again_after_255() -> None:
+    made = EdgeNode(Names("group", "edge"))
+    found = []
+    for _ in range(258):
+        made.begin()
+        found.append(payload(made.death()).metrics[0].long_value)
+    assert found == [*range(256), 0, 1]
+
+
+def test_what_a_birth_has_is_not_repeated_and_what_is_older_is_historical() -> None:
+    made = node(reading(5, 10.0), reading(7, 10.0, LEVEL))
+    some = [reading(3, 8.0), reading(5, 10.0), reading(6, 11.0), reading(8, 11.0, LEVEL)]
+    messages = list(made.data(some, latest))
+    found = [
+        [(metric.int_value, metric.is_historical) for metric in payload(message).metrics]
+        for message in messages
+    ]
+    assert found == [[(3, True)], [(6, False), (8, False)]]
+
+
+def test_a_device_without_birth_is_born_for_its_values_and_dies_after_them() -> None:
+    made = EdgeNode(Names("group", "edge"))
+    made.begin()
+    made.adopt({"pump": [SPEED]})
+    assert kinds(made.births({"pump": False}, latest)) == ["NBIRTH"]
+    silent = reading(None, 10.0, fault=FAULTS["timeout"])
+    assert kinds(made.data([silent], latest)) == []
+    old = [reading(3, 8.0), silent]
+    assert kinds(made.data(old, lambda: latest(silent))) == ["DBIRTH", "DDATA"]
+    assert kinds(made.device_deaths({"pump": False}, old)) == []
+    assert kinds(made.device_deaths({"pump": False}, [silent])) == ["DDEATH"]
+
+
+def test_an_exception_is_no_silence() -> None:
+    made = node(reading(5, 10.0))
+    [message] = made.data([reading(None, 11.0, fault=2)], latest)
+    [metric] = payload(message).metrics
+    assert metric.is_null
+    assert metric.properties.values[0].int_value == 0
+
+
+def test_a_tag_that_is_no_more_has_no_data() -> None:
+    made = node(reading(5, 10.0))
+    gone = Tag("gone", "input_registers", 5)
+    assert kinds(made.data([reading(5, 11.0, gone), reading(5, 11.0, device="fan")], latest)) == []
+
+
+@pytest.mark.parametrize(
+    ("states", "online"),
+    [
+        ([(True, 5)], True),
+        ([(True, 5), (False, 4)], True),
+        ([(True, 5), (False, 5)], False),
+        ([(False, 5), (True, 4)], False),
+        ([(False, 5), (True, 5)], True),
+    ],
+)
+def test_an_older_state_of_a_host_does_not_count(
+    states: list[tuple[bool, int]], online: bool
+) -> None:
+    host = PrimaryHost()
+    for state, timestamp in states:
+        host.take(b'{"online": %s, "timestamp": %d}' % (str(state).lower().encode(), timestamp))
+    assert host.is_online is online
+
+
+def test_the_state_of_a_host_is_unknown_in_a_new_connection() -> None:
+    host = PrimaryHost()
+    host.take(b'{"online": true, "timestamp": 5}')
+    host.begin()
+    assert not host.is_online
+    host.take(b'{"online": true, "timestamp": 4}')
+    assert not host.is_online
+
+
+def test_text_that_is_not_utf_8_is_an_error() -> None:
+    datatype, _ = datatype_of(Tag("x", "holding_registers", 0, "string:4"))
+    with pytest.raises(ValueError, match="not UTF-8"):
+        value_of(parsed(b"\x12\x04\x7a\x02\xff\xfe").metrics[0], datatype)
+
+
+@pytest.mark.parametrize("data", [b"\xff", b"\x12\x05\x0a", b"\x12\x02\x0a\xff"])
+def test_a_malformed_payload_is_an_error(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a Sparkplug B payload"):
+        parsed(data)
