@@ -739,6 +739,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "ServerTlsConfig": ["cert_file", "key_file", "ca_file"],
         "Span": ["size"],
         "StatusConfig": ["area", "slot", "memory"],
+        "SparkplugConfig": ["url", "type", "group", "edge_node"],
         "SubscriptionConfig": ["topic", "memories", "areas"],
         "SyslogConfig": ["url"],
         "TagConfig": ["area", "address"],

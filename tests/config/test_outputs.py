@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.config import ConfigError, load
+from holdfast.config import ConfigError, load, output_checks
 from holdfast.config.fingerprint import fingerprint, signature
 
 if TYPE_CHECKING:
@@ -18,6 +18,23 @@ DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, inte
 @pytest.mark.parametrize(
     ("output", "expected"),
     [
+        ("{type: sparkplug, url: 'mqtt://h', group: g}", "o.edge_node: missing"),
+        (
+            "{type: sparkplug, url: 'mqtt://h', group: a/b, edge_node: e}",
+            "o.group: found 'a/b', allowed: text without +, / and #",
+        ),
+        (
+            "{type: sparkplug, url: 'mqtt://h', group: g, edge_node: e, primary_host: '#'}",
+            "o.primary_host: found '#', allowed: text without +, / and #",
+        ),
+        (
+            "{type: sparkplug, url: 'mqtt://h', group: g, edge_node: e, tls: {}}",
+            "o.tls: found with a url that begins with mqtt://",
+        ),
+        (
+            "{type: sparkplug, url: 'mqtt://h', group: g, edge_node: e, qos: 1}",
+            "o.qos: unknown key",
+        ),
         ("{type: file, file: a, format: xml}", "o.format: found 'xml', allowed: csv, jsonl"),
         ("{file: a, format: csv}", "o.type: missing, allowed: "),
         ("{type: mysql}", "o.type: found 'mysql', allowed: "),
@@ -88,3 +105,28 @@ def test_what_is_written_to_own_files_is_no_change_of_the_configuration(tmp_path
     now = signature(file, config), fingerprint(config)
     assert now[0] != before[0]
     assert now[1] != before[1]
+
+
+NODE = "{type: sparkplug, url: 'mqtt://h', group: g, edge_node: e}"
+
+
+def test_two_edge_nodes_need_two_names(tmp_path: Path) -> None:
+    file = tmp_path / "p.yaml"
+    file.write_text(f"{DEVICE}outputs:\n  o: {NODE}\n  p: {NODE}\n")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    [problem] = caught.value.problems
+    expected = "outputs.p.edge_node: found 'e', which outputs.o has in the same group"
+    assert str(problem).startswith(f"{file}:4: {expected}")
+
+
+def test_without_protobuf_sparkplug_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(output_checks, "find_spec", lambda _: None)
+    file = tmp_path / "p.yaml"
+    file.write_text(f"{DEVICE}outputs:\n  o: {NODE}\n")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    [problem] = caught.value.problems
+    assert "requires the Python package protobuf" in str(problem)

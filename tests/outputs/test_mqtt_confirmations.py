@@ -18,6 +18,8 @@ from support.readings import numbered
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from holdfast.polling import Reading
+
 
 class Broker:
     """Confirms a number of values in each connection, then closes it."""
@@ -74,6 +76,9 @@ class Site:
 
     def answering(self) -> dict[str, bool]:
         return {}
+
+    def latest(self) -> list[Reading]:
+        return []
 
     def refresh(self) -> None:
         self.refreshed += 1

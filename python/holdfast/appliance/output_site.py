@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from holdfast.appliance.tag_values import TagValues
     from holdfast.appliance.tag_writes import TagWrites
+    from holdfast.polling import Reading
     from holdfast.tags import Tag
 
 
@@ -40,6 +41,13 @@ class OutputSite:
     def answering(self) -> dict[str, bool]:
         """Whether each device answers, as far as it is known."""
         return self._values.answering(self._only)
+
+    def latest(self) -> list[Reading]:
+        """The last reading of each tag."""
+        only = self._only
+        return [
+            reading for reading in self._values.latest() if only is None or reading.device in only
+        ]
 
     def refresh(self) -> None:
         """Has the next value of each tag published, also if it is unchanged."""

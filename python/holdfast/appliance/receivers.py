@@ -10,6 +10,7 @@ from holdfast.config.outputs import (
     InfluxConfig,
     MqttOutputConfig,
     NatsOutputConfig,
+    SparkplugConfig,
 )
 
 if TYPE_CHECKING:
@@ -34,6 +35,10 @@ def receiver(name: str, settings: Output, site: Site) -> Receiver:
             from holdfast.outputs.mqtt import MqttOutput
 
             return MqttOutput(name, settings, site)
+        case SparkplugConfig():
+            from holdfast.outputs.sparkplug import SparkplugOutput
+
+            return SparkplugOutput(name, settings, site)
         case FileConfig(format="sqlite"):
             from holdfast.outputs.database import Database
 

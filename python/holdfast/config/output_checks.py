@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.broker_checks import check_broker
@@ -52,6 +53,8 @@ class OutputChecks:
                 check_nats(path, output, self.folder, self.report)
             elif kind == "mqtt":
                 self._mqtt(path, output, devices)
+            if mapping(output).get("type") == "sparkplug":
+                self._sparkplug(path, output, outputs)
 
     def _influx(self, path: KeyPath, output: dict[Any, Any]) -> None:
         target = parsed(parse_http, output.get("url"))
@@ -74,6 +77,21 @@ class OutputChecks:
         for key in ("token_file", "password_file"):
             check_readable((*path, key), output.get(key), self.folder, self.report)
         check_client_tls((*path, "tls"), mapping(output.get("tls")), self.folder, self.report)
+
+    def _sparkplug(self, path: KeyPath, output: dict[Any, Any], outputs: dict[Any, Any]) -> None:
+        check_broker(path, output, self.folder, self.report)
+        if find_spec("google") is None or find_spec("google.protobuf") is None:
+            message = (
+                "found 'sparkplug', which requires the Python package protobuf, not installed here"
+            )
+            self.report.add((*path, "type"), message)
+        for name, other in outputs.items():
+            if other is output:
+                break
+            if all(mapping(other).get(key) == output.get(key) for key in ("group", "edge_node")):
+                found = f"found {show(output.get('edge_node'))}"
+                message = f"{found}, which outputs.{name} has in the same group"
+                self.report.add((*path, "edge_node"), message)
 
     def _mqtt(self, path: KeyPath, output: dict[Any, Any], devices: dict[Any, Any]) -> None:
         check_broker(path, output, self.folder, self.report)

@@ -13,8 +13,10 @@ from holdfast.config.scalars import (
     FilePath,
     HttpUrl,
     MqttText,
+    MqttVersion,
     Name,
     NotNull,
+    SparkplugId,
     SubjectPrefix,
     TopicName,
     TopicTemplate,
@@ -148,7 +150,28 @@ class MqttOutputConfig(OutputConfig, BrokerConfig):
         return TopicNames(self.topic, self.status, whole_device=self.payload == "device")
 
 
-OUTPUT_TYPES = ("influx", "mqtt", "file", "nats")
+class SparkplugConfig(OutputConfig, BrokerConfig):
+    """A Sparkplug B edge node, whose devices are those that are polled."""
+
+    type: Literal["sparkplug"]
+    """The type of the output."""
+    group: SparkplugId
+    """The group of the edge node."""
+    edge_node: SparkplugId
+    """The edge node; unique in its group."""
+    primary_host: Annotated[SparkplugId | None, NotNull()] = None
+    """The host without which nothing is published: values wait until it is online."""
+    version: MqttVersion = "3.1.1"
+    """The version of MQTT."""
+    client_id: Annotated[MqttText | None, NotNull()] = None
+    """The client identifier. Default: holdfast, the name of the output, and that of the host."""
+    writes: bool = False
+    """Whether commands for writable tags are written to their devices."""
+
+
+OUTPUT_TYPES = ("influx", "mqtt", "sparkplug", "file", "nats")
 """All values of `type`."""
 
-Output: TypeAlias = InfluxConfig | MqttOutputConfig | FileConfig | NatsOutputConfig
+Output: TypeAlias = (
+    InfluxConfig | MqttOutputConfig | SparkplugConfig | FileConfig | NatsOutputConfig
+)

@@ -64,6 +64,7 @@ MAX_TIME = 31_622_400
 MIN_TIME = 0.001
 
 NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"
+MAX_SPARKPLUG_ID = 255
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
 _STATUS_NAME = "[ -~]{0,16}"
@@ -204,6 +205,14 @@ def _key_of(least: int, most: int, note: str = "") -> Callable[[object], UnitKey
         return parsed
 
     return key
+
+
+def _sparkplug_id(value: object) -> str:
+    text = _text_of(MAX_SPARKPLUG_ID)(value)
+    for character in "+/#":
+        if character in text:
+            raise ValueError(f"found {show(value)}, allowed: text without +, / and #")
+    return text
 
 
 def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
@@ -403,6 +412,11 @@ TopicTemplate = Annotated[
     str,
     PlainValidator(parse_topic_template),
     WithJsonSchema({"type": "string", "examples": ["plant/{device}/{tag}"]}),
+]
+SparkplugId = Annotated[
+    str,
+    PlainValidator(_sparkplug_id),
+    WithJsonSchema({"type": "string", "pattern": "^[^+/#]{1,255}$"}),
 ]
 MqttVersion = Annotated[
     Literal["5", "3.1.1"],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from holdfast.polling import Reading
     from holdfast.tags import Tag
 
 
@@ -37,6 +38,9 @@ class Site(Protocol):
 
     def answering(self) -> Mapping[str, bool]:
         """Whether each device answers, as far as it is known."""
+
+    def latest(self) -> Sequence[Reading]:
+        """The last reading of each tag."""
 
     def refresh(self) -> None:
         """Has the next value of each tag published, also if it is unchanged."""
