@@ -146,6 +146,10 @@ class Plant:
         """The readings with an outcome: sent, refused or dropped."""
         return int(self.status().get("readings", {}).get(outcome, 0))
 
+    def has_waiting(self, least: int) -> bool:
+        """Whether at least so many values wait."""
+        return bool(self.status().get("waiting", 0) >= least)
+
     def probe(self, *topics: str) -> Client:
         """A client that has subscribed to these topics."""
         made = self._running.enter_context(Client(self.broker.port))

@@ -47,6 +47,8 @@ class Proxy:
         self.url = f"mqtt://127.0.0.1:{self._server.getsockname()[1]}"
         self._lock = threading.Lock()
         self._open: list[socket.socket] = []
+        self.swallows = False
+        """Whether it reads from clients, but forwards nothing."""
         self._threads = [threading.Thread(target=self._accept)]
         self._threads[0].start()
 
@@ -71,11 +73,11 @@ class Proxy:
                 self._threads.append(thread)
                 thread.start()
 
-    @staticmethod
-    def _pump(here: socket.socket, there: socket.socket) -> None:
+    def _pump(self, here: socket.socket, there: socket.socket) -> None:
         with contextlib.suppress(OSError):
             while piece := here.recv(65536):
-                there.sendall(piece)
+                if not self.swallows:
+                    there.sendall(piece)
         for end in (here, there):
             with contextlib.suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
@@ -113,6 +115,8 @@ class Message(NamedTuple):
     topic: str
     payload: bytes
     properties: Properties | None
+    qos: int = 0
+    retain: bool = False
 
 
 class Probe:
@@ -125,7 +129,13 @@ class Probe:
             CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5, client_id=""
         )
         self._client.on_message = lambda _client, _data, message: self.messages.put(
-            Message(message.topic, bytes(message.payload), message.properties)
+            Message(
+                message.topic,
+                bytes(message.payload),
+                message.properties,
+                message.qos,
+                message.retain,
+            )
         )
         self._client.on_subscribe = lambda *_: self._subscribed.set()
         self._client.connect(host, port)
