@@ -85,3 +85,17 @@ def test_lock_files_name_no_registry(file: str) -> None:
     text = (DRIVERS / file).read_text()
     assert '"resolved"' not in text
     assert "registry." not in text
+
+
+def test_the_host_of_sparkplug_is_the_locked_one() -> None:
+    assert f"(tahu-host {java_versions()['tahu-host']}, " in PAGE
+
+
+def test_the_tests_of_sparkplug_exist() -> None:
+    named = {
+        name for row in rows("Sparkplug B").values() for name in re.findall("`(test_\\w+)`", row[3])
+    }
+    files = [*TESTS.glob("outputs/*.py"), *TESTS.glob("config/*.py"), *TESTS.glob("peers/*.py")]
+    there = {name for file in files for name in re.findall(r"def (test_\w+)", file.read_text())}
+    assert len(named) > 10
+    assert named <= there
