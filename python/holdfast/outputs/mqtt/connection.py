@@ -8,25 +8,29 @@ All methods are for the thread that serves the connection.
 
 from __future__ import annotations
 
+import logging
 import socket
 import ssl
 from collections import deque
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from holdfast import logs
 from holdfast.mqtt.client import BrokerClient
 from holdfast.mqtt.packets import parse_publish
+from holdfast.net.addresses import joined
 from holdfast.outputs.mqtt.messages import Message, packed, size_of
 from holdfast.outputs.mqtt.packets import MAX_PACKET, Packets
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from paho.mqtt.client import Client
     from paho.mqtt.properties import Properties
 
     from holdfast.config import BrokerConfig
@@ -74,6 +78,8 @@ class Connection(BrokerClient):
         self._largest: int | None = None
         self._retains = True
         self._packets = Packets()
+        self._asked: dict[int, Sequence[str]] = {}
+        self.on_subscribe = self._tell_subscribed
         self._waiting: deque[Delivery] = deque()
         self._in_flight: dict[int, tuple[Delivery, int]] = {}
         self._written: list[Delivery] = []
@@ -105,18 +111,37 @@ class Connection(BrokerClient):
         """Subscribes to topics. With MQTT 5, retained messages come only if they are wanted, and
         those of this client never.
         """
+        handling = (
+            SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+            if retained
+            else SubscribeOptions.RETAIN_DO_NOT_SEND
+        )
+        options = SubscribeOptions(qos=1, noLocal=True, retainHandling=handling)
+        how: Any = options if self._five else 1
         for at in range(0, len(topics), TOPICS):
             some = topics[at : at + TOPICS]
-            if not self._five:
-                self.subscribe([(topic, 1) for topic in some])
-                continue
-            handling = (
-                SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
-                if retained
-                else SubscribeOptions.RETAIN_DO_NOT_SEND
-            )
-            options = SubscribeOptions(qos=1, noLocal=True, retainHandling=handling)
-            self.subscribe([(topic, options) for topic in some])
+            identifier = self.subscribe([(topic, how) for topic in some])[1]
+            if identifier is not None:
+                self._asked[identifier] = some
+
+    def _tell_subscribed(
+        self,
+        _client: Client,
+        _data: object,
+        identifier: int,
+        reasons: list[ReasonCode],
+        _properties: Properties | None,
+    ) -> None:
+        """Logs which subscriptions the broker refused."""
+        for topic, reason in zip(self._asked.pop(identifier, ()), reasons, strict=False):
+            if reason.is_failure:
+                logs.write(
+                    logging.ERROR,
+                    "mqtt_subscription_refused",
+                    broker=joined(self._settings.host, self._settings.port),
+                    topic=topic,
+                    reason=str(reason),
+                )
 
     def send_more(self) -> bool:
         """Sends waiting messages, as many as the broker may have. Returns whether some are done."""
