@@ -147,6 +147,9 @@ class Site:
     def answering(self) -> dict[str, bool]:
         return {}
 
+    def latest(self) -> list[Reading]:
+        return []
+
     def refresh(self) -> None:
         pass
 

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         RuleConfig,
         SerialRuleConfig,
     )
+    from holdfast.config.outputs import Output
     from holdfast.config.rights import UnitRights
     from holdfast.types import Area
 
@@ -161,7 +162,7 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     devices, nats = list(config.devices.items()), config.nats
     shown = devices[:MAX_DEVICES]
     names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
-    names += [*config.links, *([] if nats is None else ["nats"])]
+    names += [*config.links, *config.outputs, *([] if nats is None else ["nats"])]
     width = max(map(len, names), default=0)
     lines = [f"{file} is served:", ""]
     for endpoint in endpoints:
@@ -179,6 +180,7 @@ def _greeting(appliance: Appliance, file: Path) -> str:
     lines += [f"  {name:{width}}  {_polled(device)}" for name, device in shown]
     if len(devices) > len(shown):
         lines.append(f"  and {len(devices) - len(shown)} more devices")
+    lines += [f"  {name:{width}}  {_published(output)}" for name, output in config.outputs.items()]
     lines += ["", "Try:", ""]
     lines += [f"  {command}" for command in _suggestions(appliance, endpoints, file)]
     return "\n".join([*lines, "", "Ctrl-C stops it."])
@@ -200,6 +202,13 @@ def _polled(device: DeviceConfig) -> str:
     if device.interval is None or not device.has_readings:
         return f"{device.url} unit {device.unit}, by routes only"
     return f"{device.url} unit {device.unit}, polled every {device.interval:g} s"
+
+
+def _published(output: Output) -> str:
+    """Where an output publishes values, in one line."""
+    servers = getattr(output, "servers", ())
+    to = getattr(output, "url", None) or ", ".join(servers) or str(getattr(output, "file", ""))
+    return f"{output.type}  {to}"
 
 
 def _reached(gateway: GatewayConfig) -> str:
