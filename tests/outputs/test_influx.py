@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
@@ -10,11 +11,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.config.outputs import InfluxConfig
-from holdfast.outputs import Refused
+from holdfast.outputs import Buffer, Refused, Sending
+from holdfast.outputs import influx as module
 from holdfast.outputs.influx import Influx
+from holdfast.outputs.stored import Stored
+from holdfast.stop import Stop
+from support import wire
 from support.brokers import free_port
 from support.line_protocol import Point, parsed
-from support.readings import numbered, reading
+from support.readings import numbered, reading, tag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -172,8 +177,6 @@ def test_a_receiver_that_is_no_http_server_is_an_error(fake_server: int) -> None
 @pytest.fixture
 def fake_server() -> Iterator[int]:
     """Answers anything with something else."""
-    import socket
-
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:
@@ -186,3 +189,29 @@ def fake_server() -> Iterator[int]:
         thread.start()
         yield listener.getsockname()[1]
         thread.join()
+
+
+def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its timeout is an hour; what it has not confirmed is in the file."""
+    monkeypatch.setattr(module, "LAST", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        output = influx(url, bucket="b", timeout=3600)
+        buffer, stop = Buffer(), Stop()
+        find = {"t": tag()}
+        opened = Stored(tmp_path / "b.db", 2**30, lambda _, name: find[name])
+        sending = Sending("db", output, buffer, lambda: opened)
+        thread = threading.Thread(target=sending.run, args=[stop])
+        thread.start()
+        buffer.offer(numbered(3))
+        connection, _ = listener.accept()
+        with connection:
+            assert connection.recv(65536).startswith(b"POST")
+            stop.set()
+            thread.join(wire.DEADLINE)
+            assert not thread.is_alive()
+    stored = Stored(tmp_path / "b.db", 2**30, lambda _, name: find[name])
+    assert [each.value for each in stored.first()] == [0, 1, 2]
+    stored.close()

@@ -11,6 +11,7 @@ from holdfast.faults import NO_CONNECTION
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
 from holdfast.scanner import Servers
+from holdfast.scanner import output as output_module
 from holdfast.scanner.output import NatsOutput
 from holdfast.stop import Stop
 from support import wire
@@ -115,3 +116,25 @@ def test_a_server_that_can_not_be_reached_is_an_error(own_nats: NatsServer) -> N
         output.send(numbered(1))
     output.idle()
     output.close()
+
+
+def test_a_frozen_server_does_not_hold_up_a_stop(
+    own_nats: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(output_module, "LAST", 0.05)
+    monkeypatch.setattr(output_module, "TIMEOUT", 3600.0)
+    output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
+    buffer, stop = Buffer(), Stop()
+    sending = Sending("nats", output, buffer)
+    thread = threading.Thread(target=sending.run, args=[stop])
+    thread.start()
+    buffer.offer(numbered(1))
+    counted = sending.status
+    wire.until(lambda: "'sent': 1" in str(counted()["readings"]), "it is connected")
+    own_nats.freeze()
+    buffer.offer(numbered(1))
+    stop.set()
+    thread.join(wire.DEADLINE)
+    own_nats.thaw()
+    assert not thread.is_alive()
+    assert len(buffer) == 1

@@ -6,19 +6,25 @@ import base64
 import contextlib
 import gzip
 import http.client
+import socket
+import threading
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
 from holdfast.net.addresses import joined
 from holdfast.net.tls import NO_FILES, broker_context
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sending import Refused
+from holdfast.outputs.sending import LAST, Refused
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.config.outputs import InfluxConfig
     from holdfast.polling import Reading
+    from holdfast.stop import Stop
+
+CONNECTING = 3.0
+"""Seconds to connect, at most."""
 
 MAX_ANSWER = 65_536
 """The bytes of an answer that are read."""
@@ -38,11 +44,16 @@ class Influx:
         self._settings = settings
         self._target = settings.target
         self._connection: http.client.HTTPConnection | None = None
+        self._has_ended = False
         self._path = self._target.path
         if self._path in ("", "/"):
             query = {"org": settings.org, "bucket": settings.bucket, "precision": "ns"}
             given = {key: value for key, value in query.items() if value is not None}
             self._path = f"/api/v2/write?{urlencode(given)}"
+
+    def until(self, stop: Stop) -> None:
+        """Ends a request that waits for its answer soon after the stop. Called before all else."""
+        stop.then(self._end_soon)
 
     def send(self, readings: list[Reading]) -> None:
         """Sends all values in one request; those without a value are left out."""
@@ -108,9 +119,29 @@ class Influx:
             raise
         return answer.status, text
 
+    def _end_soon(self) -> None:
+        timer = threading.Timer(LAST, self._end)
+        timer.daemon = True
+        timer.start()
+
+    def _end(self) -> None:
+        """Called by another thread: what waits for the socket gets an error."""
+        self._has_ended = True
+        connection = self._connection
+        if connection is not None and connection.sock is not None:
+            with contextlib.suppress(OSError):
+                connection.sock.shutdown(socket.SHUT_RDWR)
+
     def _opened(self) -> http.client.HTTPConnection:
+        if self._has_ended:
+            raise OSError("stopped")
+        connection = self._created(min(CONNECTING, self._settings.timeout))
+        connection.connect()
+        connection.sock.settimeout(self._settings.timeout)
+        return connection
+
+    def _created(self, timeout: float) -> http.client.HTTPConnection:
         host, port, secure, _ = self._target
-        timeout = self._settings.timeout
         if not secure:
             return http.client.HTTPConnection(host, port, timeout=timeout)
         tls = NO_FILES if self._settings.tls is None else self._settings.tls.files

@@ -6,12 +6,15 @@ Programs that read what the scanner publishes for subscribers read these too.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import threading
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 from nats.errors import Error
 
 from holdfast.faults import fault_text, is_exception
+from holdfast.outputs.sending import LAST
 from holdfast.scanner.receiving import SafeClient, TlsClient
 from holdfast.scanner.subjects import data_subject, names
 from holdfast.scanner.tags import datatype
@@ -23,9 +26,13 @@ if TYPE_CHECKING:
     from holdfast.config.scanning import Dialect
     from holdfast.polling import Reading
     from holdfast.scanner.broker import Servers
+    from holdfast.stop import Stop
 
 TIMEOUT = 5.0
-"""Seconds to connect, and for the server to confirm what was sent."""
+"""Seconds for the server to confirm what was sent."""
+
+CONNECTING = 3.0
+"""Seconds to connect."""
 
 CLOSING = 1.0
 """Seconds to close a connection."""
@@ -46,6 +53,10 @@ class NatsOutput:
         self._lost: asyncio.Event | None = None
         """Set when the connection of the client has ended."""
         self._states: dict[str, str] = {}
+
+    def until(self, stop: Stop) -> None:
+        """Ends a wait for the server soon after the stop. Called before all else."""
+        stop.then(self._end_soon)
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes values, and states that have changed. The server has them when this returns."""
@@ -70,6 +81,18 @@ class NatsOutput:
     def status(self) -> dict[str, object]:
         """Where values go."""
         return {"servers": list(self._servers.urls), "prefix": self._prefix}
+
+    def _end_soon(self) -> None:
+        timer = threading.Timer(LAST, self._end)
+        timer.daemon = True
+        timer.start()
+
+    def _end(self) -> None:
+        """Called by another thread: what waits for the server gets an error."""
+        lost = self._lost
+        if lost is not None:
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
+                self._runner.get_loop().call_soon_threadsafe(lost.set)
 
     async def _send(self, readings: list[Reading]) -> None:
         client = await self._connected()
@@ -101,7 +124,7 @@ class NatsOutput:
 
             client = TlsClient() if self._servers.secure else SafeClient()
             try:
-                await asyncio.wait_for(self._connect(client, is_lost), TIMEOUT)
+                await asyncio.wait_for(self._connect(client, is_lost), CONNECTING)
             except BaseException:
                 await client.close()
                 raise
@@ -114,7 +137,7 @@ class NatsOutput:
         await client.connect(
             **options,
             allow_reconnect=False,
-            connect_timeout=int(TIMEOUT),
+            connect_timeout=int(CONNECTING),
             max_reconnect_attempts=1,
             reconnect_time_wait=0,
             pending_size=PENDING,
