@@ -29,6 +29,7 @@ from holdfast.config.scalars import MAX_TIME
 from holdfast.net.tls import NO_FILES
 from holdfast.polling.reader import Reader
 from holdfast.server import Identity
+from holdfast.tags import TagList
 from holdfast.tools import planning
 from holdfast.types import AREAS
 
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from holdfast.config.devices import BlockConfig, ForwardConfig, StatusConfig
     from holdfast.config.rights import UnitRights
     from holdfast.config.services import NatsServersConfig
+    from holdfast.config.tags import ProfileConfig
     from holdfast.gateway import Settings as GatewaySettings
     from holdfast.net.tls import Tls
     from holdfast.scanner import Servers
@@ -402,13 +404,16 @@ def nats_servers(settings: NatsServersConfig) -> Servers:
     )
 
 
-def scanner(settings: NatsConfig) -> ScannerSettings:
+def scanner(
+    settings: NatsConfig, profiles: Mapping[str, ProfileConfig] | None = None
+) -> ScannerSettings:
     """Returns the settings of the scanner."""
     from holdfast.scanner import Defaults, Ping, ScannerLimits, Settings
 
     limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
     trust = NO_FILES if settings.device_tls is None else settings.device_tls.files
     given = settings.defaults
+    named = {name: TagList(each.named().values()) for name, each in (profiles or {}).items()}
     return Settings(
         nats_servers(settings),
         settings.prefix,
@@ -422,6 +427,7 @@ def scanner(settings: NatsConfig) -> ScannerSettings:
         publish_logs=settings.publish_logs,
         keep_subscriptions=settings.keep_subscriptions,
         dialect=settings.dialect,
+        profiles=named,
     )
 
 

@@ -661,8 +661,10 @@ class _Running:
         if config.nats is not None:
             from holdfast.scanner.adapter import ScannerAdapter
 
-            scanner = assembly.scanner(config.nats)
-            part = add("nats", lambda: ScannerAdapter(scanner, poller), config.nats)
+            scanner = assembly.scanner(config.nats, config.profiles)
+            part = add(
+                "nats", lambda: ScannerAdapter(scanner, poller), config.nats, config.profiles
+            )
             parts["nats"] = replace(part, may_end=True)
         if config.gateway is not None:
             from holdfast.gateway import Gateway

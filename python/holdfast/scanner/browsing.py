@@ -196,6 +196,8 @@ class _Report:
                 encoding=tag.encoding,
                 writable=self._device.unwritable(tag) is None,
                 description=self._device.description(tag.id),
+                profile=tag.profile,
+                unit="" if tag.meaning is None else tag.meaning.unit,
                 error=errors.get(tag.id),
             )
 

@@ -10,11 +10,13 @@ from holdfast.client.requests import write_typed
 from holdfast.faults import fault_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import is_unwritten
+from holdfast.tags.text import value_from
 from holdfast.tags.writing import from_text
 from holdfast.values import ConversionError, encode
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
+    from holdfast import tags
     from holdfast.scanner.devices import ScannedDevice
     from holdfast.scanner.polling import Polling
     from holdfast.scanner.tags import Tag
@@ -27,6 +29,14 @@ def value(text: str, tag: Tag) -> Any:
     except ValueError as error:
         raise Refused(str(error)) from None
     return _checked(made, tag)
+
+
+def _of_profile(text: str, tag: Tag, meaning: tags.Tag) -> Any:
+    """What the registers have to hold for a value of a profile's tag, given as text."""
+    try:
+        return _checked(meaning.raw(value_from(meaning, text)), tag)
+    except ValueError as error:
+        raise Refused(str(error)) from None
 
 
 def _checked(made: Any, tag: Tag) -> Any:
@@ -45,7 +55,7 @@ async def write(polling: Polling, device: ScannedDevice, tag: Tag, text: str) ->
     """
     if (flaw := device.unwritable(tag)) is not None:
         raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
-    made = value(text, tag)
+    made = value(text, tag) if tag.meaning is None else _of_profile(text, tag, tag.meaning)
     try:
         [request] = write_typed(
             tag.area, tag.address, made, tag.type, tag.order, tag.encoding, split=False

@@ -121,6 +121,7 @@ def _tag(tag: Tag, wanted: Wanted) -> bytes:
         writable=wanted.writable,
         description=wanted.description,
         null=[_marker(marker) for marker in tag.null] or None,
+        profile=tag.profile,
     )
     text = _encode(made)
     if len(text) > MAX_PART:

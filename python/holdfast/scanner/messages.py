@@ -68,6 +68,8 @@ class TagRequest(_Request):
     description: str | None = None
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
     """Values that mean "not available"; they are published as `null`."""
+    profile: Id | None = None
+    """A profile of the configuration, whose tag of this id applies in place of all else."""
 
 
 class PlanRequest(_Request, rename=None):
@@ -90,6 +92,8 @@ class SubscribeRequest(_Request):
     device_id: Annotated[str, Meta(min_length=1, max_length=128)]
     subscriber_id: Id
     tags: list[TagRequest]
+    profile: Id | None = None
+    """A profile of the configuration: all its tags, besides those of `tags`."""
     host: Annotated[str, Meta(min_length=1, max_length=253)] | None = None
     port: Annotated[int, Meta(ge=1, le=LAST_PORT)] | None = None
     """Default: 502, with `tls` 802."""
@@ -260,6 +264,9 @@ class TagReport(_Message, omit_defaults=True):
     writable: bool
     encoding: str | None = None
     description: str | None = None
+    profile: str | None = None
+    """The profile that the tag is from; its values are scaled."""
+    unit: str = ""
     error: str | None = None
     """Why the tag has no value."""
 

@@ -215,7 +215,7 @@ class Publisher:
             [length for _, length in texts],
             [due.deadbands[tag.id] for tag in tags],
             plain=infallible,
-            special=remembered or any(tag.null for tag in tags),
+            special=remembered or any(tag.null or tag.meaning is not None for tag in tags),
             change=group.change,
             picky=remembered or not infallible,
         )

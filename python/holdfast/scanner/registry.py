@@ -20,7 +20,7 @@ from holdfast.scanner.devices import Plan, ScannedDevice, Source, Subscriber, Wa
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.health import Health
 from holdfast.scanner.subjects import next_name, subject_id
-from holdfast.scanner.tags import ORDERS, tag
+from holdfast.scanner.tags import ORDERS, profiled, tag
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
@@ -99,10 +99,14 @@ def understood(
         raise Refused("unitId is 0, which is the broadcast of a serial line")
     order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
     tags: dict[str, Tag] = {}
+    of_profile = {} if request.profile is None else profiled(request.profile, rules)
+    replaced = dict(of_profile)
+    for entry in of_profile.values():
+        tags[entry.id] = tag(entry, order, f"profile {request.profile}", changes, rules)
     for index, entry in enumerate(request.tags):
         where = f"tags[{index}]"
         made = tag(entry, order, where, changes, rules)
-        if made.id in tags:
+        if replaced.pop(made.id, None) is None and made.id in tags:
             if rules.strict:
                 raise Refused(f"{where}: duplicate id {made.id!r}")
             if rules.dialect == "tentacle-next" and made != tags[made.id]:
@@ -118,7 +122,10 @@ def understood(
         source,
         frozenset(said),
         tags,
-        {entry.id: Wanted(entry.writable, entry.description) for entry in request.tags},
+        {
+            entry.id: Wanted(entry.writable, entry.description)
+            for entry in (*of_profile.values(), *request.tags)
+        },
         _rate(request, rules, changes),
         publish,
         deadband if publish == "change" else 0.0,

@@ -9,7 +9,10 @@ from holdfast.config.scanning import SCAN_RATE, TIMEOUT
 from holdfast.scanner.limits import ScannerLimits
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from holdfast.config.scanning import Dialect, Publish
+    from holdfast.tags import TagList
 
 
 @dataclass(frozen=True)
@@ -32,3 +35,5 @@ class Rules:
     strict: bool = False
     """Whether a request is refused that would otherwise be adjusted, see `adjusting`."""
     dialect: Dialect = "tentacle"
+    profiles: Mapping[str, TagList] = field(default_factory=dict)
+    """The tags that requests can name by their profile."""

@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.keeping import Unit
     from holdfast.scanner.messages import BrowseAnswer
     from holdfast.scanner.registry import Subscription
+    from holdfast.tags import TagList
     from holdfast.types import PolledBlock
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer | bytes]]"
@@ -116,6 +117,8 @@ class Settings:
     """Whether subscriptions and states are kept in JetStream."""
     dialect: Dialect = "tentacle"
     """The programs that it serves."""
+    profiles: Mapping[str, TagList] = field(default_factory=dict)
+    """The tags that requests can name by their profile."""
 
 
 class Scanner:
@@ -131,7 +134,13 @@ class Scanner:
         self._one_by_one = asyncio.Lock()
         """Held while a request is parsed and checked."""
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._rules = Rules(settings.limits, settings.defaults, settings.strict, settings.dialect)
+        self._rules = Rules(
+            settings.limits,
+            settings.defaults,
+            settings.strict,
+            settings.dialect,
+            settings.profiles,
+        )
         self._registry = Registry(settings.limits, settings.writes, settings.dialect)
         self._adjusted: set[tuple[str, str]] = set()
         """The subscribers, and the kinds of adjustments, that are already logged."""
@@ -328,7 +337,8 @@ class Scanner:
         await self._kept.settled(asked.device, asked.subscriber)
         self._log_adjustments(asked.subscriber, asked.device, changes)
         self._log_subscribed(asked)
-        return Answer(success=True, count=len(request.tags))
+        own = len(request.tags)
+        return Answer(success=True, count=own if request.profile is None else len(asked.tags))
 
     @staticmethod
     def _log_subscribed(asked: Subscription) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
+from holdfast import tags
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages import FunctionCode
+from holdfast.scanner.messages import FunctionCode, TagRequest
 from holdfast.tags.decoding import Undecoded
 from holdfast.tags.markers import as_decoded
 from holdfast.tags.writing import unwritable
@@ -17,7 +18,7 @@ from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from holdfast.scanner.adjusting import Adjustments
-    from holdfast.scanner.messages import DataType, TagRequest
+    from holdfast.scanner.messages import DataType
     from holdfast.scanner.rules import Rules
     from holdfast.tags.markers import Marker
     from holdfast.types import Area
@@ -54,6 +55,10 @@ class Tag:
     """Markers, as decoded from the registers of the device."""
     encoding: str | None = None
     """The encoding of text; `None` for ASCII."""
+    profile: str | None = None
+    """The profile that the tag is from."""
+    meaning: tags.Tag | None = None
+    """The tag of the profile: scale, limits of writes, names of states."""
 
     @property
     def count(self) -> int:
@@ -99,9 +104,11 @@ def clean(value: Any, tag: Tag) -> Any:
         return [clean(item, tag) for item in value]
     if type(value) is float and value != value:
         return None
-    if tag.null and type(value) is not Undecoded and value in tag.null:
+    if type(value) is Undecoded:
+        return value
+    if tag.null and value in tag.null:
         return None
-    return value
+    return value if tag.meaning is None else tag.meaning.value(value)
 
 
 def datatype(type: Type) -> DataType:
@@ -115,6 +122,8 @@ def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules
     Unless the rules are strict, a number in an area of bits becomes a boolean, and `writable` is
     ignored in an area that can't be written. Adds this to `changes`.
     """
+    if request.profile is not None:
+        return _of_profile(request.profile, request.id, where, rules)
     area = AREA_OF_CODE[request.function_code]
     name = request.datatype
     if name == "boolean" or name.startswith("boolean["):
@@ -155,3 +164,36 @@ def tag(request: TagRequest, order: str, where: str, changes: Adjustments, rules
 
 def _is_number(type: Type) -> bool:
     return type.count is None and type.base.startswith(NUMERIC)
+
+
+def profiled(name: str, rules: Rules) -> dict[str, TagRequest]:
+    """The tags of a profile, as requests by id. Raises `Refused`."""
+    return {
+        tag.name: TagRequest(
+            id=tag.name,
+            address=tag.address,
+            function_code=CODE_OF_AREA[tag.area],
+            datatype=tag.type,
+            writable=tag.writable,
+            description=tag.description or None,
+            profile=name,
+        )
+        for tag in _profile(name, "profile", rules)
+    }
+
+
+def _of_profile(name: str, id: str, where: str, rules: Rules) -> Tag:
+    profile = _profile(name, f"{where}.profile", rules)
+    if id not in profile:
+        raise Refused(f"{where}: the profile {name} has no tag {id!r}")
+    tag = profile[id]
+    made = (tag.area, tag.address, tag.type, tag.order, tag.null, tag.encoding)
+    return Tag(id, *made, profile=name, meaning=tag)
+
+
+def _profile(name: str, where: str, rules: Rules) -> tags.TagList:
+    found = rules.profiles.get(name)
+    if found is None:
+        allowed = ", ".join(rules.profiles) or "none, the configuration has no profiles"
+        raise Refused(f"{where} is {name!r}, allowed: {allowed}")
+    return found

@@ -1,0 +1,109 @@
+"""Tags that requests name by a profile of the configuration: scale, markers, limits of writes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.tags import Tag, TagList
+from support import wire
+from support.nats_bus import leaving, subscription, tag
+
+if TYPE_CHECKING:
+    import holdfast
+    from support.nats_bus import Caller, Run
+
+PROFILE = TagList(
+    [
+        Tag("water", "holding_registers", 0, "int16", scale=0.1, null=frozenset([-1]), unit="°C"),
+        Tag("setpoint", "holding_registers", 1, scale=0.1, writable=True, min=5, max=30),
+        Tag("mode", "holding_registers", 2, states={0: "off", 1: "eco"}, writable=True),
+        Tag("open", "coils", 3),
+    ]
+)
+
+
+@pytest.fixture(autouse=True)
+def scanner(run_scanner: Run) -> None:
+    run_scanner(profiles={"heater": PROFILE}, writes="tags")
+
+
+def first(data: Any, count: int) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    while len(found) < count:
+        message = data.next()
+        found[message["variableId"]] = message["value"]
+    return found
+
+
+def test_the_values_of_a_profile_are_scaled(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [215, 175, 1])
+    data = caller.listen("modbus.data.plc1")
+    request = subscription(server, tag("raw", 0), profile="heater")
+    assert caller.request("modbus.subscribe", request) == {"success": True, "count": 5}
+    values = {"raw": 215, "water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
+    assert first(data, 5) == values
+    memory.write("holding_registers", 0, [65535])
+    wire.until(lambda: first(data, 5)["water"] is None, "the marker is no value")
+    [device] = caller.request("modbus.browse", b"")["devices"]
+    shown = {each["id"]: (each.get("profile"), each.get("unit")) for each in device["tags"]}
+    assert shown["water"] == ("heater", "°C")
+    assert shown["raw"] == (None, None)
+    latest = caller.request("modbus.variables", b"")
+    assert latest
+    caller.request("modbus.unsubscribe", leaving())
+
+
+def test_commands_are_scaled_and_have_the_limits_of_the_profile(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    caller.request("modbus.subscribe", subscription(server, profile="heater"))
+    for id, text, raw in (("setpoint", "19.5", [195, 0]), ("mode", "eco", [195, 1])):
+        assert caller.request(f"modbus.command.plc1.{id}", text) == {"success": True}
+        assert memory.read("holding_registers", 1, 2) == raw
+    for id, text, error in (
+        ("setpoint", "31", "31 is outside 5 to 30"),
+        ("setpoint", "19.55", "between two values of the registers"),
+        ("setpoint", "19,5", "decimal comma"),
+        ("mode", "turbo", "turbo"),
+        ("water", "20", "not writable"),
+    ):
+        answer = caller.request(f"modbus.command.plc1.{id}", text)
+        assert answer["success"] is False
+        assert error in answer["error"]
+    assert memory.read("holding_registers", 1, 2) == [195, 1]
+    caller.request("modbus.unsubscribe", leaving())
+
+
+@pytest.mark.parametrize(
+    ("request_", "error"),
+    [
+        ({"profile": "pump"}, "profile is 'pump', allowed: heater"),
+        ({"tags": [tag("x", 0, profile="heater")]}, "tags[0]: the profile heater has no tag 'x'"),
+        ({"tags": [tag("x", 0, profile="y")]}, "tags[0].profile is 'y', allowed: heater"),
+    ],
+)
+def test_an_unknown_profile_refuses_the_request(
+    caller: Caller, server: holdfast.Server, request_: dict[str, Any], error: str
+) -> None:
+    answer = caller.request("modbus.subscribe", subscription(server) | request_)
+    assert answer == {"success": False, "error": error}
+
+
+def test_a_subscription_to_a_profile_survives_a_restart(
+    caller: Caller, server: holdfast.Server, memory: holdfast.Memory, run_scanner: Run
+) -> None:
+    memory.write("holding_registers", 0, [215, 175, 1])
+    other: dict[str, Any] = {"prefix": "line2", "profiles": {"heater": PROFILE}}
+    running = run_scanner(**other)
+    request = subscription(server, profile="heater")
+    assert caller.request("line2.subscribe", request)["success"] is True
+    running.stop()
+    data = caller.listen("line2.data.plc1")
+    run_scanner(**other)
+    assert first(data, 4) == {"water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
+    answer = caller.request("line2.command.plc1.setpoint", "4")
+    assert "4 is outside 5 to 30" in answer["error"]
