@@ -9,7 +9,8 @@
 //! * All checks run before the first byte changes. A refused write changes nothing.
 //! * The seal is checked under the same lock as the operation it guards.
 //! * Memory is allocated once. No operation allocates, except a write to several memories: it
-//!   keeps a list of locks, and flattens a large batch before it takes them.
+//!   keeps a list of locks, and flattens a large batch before it takes them. A write to a memory
+//!   with observers is copied into their queues.
 //!
 //! It does no I/O, has no clock, and knows no protocol: an address is a number, a bit is a bit, a
 //! register is two bytes.
@@ -20,10 +21,14 @@ mod area;
 mod batch;
 mod bits;
 mod error;
+mod follower;
 mod memory;
+mod observer;
 mod operation;
 
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
-pub use memory::{Access, Gate, GateMode, Memory, Mirrored, check_across, write_across};
-pub use operation::{Read, Write};
+pub use follower::{Change, Follower};
+pub use memory::{Gate, GateMode, Memory, Mirrored, check_across, write_across};
+pub use observer::{WriteQueue, Written};
+pub use operation::{Access, Read, Write};

@@ -2,24 +2,14 @@
 
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use crate::area::{Area, Layout, Span};
 use crate::batch::{self, Run};
 use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
-use crate::operation::{Read, Write};
-
-/// Who accesses the memory.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Access {
-    /// A reader or writer that a sealed memory refuses. It can never write the gate bit.
-    Client,
-    /// A source of data. It ignores the seal and can open it.
-    Ingest,
-    /// A source of data that alone writes the mirrored ranges.
-    Mirror,
-}
+use crate::observer::{Observers, WriteQueue};
+use crate::operation::{Access, Read, Write};
 
 /// Items that [`Access::Mirror`] alone writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,6 +68,9 @@ struct Content {
     sealed: bool,
     /// How many times the seal opened, and how many times it closed again.
     seal_changes: (u64, u64),
+    /// How many writes were carried out, each in one step.
+    writes: u64,
+    observers: Observers,
 }
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
@@ -104,7 +97,13 @@ impl Memory {
             layout,
             gate,
             mirrored: RwLock::default(),
-            content: RwLock::new(Content { areas, sealed: gate.is_some(), seal_changes: (0, 0) }),
+            content: RwLock::new(Content {
+                areas,
+                sealed: gate.is_some(),
+                seal_changes: (0, 0),
+                writes: 0,
+                observers: Observers::default(),
+            }),
         })
     }
 
@@ -175,6 +174,37 @@ impl Memory {
         Ok(())
     }
 
+    /// Returns how many writes were carried out, and reads ranges, unless that number is `seen`. The
+    /// seal is ignored. The ranges must have been checked by `holds`.
+    pub(crate) fn read_since(&self, seen: Option<u64>, reads: &mut [Read<'_>]) -> u64 {
+        let content = self.shared();
+        if seen != Some(content.writes) {
+            for read in reads {
+                let Read { area, address, count, ref mut out } = *read;
+                let offset = usize::from(address - self.span(area).start());
+                content.copy_out(offset, Read { area, address, count, out });
+            }
+        }
+        content.writes
+    }
+
+    /// Checks a range, without the lock.
+    pub(crate) fn holds(&self, area: Area, address: u16, count: usize) -> Result<(), Refusal> {
+        match self.span(area).holds(address, count) {
+            _ if count == 0 => Err(Refusal::WrongLength),
+            true => Ok(()),
+            false => Err(Refusal::OutOfRange),
+        }
+    }
+
+    /// Returns a queue of all writes from now on, or of those of clients. It is bounded, and ends
+    /// with the memory.
+    pub fn observe(&self, clients_only: bool) -> Arc<WriteQueue> {
+        let queue = Arc::new(WriteQueue::default());
+        self.exclusive().observers.add(Arc::clone(&queue), clients_only);
+        queue
+    }
+
     /// Writes one range atomically.
     ///
     /// # Errors
@@ -219,7 +249,9 @@ impl Memory {
         let offset = offset? * 2;
         let register = &mut content.areas[area.index()][offset..offset + 2];
         let now = u16::from_be_bytes([register[0], register[1]]);
-        register.copy_from_slice(&((now & and_mask) | (or_mask & !and_mask)).to_be_bytes());
+        let bytes = ((now & and_mask) | (or_mask & !and_mask)).to_be_bytes();
+        register.copy_from_slice(&bytes);
+        content.written(access, &[Write { area, address, count: 1, bytes: &bytes }]);
         Ok(())
     }
 
@@ -278,11 +310,12 @@ impl Memory {
         &self,
         access: Access,
         content: &mut Content,
-        writes: impl IntoIterator<Item = &'w Write<'w>>,
+        writes: impl IntoIterator<Item = &'w Write<'w>> + Clone,
     ) {
-        for write in writes {
+        for write in writes.clone() {
             self.copy_in(content, write);
         }
+        content.written(access, writes);
         self.settle(access, content);
     }
 
@@ -332,6 +365,14 @@ impl Memory {
 impl Content {
     fn admit(&self, access: Access) -> Result<(), Refusal> {
         if self.sealed && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
+    }
+
+    /// Counts a write that was carried out, and passes it to the observers.
+    fn written<'w>(&mut self, access: Access, writes: impl IntoIterator<Item = &'w Write<'w>>) {
+        self.writes += 1;
+        if self.observers.is_any() {
+            self.observers.tell(access, writes);
+        }
     }
 
     fn copy_out(&self, offset: usize, read: Read<'_>) {

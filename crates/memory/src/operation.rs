@@ -1,6 +1,17 @@
-//! Read and write operations: a range and its bytes.
+//! Read and write operations: a range and its bytes, and who asks for them.
 
 use crate::area::Area;
+
+/// Who accesses the memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// A reader or writer that a sealed memory refuses. It can never write the gate bit.
+    Client,
+    /// A source of data. It ignores the seal and can open it.
+    Ingest,
+    /// A source of data that alone writes the mirrored ranges.
+    Mirror,
+}
 
 /// A range to read, of at least one item, and the buffer that receives it: `out` has exactly
 /// `area.byte_len(count)` bytes.
