@@ -38,6 +38,7 @@ __all__ = [
     "Connection",
     "Endpoint",
     "Engine",
+    "Follower",
     "Link",
     "Listener",
     "Memory",
@@ -52,6 +53,7 @@ __all__ = [
     "Rule",
     "ServerTls",
     "TlsChannel",
+    "WriteQueue",
     "__version__",
     "encode_raw_ingest",
     "pack_raw_ingest",
@@ -93,7 +95,6 @@ FAULTS: Final[dict[str, int]]
 class OutOfRange(IndexError):
     """The range is not inside the area. Nothing was read or written."""
 
-@final
 class Memory:
     """Four areas of bits and 16-bit registers, of fixed size, initially 0.
 
@@ -156,6 +157,46 @@ class Memory:
         Where two overlap, the later one wins. Raises the errors of `write`; an error in one write
         prevents all.
         """
+
+@final
+class Follower:
+    """Follows ranges of a memory, each an area, an address and a count. Ignores the seal.
+
+    Costs the writers of the memory nothing. Raises as `Memory.read`.
+    """
+
+    def __new__(cls, memory: Memory, ranges: Sequence[tuple[Area, int, int]]) -> Follower: ...
+    def changes(self) -> tuple[int, list[tuple[int, int, list[int]]]]:
+        """Returns the number of writes to the memory, and what has changed since the last call.
+
+        A change is the index of its range, an address, and the values from there: the shortest part
+        that contains all changes of the range. The first call returns all ranges as a whole.
+        """
+
+@final
+class WriteQueue:
+    """The writes to a memory from now on, in their order; with `clients_only`, of Modbus clients.
+
+    It keeps a limited number of writes, and then drops the oldest.
+    """
+
+    def __new__(cls, memory: Memory, *, clients_only: bool = False) -> WriteQueue: ...
+    def next(self, timeout: float) -> tuple[Area, int, list[int], bool] | None:
+        """Waits for the next write: area, address, values, whether a Modbus client wrote it.
+
+        Returns `None` after `timeout` seconds, and when the queue is closed.
+        """
+
+    def close(self) -> None:
+        """Closes the queue, and drops what waits in it."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the queue is closed, or its memory is gone."""
+
+    @property
+    def dropped(self) -> int:
+        """How many writes were dropped because the queue was full."""
 
 class BatchRefused(ValueError):
     """A write of a batch is refused. Nothing has changed."""

@@ -10,6 +10,7 @@ mod channel;
 mod client;
 mod connection;
 mod engine;
+mod following;
 mod heartbeat;
 mod limits;
 mod link;
@@ -35,6 +36,8 @@ mod _core {
     use super::connection::{Attempt, Connection};
     #[pymodule_export]
     use super::engine::Engine;
+    #[pymodule_export]
+    use super::following::{Follower, WriteQueue};
     #[pymodule_export]
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]

@@ -24,7 +24,7 @@ enum Seal {
     Mode(String, u16, String),
 }
 
-#[pyclass(frozen, module = "holdfast")]
+#[pyclass(frozen, subclass, module = "holdfast")]
 pub struct Memory {
     pub core: Arc<Core>,
 }
@@ -156,16 +156,16 @@ impl Memory {
 }
 
 /// A range of an area, and its bytes.
-struct Range {
-    area: Area,
-    address: u16,
-    count: usize,
+pub(crate) struct Range {
+    pub(crate) area: Area,
+    pub(crate) address: u16,
+    pub(crate) count: usize,
     bytes: Vec<u8>,
 }
 
 impl Range {
     /// A range to read. Its bytes are 0 until then.
-    fn new(memory: &Core, area: &str, address: i128, count: i128) -> PyResult<Range> {
+    pub(crate) fn new(memory: &Core, area: &str, address: i128, count: i128) -> PyResult<Range> {
         let area = named(area)?;
         if count < 1 {
             return Err(PyValueError::new_err(format!("count is {count}, at least 1 is allowed")));
@@ -210,22 +210,31 @@ impl Range {
     }
 
     fn values<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
-        if self.area.is_bits() {
-            let bit = |index: usize| self.bytes[index / 8] >> (index % 8) & 1;
-            PyList::new(py, (0..self.count).map(bit))
-        } else {
-            let registers = self.bytes.chunks_exact(2);
-            PyList::new(py, registers.map(|pair| u16::from_be_bytes([pair[0], pair[1]])))
-        }
+        listed(py, self.area, self.count, &self.bytes)
     }
 
-    fn refused(&self, memory: &Core, refusal: Refusal) -> PyErr {
+    pub(crate) fn refused(&self, memory: &Core, refusal: Refusal) -> PyErr {
         match refusal {
             Refusal::OutOfRange => {
                 out_of_range(memory, self.area, i128::from(self.address), self.count as i128)
             }
             other => PyValueError::new_err(other.to_string()),
         }
+    }
+}
+
+/// The values of `count` items of an area.
+pub fn listed<'py>(
+    py: Python<'py>,
+    area: Area,
+    count: usize,
+    bytes: &[u8],
+) -> PyResult<Bound<'py, PyList>> {
+    if area.is_bits() {
+        PyList::new(py, (0..count).map(|index| bytes[index / 8] >> (index % 8) & 1))
+    } else {
+        let registers = bytes.chunks_exact(2);
+        PyList::new(py, registers.map(|pair| u16::from_be_bytes([pair[0], pair[1]])))
     }
 }
 
@@ -317,11 +326,21 @@ pub fn item(area: Area, value: &Bound<'_, PyAny>) -> Result<u16, Unfit> {
     {
         return Ok(number);
     }
-    if let Ok(bit) = value.cast::<PyBool>() {
-        return if area.is_bits() { Ok(bit.is_true().into()) } else { Err(Unfit::Type) };
+    if value.is_instance_of::<PyBool>() || is_numpy_bool(value) {
+        let bit = value.is_truthy().map_err(|_| Unfit::Type)?;
+        return if area.is_bits() { Ok(bit.into()) } else { Err(Unfit::Type) };
     }
     let number = integer(value).map_err(|_| Unfit::Type)?;
     u16::try_from(number).ok().filter(|number| *number <= most).ok_or(Unfit::Value)
+}
+
+/// Whether this is a boolean of NumPy, which is not a `bool`, and in old versions an integer.
+fn is_numpy_bool(value: &Bound<'_, PyAny>) -> bool {
+    let kind = value.get_type();
+    let is = |name: PyResult<Bound<'_, PyString>>, allowed: &[&str]| {
+        name.is_ok_and(|name| allowed.iter().any(|allowed| name == *allowed))
+    };
+    is(kind.name(), &["bool", "bool_"]) && is(kind.module(), &["numpy"])
 }
 
 fn number(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {

@@ -7,10 +7,10 @@ use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest::{Format, Header};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBool, PyBytes, PyInt, PyList};
+use pyo3::types::{PyBytes, PyList};
 
 use crate::arguments::word;
-use crate::memory::{integer, named};
+use crate::memory::{self, Unfit, named};
 
 /// Packs bits or registers into a payload. Values must be integers; booleans are allowed for bits
 /// only.
@@ -64,23 +64,13 @@ pub fn encode_raw_ingest<'py>(
 }
 
 fn item(area: Area, index: usize, value: &Bound<'_, PyAny>) -> PyResult<u16> {
-    if !area.is_bits()
-        && let Ok(register) = value.cast_exact::<PyInt>()
-        && let Ok(register) = register.extract::<u16>()
-    {
-        return Ok(register);
-    }
-    let (most, allowed) =
-        if area.is_bits() { (1, "0, 1, False, True") } else { (u16::MAX, "integers 0 to 65535") };
-    let is_bool = value.is_instance_of::<PyBool>();
-    let is_integer = value.is_instance_of::<PyInt>() && (area.is_bits() || !is_bool);
-    if is_integer
-        && let Ok(number) = u16::try_from(integer(value)?)
-        && number <= most
-    {
-        return Ok(number);
-    }
-    let shown = value.py().import("reprlib")?.call_method1("repr", (value,))?;
-    let message = format!("values[{index}] is {shown}, allowed are {allowed}");
-    Err(if is_integer { PyValueError::new_err(message) } else { PyTypeError::new_err(message) })
+    memory::item(area, value).or_else(|unfit| {
+        let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
+        let shown = value.py().import("reprlib")?.call_method1("repr", (value,))?;
+        let message = format!("values[{index}] is {shown}, allowed are {allowed}");
+        Err(match unfit {
+            Unfit::Value => PyValueError::new_err(message),
+            Unfit::Type => PyTypeError::new_err(message),
+        })
+    })
 }
