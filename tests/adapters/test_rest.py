@@ -462,6 +462,7 @@ def test_nothing_else_is_there(
 ROUTES = {
     "/api/v1/ingest": "POST",
     "/api/v1/memory/read": "GET",
+    "/api/v1/memory/changes": "GET",
     "/api/v1/health": "GET",
     "/api/v1/diagnostics/memory": "GET",
     "/api/v1/diagnostics/stats": "GET",
@@ -805,7 +806,7 @@ def nodes(value: Any) -> Iterator[dict[str, Any]]:
 TYPES = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}
 KNOWN = {
     *("$ref", "oneOf", "const", "enum", "type", "properties", "required", "items", "minItems"),
-    *("minimum", "maximum", "additionalProperties", "propertyNames", "description"),
+    *("minimum", "maximum", "additionalProperties", "propertyNames", "description", "default"),
 }
 
 
@@ -927,6 +928,8 @@ def test_every_example_command_is_accepted(document: dict[str, Any]) -> None:
         ("GET", "/api/v1/memory/read?memory=plant_a&area=coils&address=0&count=8", None),
         ("GET", "/api/v1/memory/read?memory=plant_b&area=coils&address=0&count=8", None),
         ("GET", "/api/v1/memory/read", None),
+        ("GET", "/api/v1/memory/changes", None),
+        ("GET", "/api/v1/memory/changes?memory=plant_b&area=coils&address=0&count=8", None),
         ("GET", "/api/v1/health", None),
         ("GET", "/api/v1/diagnostics/memory", None),
         ("GET", "/api/v1/diagnostics/stats", None),

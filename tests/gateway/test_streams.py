@@ -12,8 +12,9 @@ import pytest
 import holdfast
 from holdfast.types import AREAS
 from support import gateways, wire
+from support.event_streams import EventStream
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
-from support.gateways import Running, Stream
+from support.gateways import Running
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,13 +31,13 @@ def gateway() -> Iterator[Running]:
         yield started
 
 
-def watch(gateway: Running, port: int, **query: Any) -> Stream:
+def watch(gateway: Running, port: int, **query: Any) -> EventStream:
     """A watch of holding registers from 0 on."""
     usual = {"host": "127.0.0.1", "port": port, "functionCode": 3, "address": 0, "interval": 10}
     return gateway.stream("GET", f"/watch?{urlencode({**usual, **query})}")
 
 
-def mapped(gateway: Running, port: int, **body: Any) -> Stream:
+def mapped(gateway: Running, port: int, **body: Any) -> EventStream:
     return gateway.stream("POST", "/map", {"host": "127.0.0.1", "port": port, **body})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from holdfast.adapters import Stop
@@ -15,6 +15,7 @@ from holdfast.gateway.pool import dial
 from holdfast.net.resolver import NoSuchName
 from holdfast.web.port import listen
 from support import web, wire
+from support.event_streams import EventStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -56,47 +57,6 @@ class Names:
         return answers.pop(0) if len(answers) > 1 else answers[0]
 
 
-@dataclass
-class Event:
-    """An event of a stream; a comment has the name `:`."""
-
-    name: str
-    data: Any
-
-
-class Stream:
-    """A response that is a stream of events."""
-
-    def __init__(self, connection: http.client.HTTPConnection) -> None:
-        self._connection = connection
-        self.reply = connection.getresponse()
-        self.status = self.reply.status
-        self.kind = self.reply.headers["Content-Type"]
-
-    def __iter__(self) -> Iterator[Event]:
-        """Returns all events and comments until the end of the stream."""
-        name = ""
-        for line in self.reply:
-            text = line.decode().rstrip("\n")
-            if text == ":":
-                yield Event(":", None)
-            elif text.startswith("event: "):
-                name = text.removeprefix("event: ")
-            elif text.startswith("data: "):
-                yield Event(name, json.loads(text.removeprefix("data: ")))
-
-    def next(self, name: str) -> Any:
-        """Returns the data of the next event of this name."""
-        for event in self:
-            if event.name == name:
-                return event.data
-        raise AssertionError(f"the stream ended without {name}")
-
-    def close(self) -> None:
-        self.reply.close()
-        self._connection.close()
-
-
 class Running:
     """A running gateway with a client."""
 
@@ -119,12 +79,12 @@ class Running:
 
     def stream(
         self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
-    ) -> Stream:
+    ) -> EventStream:
         connection = http.client.HTTPConnection(*self.address, timeout=wire.DEADLINE)
         self._open.callback(connection.close)
         sent = None if body is None else json.dumps(body)
         connection.request(method, API + path, sent, {**web.JSON, **(headers or {})})
-        return Stream(connection)
+        return EventStream(connection)
 
     def close(self) -> None:
         self._open.close()

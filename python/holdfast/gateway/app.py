@@ -18,7 +18,6 @@ from holdfast.gateway import assets, identifying, openapi, reading, surveying, w
 from holdfast.gateway.broadcasting import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
-from holdfast.gateway.events import Stream
 from holdfast.gateway.fields import from_json, from_query, malformed, timeout
 from holdfast.gateway.pool import Pool, dial
 from holdfast.gateway.refusals import FAILURE, REFUSALS
@@ -26,6 +25,7 @@ from holdfast.gateway.sharing import Shared
 from holdfast.net.allow_list import AllowList
 from holdfast.net.resolver import Resolver
 from holdfast.web import openapi_page as page
+from holdfast.web.events import Stream
 from holdfast.web.host import SAFE, headers_of, respond
 from holdfast.web.openapi import DOCUMENT, PAGE
 from holdfast.web.refusals import UNREAD, headers_with

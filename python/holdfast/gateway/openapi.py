@@ -33,6 +33,7 @@ from holdfast.web.openapi import (
     ref,
     refusal_components,
     refused_by,
+    stream_answer,
 )
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
                     {"Registers below 1000": {**EXAMPLE, "areas": list(AREAS[2:]), "last": 999}},
                 ),
                 "responses": {
-                    "200": _stream(progress="Progress", result="Map"),
+                    "200": stream_answer(progress="Progress", result="Map"),
                     **_refusals(*BODY, *ASKING, *DEVICE),
                     **FAILED,
                 },
@@ -136,7 +137,7 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
                 "values, `problem` for a Modbus exception or no response. Comments are heartbeats.",
                 "parameters": [_parameter(field) for field in watching.fields(limits)],
                 "responses": {
-                    "200": _stream(values="Values", change="Change", problem="Problem"),
+                    "200": stream_answer(values="Values", change="Change", problem="Problem"),
                     **_refusals(*QUERY, *ASKING, *DEVICE),
                     **FAILED,
                 },
@@ -358,25 +359,6 @@ def _parameter(field: Field) -> dict[str, Any]:
         "schema": schema,
         "example": examples.get(field.name, field.default),
     }
-
-
-def _stream(**events: str) -> dict[str, Any]:
-    """A response of server-sent events; the value of each event is the schema of its data."""
-    kinds = [
-        object_of(
-            {
-                "event": {"const": name},
-                "data": {
-                    "type": "string",
-                    "contentMediaType": "application/json",
-                    "contentSchema": ref(schema),
-                },
-            }
-        )
-        for name, schema in events.items()
-    ]
-    content = {"text/event-stream": {"schema": {"oneOf": kinds}}}
-    return {"description": "A stream of these server-sent events", "content": content}
 
 
 def _refusals(*reasons: str) -> dict[str, Any]:

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from holdfast.client import Client
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
-    from holdfast.gateway.events import Stream
     from holdfast.gateway.settings import GatewayLimits
     from holdfast.tools.discovery import AreaMap
     from holdfast.types import Area
+    from holdfast.web.events import Stream
 
 PATH = "/api/modbus/map"
 TIMEOUT = 2_000

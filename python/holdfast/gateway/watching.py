@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
-    from holdfast.gateway.events import Stream
     from holdfast.gateway.settings import GatewayLimits
+    from holdfast.web.events import Stream
 
     Event: TypeAlias = tuple[str, Any]
 

@@ -23,7 +23,7 @@ from holdfast.types import AREAS, BIT_AREAS
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from holdfast._core import Memory, Passage
+    from holdfast._core import Follower, Memory, Passage
     from holdfast.audit import Audit
 
 MAX_SHOWN = 40
@@ -172,6 +172,25 @@ class MemoryAccess:
         with self._lock:
             self._counts.reads += 1
         return values
+
+    def follow(
+        self, memory: str, ranges: Sequence[tuple[str, int, int]], grant: Grant, peer: str
+    ) -> Follower:
+        """Returns a follower of ranges: area, address and count. Raises `Refused`."""
+        try:
+            for area, address, count in ranges:
+                target = self._granted(memory, area, address, grant)
+                try:
+                    _core.Follower(target, [(area, address, count)])  # type: ignore[list-item]
+                except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
+                    raise self._out_of_range(memory, area, address, count) from None
+            follower = _core.Follower(self.memories[memory], ranges)  # type: ignore[arg-type]
+        except Refused as refused:
+            self.note(refused, grant.name, peer)
+            raise
+        with self._lock:
+            self._counts.reads += 1
+        return follower
 
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
         """Counts, logs and audits a refused write. Adapters call it for writes they refuse."""

@@ -108,6 +108,8 @@ class Host:
     in time, `scope["state"]["late"]` is set and `receive` returns. The application then has
     `LATE_ANSWER_TIMEOUT` seconds to answer before the connection is dropped.
 
+    An application that sets `scope["state"]["leaving"]` gets a half-close as a disconnect.
+
     `rejection` creates the response to requests that never reach the application.
 
     With `https`, connections use TLS; the limits and `request_timeout` include the handshake.
@@ -396,7 +398,7 @@ class _Connection(HttpToolsProtocol):
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """Handles a half-close: the peer may still wait for responses."""
-        if self.host.leaving:
+        if self.host.leaving or (self._busy() and "leaving" in self.cycle.scope["state"]):
             return False
         self._ended = True
         whole = self._busy() and not self.cycle.more_body

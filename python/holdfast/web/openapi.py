@@ -57,14 +57,36 @@ def html_answer() -> dict[str, Any]:
     return {"description": "HTML", "content": {"text/html": {"schema": {"type": "string"}}}}
 
 
-def parameter(name: str, schema: Schema, example: object, description: str) -> dict[str, Any]:
-    """A required query parameter."""
+def stream_answer(**events: str) -> dict[str, Any]:
+    """A response of server-sent events; the value of each event is the schema of its data."""
+    kinds = [
+        object_of(
+            {
+                "event": {"const": name},
+                "data": {
+                    "type": "string",
+                    "contentMediaType": "application/json",
+                    "contentSchema": ref(schema),
+                },
+            }
+        )
+        for name, schema in events.items()
+    ]
+    content = {"text/event-stream": {"schema": {"oneOf": kinds}}}
+    return {"description": "A stream of these server-sent events", "content": content}
+
+
+def parameter(
+    name: str, schema: Schema, example: object, description: str, *, default: object = None
+) -> dict[str, Any]:
+    """A query parameter, required unless it has a default."""
+    more = {} if default is None else {"default": default}
     return {
         "name": name,
         "in": "query",
-        "required": True,
+        "required": default is None,
         "description": description,
-        "schema": schema,
+        "schema": schema | more,
         "example": example,
     }
 

@@ -127,7 +127,7 @@ def _examples(
             yield example["summary"], f"{head} -d {body}"
         return
     query = urlencode(
-        {entry["name"]: entry["example"] for entry in operation.get("parameters", [])}
+        {entry["name"]: entry["example"] for entry in operation.get("parameters", [])}, doseq=True
     )
     yield "Example", f"curl '{server}{path}{'?' if query else ''}{query}'{token}"
 

@@ -116,6 +116,10 @@ class Request:
         while (await self.receive())["type"] != "http.disconnect":
             pass
 
+    def let_leave(self) -> None:
+        """Treats a half-close as a disconnect from now on: a stream has no other end."""
+        self.scope["state"]["leaving"] = True
+
     @property
     def is_foreign(self) -> bool:
         """Whether a browser sent the request from a page of another site."""

@@ -35,9 +35,10 @@ class Rest:
         https: Https | None = None,
     ) -> None:
         scheme = "http" if https is None else "https"
+        self._app = App(settings, memory_access, diagnostics, sessions, listener, scheme)
         self._host = Host(
             "rest",
-            App(settings, memory_access, diagnostics, sessions, listener, scheme),
+            self._app,
             listener,
             sources=settings.sources,
             limits=ConnectionLimits(
@@ -52,12 +53,14 @@ class Rest:
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""
+        stop.then(self._app.end)
         self._host.run(stop)
 
     def status(self) -> dict[str, object]:
-        """Returns the address and the counts of connections."""
+        """Returns the address, the counts of connections, and how many change streams are open."""
         return {
             "address": self._host.address,
             "connections": self._host.counts(),
+            "streams": self._app.open_streams,
             "tls_failures": self._host.tls_failures(),
         }

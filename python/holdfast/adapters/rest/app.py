@@ -6,6 +6,8 @@ The memory access checks everything about memories. A request that is refused he
 from __future__ import annotations
 
 import asyncio
+import contextlib
+from collections.abc import Awaitable
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qsl
@@ -14,19 +16,21 @@ import msgspec
 
 from holdfast import __version__
 from holdfast.adapters.rest import openapi
+from holdfast.adapters.rest.changes import MAX_VALUES, ChangeStreams
 from holdfast.adapters.rest.refusals import REFUSALS
-from holdfast.adapters.rest.routes import INGEST, READ, ROUTES
+from holdfast.adapters.rest.routes import CHANGES, INGEST, READ, ROUTES
 from holdfast.adapters.sessions import parse_session_id
 from holdfast.ingest import Grant, Refused
 from holdfast.types import AREAS
 from holdfast.web import openapi_page as page
+from holdfast.web.events import headers_of_stream
 from holdfast.web.host import SAFE, address_of, headers_of, respond
 from holdfast.web.refusals import UNREAD, headers_with
 from holdfast.web.requests import BadRequest, ClientDisconnected, Request, respond_to_its_end, shown
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.rest.routes import Parameter
@@ -36,10 +40,12 @@ if TYPE_CHECKING:
     from holdfast.web.host import Receive, Scope, Send
 
     Answer: TypeAlias = tuple[bytes, bytes]
-    Handler: TypeAlias = Callable[[Request], Answer | Awaitable[Answer]]
+    Following: TypeAlias = Callable[[Send], Awaitable[None]]
+    Handler: TypeAlias = Callable[[Request], Answer | Following | Awaitable[Answer]]
 
 JSON = b"application/json"
-MAX_PARAMETERS = 8
+MORE_PARAMETERS = 4
+"""Parameters that are read in excess of the allowed ones, for an error that names the wrong one."""
 ANYONE = "anyone"
 """The name of the client when no tokens are configured."""
 
@@ -82,6 +88,8 @@ class App:
             for token in tokens
         }
         self._managers = {token.name for token in tokens if token.manage}
+        self._streams = ChangeStreams(settings.max_connections)
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._anyone = (
             Grant(ANYONE, frozenset(memory_access.memories), frozenset(AREAS))
             if settings.tokens == "none"
@@ -94,6 +102,7 @@ class App:
         handlers: dict[str, Handler] = {
             "ingest": self._ingest,
             "read": self._read,
+            "changes": self._changes,
             "health": self._health,
             "memories": self._memories,
             "stats": self._stats,
@@ -107,9 +116,10 @@ class App:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answers one request."""
+        self._loop = asyncio.get_running_loop()
         request = Request(scope, receive)
         try:
-            kind, body = await self._answer(request)
+            answer = await self._answer(request)
         except BadRequest as unfit:
             await self._refuse(request, Declined(unfit.reason, unfit.detail), send)
         except Refused as refused:
@@ -117,10 +127,25 @@ class App:
         except ClientDisconnected:
             pass
         else:
+            if not isinstance(answer, tuple):
+                await answer(send)
+                return
+            kind, body = answer
             headers = headers_of(kind, body) if body else list(SAFE)
             await respond(send, 200 if body else 204, headers + request.more_headers, body)
 
-    async def _answer(self, request: Request) -> Answer:
+    @property
+    def open_streams(self) -> int:
+        """How many change streams are open."""
+        return self._streams.open
+
+    def end(self) -> None:
+        """Ends all streams. Thread-safe."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # The loop is already closed.
+                self._loop.call_soon_threadsafe(self._streams.end)
+
+    async def _answer(self, request: Request) -> Answer | Following:
         path, method = request.scope["path"], request.scope["method"]
         route = self.routes.get(path)
         if route is None:
@@ -128,7 +153,7 @@ class App:
         allowed, handler = route
         if method == allowed or (method == "HEAD" and allowed == "GET"):
             answer = handler(request)
-            return answer if isinstance(answer, tuple) else await answer
+            return await answer if isinstance(answer, Awaitable) else answer
         methods = "POST, OPTIONS" if allowed == "POST" else "GET, HEAD, OPTIONS"
         request.more_headers.append((b"allow", methods.encode()))
         if method == "OPTIONS":
@@ -163,6 +188,18 @@ class App:
         given = _given(request.scope["query_string"], READ.parameters)
         values = self._memory_access.read(**given, grant=grant, peer=request.peer)
         return JSON, msgspec.json.encode({"values": values})
+
+    def _changes(self, request: Request) -> Following:
+        grant = self._authorize(request)
+        given = _given(request.scope["query_string"], CHANGES.parameters)
+        memory, ranges = given["memory"], _ranges(given)
+        self._streams.check_room()
+        follower = self._memory_access.follow(memory, ranges, grant, request.peer)
+        if request.method == "HEAD":
+            headers = headers_of_stream() + request.more_headers
+            return lambda send: respond(send, 200, headers)
+        places = [(memory, area) for area, _, _ in ranges]
+        return partial(self._streams.serve, request, follower, places, given["min_interval"])
 
     def _health(self, _: Request) -> Answer:
         return JSON, b'{"status":"ok"}'
@@ -235,27 +272,42 @@ class App:
 
 
 def _given(query: bytes, parameters: Sequence[Parameter]) -> dict[str, Any]:
-    """Parses a query: every parameter must be given once. Raises `BadRequest` or `Declined`."""
+    """Parses a query: every parameter once, unless it has a default or may be repeated.
+
+    Raises `BadRequest` or `Declined`.
+    """
     known = {each.name: each for each in parameters}
     names = ", ".join(known)
+    most = sum(each.most for each in parameters) + MORE_PARAMETERS
     try:
-        pairs = parse_qsl(
-            query.decode("latin-1"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS
-        )
+        pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True, max_num_fields=most)
     except ValueError:
-        more = f"more than {MAX_PARAMETERS} parameters"
-        raise _malformed(f"{more}, allowed are {names}") from None
-    given: dict[str, str] = {}
+        raise _malformed(f"more than {most} parameters, allowed are {names}") from None
+    given: dict[str, list[str]] = {}
     for name, value in pairs:
         if name not in known:
             raise _malformed(f"{shown(name)} is not a parameter, allowed are {names}")
-        if name in given:
-            raise _malformed(f"{name} is given more than once")
-        given[name] = value
-    for name in known:
+        values = given.setdefault(name, [])
+        values.append(value)
+        if len(values) > known[name].most:
+            times = "once" if known[name].most == 1 else f"{known[name].most} times"
+            raise _malformed(f"{name} is given more than {times}")
+    required = [each.name for each in parameters if each.default is None]
+    for name in required:
         if name not in given:
-            raise _malformed(f"{name} is missing, required: {names}")
-    return {name: each.read(given[name]) for name, each in known.items()}
+            raise _malformed(f"{name} is missing, required: {', '.join(required)}")
+    return {name: each.parse(given.get(name)) for name, each in known.items()}
+
+
+def _ranges(given: Mapping[str, Any]) -> list[tuple[str, int, int]]:
+    """Returns the ranges of a query. Raises `Declined` if they are incomplete or too large."""
+    areas, addresses, counts = (given[key] for key in ("area", "address", "count"))
+    if not len(areas) == len(addresses) == len(counts):
+        found = f"{len(areas)} area, {len(addresses)} address and {len(counts)} count"
+        raise _malformed(f"the query has {found}, allowed is the same number of each")
+    if sum(counts) > MAX_VALUES:
+        raise _malformed(f"the ranges have {sum(counts)} values, allowed are {MAX_VALUES}")
+    return list(zip(areas, addresses, counts, strict=True))
 
 
 def _malformed(detail: str) -> Declined:

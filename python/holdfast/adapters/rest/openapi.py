@@ -55,7 +55,8 @@ def _operation(route: Route, *, secured: bool) -> dict[str, Any]:
         asked["requestBody"] = _body(route.body)
     if route.parameters:
         asked["parameters"] = [
-            parameter(each.name, each.schema, each.example, each.text) for each in route.parameters
+            parameter(each.name, each.described(), each.example, each.text, default=each.default)
+            for each in route.parameters
         ]
     return {
         "operationId": route.name,

@@ -61,8 +61,9 @@ REFUSALS = Refusals(
     ),
     Refusal(
         503,
-        ("unrecorded",),
-        "The audit log can't be written, and no write is carried out without a record",
+        ("unrecorded", "busy"),
+        "The audit log can't be written, and no write is carried out without a record; or too many "
+        "change streams are open",
         "the audit log can't be written, and no write is carried out without a record",
     ),
     Refusal(
@@ -79,4 +80,5 @@ QUERY = ("malformed",)
 MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 """Refusals of a range by the memory access."""
 
+STREAM = ("busy",)
 VALUES = ("invalid_value", "mirrored", "device_refused", "unrecorded")

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from holdfast.adapters.rest.refusals import BODY, MEMORY, QUERY, VALUES
+from holdfast.adapters.rest.refusals import BODY, MEMORY, QUERY, STREAM, VALUES
 from holdfast.adapters.rest.schemas import ADDRESS, TEXT
 from holdfast.protocol import ADDRESSES
 from holdfast.web.openapi import (
@@ -20,28 +20,63 @@ from holdfast.web.openapi import (
     integer,
     json_answer,
     ref,
+    stream_answer,
 )
 from holdfast.web.requests import BadRequest, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+MAX_RANGES = 16
+"""The most ranges of a change stream."""
+
+_NUMBERS: dict[str, tuple[Callable[[str], float], str]] = {
+    "integer": (int, "[0-9]{1,10}"),
+    "number": (float, "[0-9]{1,10}(\\.[0-9]{1,10})?"),
+}
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A required query parameter."""
+    """A query parameter. It is required unless it has a default."""
 
     name: str
     text: str
     schema: Schema
     example: object
+    default: object = None
+    repeats: bool = False
+    """Whether it may be given up to `MAX_RANGES` times. Then it is parsed as a list."""
 
-    def read(self, given: str) -> Any:
-        """Parses a value: an integer or a string, as in the schema. Raises `BadRequest`."""
-        if self.schema.get("type") != "integer":
+    @property
+    def most(self) -> int:
+        """How often it may be given."""
+        return MAX_RANGES if self.repeats else 1
+
+    def parse(self, given: Sequence[str] | None) -> Any:
+        """Parses what was given, as in the schema. Raises `BadRequest`."""
+        if given is None:
+            return self.default
+        values = [self._one(value) for value in given]
+        return values if self.repeats else values[0]
+
+    def _one(self, given: str) -> Any:
+        kind = self.schema.get("type")
+        if kind not in _NUMBERS:
             return given
+        convert, form = _NUMBERS[kind]
         least, most = self.schema["minimum"], self.schema["maximum"]
-        if re.fullmatch("[0-9]{1,10}", given) and least <= int(given) <= most:
-            return int(given)
-        allowed = f"allowed is an integer from {least} to {most}"
+        if re.fullmatch(form, given) and least <= convert(given) <= most:
+            return convert(given)
+        named = "an integer" if kind == "integer" else "a number"
+        allowed = f"allowed is {named} from {least} to {most}"
         raise BadRequest("malformed", f"{self.name} is {shown(given)}, {allowed}")
+
+    def described(self) -> Schema:
+        """The schema of everything that is given."""
+        if self.repeats:
+            return {"type": "array", "minItems": 1, "items": self.schema}
+        return self.schema
 
 
 @dataclass(frozen=True)
@@ -118,9 +153,40 @@ READ = Route(
     ),
 )
 
+CHANGES = Route(
+    "/api/v1/memory/changes",
+    "GET",
+    "changes",
+    "Follow ranges: a stream of their values and changes",
+    stream_answer(values="Change"),
+    (*QUERY, *MEMORY, *STREAM),
+    description="Server-sent events. The first event of each range has its current values; later "
+    "events have the shortest part of a range that contains all changes. The `id` of an event is "
+    "the number of writes to the memory; events with the same `id` are of the same moment. A "
+    "client that reads slowly receives the newest values. `area`, `address` and `count` can be "
+    f"repeated together, for up to {MAX_RANGES} ranges. After a reconnect, with or without "
+    "`Last-Event-ID`, the stream begins with the current values.",
+    parameters=(
+        Parameter("memory", "The name of the memory", TEXT, "plant_a"),
+        Parameter("area", "The area", ref("Area"), ["holding_registers"], repeats=True),
+        Parameter("address", "The first address", ADDRESS, [0], repeats=True),
+        Parameter(
+            "count", "The number of bits or registers", integer(1, ADDRESSES), [3], repeats=True
+        ),
+        Parameter(
+            "min_interval",
+            "The shortest time in seconds between two events of a range",
+            {"type": "number", "minimum": 0.05, "maximum": 3600},
+            0.5,
+            default=0.1,
+        ),
+    ),
+)
+
 ROUTES = (
     INGEST,
     READ,
+    CHANGES,
     Route(
         "/api/v1/health",
         "GET",

@@ -49,6 +49,9 @@ ANSWERS: dict[str, Schema] = {
         {"status": {"const": "accepted"}, "commands": AT_LEAST_ONE, "written": AT_LEAST_ONE}
     ),
     "Values": object_of({"values": _values(REGISTER)}),
+    "Change": object_of(
+        {"memory": TEXT, "area": ref("Area"), "address": ADDRESS, "values": _values(REGISTER)}
+    ),
     "EndedSession": object_of({"status": {"const": "ended"}, "id": SESSION_ID}),
     "Health": object_of({"status": {"const": "ok"}}),
     "Refusal": {

@@ -10,12 +10,17 @@ import msgspec
 from holdfast.web.host import SAFE
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Coroutine, Iterable
 
-    from holdfast.web.host import Send
+    from holdfast.web.host import Headers, Send
 
 Result = TypeVar("Result")
 KIND = b"text/event-stream"
+
+
+def headers_of_stream() -> Headers:
+    """Returns the headers of a stream. `x-accel-buffering` keeps nginx from holding events back."""
+    return [(b"content-type", KIND), (b"x-accel-buffering", b"no"), *SAFE]
 
 
 class Stream:
@@ -29,15 +34,17 @@ class Stream:
         self.began = False
         """Whether the response has begun."""
 
-    async def begin(self) -> None:
+    async def begin(self, more_headers: Iterable[tuple[bytes, bytes]] = ()) -> None:
         """Begins the response. The header is sent with the first event."""
-        start = [(b"content-type", KIND), (b"x-accel-buffering", b"no"), *SAFE]
+        start = [*headers_of_stream(), *more_headers]
         self.began = True
         await self._send({"type": "http.response.start", "status": 200, "headers": start})
 
-    async def event(self, name: str, data: Any) -> None:
-        """Sends one event with JSON data."""
-        await self._write(b"event: %b\ndata: %b\n\n" % (name.encode(), msgspec.json.encode(data)))
+    async def event(self, name: str, data: Any, number: int | None = None) -> None:
+        """Sends one event with JSON data. `number` is its id."""
+        head = b"" if number is None else b"id: %d\n" % number
+        body = b"event: %b\ndata: %b\n\n" % (name.encode(), msgspec.json.encode(data))
+        await self._write(head + body)
 
     async def beat(self) -> None:
         """Sends a heartbeat if nothing was sent for the heartbeat interval."""

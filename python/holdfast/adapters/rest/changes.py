@@ -1,0 +1,102 @@
+"""The change stream: what changes in ranges of a memory, as server-sent events.
+
+A stream looks at the memory at most once per `min_interval`, and only when its peer has taken the
+events before. So a slow peer receives the newest values, and nothing is queued for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from holdfast.web.events import Stream
+from holdfast.web.requests import BadRequest
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from holdfast.ingest import Follower
+    from holdfast.web.host import Send
+    from holdfast.web.requests import Request
+
+MAX_STREAMS = 32
+"""The most open streams. At most half of the connections of the server are streams."""
+
+MAX_VALUES = 65_536
+"""The most values in all ranges of one stream."""
+
+HEARTBEAT = 15.0
+"""The longest time in seconds between two events or comments of a stream."""
+
+EVENT = "values"
+
+
+class ChangeStreams:
+    """The open change streams of one server."""
+
+    def __init__(self, max_connections: int) -> None:
+        self.most = min(MAX_STREAMS, max(1, max_connections // 2))
+        self.open = 0
+        self._ending = asyncio.Event()
+
+    def end(self) -> None:
+        """Ends all streams. Called in the thread of the server."""
+        self._ending.set()
+
+    def check_room(self) -> None:
+        """Raises `BadRequest` if no more streams may be opened."""
+        if self.open >= self.most:
+            detail = f"too many change streams: {self.most} are open, which is the limit"
+            raise BadRequest("busy", detail)
+
+    async def serve(
+        self,
+        request: Request,
+        follower: Follower,
+        ranges: Sequence[tuple[str, str]],
+        min_interval: float,
+        send: Send,
+    ) -> None:
+        """Sends events until the peer leaves or the server stops.
+
+        `ranges` are the memory and the area of each range of the follower.
+        """
+        self.open += 1
+        ends = [
+            asyncio.create_task(request.gone()),
+            asyncio.create_task(self._ending.wait()),
+        ]
+        try:
+            request.let_leave()
+            stream = Stream(send, HEARTBEAT)
+            await stream.begin(request.more_headers)
+            await _follow(stream, follower, ranges, min_interval, ends)
+            await stream.end()
+        finally:
+            self.open -= 1
+            for each in ends:
+                each.cancel()
+            await asyncio.gather(*ends, return_exceptions=True)
+
+
+async def _follow(
+    stream: Stream,
+    follower: Follower,
+    ranges: Sequence[tuple[str, str]],
+    min_interval: float,
+    ends: Sequence[asyncio.Task[object]],
+) -> None:
+    """Sends events until one of the tasks `ends` is done."""
+    loop = asyncio.get_running_loop()
+    due = loop.time()
+    while not any(task.done() for task in ends):
+        if loop.time() >= due:
+            due = loop.time() + min_interval
+            sequence, changes = follower.changes()
+            for index, address, values in changes:
+                memory, area = ranges[index]
+                data = {"memory": memory, "area": area, "address": address, "values": values}
+                await stream.event(EVENT, data, sequence)
+        await stream.beat()
+        pause = max(0.0, min(due - loop.time(), HEARTBEAT))
+        await asyncio.wait(ends, timeout=pause, return_when=asyncio.FIRST_COMPLETED)
