@@ -12,6 +12,7 @@ from holdfast.client.endpoint import endpoint
 from holdfast.client.one_at_a_time import OneAtATime
 from holdfast.client.url import IN_FLIGHT, MAX_IN_FLIGHT, NetworkTarget
 from holdfast.errors import InvalidResponse, ModbusException
+from holdfast.integers import as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
@@ -58,11 +59,12 @@ class Client(BaseClient):
         self, url: str, *, unit: int = 1, timeout: float = 1.0, max_in_flight: int = 1
     ) -> None:
         super().__init__(url, unit, timeout)
-        if type(max_in_flight) is not int or not 1 <= max_in_flight <= MAX_IN_FLIGHT:
+        most = as_integer(max_in_flight)
+        if most is None or not 1 <= most <= MAX_IN_FLIGHT:
             raise ValueError(f"max_in_flight is {max_in_flight!r}, allowed: 1 to {MAX_IN_FLIGHT}")
         self._transport: Transport
         if isinstance(self.target, NetworkTarget) and self.target.transport in IN_FLIGHT:
-            self._transport = AsyncConnection(self.target, endpoint(self.target), max_in_flight)
+            self._transport = AsyncConnection(self.target, endpoint(self.target), most)
         else:
             self._transport = OneAtATime(self.target)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from holdfast._core import Request
 from holdfast.client.url import SerialTarget, parse
+from holdfast.integers import as_integer
 from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
 
 MAX_TIMEOUT = 86_400.0
@@ -30,9 +31,10 @@ class BaseClient:
 
 
 def _unit(unit: int) -> int:
-    if type(unit) is not int or not 0 <= unit <= MAX_UNIT:
+    number = as_integer(unit)
+    if number is None or not 0 <= number <= MAX_UNIT:
         raise ValueError(f"unit is {unit!r}, allowed: 0 to {MAX_UNIT}")
-    return unit
+    return number
 
 
 def _timeout(seconds: float) -> float:

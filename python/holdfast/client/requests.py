@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from holdfast._core import Request
 from holdfast.errors import InvalidResponse, ModbusException
+from holdfast.integers import as_integer
 from holdfast.protocol import (
     ADDRESSES,
     ILLEGAL_ADDRESS,
@@ -215,10 +216,12 @@ def _stream(code: int, objects: dict[int, bytes]) -> Steps[int]:
 
 def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
     """Sends and receives data words (function 8)."""
+    sent = b""
     for word in data:
-        if type(word) is not int or not 0 <= word <= MAX_WORD:
+        number = as_integer(word)
+        if number is None or not 0 <= number <= MAX_WORD:
             raise ValueError(f"data contains {word!r}, allowed: words 0 to {MAX_WORD}")
-    sent = b"".join(word.to_bytes(2, "big") for word in data)
+        sent += number.to_bytes(2, "big")
     came: bytes = yield Request.diagnostics(sub_function, sent)
     return [int.from_bytes(came[at : at + 2], "big") for at in range(0, len(came), 2)]
 

@@ -6,6 +6,7 @@ import reprlib
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict
 
 from holdfast._core import encode_raw_ingest, pack_raw_ingest
+from holdfast.integers import as_integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
 from holdfast.types import AREAS, BIT_AREAS
 
@@ -65,7 +66,7 @@ def encode(
         raise ValueError(f"crc is {crc!r}, allowed: 'required' or 'none'")
     if crc is not None and layout == "v1":
         raise ValueError("crc requires format crc: a packet of format v1 has no CRC")
-    checked_field("address", address)
+    address = checked_field("address", address)
     payload, items = _payload(area, values, data, count)
     if address + items > ADDRESSES:
         last = f"the last address is {LAST_ADDRESS}"
@@ -89,12 +90,13 @@ def _payload(
     if (values is None) == (data is None):
         raise TypeError("a packet requires either values or data")
     if count is not None:
-        checked_field("count", count, least=1)
+        count = checked_field("count", count, least=1)
     if data is not None:
         return _checked(area, data, count)
     if isinstance(values, Data):
         raise TypeError("values are bytes; pass them as data")
-    items = list(values or ())
+    assert values is not None
+    items = list(values)
     if not 1 <= len(items) <= MAX_FIELD:
         raise ValueError(f"found {len(items)} values, allowed: 1 to {MAX_FIELD}")
     if count not in (None, len(items)):
@@ -126,10 +128,11 @@ def _checked(area: Area, data: Data, count: int | None) -> tuple[bytes, int]:
 
 def checked_field(name: str, value: object, least: int = 0) -> int:
     """Returns an integer from `least` to 65535. Raises `TypeError` and `ValueError`."""
-    if isinstance(value, bool) or not isinstance(value, int):
+    number = as_integer(value)
+    if number is None:
         raise TypeError(
             f"{name} is {reprlib.repr(value)}, allowed: integers {least} to {MAX_FIELD}"
         )
-    if not least <= value <= MAX_FIELD:
+    if not least <= number <= MAX_FIELD:
         raise ValueError(f"{name} is {value}, allowed: {least} to {MAX_FIELD}")
-    return value
+    return number

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from holdfast.integers import as_integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.tags.linear import Linear
 from holdfast.tags.markers import FLOATS, Marker, as_decoded
@@ -68,9 +69,11 @@ class Tag:
     def __post_init__(self) -> None:
         if self.area not in AREAS:
             raise TagError("area", f"area is {self.area!r}, allowed: {', '.join(AREAS)}")
-        if type(self.address) is not int or not 0 <= self.address < ADDRESSES:
+        address = as_integer(self.address)
+        if address is None or not 0 <= address < ADDRESSES:
             found = f"address is {self.address!r}"
             raise TagError("address", f"{found}, allowed: 0 to {LAST_ADDRESS}")
+        self._put("address", address)
         if not self.type:
             self._put("type", default_type(self.area))
         try:
@@ -176,6 +179,8 @@ class Tag:
         Raises `DoesNotFit` for a value that they can't hold exactly, and for one below `min` or
         above `max`. Floating-point registers take the nearest number.
         """
+        if hasattr(value, "tolist"):
+            value = value.tolist()
         if isinstance(value, list | tuple):
             return [self.raw(item) for item in value]
         if isinstance(value, str) and self.states:

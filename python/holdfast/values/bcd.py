@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from holdfast.values.errors import DoesNotFit, Undecodable, is_integer, shown
+from holdfast.integers import as_integer
+from holdfast.values.errors import DoesNotFit, Undecodable, shown
 from holdfast.values.kinds import Bytewise
 
 
@@ -22,9 +23,10 @@ class Bcd(Bytewise):
 
     def pack_one(self, value: Any) -> bytes:
         """The digits of an integer. Raises `DoesNotFit`."""
-        if not is_integer(value):
+        number = as_integer(value)
+        if number is None:
             raise DoesNotFit(f"{shown(value)} is not an integer, which {self.name} requires")
         most = 10 ** (2 * self.width) - 1
-        if not 0 <= value <= most:
+        if not 0 <= number <= most:
             raise DoesNotFit(f"{shown(value)} is outside 0 to {most} of {self.name}")
-        return self.arrange(bytes.fromhex(f"{value:0{2 * self.width}d}"))
+        return self.arrange(bytes.fromhex(f"{number:0{2 * self.width}d}"))

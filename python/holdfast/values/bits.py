@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.integers import as_boolean, as_integer
 from holdfast.protocol import MAX_WORD
 from holdfast.values.errors import DoesNotFit, shown
 from holdfast.values.kinds import Kind
@@ -70,6 +71,10 @@ def merge(data: bytearray, start: int, masks: bytes) -> None:
 
 
 def _truth(value: object, name: str) -> bool:
-    if type(value) in (bool, int) and value in (0, 1):
-        return value == 1
+    truth = as_boolean(value)
+    if truth is not None:
+        return truth
+    number = as_integer(value)
+    if number in (0, 1):
+        return number == 1
     raise DoesNotFit(f"{shown(value)} is not False, True, 0 or 1, which {name} requires")

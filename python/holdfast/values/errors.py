@@ -6,8 +6,9 @@ A message says what was found and what is allowed. The place comes first, from o
 
 from __future__ import annotations
 
-import operator
 from typing import TypeVar
+
+from holdfast.integers import as_integer
 
 MAX_SHOWN = 40
 LARGEST_SHOWN = 1 << 128
@@ -79,13 +80,7 @@ def shown(value: object) -> str:
 
 def is_integer(value: object) -> bool:
     """Whether a value is an integer of any library, but not a bool."""
-    if isinstance(value, bool):
-        return False
-    try:
-        operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        return False
-    return True
+    return as_integer(value) is not None
 
 
 def counted(number: int, noun: str) -> str:

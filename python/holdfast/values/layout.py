@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from holdfast.integers import as_integer
 from holdfast.values.bits import Bit, merge
 from holdfast.values.codec import Codec, codec_of
 from holdfast.values.errors import ConversionError, DoesNotFit, InvalidLayout, at, shown
@@ -112,10 +113,11 @@ def _field(entry: Field | tuple[Any, ...]) -> Field:
         raise InvalidLayout(f"a field is {shown(entry)}, allowed: {allowed}")
     if not isinstance(made.name, str) or not made.name:
         raise InvalidLayout(f"the name of a field is {shown(made.name)}, allowed: non-empty text")
-    if type(made.offset) is not int or not 0 <= made.offset < MAX_REGISTERS:
+    offset = as_integer(made.offset)
+    if offset is None or not 0 <= offset < MAX_REGISTERS:
         allowed = f"allowed: 0 to {MAX_REGISTERS - 1}"
         raise at(made.name, InvalidLayout(f"offset {shown(made.offset)}, {allowed}"), made.name)
-    return made
+    return made if type(made.offset) is int else replace(made, offset=offset)
 
 
 def _codec(entry: Field) -> Codec:
@@ -138,9 +140,10 @@ def _size(fields: tuple[Field, ...], codecs: list[Codec], size: int | None) -> i
         raise at(name, InvalidLayout(found), name)
     if size is None:
         return last
-    if type(size) is not int or not last <= size <= MAX_REGISTERS:
+    number = as_integer(size)
+    if number is None or not last <= number <= MAX_REGISTERS:
         raise InvalidLayout(f"size {shown(size)}, allowed: {last} to {MAX_REGISTERS}")
-    return size
+    return number
 
 
 def _overlap(fields: tuple[Field, ...], codecs: list[Codec]) -> tuple[str, str] | None:

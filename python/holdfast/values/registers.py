@@ -5,8 +5,9 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+from holdfast.integers import as_boolean
 from holdfast.protocol import MAX_WORD
 from holdfast.values.errors import InvalidRegister, WrongLength, counted, is_integer, shown
 from holdfast.values.orders import swap_registers
@@ -45,6 +46,8 @@ class RegisterBlock:
         try:
             return self._pack(*registers)
         except (struct.error, TypeError):
+            if self._bits and any(map(_is_foreign_boolean, registers)):
+                return self.pack([_plain_boolean(register) for register in registers])
             raise self._flaw(registers) from None
 
     def unpack(self, data: bytes | bytearray) -> list[int]:
@@ -70,6 +73,15 @@ class RegisterBlock:
     def _wrong_length(self, found: str, also: str = "") -> WrongLength:
         takes = counted(self.count, "register")
         return WrongLength(f"{self._name} takes {takes}{also}, found {found}")
+
+
+def _is_foreign_boolean(value: object) -> bool:
+    return not isinstance(value, bool) and as_boolean(value) is not None
+
+
+def _plain_boolean(value: Any) -> Any:
+    truth = as_boolean(value)
+    return value if truth is None else truth
 
 
 def _plain(registers: Registers) -> bytes | Sequence[int]:
