@@ -25,6 +25,37 @@ NarrowedRights: TypeAlias = (
 `None` is everything.
 """
 
+BoolType: TypeAlias = Literal[
+    "bool",
+    "bit:0",
+    "bit:1",
+    "bit:2",
+    "bit:3",
+    "bit:4",
+    "bit:5",
+    "bit:6",
+    "bit:7",
+    "bit:8",
+    "bit:9",
+    "bit:10",
+    "bit:11",
+    "bit:12",
+    "bit:13",
+    "bit:14",
+    "bit:15",
+]
+IntegerType: TypeAlias = Literal[
+    "int16", "uint16", "int32", "uint32", "int64", "uint64", "bcd16", "bcd32"
+]
+FloatType: TypeAlias = Literal["float16", "float32", "float64"]
+ValueType: TypeAlias = BoolType | IntegerType | FloatType | str
+"""A type of `holdfast.values`. Text, bytes and arrays have a length in their names, so not every
+name can be listed: `string:20`, `uint16[8]`."""
+
+FourByteOrder: TypeAlias = Literal["ABCD", "DCBA", "BADC", "CDAB"]
+ByteOrder: TypeAlias = FourByteOrder | str
+"""A byte order of `holdfast.values`: four letters, or eight for a field of eight bytes."""
+
 Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp", "ascii+tcp", "rtu+udp"]
 """How a device with an address is talked to."""
 

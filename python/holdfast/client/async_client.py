@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, overload
 
 from holdfast._core import Request
 from holdfast.client import requests
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from typing import Protocol
 
     from holdfast.client.requests import Identification, Plan, Result, ServerId, Steps
-    from holdfast.types import Area
+    from holdfast.types import Area, BoolType, ByteOrder, FloatType, IntegerType, ValueType
 
     class Transport(Protocol):
         """Carries calls to a device."""
@@ -94,12 +94,56 @@ class Client(BaseClient):
         """
         return await self._run(requests.read_range("input_registers", address, count), unit)
 
+    @overload
     async def read(
         self,
         area: Area,
         address: int,
-        type: str,
-        order: str = "ABCD",
+        type: BoolType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> bool: ...
+    @overload
+    async def read(
+        self,
+        area: Area,
+        address: int,
+        type: IntegerType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> int: ...
+    @overload
+    async def read(
+        self,
+        area: Area,
+        address: int,
+        type: FloatType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> float: ...
+    @overload
+    async def read(
+        self,
+        area: Area,
+        address: int,
+        type: ValueType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> Any: ...
+    async def read(
+        self,
+        area: Area,
+        address: int,
+        type: ValueType,
+        order: ByteOrder = "ABCD",
         *,
         encoding: str | None = None,
         unit: int | None = None,
@@ -116,8 +160,8 @@ class Client(BaseClient):
         area: Area,
         address: int,
         value: Any,
-        type: str,
-        order: str = "ABCD",
+        type: ValueType,
+        order: ByteOrder = "ABCD",
         *,
         encoding: str | None = None,
         split: bool = False,

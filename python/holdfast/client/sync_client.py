@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, overload
 
 from holdfast._core import Request
 from holdfast.client import requests
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast.client.requests import Identification, Plan, Result, ServerId
-    from holdfast.types import Area
+    from holdfast.types import Area, BoolType, ByteOrder, FloatType, IntegerType, ValueType
 
 
 class SyncClient(BaseClient):
@@ -71,12 +71,56 @@ class SyncClient(BaseClient):
         """
         return self._run(requests.read_range("input_registers", address, count), unit)
 
+    @overload
     def read(
         self,
         area: Area,
         address: int,
-        type: str,
-        order: str = "ABCD",
+        type: BoolType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> bool: ...
+    @overload
+    def read(
+        self,
+        area: Area,
+        address: int,
+        type: IntegerType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> int: ...
+    @overload
+    def read(
+        self,
+        area: Area,
+        address: int,
+        type: FloatType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> float: ...
+    @overload
+    def read(
+        self,
+        area: Area,
+        address: int,
+        type: ValueType,
+        order: ByteOrder = "ABCD",
+        *,
+        encoding: str | None = None,
+        unit: int | None = None,
+    ) -> Any: ...
+    def read(
+        self,
+        area: Area,
+        address: int,
+        type: ValueType,
+        order: ByteOrder = "ABCD",
         *,
         encoding: str | None = None,
         unit: int | None = None,
@@ -93,8 +137,8 @@ class SyncClient(BaseClient):
         area: Area,
         address: int,
         value: Any,
-        type: str,
-        order: str = "ABCD",
+        type: ValueType,
+        order: ByteOrder = "ABCD",
         *,
         encoding: str | None = None,
         split: bool = False,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from holdfast.types import BIT_AREAS
 from holdfast.values.bcd import Bcd
@@ -24,15 +24,35 @@ from holdfast.values.text import Bytes, Text
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from holdfast.types import Area
+    from holdfast.types import Area, BoolType, ByteOrder, FloatType, IntegerType, ValueType
     from holdfast.values.kinds import Kind
     from holdfast.values.orders import Order
     from holdfast.values.registers import Registers
     from holdfast.values.types import Type
 
 
+@overload
 def decode(
-    registers: Registers, type: str, order: str = "ABCD", *, encoding: str | None = None
+    registers: Registers, type: BoolType, order: ByteOrder = "ABCD", *, encoding: str | None = None
+) -> bool: ...
+@overload
+def decode(
+    registers: Registers,
+    type: IntegerType,
+    order: ByteOrder = "ABCD",
+    *,
+    encoding: str | None = None,
+) -> int: ...
+@overload
+def decode(
+    registers: Registers, type: FloatType, order: ByteOrder = "ABCD", *, encoding: str | None = None
+) -> float: ...
+@overload
+def decode(
+    registers: Registers, type: ValueType, order: ByteOrder = "ABCD", *, encoding: str | None = None
+) -> Any: ...
+def decode(
+    registers: Registers, type: ValueType, order: ByteOrder = "ABCD", *, encoding: str | None = None
 ) -> Any:
     """Converts registers to a bool, int, float, str or bytes; to a list for an array type.
 
@@ -46,7 +66,9 @@ def decode(
     return codec.unpack(codec.to_bytes(registers))
 
 
-def encode(value: Any, type: str, order: str = "ABCD", *, encoding: str | None = None) -> list[int]:
+def encode(
+    value: Any, type: ValueType, order: ByteOrder = "ABCD", *, encoding: str | None = None
+) -> list[int]:
     """Converts a value, or a sequence of values for an array type, to registers, 0 to 65535.
 
     A single `bit:N` becomes a mask for its register: for true, only that bit is set, for OR; for
@@ -57,7 +79,7 @@ def encode(value: Any, type: str, order: str = "ABCD", *, encoding: str | None =
     return codec_of(type, order, encoding).encode(value)
 
 
-def register_count(type: str) -> int:
+def register_count(type: ValueType) -> int:
     """Registers per field of this type; for `bool`, bits. Raises `UnknownType`."""
     return parsed(type).registers
 

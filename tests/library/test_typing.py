@@ -1,0 +1,98 @@
+"""The types of results, which mypy checks with the tests; and the docstrings of public names."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from typing import TYPE_CHECKING, Any, assert_type, get_args
+
+import pytest
+
+import holdfast
+from holdfast import _core, raw_ingest, values
+from holdfast.types import BoolType, FloatType, FourByteOrder, IntegerType
+from holdfast.values import register_count
+from holdfast.values.orders import FOUR
+from holdfast.values.types import FIXED
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def of_the_blocking_client(plc: holdfast.SyncClient, kind: str) -> None:
+    assert_type(plc.read("holding_registers", 0, "float32", "CDAB"), float)
+    assert_type(plc.read("holding_registers", 0, "uint64", order="GHEFCDAB"), int)
+    assert_type(plc.read("coils", 0, "bool"), bool)
+    assert_type(plc.read("holding_registers", 0, "bit:3", unit=7), bool)
+    assert_type(plc.read("holding_registers", 0, "string:20", encoding="utf-8"), Any)
+    assert_type(plc.read("holding_registers", 0, kind), Any)
+    assert_type(plc.read_coils(0, 8), list[bool])
+
+
+async def of_the_asynchronous_client(plc: holdfast.Client) -> None:
+    assert_type(await plc.read("holding_registers", 0, "float64"), float)
+    assert_type(await plc.read("holding_registers", 0, "bcd16"), int)
+    assert_type(await plc.read("input_registers", 0, "bit:15"), bool)
+    assert_type(await plc.read("holding_registers", 0, "uint16[4]"), Any)
+
+
+def test_decoded_values_have_the_type_that_is_promised() -> None:
+    number = values.decode([0x4148, 0], "float32")
+    count = values.decode([7], "uint16")
+    bit = values.decode([8], "bit:3")
+    assert_type(number, float)
+    assert_type(count, int)
+    assert_type(bit, bool)
+    found: list[object] = [number, count, bit]
+    assert [type(value) for value in found] == [float, int, bool]
+
+
+def test_the_named_types_and_orders_are_all_there_are() -> None:
+    numbers = {*get_args(IntegerType), *get_args(FloatType)}
+    bits = {name for name in get_args(BoolType) if name.startswith("bit:")}
+    assert numbers | {"bool"} == set(FIXED)
+    assert bits == {f"bit:{number}" for number in range(16)}
+    assert all(register_count(name) == 1 for name in bits)
+    assert set(get_args(FourByteOrder)) == set(FOUR)
+
+
+# Docstrings.
+
+
+def public() -> Iterator[tuple[str, Any]]:
+    """Every public name of the library, and every public member of its classes."""
+    for module in (holdfast, values, raw_ingest):
+        yield module.__name__, module
+        for name in module.__all__:
+            found = getattr(module, name)
+            if isinstance(found, str) or inspect.ismodule(found):
+                continue
+            path = f"{module.__name__}.{name}"
+            if inspect.isclass(found) or callable(found):
+                yield path, found
+            if inspect.isclass(found):
+                for member, value in vars(found).items():
+                    is_member = inspect.isroutine(value) or inspect.isdatadescriptor(value)
+                    is_field = inspect.ismemberdescriptor(value)  # Its class describes it.
+                    if is_member and not is_field and not member.startswith("_"):
+                        yield f"{path}.{member}", value
+
+
+@pytest.mark.parametrize(("path", "value"), [pytest.param(*each, id=each[0]) for each in public()])
+def test_every_public_name_has_a_docstring(path: str, value: Any) -> None:
+    assert (getattr(value, "__doc__", None) or "").strip(), path
+
+
+def stub() -> dict[str, ast.ClassDef]:
+    tree = ast.parse((ROOT / "python/holdfast/_core.pyi").read_text())
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+@pytest.mark.parametrize("name", ["Memory", "OutOfRange", "Rule", "ServerTls"])
+def test_help_shows_what_editors_show(name: str) -> None:
+    native, described = getattr(_core, name), stub()[name]
+    assert inspect.cleandoc(native.__doc__) == ast.get_docstring(described)
+    for node in described.body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            assert inspect.cleandoc(getattr(native, node.name).__doc__) == ast.get_docstring(node)
