@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from holdfast import raw_ingest, values
-from holdfast._core import Memory, OutOfRange, Rule, __version__
+from holdfast._core import Memory, OutOfRange, Rule, ServerTls, __version__
 from holdfast.client import Client, SyncClient
 from holdfast.errors import (
     ConnectFailed,
@@ -41,6 +41,7 @@ __all__ = [
     "RequestTimeout",
     "Rule",
     "Server",
+    "ServerTls",
     "SyncClient",
     "Tag",
     "TagError",

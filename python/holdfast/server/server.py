@@ -1,78 +1,43 @@
-"""A Modbus TCP server for memories, for use from Python.
-
-The server is one listener of the native engine, whose threads serve it outside the interpreter.
-`holdfast.appliance` has appliances with several listeners.
-"""
+"""`Server`: one listener of the native engine."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self, cast
 
 from holdfast import _core
-from holdfast._core import __version__
 from holdfast.net.addresses import LOOPBACK
+from holdfast.server.identity import Identity
+from holdfast.server.listening import NAME, Limits, listener
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
-    from holdfast._core import Memory, Rule
+    from holdfast._core import Memory, Rule, ServerTls
     from holdfast.types import Access, ModbusCounters, WhenFull
 
 MAX_WORKERS = 64
 SOURCES = tuple(map(str, LOOPBACK))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Identity:
-    """The identification objects of all units, and names of single units.
-
-    Text is sent as UTF-8, at most 244 bytes each. Optional objects with empty text are omitted.
-    `unit_names`, by unit id 0 to 255, override `user_application_name`. `private_objects` are by
-    object id, 128 to 255.
-    """
-
-    vendor_name: str = "Holdfast"
-    product_code: str = "HF"
-    revision: str = __version__
-    vendor_url: str = ""
-    product_name: str = ""
-    model_name: str = ""
-    user_application_name: str = ""
-    unit_names: Mapping[int, str] = field(default_factory=dict)
-    private_objects: Mapping[int, str] = field(default_factory=dict)
-
-    def objects(self) -> list[tuple[int, str]]:
-        """Object ids and texts, the three mandatory objects first."""
-        mandatory = [self.vendor_name, self.product_code, self.revision]
-        optional = [
-            self.vendor_url,
-            self.product_name,
-            self.model_name,
-            self.user_application_name,
-        ]
-        regular = [(index, text) for index, text in enumerate(optional, start=3) if text]
-        return [*enumerate(mandatory), *regular, *self.private_objects.items()]
-
-    def names(self) -> list[tuple[int, str]]:
-        """Unit ids and names."""
-        return list(self.unit_names.items())
-
-
 class Server:
-    """Serves memories over Modbus TCP, from `start` (or `with`) to `stop`.
+    """Serves memories over Modbus, from `start` (or `with`) to `stop`.
 
     `units` maps unit ids, 0 to 255, to memories. Peers from `sources` have `access` to them,
     limited by `functions` or `deny`, lists of function codes. Alternatively, set `rules`: the first
     rule whose sources contain the peer applies. A peer without a rule is disconnected at once.
-    `bind` is `address:port`; port 0 lets the system pick a port.
+    `bind` is `address:port` for Modbus TCP, or a URL with the schemes of clients: `tcp`, `tls`,
+    `udp`, `rtu+tcp`, `rtu+udp` and `ascii+tcp` with an IP address and a port, `rtu` and `ascii`
+    with a serial line, as in `rtu:///dev/ttyUSB0?baud=19200&parity=even`. Port 0 lets the system
+    pick a port. `tls` requires `tls`, the certificates. An option that the transport does not have
+    is refused.
 
     Times are in seconds. `idle_timeout` is the time without a request; 0 is unlimited.
     `request_timeout` is the time from the first byte of a request to its last, and the time for a
-    peer to read its replies. With `listen_only`, a peer that may write can set a unit to listen
-    only mode for all peers (function 8, sub-function 4). `workers` is the number of native threads.
+    peer to read its replies. `frame_timeout`, for `rtu+tcp`, is the time without a byte after which
+    the next request may follow an incomplete one. With `listen_only`, a peer that may write can set
+    a unit to listen only mode for all peers (function 8, sub-function 4). `workers` is the number
+    of native threads.
 
     Raises `ValueError` or `TypeError` at once for invalid arguments.
 
@@ -98,7 +63,10 @@ class Server:
         when_full: WhenFull = "refuse",
         idle_timeout: float = 300.0,
         request_timeout: float = 10.0,
+        frame_timeout: float = 0.05,
         listen_only: bool = False,
+        tls: ServerTls | None = None,
+        max_handshakes: int = 256,
         identity: Identity | None = None,
         workers: int = 1,
     ) -> None:
@@ -117,10 +85,7 @@ class Server:
             raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= workers <= MAX_WORKERS:
             raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
-        self._listener = _core.Listener(
-            "server",
-            bind,
-            list(rules),
+        limits = Limits(
             max_connections=max_connections,
             max_connections_per_source=max_connections_per_source,
             max_requests_per_source=max_requests_per_source,
@@ -128,8 +93,12 @@ class Server:
             when_full=when_full,
             idle_timeout=idle_timeout,
             request_timeout=request_timeout,
+            frame_timeout=frame_timeout,
             listen_only=listen_only,
+            tls=tls,
+            max_handshakes=max_handshakes,
         )
+        self._listener = listener(bind, list(rules), limits)
         self._identity = identity or Identity()
         self._workers = workers
         self._engine: _core.Engine | None = None
@@ -162,14 +131,18 @@ class Server:
 
     @property
     def address(self) -> tuple[str, int]:
-        """The address and port of the server. Raises `RuntimeError` if it is not running."""
+        """The address and port of the server.
+
+        Raises `RuntimeError` if it is not running, and for a serial line, which has none.
+        """
         address = self._running().addresses[0]
-        assert address is not None
+        if address is None:
+            raise RuntimeError("a serial line has no address")
         return address
 
     def counters(self) -> ModbusCounters:
         """The counters since the start. Raises `RuntimeError` if the server is not running."""
-        return cast("ModbusCounters", self._running().counters()["server"])
+        return cast("ModbusCounters", self._running().counters()[NAME])
 
     def _running(self) -> _core.Engine:
         if self._engine is None:
