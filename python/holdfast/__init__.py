@@ -24,6 +24,7 @@ from holdfast.errors import (
 from holdfast.polling import Poller
 from holdfast.server import Server
 from holdfast.tags import Tag, TagError, TagList
+from holdfast.write_callback import WriteCallback
 
 if TYPE_CHECKING:
     from holdfast.config.tag_files import load_tags
@@ -47,6 +48,7 @@ __all__ = [
     "TagError",
     "TagList",
     "TlsFailed",
+    "WriteCallback",
     "__version__",
     "load_tags",
     "raw_ingest",

@@ -20,6 +20,7 @@ from holdfast.types import (
     ThreadHeartbeat,
     WhenFull,
 )
+from holdfast.write_callback import WriteCallback
 
 __all__ = [
     "ADDRESSES",
@@ -95,6 +96,7 @@ FAULTS: Final[dict[str, int]]
 class OutOfRange(IndexError):
     """The range is not inside the area. Nothing was read or written."""
 
+@final
 class Memory:
     """Four areas of bits and 16-bit registers, of fixed size, initially 0.
 
@@ -158,6 +160,22 @@ class Memory:
         prevents all.
         """
 
+    def on_write(
+        self, callback: Callable[[Area, int, list[int]], object], *, clients_only: bool = False
+    ) -> WriteCallback:
+        """Calls `callback(area, address, values)` after every write to this memory.
+
+        Writes are those of Modbus clients and of everything else, also of this program; with
+        `clients_only`, only those of Modbus clients. A write that changes no value is one too, and
+        a write of several ranges is several calls. The calls are in the order of the writes, on one
+        thread of their own, and hold up neither the memory nor a client. If the callback is slower
+        than the writes, the oldest are dropped and counted.
+
+        An exception of the callback goes to `threading.excepthook`; the next call follows. A
+        callback that writes to the same memory is called for that write as well, unless
+        `clients_only` is set. Close the result to end the calls; they also end with the program.
+        """
+
 @final
 class Follower:
     """Follows ranges of a memory, each an area, an address and a count. Ignores the seal.
@@ -175,12 +193,8 @@ class Follower:
 
 @final
 class WriteQueue:
-    """The writes to a memory from now on, in their order; with `clients_only`, of Modbus clients.
+    """The writes to a memory, in their order. It is bounded: it drops the oldest writes."""
 
-    It keeps a limited number of writes, and then drops the oldest.
-    """
-
-    def __new__(cls, memory: Memory, *, clients_only: bool = False) -> WriteQueue: ...
     def next(self, timeout: float) -> tuple[Area, int, list[int], bool] | None:
         """Waits for the next write: area, address, values, whether a Modbus client wrote it.
 

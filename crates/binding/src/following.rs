@@ -1,13 +1,13 @@
-//! `Follower` and `WriteQueue`: what has changed in a memory, and what was written to it.
+//! `Follower`: what has changed in ranges of a memory.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use holdfast_memory::{Access, Follower as CoreFollower, WriteQueue as CoreQueue};
+use holdfast_memory::Follower as CoreFollower;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
-use crate::arguments::seconds;
-use crate::memory::{Memory, Range, integer, listed};
+use crate::listed::listed;
+use crate::memory::{Memory, Range, integer};
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Follower {
@@ -42,45 +42,5 @@ impl Follower {
             Ok((change.range, change.address, values))
         });
         Ok((writes, told.collect::<PyResult<_>>()?))
-    }
-}
-
-/// Area, address, values, and whether a Modbus client wrote them.
-type Written<'py> = (&'static str, u16, Bound<'py, PyList>, bool);
-
-#[pyclass(frozen, module = "holdfast")]
-pub struct WriteQueue {
-    core: Arc<CoreQueue>,
-}
-
-#[pymethods]
-impl WriteQueue {
-    #[new]
-    #[pyo3(signature = (memory, *, clients_only=false))]
-    fn new(py: Python<'_>, memory: PyRef<'_, Memory>, clients_only: bool) -> WriteQueue {
-        let core = Arc::clone(&memory.core);
-        WriteQueue { core: py.detach(|| core.observe(clients_only)) }
-    }
-
-    fn next<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Written<'py>>> {
-        let timeout = seconds("timeout", timeout)?;
-        let Some(written) = py.detach(|| self.core.next(timeout)) else { return Ok(None) };
-        let values = listed(py, written.area, written.count, &written.bytes)?;
-        let is_client = written.access == Access::Client;
-        Ok(Some((written.area.name(), written.address, values, is_client)))
-    }
-
-    fn close(&self) {
-        self.core.close();
-    }
-
-    #[getter]
-    fn is_closed(&self) -> bool {
-        self.core.is_closed()
-    }
-
-    #[getter]
-    fn dropped(&self) -> u64 {
-        self.core.dropped()
     }
 }

@@ -14,11 +14,13 @@ mod following;
 mod heartbeat;
 mod limits;
 mod link;
+mod listed;
 mod listener;
 mod memory;
 mod peer;
 mod poller;
 mod raw_ingest;
+mod write_queue;
 
 use pyo3::prelude::*;
 
@@ -37,7 +39,7 @@ mod _core {
     #[pymodule_export]
     use super::engine::Engine;
     #[pymodule_export]
-    use super::following::{Follower, WriteQueue};
+    use super::following::Follower;
     #[pymodule_export]
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]
@@ -48,6 +50,8 @@ mod _core {
     use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
     #[pymodule_export]
     use super::raw_ingest::{encode_raw_ingest, pack_raw_ingest};
+    #[pymodule_export]
+    use super::write_queue::WriteQueue;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -40,6 +40,17 @@ type Limits = (Option<Vec<Range>>, Option<Vec<Range>>);
 /// The rights of a unit: access, functions, denied functions, ranges.
 type Narrow = (String, Option<Vec<i128>>, Option<Vec<i128>>, Limits);
 
+/// What the peers of some networks may do.
+///
+/// `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
+/// addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set
+/// `functions`, the allowed function codes, or `deny`, the codes that are not allowed, but not
+/// both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
+/// certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
+/// access, functions, denied functions, and the ranges that they may read and write, each an area,
+/// its first address and a count; `None` is everything.
+///
+/// Raises `ValueError` for an invalid source or access.
 #[pyclass(frozen, module = "holdfast")]
 pub struct Rule {
     core: CoreRule,
@@ -115,6 +126,12 @@ impl RawRule {
     }
 }
 
+/// Settings of a TLS server with mutual authentication. Reads the PEM files at once.
+///
+/// `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
+/// `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
+/// their clients after `nextUpdate`. `key` is the content of `key_file` without its passphrase, if
+/// it has one. Raises `ValueError` for a file that can't be used.
 #[pyclass(frozen, module = "holdfast")]
 pub struct ServerTls {
     core: Arc<CoreServerTls>,
@@ -140,6 +157,7 @@ impl ServerTls {
         Ok(ServerTls { core: Arc::new(core) })
     }
 
+    /// What is doubtful about the files: dates, and revocation lists.
     #[getter]
     fn warnings(&self) -> Vec<String> {
         self.core.warnings().to_vec()

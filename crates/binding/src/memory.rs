@@ -9,7 +9,15 @@ use pyo3::exceptions::{PyIndexError, PyOverflowError, PyTypeError, PyValueError}
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
 
-pyo3::create_exception!(holdfast, OutOfRange, PyIndexError, "A range outside its area.");
+use crate::listed::listed;
+use crate::write_queue::WriteQueue;
+
+pyo3::create_exception!(
+    holdfast,
+    OutOfRange,
+    PyIndexError,
+    "The range is not inside the area. Nothing was read or written."
+);
 
 /// A size from address 0, or a start and a size.
 #[derive(FromPyObject)]
@@ -24,7 +32,17 @@ enum Seal {
     Mode(String, u16, String),
 }
 
-#[pyclass(frozen, subclass, module = "holdfast")]
+/// Four areas of bits and 16-bit registers, of fixed size, initially 0.
+///
+/// An area is a size (addresses from 0), or start and size; an omitted area does not exist.
+/// `start + size` is at most 65536. Every read sees a whole write or none of it, and a refused
+/// write changes nothing. Methods are thread-safe.
+///
+/// `seal` is the gate bit, in coils or discrete inputs. Modbus clients receive exception 06 until a
+/// write other than by Modbus sets that bit to 1: permanently (`once`), or while it is 1 (`level`).
+///
+/// Raises `ValueError` for an invalid size or gate bit.
+#[pyclass(frozen, module = "holdfast")]
 pub struct Memory {
     pub core: Arc<Core>,
 }
@@ -58,6 +76,7 @@ impl Memory {
         Ok(Memory { core: Arc::new(core) })
     }
 
+    /// The addresses of each area that exists.
     #[getter]
     fn areas<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let areas = PyDict::new(py);
@@ -72,6 +91,9 @@ impl Memory {
         Ok(areas)
     }
 
+    /// Reserves ranges (area, address, count) for the poller; others can't write them any more.
+    ///
+    /// They replace those of an earlier call. Raises `ValueError` for a range outside its area.
     fn mirror(&self, ranges: Vec<(String, u16, usize)>) -> PyResult<()> {
         let ranges = ranges
             .into_iter()
@@ -80,16 +102,21 @@ impl Memory {
         self.core.mirror(ranges).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
+    /// Whether the memory is sealed, so Modbus clients receive exception 06.
     #[getter]
     fn sealed(&self, py: Python<'_>) -> bool {
         py.detach(|| self.core.sealed())
     }
 
+    /// How often the seal opened, and how often it closed again.
     #[getter]
     fn seal_changes(&self, py: Python<'_>) -> (u64, u64) {
         py.detach(|| self.core.seal_changes())
     }
 
+    /// Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
+    ///
+    /// Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1.
     fn read<'py>(
         &self,
         py: Python<'py>,
@@ -103,6 +130,7 @@ impl Memory {
         range.values(py)
     }
 
+    /// Reads several ranges (area, address, count) as one snapshot. Raises like `read`.
     fn read_many<'py>(
         &self,
         py: Python<'py>,
@@ -120,6 +148,10 @@ impl Memory {
         ranges.iter().map(|range| range.values(py)).collect()
     }
 
+    /// Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
+    ///
+    /// Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
+    /// unknown area, `TypeError` for a value of another type. An error changes nothing.
     fn write(
         &self,
         py: Python<'_>,
@@ -132,6 +164,10 @@ impl Memory {
             .map_err(|refusal| range.refused(&self.core, refusal))
     }
 
+    /// Writes to several ranges (area, address, values) in one step.
+    ///
+    /// Where two overlap, the later one wins. Raises the errors of `write`; an error in one write
+    /// prevents all.
     fn write_many(
         &self,
         py: Python<'_>,
@@ -146,6 +182,32 @@ impl Memory {
             self.core.write_many(Access::Ingest, &writes)
         })
         .map_err(|refused| ranges[refused.index].refused(&self.core, refused.refusal))
+    }
+
+    /// Calls `callback(area, address, values)` after every write to this memory.
+    ///
+    /// Writes are those of Modbus clients and of everything else, also of this program; with
+    /// `clients_only`, only those of Modbus clients. A write that changes no value is one too, and
+    /// a write of several ranges is several calls. The calls are in the order of the writes, on one
+    /// thread of their own, and hold up neither the memory nor a client. If the callback is slower
+    /// than the writes, the oldest are dropped and counted.
+    ///
+    /// An exception of the callback goes to `threading.excepthook`; the next call follows. A
+    /// callback that writes to the same memory is called for that write as well, unless
+    /// `clients_only` is set. Close the result to end the calls; they also end with the program.
+    #[pyo3(signature = (callback, *, clients_only=false))]
+    fn on_write<'py>(
+        &self,
+        py: Python<'py>,
+        callback: &Bound<'py, PyAny>,
+        clients_only: bool,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        if !callback.is_callable() {
+            let message = format!("callback is {}, allowed: a function", callback.repr()?);
+            return Err(PyTypeError::new_err(message));
+        }
+        let queue = WriteQueue { core: py.detach(|| self.core.observe(clients_only)) };
+        py.import("holdfast.write_callback")?.getattr("WriteCallback")?.call1((queue, callback))
     }
 
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
@@ -220,21 +282,6 @@ impl Range {
             }
             other => PyValueError::new_err(other.to_string()),
         }
-    }
-}
-
-/// The values of `count` items of an area.
-pub fn listed<'py>(
-    py: Python<'py>,
-    area: Area,
-    count: usize,
-    bytes: &[u8],
-) -> PyResult<Bound<'py, PyList>> {
-    if area.is_bits() {
-        PyList::new(py, (0..count).map(|index| bytes[index / 8] >> (index % 8) & 1))
-    } else {
-        let registers = bytes.chunks_exact(2);
-        PyList::new(py, registers.map(|pair| u16::from_be_bytes([pair[0], pair[1]])))
     }
 }
 

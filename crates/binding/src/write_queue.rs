@@ -1,0 +1,43 @@
+//! `WriteQueue`: the writes to a memory.
+
+use std::sync::Arc;
+
+use holdfast_memory::{Access, WriteQueue as CoreQueue};
+use pyo3::prelude::*;
+use pyo3::types::PyList;
+
+use crate::arguments::seconds;
+use crate::listed::listed;
+
+/// Area, address, values, and whether a Modbus client wrote them.
+type Written<'py> = (&'static str, u16, Bound<'py, PyList>, bool);
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct WriteQueue {
+    pub core: Arc<CoreQueue>,
+}
+
+#[pymethods]
+impl WriteQueue {
+    fn next<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Written<'py>>> {
+        let timeout = seconds("timeout", timeout)?;
+        let Some(written) = py.detach(|| self.core.next(timeout)) else { return Ok(None) };
+        let values = listed(py, written.area, written.count, &written.bytes)?;
+        let is_client = written.access == Access::Client;
+        Ok(Some((written.area.name(), written.address, values, is_client)))
+    }
+
+    fn close(&self) {
+        self.core.close();
+    }
+
+    #[getter]
+    fn is_closed(&self) -> bool {
+        self.core.is_closed()
+    }
+
+    #[getter]
+    fn dropped(&self) -> u64 {
+        self.core.dropped()
+    }
+}

@@ -1,0 +1,81 @@
+"""`WriteCallback`: calls a function for the writes to a memory."""
+
+from __future__ import annotations
+
+import atexit
+import sys
+import threading
+from typing import TYPE_CHECKING, Protocol, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from holdfast.types import Area
+
+WAIT = 3600.0
+"""Seconds of one wait for a write. It ends when the queue is closed."""
+
+END = 1.0
+"""Seconds to wait for a callback that runs while it is closed."""
+
+
+class Queue(Protocol):
+    """The native queue of writes."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the queue is closed, or its memory is gone."""
+
+    @property
+    def dropped(self) -> int:
+        """How many writes were dropped because the queue was full."""
+
+    def next(self, timeout: float) -> tuple[Area, int, list[int], bool] | None:
+        """Waits for the next write."""
+
+    def close(self) -> None:
+        """Closes the queue."""
+
+
+class WriteCallback:
+    """A callback for the writes to a memory, until `close`. Made by `Memory.on_write`."""
+
+    def __init__(self, queue: Queue, callback: Callable[[Area, int, list[int]], object]) -> None:
+        self._queue = queue
+        self._callback = callback
+        self._thread = threading.Thread(target=self._run, name="holdfast-on-write", daemon=True)
+        # A thread that waits in native code must have ended before the interpreter does.
+        atexit.register(self.close)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """How many writes were dropped because the callback is too slow."""
+        return self._queue.dropped
+
+    def close(self) -> None:
+        """Ends the calls, and waits for one that runs for up to a second. Writes that wait for the
+        callback are dropped. Can be called from any thread, also from the callback.
+        """
+        self._queue.close()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(END)
+
+    def _run(self) -> None:
+        while not self._queue.is_closed:
+            written = self._queue.next(WAIT)
+            if written is None:
+                continue
+            area, address, values, _ = written
+            try:
+                self._callback(area, address, values)
+            except Exception:
+                thrown = threading.ExceptHookArgs((*sys.exc_info(), self._thread))
+                threading.excepthook(thrown)
+        atexit.unregister(self.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
