@@ -117,14 +117,18 @@ def test_every_request_of_a_device_may_have_tls() -> None:
 def test_every_example_is_answered_as_the_document_says(gateway: Running) -> None:
     document = gateway.client().get("/openapi.json").json
     for path, methods in document["paths"].items():
-        if path == "/api/modbus/map" or "post" not in methods:
+        if "post" not in methods:
+            continue
+        answers = methods["post"]["responses"]["200"]["content"]
+        if "text/event-stream" in answers:
             continue
         content = methods["post"]["requestBody"]["content"]["application/json"]
+        more = {"timeout": 200} if path.startswith(gateways.API) else {}
         for example in content["examples"].values():
-            answer = gateway.client().ask("POST", path, {**example["value"], "timeout": 200})
+            answer = gateway.client().ask("POST", path, {**example["value"], **more})
             assert (answer.status, answer.json["success"]) == (200, True), (path, answer.json)
-        told = methods["post"]["responses"]["200"]["content"]["application/json"]
-        properties, *_ = told["schema"]["oneOf"]
+        told = answers["application/json"]
+        properties, *_ = told["schema"].get("oneOf", [told["schema"]])
         assert set(properties["required"]) <= set(told["example"])
         assert set(told["example"]) <= set(properties["properties"])
 

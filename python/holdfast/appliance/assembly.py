@@ -355,7 +355,9 @@ def tell_disabled(name: str, status: StatusConfig, memories: Mapping[str, Memory
     _core.tell_disabled(memories[status.memory], _block(name, status))
 
 
-def gateway(settings: GatewayConfig) -> GatewaySettings:
+def gateway(
+    settings: GatewayConfig, profiles: Mapping[str, ProfileConfig] | None = None
+) -> GatewaySettings:
     """Returns the settings of the gateway."""
     from holdfast.gateway import GatewayLimits, Settings
 
@@ -366,6 +368,9 @@ def gateway(settings: GatewayConfig) -> GatewaySettings:
         tokens=tuple((token.name, bytes.fromhex(token.sha256)) for token in tokens),
         sources=settings.sources,
         limits=GatewayLimits(in_flight=settings.in_flight),
+        profiles={
+            name: TagList(profile.named().values()) for name, profile in (profiles or {}).items()
+        },
         tls=gateway_tls(settings),
     )
 

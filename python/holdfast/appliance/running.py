@@ -669,13 +669,15 @@ class _Running:
         if config.gateway is not None:
             from holdfast.gateway import Gateway
 
-            gateway, gateway_at = assembly.gateway(config.gateway), ports["gateway"]
+            gateway = assembly.gateway(config.gateway, config.profiles)
+            gateway_at = ports["gateway"]
             add(
                 "gateway",
                 lambda: Gateway(
                     gateway, gateway_at.listener, poller=poller, https=self._https["gateway"]
                 ),
                 *_apart_from_files(config.gateway),
+                config.profiles,
                 poller is None,
             )
         if config.metrics is not None:

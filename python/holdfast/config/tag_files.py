@@ -57,11 +57,20 @@ def load_tags(path: Path | str) -> TagList:
     return TagList(load_profile(Path(path), str(path)).named().values())
 
 
+def parse_tags(text: str, file: str, *, is_csv: bool) -> TagList:
+    """Parses a tag list; messages call it `file`. Raises `ConfigError` with every problem."""
+    return TagList(_profile(text, file, "tags", Path(), is_csv=is_csv).named().values())
+
+
 def load_profile(path: Path, file: str) -> ProfileConfig:
     """Reads a profile; messages call it `file`. Raises `ConfigError` with every problem."""
     name = path.stem if is_name(path.stem) else "tags"
     text = source.read_text(path, file, "YAML or CSV")
-    if path.suffix.lower() == ".csv":
+    return _profile(text, file, name, path.parent, is_csv=path.suffix.lower() == ".csv")
+
+
+def _profile(text: str, file: str, name: str, folder: Path, *, is_csv: bool) -> ProfileConfig:
+    if is_csv:
         document, problems = _csv(text, file)
     else:
         document, problems = source.parse(text, file)
@@ -71,7 +80,7 @@ def load_profile(path: Path, file: str) -> ProfileConfig:
     whole = document.inside("profiles", name)
     report = Report(whole)
     TagChecks(report).profiles(whole.data["profiles"])
-    config = structure.build(whole.data, {"folder": path.parent}, report)
+    config = structure.build(whole.data, {"folder": folder}, report)
     problems += [_without(f"profiles.{name}", problem) for problem in report.problems]
     if problems or config is None:
         raise ConfigError(file, problems)

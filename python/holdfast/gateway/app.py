@@ -8,13 +8,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
 from holdfast import __version__, logs
 from holdfast.errors import ModbusException
-from holdfast.gateway import assets, identifying, openapi, reading, surveying, watching, writing
+from holdfast.gateway import (
+    assets,
+    identifying,
+    listing,
+    openapi,
+    reading,
+    surveying,
+    viewing,
+    watching,
+    writing,
+)
 from holdfast.gateway.broadcasting import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
@@ -36,6 +47,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Poller
     from holdfast.gateway.endpoint import Operation
+    from holdfast.gateway.listing import Local
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
     from holdfast.net.resolver import Resolve
@@ -80,6 +92,8 @@ class App:
             shared=None if poller is None else Shared(poller),
         )
         self._running = {"requests": 0, "streams": 0}
+        self._streams: Counter[str] = Counter()
+        """The number of streams by the address of the client."""
         self._shares: dict[tuple[str, int], int] = {}
         """The number of pending requests by host and port."""
         self._requests = self._failed = self._writes = 0
@@ -93,6 +107,9 @@ class App:
             **{each.path: ("POST", self._handler(each)) for each in ENDPOINTS},
             surveying.PATH: ("POST", self._map),
             watching.PATH: ("GET", self._watch),
+            viewing.PATH: ("POST", self._view),
+            **{each.path: ("POST", self._local(each)) for each in listing.ENDPOINTS},
+            listing.PROFILES: ("GET", self._profiles),
             openapi.STATUS: ("GET", self._status),
             DOCUMENT: ("GET", self._openapi),
             PAGE: ("GET", self._docs),
@@ -352,9 +369,10 @@ class App:
     async def _map(self, request: Request, send: Send) -> None:
         self._admit(request)
         request.check_json(b"", FORM, parameters=True)
-        with self._place("streams", self._limits.streams):
+        with self._stream(request):
             body = await request.body(self._limits.body)
             given = from_json(body, surveying.fields(self._limits))
+            self._require_stream(request, given["maxStreams"])
             device = RequestedDevice(self._egress, self._pool, given)
             survey = surveying.planned(given)
             stream = Stream(send, self._limits.heartbeat)
@@ -365,11 +383,69 @@ class App:
 
     async def _watch(self, request: Request, send: Send) -> None:
         self._admit(request)
-        with self._place("streams", self._limits.streams):
+        with self._stream(request):
             given = from_query(request.scope["query_string"], watching.fields(self._limits))
             device = RequestedDevice(self._egress, self._pool, given)
             stream = Stream(send, self._limits.heartbeat)
             await self._while_streaming(request, stream, watching.watch(given, device, stream))
+
+    async def _view(self, request: Request, send: Send) -> None:
+        self._admit(request)
+        request.check_json(b"", FORM, parameters=True)
+        with self._place("requests", self._limits.requests):
+            body = await request.body(self._limits.body)
+            given = from_json(body, viewing.fields(self._limits))
+            parts = await viewing.parts_of(given, self._settings.profiles)
+        device = RequestedDevice(self._egress, self._pool, given)
+        streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
+        once = self._place("requests", self._limits.requests)
+        with self._stream(request) if streaming else once:
+            stream = Stream(send, self._limits.heartbeat)
+            work = viewing.follow(given, viewing.View(parts, device), stream, streaming=streaming)
+            await self._while_streaming(request, stream, work)
+
+    @contextlib.contextmanager
+    def _stream(self, request: Request) -> Iterator[None]:
+        """Counts a stream. Raises `BadRequest` above the limit."""
+        host = host_of(request.peer)
+        with self._place("streams", self._limits.streams):
+            self._streams[host] += 1
+            try:
+                yield
+            finally:
+                self._streams[host] -= 1
+                if not self._streams[host]:
+                    del self._streams[host]
+
+    def _has_stream(self, request: Request, most: int | None) -> bool:
+        """Whether a client that asks for at most `most` streams can have one more."""
+        if most is None:
+            return True
+        full = self._running["streams"] >= self._limits.streams
+        return not full and self._streams[host_of(request.peer)] < most
+
+    def _require_stream(self, request: Request, most: int | None) -> None:
+        """Raises `BadRequest` if the client has more than `most` streams, with the newest."""
+        if most is not None and self._streams[host_of(request.peer)] > most:
+            raise BadRequest("busy", f"{most} streams of this address are open, as maxStreams says")
+
+    def _local(self, endpoint: Local) -> Handler:
+        """Returns the handler of an endpoint that asks no device."""
+
+        async def handle(request: Request, send: Send) -> None:
+            self._admit(request)
+            request.check_json(b"", FORM, parameters=True)
+            with self._place("requests", self._limits.requests):
+                given = from_json(await request.body(self._limits.body), endpoint.fields)
+                answer = await endpoint.answer(given, self._settings.profiles)
+            await self._reply(request, send, msgspec.json.encode(answer))
+
+        return handle
+
+    async def _profiles(self, request: Request, send: Send) -> None:
+        self._admit(request)
+        answer = listing.profiles(self._settings.profiles)
+        await self._reply(request, send, msgspec.json.encode(answer))
 
     async def _while_streaming(
         self, request: Request, stream: Stream, work: Coroutine[Any, Any, None]
@@ -411,6 +487,11 @@ class App:
         kind, body = assets.read(request.path)
         request.more_headers += assets.HEADERS
         await self._reply(request, send, body, kind=kind)
+
+
+def host_of(peer: str) -> str:
+    """The address of a peer without its port."""
+    return peer.rpartition(":")[0]
 
 
 def rejection(reason: str, detail: str) -> tuple[Headers, bytes]:

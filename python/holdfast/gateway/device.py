@@ -11,6 +11,7 @@ from holdfast.errors import (
     ConnectFailed,
     ConnectionLost,
     InvalidResponse,
+    ModbusError,
     ModbusException,
     RequestTimeout,
     TlsFailed,
@@ -96,14 +97,18 @@ class RequestedDevice:
             return await self.attempt(call)
         except ModbusException:
             raise
-        except RequestTimeout:
-            raise Failed("timeout", self._timed_out()) from None
-        except ConnectionLost as error:
+        except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
+            raise self.failure(error) from None
+
+    def failure(self, error: ModbusError) -> Failed:
+        """Returns the failure for an error of `attempt` other than a Modbus exception."""
+        if isinstance(error, RequestTimeout):
+            return Failed("timeout", self._timed_out())
+        if isinstance(error, ConnectionLost):
             if not error.maybe_sent:
                 self.asked = False
-            raise Failed(self._reason(error), self._explained(error)) from None
-        except InvalidResponse as error:
-            raise Failed("invalid_reply", str(error)) from None
+            return Failed(self._reason(error), self._explained(error))
+        return Failed("invalid_reply", str(error))
 
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""

@@ -176,7 +176,7 @@ def from_json(body: bytes, fields: Sequence[Field]) -> dict[str, Any]:
         raise malformed(f"the body is not JSON: {str(error)[:100]}") from None
     if not isinstance(given, dict):
         raise malformed("the body is not a JSON object")
-    return _filled(given, fields)
+    return filled(given, fields)
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> None:
@@ -202,7 +202,7 @@ def from_query(query: bytes, fields: Sequence[Field]) -> dict[str, Any]:
         if name in given:
             raise malformed(f"{name} is given more than once")
         given[name] = known[name].read(text) if name in known else text
-    return _filled(given, fields)
+    return filled(given, fields)
 
 
 def malformed(detail: str) -> BadRequest:
@@ -210,7 +210,8 @@ def malformed(detail: str) -> BadRequest:
     return BadRequest("malformed", detail)
 
 
-def _filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]:
+def filled(given: Mapping[str, Any], fields: Sequence[Field]) -> dict[str, Any]:
+    """Checks the fields of an object and fills in defaults. Raises `BadRequest`."""
     missing = [field.name for field in fields if field.required]
     missing = [name for name in missing if name not in given]
     if missing:
@@ -243,7 +244,8 @@ def _flaw(value: Any, schema: Schema) -> str | None:
     if kind != "string":
         return None
     fits = isinstance(value, str) and re.fullmatch(schema.get("pattern", ".*"), value) is not None
-    long = isinstance(value, str) and not 1 <= len(value) <= schema.get("maxLength", 8)
+    least, most = schema.get("minLength", 1), schema.get("maxLength", 8)
+    long = isinstance(value, str) and not least <= len(value) <= most
     return f" is {told(value)}, which is not valid" if long or not fits else None
 
 

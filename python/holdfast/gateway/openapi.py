@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, get_args
 
-from holdfast.gateway import surveying, watching
+from holdfast.gateway import listing, surveying, viewing, watching
 from holdfast.gateway.endpoint import EXAMPLE, never
 from holdfast.gateway.fields import ADDRESS_SCHEMA, UNIT_SCHEMA, Field, timeout
 from holdfast.gateway.reading import FUNCTION_SCHEMA, TYPED
@@ -54,7 +54,7 @@ def document(version: str, endpoints: Iterable[Operation], settings: Settings) -
     secured = bool(settings.tokens)
     limits = settings.limits
     paths: dict[str, Any] = {each.path: {"post": _endpoint(each, limits)} for each in endpoints}
-    paths |= _streams(limits) | {STATUS: {"get": _status()}}
+    paths |= _streams(limits) | {STATUS: {"get": _status()}, **_of_lists()}
     for path in paths.values():
         for operation in path.values():
             operation["security"] = [{"token": []}] if secured else []
@@ -129,6 +129,7 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
                 },
             }
         },
+        viewing.PATH: {"post": _view(limits)},
         watching.PATH: {
             "get": {
                 "operationId": "watch",
@@ -144,6 +145,67 @@ def _streams(limits: GatewayLimits) -> dict[str, Any]:
             }
         },
     }
+
+
+def _view(limits: GatewayLimits) -> dict[str, Any]:
+    parts: list[dict[str, Any]] = [
+        {"functionCode": 3, "address": 0, "quantity": 10, "datatype": "float32"},
+        {"tags": "tags:\n  level: {area: input_registers, address: 8, type: int16, unit: mm}\n"},
+    ]
+    return {
+        "operationId": "view",
+        "summary": "Poll several ranges and tag lists in one stream",
+        "description": "Events: `view` with all values, then `change` for each poll with the "
+        "changed values, as pairs of index and value. A part that can't be read has an `error` "
+        "until it can. Comments are heartbeats.",
+        "requestBody": _body(
+            viewing.fields(limits), {"A range and tags": {**EXAMPLE, "parts": parts}}
+        ),
+        "responses": {
+            "200": _stream(view="View", change="ViewChange"),
+            **_refusals(*BODY, *ASKING, *DEVICE),
+            **FAILED,
+        },
+    }
+
+
+def _of_lists() -> dict[str, Any]:
+    """The operations on tag lists."""
+    found: dict[str, Any] = {
+        each.path: {
+            "post": {
+                "operationId": each.name,
+                "summary": each.summary,
+                "description": each.description,
+                "requestBody": _body(each.fields, {"A list of one tag": each.request}),
+                "responses": {
+                    "200": json_answer(
+                        "The list is valid",
+                        object_of({"success": {"const": True}, **each.properties}),
+                        {"success": True, **each.reply},
+                    ),
+                    **_refusals(*BODY, *ASKING, "busy"),
+                },
+            }
+        }
+        for each in listing.ENDPOINTS
+    }
+    profile = object_of({"name": {"type": "string"}, "tags": COUNT})
+    found[listing.PROFILES] = {
+        "get": {
+            "operationId": "profiles",
+            "summary": "List the profiles of the configuration",
+            "responses": {
+                "200": json_answer(
+                    "The profiles",
+                    object_of({"profiles": array_of(profile)}),
+                    {"profiles": [{"name": "sdm630", "tags": 24}]},
+                ),
+                **_refusals(*ASKING),
+            },
+        }
+    }
+    return found
 
 
 def _status() -> dict[str, Any]:
@@ -234,6 +296,7 @@ def _schemas() -> dict[str, Schema]:
             }
         ),
         **_schemas_of_watches(),
+        **_schemas_of_views(),
         **_schemas_of_maps(),
     }
 
@@ -261,6 +324,53 @@ def _schemas_of_watches() -> dict[str, Schema]:
             optional=("typed",),
         ),
         "Problem": object_of({**NOW, "error": {"type": "string"}, "reason": {"type": "string"}}),
+    }
+
+
+def _schemas_of_views() -> dict[str, Schema]:
+    pair = {"type": "array", "minItems": 2, "maxItems": 2, "prefixItems": [COUNT, {}]}
+    problem: dict[str, Schema] = {
+        "error": {"type": ["string", "null"], "description": "Why the last poll failed"},
+        "reason": {"type": "string"},
+    }
+    states: dict[str, Schema] = {
+        "values": {"type": "array", "description": "Registers or bits; the values of tags"},
+        "texts": array_of({"type": "string"}),
+        "errors": {"type": "object", "additionalProperties": {"type": "string"}},
+        **problem,
+    }
+    ranged: dict[str, Schema] = {
+        "kind": {"const": "range"},
+        "functionCode": FUNCTION_SCHEMA,
+        "address": ADDRESS_SCHEMA,
+        "quantity": integer(1, READ_BITS),
+        "format": {"enum": ["coils", "registers"]},
+    }
+    tagged: dict[str, Schema] = {"kind": {"const": "tags"}, "tags": array_of(listing.TAG)}
+    changes = {name: array_of(pair) for name in ("values", "texts", "errors")}
+    return {
+        "View": object_of(
+            {
+                **NOW,
+                "stream": {"type": "boolean", "description": "Whether more events follow"},
+                "parts": array_of(
+                    {
+                        "oneOf": [
+                            object_of({**ranged, **states}, optional=tuple(states)),
+                            object_of({**tagged, **states}, optional=(*states, "tags")),
+                        ]
+                    }
+                ),
+            }
+        ),
+        "ViewChange": object_of(
+            {
+                **NOW,
+                "parts": array_of(
+                    object_of({"part": COUNT, **changes, **problem}, optional=(*changes, *problem))
+                ),
+            }
+        ),
     }
 
 

@@ -9,10 +9,13 @@ from holdfast.net.addresses import LOOPBACK
 from holdfast.net.tls import NO_FILES
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from holdfast.gateway.tokens import Token
     from holdfast.net.addresses import Network
     from holdfast.net.allow_list import AllowedNetwork
     from holdfast.net.tls import Tls
+    from holdfast.tags import TagList
 
 
 @dataclass(frozen=True)
@@ -64,5 +67,7 @@ class Settings:
     """Without tokens, every client from `sources` is allowed."""
     sources: tuple[Network, ...] = LOOPBACK
     limits: GatewayLimits = field(default_factory=GatewayLimits)
+    profiles: Mapping[str, TagList] = field(default_factory=dict)
+    """Tag lists that clients can choose by name."""
     tls: Tls = NO_FILES
     """The TLS files for connections to devices. Requests can't change them."""

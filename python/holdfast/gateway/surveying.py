@@ -52,6 +52,12 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         Field("exact", {"type": "boolean"}, "Read every address instead of samples", False),
         Field("step", integer(1, ADDRESSES), "Largest distance of two samples", discovery.STEP),
         Field("maxQuantity", integer(1, READ_BITS), "Largest quantity of one read", None),
+        Field(
+            "maxStreams",
+            integer(1, 64),
+            "Refuse the map (`busy`) if the client's address has this many streams",
+            None,
+        ),
         timeout(TIMEOUT, round(1000 * limits.timeout), "Timeout of each read in ms"),
     )
 

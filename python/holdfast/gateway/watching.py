@@ -30,9 +30,19 @@ INTERVAL = 1_000
 MAX_INTERVAL = 3_600_000
 
 
+def interval_field(limits: GatewayLimits) -> Field:
+    """Returns the field for the polling interval."""
+    least = round(1000 * limits.interval)
+    return Field(
+        "interval",
+        integer(least, MAX_INTERVAL),
+        "Polling interval in ms",
+        max(least, INTERVAL),
+    )
+
+
 def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """Returns the fields of a request for a watch."""
-    least = round(1000 * limits.interval)
     return (
         *TARGET,
         FUNCTION,
@@ -40,12 +50,7 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         QUANTITY,
         DATATYPE,
         BYTE_ORDER,
-        Field(
-            "interval",
-            integer(least, MAX_INTERVAL),
-            "Polling interval in ms",
-            max(least, INTERVAL),
-        ),
+        interval_field(limits),
         timeout(TIMEOUT, round(1000 * limits.timeout), "Timeout of each poll in ms"),
     )
 

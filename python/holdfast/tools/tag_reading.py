@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from holdfast._core import plan_blocks
 from holdfast.errors import (
@@ -22,7 +22,7 @@ from holdfast.types import BIT_AREAS
 from holdfast.values import ConversionError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Awaitable, Callable, Generator, Iterable, Sequence
 
     from holdfast.client import SyncClient
     from holdfast.tags import Tag
@@ -41,6 +41,9 @@ GATEWAY = (0x0A, 0x0B)
 """Exceptions of a gateway whose device does not answer."""
 
 Error: TypeAlias = ModbusError | ConversionError
+Result = TypeVar("Result")
+Steps: TypeAlias = "Generator[_Block, bytes, Result]"
+Fetch: TypeAlias = "Callable[[Area, int, int], Awaitable[bytes]]"
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,40 @@ class TagReader:
 
         A device that does not answer three requests in a row is not asked any further.
         """
+        steps = self._steps()
+        try:
+            block = next(steps)
+            while True:
+                try:
+                    data = _fetched(client, block)
+                except ModbusError as error:
+                    between()
+                    block = steps.throw(error)
+                else:
+                    between()
+                    block = steps.send(data)
+        except StopIteration as end:
+            found: list[Reading] = end.value
+            return found
+
+    async def read_with(self, fetch: Fetch) -> list[Reading]:
+        """As `read`, but `fetch` returns the bytes of area, address and count, as in a reply."""
+        steps = self._steps()
+        try:
+            block = next(steps)
+            while True:
+                try:
+                    data = await fetch(block.area, block.address, block.count)
+                except ModbusError as error:
+                    block = steps.throw(error)
+                else:
+                    block = steps.send(data)
+        except StopIteration as end:
+            found: list[Reading] = end.value
+            return found
+
+    def _steps(self) -> Steps[list[Reading]]:
+        """Reads all tags: yields what to request, and takes the bytes of the reply."""
         self._plan()
         self._number += 1
         self._readings = {}
@@ -137,7 +174,7 @@ class TagReader:
                 self._fail(block, ended)
                 blocks.append(block)
                 continue
-            made, error = self._asked(client, block, between)
+            made, error = yield from self._asked(block)
             blocks += made
             if error is None:
                 silent = 0
@@ -175,39 +212,33 @@ class TagReader:
         tags = [self.tags[index] for each in found for index in each.tags]
         return _Block(found[0].area, address, count, found, decoder(tags, address, count))
 
-    def _asked(
-        self, client: SyncClient, block: _Block, between: Callable[[], object]
-    ) -> tuple[list[_Block], ModbusError | None]:
+    def _asked(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
         block.asked = self._number
         try:
-            data = _fetched(client, block)
+            data = yield block
         except ModbusError as error:
-            between()
             if isinstance(error, ModbusException) and error.code in ILLEGAL:
                 self._is_whole = False
                 if len(block.fields) > 1:
-                    return self._halved(client, block, between)
+                    return (yield from self._halved(block))
                 block.refused = error
             self._fail(block, error)
             block.answered = not _is_silence(error)
             return [block], None if block.answered else error
-        between()
         block.answered = True
         self._take(block, data)
         return [block], None
 
-    def _halved(
-        self, client: SyncClient, block: _Block, between: Callable[[], object]
-    ) -> tuple[list[_Block], ModbusError | None]:
+    def _halved(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads the halves of a refused block; the second only if the device still answers."""
         middle = len(block.fields) // 2
         first, second = self._block(block.fields[:middle]), self._block(block.fields[middle:])
-        blocks, error = self._asked(client, first, between)
+        blocks, error = yield from self._asked(first)
         if error is not None:
             self._fail(second, error)
             return [*blocks, second], error
-        others, error = self._asked(client, second, between)
+        others, error = yield from self._asked(second)
         return blocks + others, error
 
     def _take(self, block: _Block, data: bytes) -> None:
@@ -232,8 +263,13 @@ def _fetched(client: SyncClient, block: _Block) -> bytes:
         registers: bytes = client.read(area, address, f"bytes:{2 * count}")
         return registers
     read = client.read_coils if area == "coils" else client.read_discrete_inputs
-    bits = sum(bit << at for at, bit in enumerate(read(address, count)))
-    return bits.to_bytes((count + 7) // 8, "little")
+    return packed(read(address, count))
+
+
+def packed(bits: Sequence[bool]) -> bytes:
+    """Bits as in a Modbus reply."""
+    together = sum(bit << at for at, bit in enumerate(bits))
+    return together.to_bytes((len(bits) + 7) // 8, "little")
 
 
 def _is_silence(error: ModbusError) -> bool:

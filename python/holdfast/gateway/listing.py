@@ -1,0 +1,121 @@
+"""The endpoints for tag lists. They ask no device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast.gateway import tagging
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from holdfast.gateway.endpoint import Answer, Given
+    from holdfast.gateway.fields import Field, Schema
+    from holdfast.tags import TagList
+
+PROFILES = "/api/gateway/profiles"
+
+
+@dataclass(frozen=True)
+class Local:
+    """An endpoint that asks no device."""
+
+    path: str
+    name: str
+    summary: str
+    description: str
+    fields: tuple[Field, ...]
+    answer: Callable[[Given, Mapping[str, TagList]], Awaitable[Answer]]
+    properties: dict[str, Schema]
+    """The schemas of the answer's fields, without `success`."""
+    request: dict[str, Any]
+    """An example of a request, and of its answer."""
+    reply: dict[str, Any]
+
+
+def profiles(known: Mapping[str, TagList]) -> Answer:
+    """The names of the profiles, and how many tags they have."""
+    return {"profiles": [{"name": name, "tags": len(tags)} for name, tags in known.items()]}
+
+
+NUMBER = {"type": ["number", "null"]}
+TEXT = {"type": "string"}
+TAG: Schema = {
+    "type": "object",
+    "required": ["name", "area", "address", "count", "type", "order", "unit", "writable"],
+    "properties": {
+        "name": TEXT,
+        "area": TEXT,
+        "address": {"type": "integer"},
+        "count": {"type": "integer", "description": "Bits or registers"},
+        "type": TEXT,
+        "order": TEXT,
+        "unit": TEXT,
+        "scale": {"type": "number"},
+        "offset": {"type": "number"},
+        "writable": {"type": "boolean"},
+        "min": NUMBER,
+        "max": NUMBER,
+        "states": {"type": "object", "additionalProperties": TEXT},
+        "description": TEXT,
+    },
+    "additionalProperties": False,
+}
+_EXAMPLE = (
+    "name,area,address,type,order,scale,offset,unit,writable\nsetpoint,hr,24,uint16,,0.1,,°C,true\n"
+)
+
+ENDPOINTS = (
+    Local(
+        "/api/gateway/tags",
+        "tags",
+        "Check a tag list",
+        "Parses a tag list as the command line does, and returns its tags. An error names the "
+        "line, the tag and the key.",
+        tagging.LIST,
+        tagging.parse,
+        {"tags": {"type": "array", "items": TAG}},
+        {"tags": _EXAMPLE, "format": "csv"},
+        {
+            "tags": [
+                {
+                    "name": "setpoint",
+                    "area": "holding_registers",
+                    "address": 24,
+                    "count": 1,
+                    "type": "uint16",
+                    "order": "ABCD",
+                    "unit": "°C",
+                    "scale": 0.1,
+                    "offset": 0.0,
+                    "writable": True,
+                    "min": None,
+                    "max": None,
+                    "states": {},
+                    "description": "",
+                }
+            ]
+        },
+    ),
+    Local(
+        "/api/gateway/tags/value",
+        "tagValue",
+        "Check a value of a tag before it is written",
+        "Returns what a write has to send. Nothing is sent. A value that does not fit the type, "
+        "the scale, `min` and `max` is refused, as are tags that are not `writable`.",
+        (*tagging.LIST, tagging.NAME, tagging.VALUE),
+        tagging.encode,
+        {
+            "form": {
+                "enum": ["coils", "registers", "mask"],
+                "description": "What to write; for `mask`, `values` are the AND and the OR mask",
+            },
+            "values": {"type": "array", "items": {"type": ["integer", "boolean"]}},
+            "value": {"description": "The value as it is then read"},
+            "text": TEXT,
+        },
+        {"tags": _EXAMPLE, "format": "csv", "name": "setpoint", "value": "21.5"},
+        {"form": "registers", "values": [215], "value": 21.5, "text": "21.5"},
+    ),
+)

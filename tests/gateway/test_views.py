@@ -1,0 +1,303 @@
+"""Views: several ranges and tag lists in one stream, and the endpoints for tag lists."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from holdfast.tags import Tag, TagList
+from support import gateways
+from support.fake_device import FakeDevice, exception, registers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from support.gateways import Running, Stream
+
+SOON = 0.01
+"""Seconds from poll to poll."""
+METER = """\
+tags:
+  voltage: {area: holding_registers, address: 0, type: uint16, scale: 0.1, unit: V}
+  state: {area: holding_registers, address: 1, states: {0: off, 2: fault}}
+  running: {area: coils, address: 3}
+  setpoint: {area: holding_registers, address: 4, scale: 0.1, writable: true, min: 5, max: 30}
+  alarm: {area: holding_registers, address: 5, type: "bit:3", order: BADC, writable: true}
+"""
+PROFILE = TagList([Tag("level", "input_registers", 2, "int16", unit="mm")])
+
+
+@pytest.fixture
+def gateway() -> Iterator[Running]:
+    profiles = {"tank": PROFILE}
+    with gateways.running(limits={"interval": SOON}, profiles=profiles) as started:
+        yield started
+
+
+def view(gateway: Running, port: int, *parts: Any, **body: Any) -> Stream:
+    usual = {"host": "127.0.0.1", "port": port, "interval": 10, "parts": parts}
+    return gateway.stream("POST", "/watch/view", {**usual, **body})
+
+
+def ranged(address: int, quantity: int = 1, function: int = 3, **more: Any) -> dict[str, Any]:
+    return {"functionCode": function, "address": address, "quantity": quantity, **more}
+
+
+def changed(stream: Stream) -> Any:
+    """The parts of the next event that has a change."""
+    while not (parts := stream.next("change")["parts"]):
+        pass
+    return parts
+
+
+def test_ranges_and_tag_lists_share_one_stream(
+    gateway: Running, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [2304, 2, 0, 7])
+    memory.write("input_registers", 2, [65535])
+    parts = (ranged(2, 2, datatype="int16"), {"tags": METER}, {"profile": "tank"})
+    stream = view(gateway, server.address[1], *parts)
+    assert (stream.status, stream.kind) == (200, "text/event-stream")
+    first = stream.next("view")
+    assert first["stream"] is True
+    registers, meter, tank = first["parts"]
+    assert (registers["values"], registers["texts"], registers["errors"]) == (
+        [0, 7],
+        ["0", "7"],
+        {},
+    )
+    assert meter["values"] == [230.4, 2, False, 0.0, False]
+    assert meter["texts"] == ["230.4", "fault", "false", "0.0", "false"]
+    assert [(tag["name"], tag["unit"]) for tag in meter["tags"][:2]] == [
+        ("voltage", "V"),
+        ("state", ""),
+    ]
+    assert meter["tags"][1]["states"] == {"0": "off", "2": "fault"}
+    assert (tank["values"], tank["tags"][0]["unit"]) == ([-1], "mm")
+    memory.write("holding_registers", 3, [8])
+    assert changed(stream) == [{"part": 0, "values": [[1, 8]], "texts": [[1, "8"]]}]
+    memory.write("holding_registers", 1, [0])
+    assert changed(stream) == [{"part": 1, "values": [[1, 0]], "texts": [[1, "off"]]}]
+
+
+def test_every_poll_has_an_event(gateway: Running, server: holdfast.Server) -> None:
+    stream = view(gateway, server.address[1], ranged(0))
+    first = stream.next("view")["time"]
+    assert [stream.next("change")["parts"] for _ in range(3)] == [[], [], []]
+    assert stream.next("change")["time"] >= first
+
+
+def only(function: int, *, silent: bool = False) -> Callable[[bytes], bytes | None]:
+    """A device with one function; others are refused, or not answered."""
+
+    def answer(pdu: bytes) -> bytes | None:
+        if pdu[0] == function:
+            return registers(pdu, 5)
+        return None if silent else exception(pdu, 1)
+
+    return answer
+
+
+def test_a_part_that_is_refused_costs_no_other_part(gateway: Running) -> None:
+    with FakeDevice(only(3)) as device:
+        stream = view(gateway, device.port, ranged(0, function=4), ranged(0))
+        refused, there = stream.next("view")["parts"]
+        assert refused["error"] == "Modbus exception: Illegal Function (code 0x1)"
+        assert (refused["reason"], "values" in refused) == ("exception", False)
+        assert (there["values"], "error" in there) == ([5], False)
+
+
+def test_a_silent_part_is_asked_last(gateway: Running) -> None:
+    with FakeDevice(only(3, silent=True)) as device:
+        parts = (ranged(0, function=4), ranged(0))
+        stream = view(gateway, device.port, *parts, timeout=50)
+        assert stream.status == 500, "nothing was answered in the first poll"
+        stream = view(gateway, device.port, *reversed(parts), timeout=50)
+        there, silent = stream.next("view")["parts"]
+        assert (there["values"], silent["reason"]) == ([5], "timeout")
+        count = len(device.asked)
+        stream.next("change")
+        assert [pdu[0] for pdu in device.asked[count:]][:2] == [3, 4]
+
+
+def test_a_part_that_fails_for_a_while_comes_back(gateway: Running) -> None:
+    fails = iter([False, True, True])
+
+    def answer(pdu: bytes) -> bytes:
+        return exception(pdu, 6) if next(fails, False) else registers(pdu, 5)
+
+    with FakeDevice(answer) as device:
+        stream = view(gateway, device.port, ranged(0))
+        assert stream.next("view")["parts"][0]["values"] == [5]
+        error = "Modbus exception: Server Device Busy (code 0x6)"
+        assert changed(stream) == [{"part": 0, "error": error, "reason": "exception"}]
+        assert changed(stream) == [{"part": 0, "error": None}]
+
+
+def test_tags_without_a_value_say_why(gateway: Running) -> None:
+    def answer(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        return exception(pdu, 2) if first <= 5 < first + count else registers(pdu, 0xFFFF)
+
+    tags = """\
+name,area,address,type
+there,hr,4,uint16
+absent,hr,5,uint16
+digits,hr,6,bcd16
+"""
+    with FakeDevice(answer) as device:
+        stream = view(gateway, device.port, {"tags": tags, "format": "csv"})
+        [found] = stream.next("view")["parts"]
+        assert found["values"] == [65535, None, None]
+        assert found["errors"]["1"] == "Modbus exception: Illegal Data Address (code 0x2)"
+        assert "digit" in found["errors"]["2"]
+
+
+def test_a_view_ends_after_one_event_if_asked(gateway: Running, server: holdfast.Server) -> None:
+    stream = view(gateway, server.address[1], ranged(0), {"tags": METER}, once=True, describe=False)
+    [event] = list(stream)
+    assert event.data["stream"] is False
+    assert "tags" not in event.data["parts"][1]
+
+
+def test_a_client_with_many_streams_gets_single_events(
+    gateway: Running, server: holdfast.Server
+) -> None:
+    port = server.address[1]
+    streams = [view(gateway, port, ranged(0), maxStreams=2) for _ in range(3)]
+    begun = [stream.next("view")["stream"] for stream in streams]
+    assert begun == [True, True, False]
+    streams[0].close()
+    while not view(gateway, port, ranged(0), maxStreams=2).next("view")["stream"]:
+        pass
+
+
+def test_a_full_gateway_answers_once(server: holdfast.Server) -> None:
+    with gateways.running(limits={"interval": SOON, "streams": 1}) as gateway:
+        held = view(gateway, server.address[1], ranged(0))
+        held.next("view")
+        second = view(gateway, server.address[1], ranged(0), maxStreams=4)
+        assert second.next("view")["stream"] is False
+        assert view(gateway, server.address[1], ranged(0)).status == 503
+
+
+def test_a_map_leaves_a_connection_to_the_browser(
+    gateway: Running, server: holdfast.Server
+) -> None:
+    held = view(gateway, server.address[1], ranged(0))
+    held.next("view")
+    body = {"host": "127.0.0.1", "port": server.address[1], "maxStreams": 1}
+    answer = gateway.ask("/map", body)
+    assert (answer.status, answer.json["error"]) == (
+        503,
+        "1 streams of this address are open, as maxStreams says",
+    )
+
+
+@pytest.mark.parametrize(
+    ("part", "says"),
+    [
+        ({}, "parts[1]: Missing required parameters: functionCode and address"),
+        (7, "parts[1] is not an object"),
+        ({"functionCode": 3, "address": 0, "quantity": 126}, "parts[1]: Quantity must be between"),
+        ({"profile": "tanc"}, "parts[1]: no profile \"tanc\", allowed: tank; did you mean 'tank'?"),
+        ({"tags": "x", "profile": "tank"}, "parts[1]: one of tags and profile is required"),
+        ({"tags": "a: 1", "profiles": "b"}, 'parts[1]: "profiles" is not a parameter'),
+        ({"tags": "tags:\n  a: {area: coil, address: 0}"}, "parts[1]: tags:2: tags.a.area"),
+    ],
+)
+def test_wrong_parts_are_refused(
+    gateway: Running, server: holdfast.Server, part: Any, says: str
+) -> None:
+    body = {"host": "127.0.0.1", "port": server.address[1], "parts": [ranged(0), part]}
+    answer = gateway.ask("/watch/view", body)
+    assert answer.status == 400
+    assert says in answer.json["error"], answer.json["error"]
+
+
+# Tag lists.
+
+
+def local(gateway: Running, path: str, body: Any) -> Any:
+    return gateway.client().ask("POST", f"/api/gateway{path}", body)
+
+
+def test_profiles_are_listed(gateway: Running) -> None:
+    answer = gateway.client().get("/api/gateway/profiles")
+    assert answer.json == {"profiles": [{"name": "tank", "tags": 1}]}
+
+
+def test_every_problem_of_a_list_is_told_with_its_line(gateway: Running) -> None:
+    text = "name,area,address,type\na,hr,0,uint99\nb,hr,70000,uint16\n"
+    answer = local(gateway, "/tags", {"tags": text, "format": "csv"})
+    assert answer.status == 400
+    first, second = answer.json["error"].split("\n")
+    assert first.startswith("tags:2: tags.a.type: ")
+    assert second.startswith("tags:3: tags.b.address: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("tags: {a: {area: coils, address: 0, type: 'bool[2000]'}}", None),
+        ("{a: " * 3000, "nested too deeply"),
+        ("[" * 30000, "nested too deeply"),
+        ("a: &a [1,1,1,1,1,1,1,1]\nb: &b [*a,*a,*a,*a]\ntags: [*b,*b]", "tags"),
+        ("just text", "allowed: a mapping"),
+        ("\0", "U+0000"),
+    ],
+    ids=["array", "braces", "brackets", "aliases", "text", "nul"],
+)
+def test_hostile_lists_are_refused(gateway: Running, text: str, says: str | None) -> None:
+    answer = local(gateway, "/tags", {"tags": text})
+    assert answer.status == (200 if says is None else 400)
+    assert says is None or says in answer.json["error"]
+
+
+def test_lists_are_bounded(gateway: Running) -> None:
+    def csv(lines: list[str]) -> str:
+        return "\n".join(["name,area,address,type", *lines])
+
+    many = csv([f"t{at},hr,{at},uint16" for at in range(2001)])
+    answer = local(gateway, "/tags", {"tags": many, "format": "csv"})
+    assert answer.json["error"] == "tags: found 2001 tags, allowed: up to 2000"
+    long = csv([f"t{at},hr,0,uint16[200]" for at in range(101)])
+    answer = local(gateway, "/tags", {"tags": long, "format": "csv"})
+    assert answer.json["error"] == "tags: found 20200 bits and registers, allowed: up to 20000"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "form", "values", "shown"),
+    [
+        ("setpoint", "21.5", "registers", [215], "21.5"),
+        ("alarm", "on", "mask", [0xF7FF, 0x0800], "true"),
+        ("alarm", "0", "mask", [0xF7FF, 0], "false"),
+    ],
+)
+def test_a_value_of_a_tag_is_encoded(
+    gateway: Running, name: str, text: str, form: str, values: list[int], shown: str
+) -> None:
+    answer = local(gateway, "/tags/value", {"tags": METER, "name": name, "value": text})
+    found = answer.json
+    assert (found["form"], found["values"], found["text"]) == (form, values, shown)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("setpoint", "21,5", "decimal comma, allowed: a decimal point, as in 21.5"),
+        ("setpoint", "31", "31 is outside 5.0 to 30.0"),
+        ("setpoint", "21.55", "between two values of the registers"),
+        ("setpoint", "", "is not a number"),
+        ("voltage", "230", "voltage can't be written: writable is not true in the tag list"),
+        ("setpont", "1", "did you mean 'setpoint'?"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_refused(
+    gateway: Running, name: str, text: str, says: str
+) -> None:
+    answer = local(gateway, "/tags/value", {"tags": METER, "name": name, "value": text})
+    assert answer.status == 400
+    assert says in answer.json["error"], answer.json["error"]
