@@ -125,12 +125,12 @@ def test_a_coil_is_written(opened: Opened, plant: holdfast.Memory) -> None:
     view.connect()
     view.choose(area="1", quantity="20")
     view.button("Read").click()
-    view.button("1 is off").click()
+    view.button("Coil 1: 0, off").click()
     view.page.get_by_role("textbox", name="New value").fill("on")
     view.button("Review").click()
     expect(view.page.get_by_role("row", name="1 off on")).to_be_visible()
     view.button("Write it").click()
-    expect(view.button("1 is on")).to_be_visible()
+    expect(view.button("Coil 1: 1, on")).to_be_visible()
     assert plant.read("coils", 0, 3) == [1, 1, 1]
 
 
@@ -344,7 +344,10 @@ def test_the_keyboard_is_enough(opened: Opened, plant: holdfast.Memory) -> None:
     keyboard.press("Enter")
     view.says("read in")
     expect(view.button("Read")).to_be_focused()
-    for name in ("Watch", "All types from 0", "Plot 0", "Write 0"):
+    for name in ("Watch", "Add range to view", "Add tag list…", "All types from 0", "Plot 0"):
+        keyboard.press("Tab")
+        expect(view.button(name)).to_be_focused()
+    for name in ("Write 0",):
         keyboard.press("Tab")
         expect(view.button(name)).to_be_focused()
     keyboard.press("Enter")
@@ -917,9 +920,10 @@ def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
     view.connect()
     view.says("The device responded")
     view.choose(quantity="2", interval="50")
-    told = {"time": 0, "rtt": 0, "address": 0, "quantity": 2, "format": "registers"}
-    body = json.dumps({**told, "values": [0, 0], "typed": [0.0], "typedText": ["0"]})
-    answers = iter([f"event: values\ndata: {body}\n\n"])
+    part = {"kind": "range", "functionCode": 3, "address": 0, "quantity": 2, "format": "registers"}
+    part |= {"values": [0, 0], "texts": ["0"], "errors": {}}
+    body = json.dumps({"time": 0, "rtt": 0, "stream": True, "parts": [part]})
+    answers = iter([f"event: view\ndata: {body}\n\n"])
 
     def gone(route: Route) -> None:
         once = next(answers, None)
@@ -928,11 +932,11 @@ def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
         else:
             route.fulfill(content_type="text/event-stream", body=once)
 
-    view.page.route("**/api/modbus/watch*", gone)
+    view.page.route("**/api/modbus/watch/view", gone)
     view.button("Watch").click()
     view.says("The gateway ended the watch or does not answer. The watch resumes")
     view.says("Stale values of")
-    view.page.unroute("**/api/modbus/watch*")
+    view.page.unroute("**/api/modbus/watch/view")
     view.says("Watching holding registers 0 to 1")
     expect(view.row(0).locator(".typed")).to_have_text("21.5")
     view.button("Stop").click()

@@ -416,6 +416,7 @@ def _schemas_of_maps() -> dict[str, Schema]:
                                 "can't read the area",
                             },
                             "absent": {**COUNT, "description": "Addresses that do not exist"},
+                            "absentRanges": RANGES,
                             "notAsked": {
                                 **COUNT,
                                 "description": "Addresses that were not read: unknown",

@@ -193,6 +193,7 @@ def _area(found: AreaMap, size: int) -> dict[str, Any]:
         "addresses": found.addresses,
         "ranges": _pairs(found.ranges),
         "absent": sum(map(len, found.absent)),
+        "absentRanges": _pairs(found.absent),
         "notAsked": size - found.asked,
         "failures": {str(kind): _pairs(ranges) for kind, ranges in found.failures.items()},
         "givenUp": found.given_up,

@@ -23,15 +23,15 @@ from holdfast.gateway.fields import (
     timeout,
 )
 from holdfast.gateway.reading import FUNCTION, QUANTITY, Range
-from holdfast.gateway.tagging import LIST, described, tags_of
+from holdfast.gateway.tagging import LIST, MAX_TAGS, described, tags_of
 from holdfast.gateway.watching import TIMEOUT, interval_field
 from holdfast.tags.text import plain, text_of
 from holdfast.tools.tag_reading import TagReader, packed
 from holdfast.types import BIT_AREAS
-from holdfast.web.requests import BadRequest
+from holdfast.web.requests import BadRequest, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from holdfast.client import Client
     from holdfast.gateway.device import RequestedDevice
@@ -46,7 +46,19 @@ PATH = "/api/modbus/watch/view"
 MAX_PARTS = 32
 
 RANGE = (FUNCTION, ADDRESS, QUANTITY, DATATYPE, BYTE_ORDER)
-KINDS = (RANGE, LIST)
+ONLY = Field(
+    "only",
+    {
+        "type": "array",
+        "minItems": 1,
+        "maxItems": MAX_TAGS,
+        "items": {"type": "string", "minLength": 1, "maxLength": 128},
+    },
+    "Only the tags with these names",
+    None,
+)
+TAGS = (*LIST, ONLY)
+KINDS = (RANGE, TAGS)
 PART_SCHEMA: Schema = {
     "oneOf": [
         {
@@ -132,9 +144,9 @@ class _RangePart:
 
 
 class _TagsPart:
-    def __init__(self, tags: TagList) -> None:
+    def __init__(self, tags: Iterable[Tag]) -> None:
         self.tags: Sequence[Tag] = list(tags)
-        self._reader = TagReader(tags)
+        self._reader = TagReader(self.tags)
 
     def about(self) -> dict[str, Any]:
         return {"kind": "tags"}
@@ -182,13 +194,19 @@ async def parts_of(given: Given, profiles: Mapping[str, TagList]) -> list[_Part]
             raise malformed(f"parts[{at}] is not an object")
         is_list = "tags" in part or "profile" in part
         try:
-            known = filled(part, LIST if is_list else RANGE)
-            parts.append(
-                _TagsPart(await tags_of(known, profiles)) if is_list else _RangePart(known)
-            )
+            known = filled(part, TAGS if is_list else RANGE)
+            parts.append(await _listed(known, profiles) if is_list else _RangePart(known))
         except BadRequest as error:
             raise malformed(f"parts[{at}]: {error.detail}") from None
     return parts
+
+
+async def _listed(given: Given, profiles: Mapping[str, TagList]) -> _TagsPart:
+    tags, only = await tags_of(given, profiles), given["only"]
+    for name in only or ():
+        if name not in tags:
+            raise malformed(f"only: the list has no tag {shown(name)}")
+    return _TagsPart(tags if only is None else [tags[name] for name in only])
 
 
 @dataclass

@@ -4,6 +4,8 @@ import { $, h } from "./dom.js";
 
 const KEY = "holdfast-token";
 const JSON_TYPE = { "Content-Type": "application/json" };
+/** How long the gateway may need beyond the timeouts of the device, in milliseconds. */
+const GRACE = 10_000;
 
 /** An error: a reason as a word, and the gateway's message. */
 export class Problem extends Error {
@@ -12,6 +14,9 @@ export class Problem extends Error {
     this.reason = reason;
   }
 }
+
+/** Returns an error with a reason, as the gateway tells it. */
+export const failure = (reason, said) => new Problem(reason, said);
 
 export const hasToken = () => sessionStorage.getItem(KEY) !== null;
 export const forgetToken = () => sessionStorage.removeItem(KEY);
@@ -26,6 +31,7 @@ export const post = async (path, body, signal) =>
     headers: JSON_TYPE,
     body: typeof body === "string" ? body : JSON.stringify(body),
     signal,
+    patience: typeof body === "string" ? JSON.parse(body).timeout : body.timeout,
   }));
 
 /** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */
@@ -53,16 +59,25 @@ export async function stream(path, options, onEvent) {
   }
 }
 
-async function send(path, options = {}) {
+/** Sends a request, and waits for `patience` beyond the usual time for the answer to begin. */
+async function send(path, { patience = 0, signal, ...options } = {}) {
   for (;;) {
     const token = sessionStorage.getItem(KEY);
     const headers = { ...options.headers, ...(token ? { Authorization: `Bearer ${token}` } : {}) };
+    const ending = new AbortController();
+    const end = () => ending.abort();
+    signal?.addEventListener("abort", end);
+    if (signal?.aborted) end();
+    const alarm = setTimeout(end, patience + GRACE);
     let reply;
     try {
-      reply = await fetch(path, { ...options, headers, cache: "no-store" });
+      reply = await fetch(path, { ...options, headers, cache: "no-store", signal: ending.signal });
     } catch (error) {
-      if (error.name === "AbortError") throw error;
+      if (signal?.aborted) throw error;
+      if (error.name === "AbortError") throw new Problem("gateway_gone", `no answer within ${(patience + GRACE) / 1000} s; other tabs may use all connections of the browser`);
       throw new Problem("gateway_gone", "the gateway does not answer");
+    } finally {
+      clearTimeout(alarm);
     }
     if (reply.status !== 401) return reply;
     await askForToken(token === null ? "" : "Unknown token.");
@@ -184,6 +199,9 @@ const EXCEPTIONS = {
   "0xa": ["The Modbus gateway has no path to the device.", ["Is the unit id right?", "Is the serial line of that gateway configured?"]],
   "0xb": ["The device behind the Modbus gateway does not respond.", ["Is the unit id right?", "Is the device powered, and the serial line wired?"]],
 };
+
+/** Returns what an error means, in one sentence. */
+export const meaning = (error) => explained(error)[0];
 
 function explained(error) {
   const code = /\(code (0x[0-9a-f]+)\)/.exec(error.message);

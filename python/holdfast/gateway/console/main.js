@@ -2,6 +2,7 @@
 
 import { forgetToken, get, hasToken, notice, post, unmark } from "./api.js";
 import { $, h, say, tabs } from "./dom.js";
+import * as link from "./link.js";
 import { Map_ } from "./mapping.js";
 import { Values } from "./values.js";
 
@@ -50,17 +51,16 @@ async function begin() {
     say($("connection"), notice(error));
   }
   $("forget").hidden = !hasToken();
+  if ((await values.recall()) && $("device").checkValidity()) connect();
 }
 
 /** Stores the device in the page's URL, so that it can be bookmarked and shared. */
 function remember() {
-  const given = fields.filter((id) => id !== "server" || target().serverName);
-  const query = new URLSearchParams(given.map((id) => [id, $(id).value.trim()]));
-  history.replaceState(null, "", `#${query}`);
+  link.put(Object.fromEntries(fields.map((id) => [id, id === "server" && !target().serverName ? null : $(id).value.trim()])));
 }
 
 function recall() {
-  for (const [id, value] of new URLSearchParams(location.hash.slice(1))) {
+  for (const [id, value] of link.given()) {
     if (fields.includes(id)) $(id).value = value;
   }
   $("server-label").hidden = !isSecure();

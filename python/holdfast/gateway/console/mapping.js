@@ -8,6 +8,12 @@ const FAILURES = { timeout: "no response", connection: "connection lost", invali
 const CELLS = 1024;
 const NARROW = 640;
 const MOST_LISTED = 200;
+const ZOOM = 8;
+/** The fewest addresses that a picture shows. */
+const LEAST = 64;
+const LEGEND = { there: "valid", absent: "asked, absent", failed: "failed", unread: "not asked" };
+/** Streams of this browser, with this map: one connection is left for everything else. */
+const STREAMS = 5;
 
 /** The map view. `open` shows a range in the values view. */
 export class Map_ {
@@ -49,9 +55,9 @@ export class Map_ {
     const stopping = new AbortController();
     this.running = stopping;
     this.prepare(areas, first, last);
-    const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact") });
+    const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact"), maxStreams: STREAMS });
     try {
-      await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal }, (name, data) => {
+      await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal, patience: this.device.timeout * areas.length }, (name, data) => {
         if (this.running === stopping) this.happened(name, data);
       });
     } catch (error) {
@@ -99,7 +105,7 @@ export class Map_ {
 
   stop() {
     this.running.abort();
-    say($("survey-state"), "Stopped. The map is incomplete.");
+    say($("survey-state"), "Stopped. The map is incomplete: what it does not show as valid is unknown.");
     this.pictures.forEach((each) => each.list());
     this.end();
   }
@@ -115,42 +121,83 @@ export class Map_ {
 class Picture {
   constructor(area, first, last, open) {
     ({ title: this.title, code: this.code } = AREAS[area]);
-    this.first = first;
+    this.whole = this.span = [first, last];
     this.columns = innerWidth < NARROW ? 32 : 64;
-    this.each = Math.max(1, Math.ceil((last - first + 1) / CELLS));
-    this.rows = Math.ceil((last - first + 1) / this.each / this.columns);
     this.open = open;
     this.ranges = [];
+    this.absent = null;
     this.failures = {};
     this.count = h("span", { class: "dim" }, "…");
     this.canvas = h("canvas", { role: "img" });
     this.ranged = h("ul", { class: "ranges" });
     this.canvas.addEventListener("pointermove", (event) => this.point(event));
-    const per = this.each === 1 ? "1 address per cell" : `${this.each} addresses per cell`;
+    this.canvas.addEventListener("click", (event) => this.zoom(this.addressAt(event), 1 / ZOOM));
+    this.ends = [h("span"), h("span"), h("span")];
     this.root = h("article", { class: "card picture" },
-      h("header", {}, h("h3", {}, this.title), this.count),
+      h("header", {}, h("h3", {}, this.title), this.count, this.buttons()),
       this.canvas,
-      h("div", { class: "scale" }, h("span", {}, String(first)), h("span", {}, per), h("span", {}, String(last))),
+      h("div", { class: "scale" }, this.ends),
+      h("p", { class: "legend" }, Object.entries(LEGEND).map(([kind, text]) => h("span", { class: kind }, text))),
       this.ranged);
     new ResizeObserver(() => this.draw()).observe(this.root);
   }
 
-  update({ addresses, ranges, failures, givenUp }) {
+  buttons() {
+    const button = (text, label, onclick) =>
+      h("button", { class: "quiet", type: "button", "aria-label": `${label}: ${this.title.toLowerCase()}`, onclick }, text);
+    return h("span", { class: "zoom" },
+      button("◀", "Lower addresses", () => this.move(-1)),
+      button("▶", "Higher addresses", () => this.move(1)),
+      button("＋", "Zoom in", () => this.zoom(this.middle(), 1 / ZOOM)),
+      button("－", "Zoom out", () => this.zoom(this.middle(), ZOOM)));
+  }
+
+  get size() {
+    return this.span[1] - this.span[0] + 1;
+  }
+
+  middle() {
+    return this.span[0] + Math.floor(this.size / 2);
+  }
+
+  /** Shows `factor` times as many addresses around one. */
+  zoom(address, factor) {
+    const [first, last] = this.whole;
+    const size = Math.min(last - first + 1, Math.max(LEAST, Math.ceil(this.size * factor)));
+    this.show(address - Math.floor(size / 2), size);
+  }
+
+  /** Shows the addresses before or after. */
+  move(direction) {
+    this.show(this.span[0] + direction * Math.ceil(this.size / 2), this.size);
+  }
+
+  show(from, size) {
+    const [first, last] = this.whole;
+    const start = Math.max(first, Math.min(from, last - size + 1));
+    this.span = [start, Math.min(last, start + size - 1)];
+    this.draw();
+  }
+
+  update({ addresses, ranges, absentRanges, failures, givenUp, absent, notAsked }) {
     if (ranges) this.ranges = ranges;
+    this.absent = absentRanges ?? null;
     this.failures = failures ?? {};
     this.givenUp = givenUp;
+    this.told = absentRanges ? `${absent.toLocaleString("en")} asked and absent, ${notAsked.toLocaleString("en")} not asked` : null;
     this.count.textContent = addresses === 1 ? "1 address" : `${addresses.toLocaleString("en")} addresses`;
-    this.canvas.setAttribute("aria-label", `${this.title}: ${this.count.textContent} in ${this.ranges.length} ranges`);
+    this.canvas.setAttribute("aria-label", `${this.title}: ${this.count.textContent} in ${this.ranges.length} ranges${this.told ? `, ${this.told}` : ""}`);
     this.draw();
   }
 
   /** Returns the number of addresses of each cell that the ranges contain. */
   filled(ranges) {
+    const [first, last] = this.span;
     const cells = new Float32Array(this.columns * this.rows);
     for (const [from, to] of ranges) {
-      for (let at = from; at <= to; ) {
-        const cell = Math.floor((at - this.first) / this.each);
-        const end = Math.min(to, this.first + (cell + 1) * this.each - 1);
+      for (let at = Math.max(from, first); at <= Math.min(to, last); ) {
+        const cell = Math.floor((at - first) / this.each);
+        const end = Math.min(to, last, first + (cell + 1) * this.each - 1);
         cells[cell] += end - at + 1;
         at = end + 1;
       }
@@ -160,6 +207,11 @@ class Picture {
 
   /** Draws the cells aligned to screen pixels. */
   draw() {
+    const [first, last] = this.span;
+    this.each = Math.max(1, Math.ceil(this.size / CELLS));
+    this.rows = Math.ceil(this.size / this.each / this.columns);
+    const per = this.each === 1 ? "1 address per cell" : `${this.each} addresses per cell`;
+    [first, per, last].forEach((text, at) => (this.ends[at].textContent = text));
     const room = this.root.clientWidth - 2 * parseFloat(getComputedStyle(this.root).paddingLeft);
     const size = Math.max(3, Math.floor((room * devicePixelRatio) / this.columns));
     this.canvas.width = this.columns * size;
@@ -168,22 +220,38 @@ class Picture {
     this.canvas.style.width = `${this.canvas.width / devicePixelRatio}px`;
     const context = this.canvas.getContext("2d");
     this.there = this.filled(this.ranges);
-    const wrong = this.filled(Object.values(this.failures).flat());
-    const [soft, accent, warm] = [colour("--line"), colour("--accent"), colour("--warm-ink")];
-    for (let cell = 0; cell < this.there.length; cell += 1) {
+    this.wrong = this.filled(Object.values(this.failures).flat());
+    this.missing = this.filled(this.absent ?? []);
+    const [soft, edge, accent, warm] = ["--line", "--edge", "--accent", "--warm-ink"].map(colour);
+    const cells = Math.ceil(this.size / this.each);
+    for (let cell = 0; cell < cells; cell += 1) {
       const part = this.there[cell] / this.each;
-      context.globalAlpha = part > 0 ? 0.4 + 0.6 * part : wrong[cell] > 0 ? 0.8 : 0.6;
-      context.fillStyle = part > 0 ? accent : wrong[cell] > 0 ? warm : soft;
-      context.fillRect((cell % this.columns) * size, Math.floor(cell / this.columns) * height, size - 1, height - 1);
+      const [left, top] = [(cell % this.columns) * size, Math.floor(cell / this.columns) * height];
+      context.globalAlpha = part > 0 ? 0.4 + 0.6 * part : this.wrong[cell] > 0 ? 0.8 : 0.7;
+      context.fillStyle = part > 0 ? accent : this.wrong[cell] > 0 ? warm : this.missing[cell] > 0 ? edge : soft;
+      // What was asked and is absent is a small mark, so that it differs without its color too.
+      const isSmall = part === 0 && this.wrong[cell] === 0 && this.missing[cell] > 0;
+      const inset = isSmall ? Math.max(1, Math.floor(Math.min(size, height) / 4)) : 0;
+      context.fillRect(left + inset, top + inset, size - 1 - 2 * inset, Math.max(1, height - 1 - 2 * inset));
     }
   }
 
-  point(event) {
+  /** Returns the first address of the cell that an event is at. */
+  addressAt(event) {
     const box = this.canvas.getBoundingClientRect();
     const column = Math.floor(((event.clientX - box.left) / box.width) * this.columns);
     const cell = Math.floor(((event.clientY - box.top) / box.height) * this.rows) * this.columns + column;
-    const from = this.first + cell * this.each;
-    this.canvas.title = `${from}${this.each > 1 ? ` to ${from + this.each - 1}` : ""}: ${this.there[cell] ?? 0} valid`;
+    return Math.min(this.span[1], this.span[0] + cell * this.each);
+  }
+
+  point(event) {
+    const from = this.addressAt(event);
+    const cell = Math.floor((from - this.span[0]) / this.each);
+    const to = Math.min(this.span[1], from + this.each - 1);
+    const failed = this.wrong[cell] > 0 ? `, ${this.wrong[cell]} failed` : "";
+    const unread = to - from + 1 - this.there[cell] - this.wrong[cell] - this.missing[cell];
+    const rest = this.absent ? `, ${this.missing[cell]} absent, ${unread} not asked` : "";
+    this.canvas.title = `${from === to ? from : `${from} to ${to}`}: ${this.there[cell] ?? 0} valid${failed}${rest}`;
   }
 
   /** Lists the ranges; a click reads a range. */
@@ -199,6 +267,7 @@ class Picture {
       items.push(h("li", { class: "wrong" }, `${count} with ${FAILURES[kind] ?? `exception ${kind}`}`));
     }
     if (items.length === 0) items.push(h("li", { class: "dim" }, this.givenUp === 1 ? "The device does not support this area." : "None found."));
+    if (this.told) items.push(h("li", { class: "dim" }, `${this.told}.`));
     this.ranged.replaceChildren(...items);
   }
 }

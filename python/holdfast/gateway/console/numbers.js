@@ -54,6 +54,16 @@ export function bit(text) {
   throw new Error(`“${text.trim()}” is not a bit: 0, 1, on or off`);
 }
 
+/** Splits values. Throws an error for a comma that may be a decimal comma. */
+export function separated(text) {
+  const comma = /(?<![\w.])[+-]?\d+,\d+([eE][-+]?\d+)?/.exec(text);
+  if (comma) {
+    const [whole] = comma;
+    throw new Error(`“${whole}” has a decimal comma. Write ${whole.replace(",", ".")} for one value, or ${whole.replace(",", "; ")} for two.`);
+  }
+  return text.split(/[;,]/);
+}
+
 /** Parses a value of a type. Returns its display text and its JSON. Throws an error for other text. */
 export function literal(text, type) {
   if (type.kind === "string") return characters(text, type);
@@ -88,11 +98,35 @@ const EXTENTS = {
   int64: [-(2n ** 63n), 2n ** 63n - 1n], uint64: [0n, 2n ** 64n - 1n],
 };
 
+/** The greatest number of floating-point types, and what a number becomes in their registers. */
+const FLOATS = {
+  float16: [65504, (number) => rounded(number, 10, -14)],
+  float32: [3.4028234663852886e38, Math.fround],
+  float64: [Number.MAX_VALUE, (number) => number],
+};
+
+/** Rounds a number to a significand of some bits, as `Math.fround` does. */
+function rounded(number, bits, least) {
+  if (number === 0) return number;
+  const step = 2 ** (Math.max(Math.floor(Math.log2(Math.abs(number))), least) - bits);
+  const [down, rest] = [Math.floor(number / step), number / step - Math.floor(number / step)];
+  return step * (down + Number(rest > 0.5 || (rest === 0.5 && down % 2 !== 0)));
+}
+
+/** Parses a number of a floating-point type. */
+function floating(text, plain, type) {
+  const [most, fit] = FLOATS[type];
+  const found = fit(Number(plain));
+  if (!(Math.abs(found) <= most)) throw new Error(`“${text.trim()}” does not fit ${type}: −${most.toPrecision(6)} to ${most.toPrecision(6)}`);
+  if (found === 0 && /[1-9]/.test(plain.split(/e/i)[0])) throw new Error(`“${text.trim()}” is too small for ${type}, which would be 0`);
+  return plain;
+}
+
 /** Parses a number of a type. Returns JSON text with the same digits. Throws an error for other text. */
 export function numeral(text, type) {
   const plain = text.trim().replace(/^\+/, "");
   const extent = EXTENTS[type];
-  if (!extent && /^-?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?$/.test(plain)) return plain;
+  if (!extent && /^-?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?$/.test(plain)) return floating(text, plain, type);
   if (extent && /^-?(0|[1-9]\d{0,19})$/.test(plain)) {
     const whole = BigInt(plain);
     if (whole >= extent[0] && whole <= extent[1]) return plain;

@@ -1,11 +1,13 @@
 // Small plots of watched values, one above the other, with a common time axis.
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
+import { save, stamp } from "./csv.js";
 import { $, colour, h, onTheme } from "./dom.js";
+import { History } from "./history.js";
 
-const SPAN = 120;
+const SPANS = { 120: "2 minutes", 600: "10 minutes", 3600: "1 hour" };
 const MOST = 8;
-const MOST_POINTS = 5000;
+const AUTOMATIC = 4;
 const HEIGHT = 96;
 const TICK = 250;
 
@@ -13,20 +15,18 @@ const now = () => Date.now() / 1000;
 
 /** The plots of one watch. */
 export class Plots {
-  /** `number(address)` returns the current value of an address of the range. */
-  constructor(range, number) {
-    this.first = range.address;
-    this.last = range.address + range.quantity - 1;
-    this.number = number;
+  /** `panels` are the parts of the view; `onChoice()` is called when the plots change. */
+  constructor(panels, span, onChoice) {
+    this.panels = panels;
+    this.span = SPANS[span] ? Number(span) : 120;
+    this.onChoice = onChoice;
     this.place = $("plots");
     this.shown = new Map();
     this.chosen = false;
-    const input = h("input", { type: "number", min: this.first, max: this.last, id: "plot-address" });
     this.told = h("p", { class: "dim", role: "status" });
-    const add = () => this.wish(input.value);
-    this.place.replaceChildren(h("div", { class: "bar" },
-      h("label", {}, "Plot address", input),
-      h("button", { type: "button", onclick: add }, "Add plot"), this.told));
+    this.place.replaceChildren(h("div", { class: "bar" }, ...this.chooser(),
+      h("label", {}, "Time span", this.spans()),
+      h("button", { type: "button", onclick: () => this.download() }, "Download plots as CSV"), this.told));
     this.place.hidden = false;
     this.timer = setInterval(() => this.draw(), TICK);
     this.resized = new ResizeObserver(() => this.fit());
@@ -34,44 +34,106 @@ export class Plots {
     onTheme(() => this.restyle());
   }
 
+  /** Returns what chooses a value: an address of the only range, or one of all values. */
+  chooser() {
+    const [only, ...more] = this.panels;
+    const isRange = more.length === 0 && only.part.kind === "range";
+    const place = isRange ? this.addresses(only) : h("select", { id: "plot-cell" }, this.cells().map(([key, text]) => h("option", { value: key }, text)));
+    const add = () => (isRange ? this.wish(only, place.value) : this.wishKey(place.value));
+    return [h("label", {}, isRange ? "Plot address" : "Plot value", place), h("button", { type: "button", onclick: add }, "Add plot")];
+  }
+
+  addresses({ part: { address, quantity } }) {
+    return h("input", { type: "number", min: address, max: address + quantity - 1, id: "plot-address" });
+  }
+
+  cells() {
+    return this.panels.flatMap((panel, at) => panel.cells().map((cell) => [`${at}.${cell}`, panel.label(cell, false)]));
+  }
+
+  spans() {
+    const onchange = (event) => {
+      this.span = Number(event.target.value);
+      this.draw();
+      this.onChoice();
+    };
+    return h("select", { id: "plot-span", onchange }, Object.entries(SPANS).map(([seconds, text]) =>
+      h("option", { value: seconds, selected: Number(seconds) === this.span }, text)));
+  }
+
   /** Adds the plot of a typed address, or shows an error. */
-  wish(text) {
+  wish({ part: { address: first, quantity } }, text) {
     const address = Number(text);
-    if (text === "" || !(address >= this.first && address <= this.last)) {
-      this.told.textContent = text ? `${text} is not watched, only ${this.first} to ${this.last}.` : `Enter an address from ${this.first} to ${this.last}.`;
-    } else if (this.shown.has(address)) {
-      this.told.textContent = `${address} is already plotted.`;
+    const last = first + quantity - 1;
+    if (text === "" || !(address >= first && address <= last)) {
+      this.told.textContent = text ? `${text} is not watched, only ${first} to ${last}.` : `Enter an address from ${first} to ${last}.`;
     } else {
-      this.choose(address);
+      this.wishKey(`0.${address}`);
     }
   }
 
-  /** Adds the plot of an address, or removes it. */
-  choose(address) {
+  wishKey(key) {
+    if (this.shown.has(key)) this.told.textContent = `${this.shown.get(key).label} is already plotted.`;
+    else this.choose(key);
+  }
+
+  /** Adds the plot of a value, or removes it. */
+  choose(key) {
     this.told.textContent = "";
-    if (this.shown.has(address)) this.remove(address);
-    else if (this.shown.size < MOST) this.add(address);
+    if (this.shown.has(key)) this.remove(key);
+    else if (this.shown.size < MOST) this.add(key);
     else this.told.textContent = `There can be at most ${MOST} plots. Remove one first.`;
     this.chosen = true;
+    this.onChoice();
   }
 
   /** Handles a changed value. Until the user chooses plots, the first values that change get one. */
-  changed(address) {
-    if (!this.chosen && !this.shown.has(address) && this.shown.size < 4) this.add(address);
-    this.shown.get(address)?.take(this.number(address));
+  changed(panel, cell) {
+    const key = `${this.panels.indexOf(panel)}.${cell}`;
+    if (!this.chosen && !this.shown.has(key) && this.shown.size < AUTOMATIC) this.add(key);
   }
 
-  add(address) {
-    const plot = new Plot(address, () => this.choose(address));
-    this.shown.set(address, plot);
+  /** Takes the values of a poll. A part that was not answered has a gap. */
+  poll() {
+    const time = now();
+    for (const plot of this.shown.values()) plot.take(time);
+  }
+
+  /** Marks that nothing is known since the last poll. */
+  gap() {
+    for (const plot of this.shown.values()) plot.gap();
+  }
+
+  /** Returns the keys of the plots that the user has chosen; null if none were chosen. */
+  keys() {
+    return this.chosen ? [...this.shown.keys()] : null;
+  }
+
+  add(key) {
+    const dot = key.indexOf(".");
+    const panel = this.panels[Number(key.slice(0, dot))];
+    const cell = panel?.cells().find((each) => String(each) === key.slice(dot + 1));
+    if (cell === undefined) return;
+    const plot = new Plot(this, panel, cell, panel.label(cell, this.panels.length === 1), () => this.choose(key));
+    this.shown.set(key, plot);
     this.place.append(plot.root);
-    plot.take(this.number(address));
+    plot.take(now());
     plot.show();
   }
 
-  remove(address) {
-    this.shown.get(address).end();
-    this.shown.delete(address);
+  remove(key) {
+    this.shown.get(key).end();
+    this.shown.delete(key);
+  }
+
+  /** Saves the points that are drawn. A gap is a row without a value. */
+  download() {
+    const start = now() - this.span;
+    const rows = [...this.shown.values()].flatMap((plot) => {
+      const [times, values] = plot.history.points();
+      return times.flatMap((time, at) => (time < start ? [] : [[new Date(1000 * time).toISOString(), plot.label, values[at] ?? ""]]));
+    });
+    save(`plots-${stamp()}.csv`, [["time", "name", "value"], ...rows.sort(([a], [b]) => (a < b ? -1 : Number(a > b)))]);
   }
 
   draw() {
@@ -89,42 +151,66 @@ export class Plots {
 
   /** Stops updating. */
   stop() {
+    this.draw();
     clearInterval(this.timer);
   }
 
   end() {
     this.stop();
     this.resized.disconnect();
-    for (const address of [...this.shown.keys()]) this.remove(address);
+    for (const key of [...this.shown.keys()]) this.remove(key);
     this.place.hidden = true;
   }
 }
 
 class Plot {
-  constructor(address, onRemove) {
-    this.address = address;
-    this.times = [];
-    this.values = [];
+  constructor(plots, panel, cell, label, onRemove) {
+    Object.assign(this, { plots, panel, cell, label });
+    this.history = new History();
     this.output = h("output", { "aria-live": "off" });
     this.extent = h("span", { class: "extent" });
-    this.body = h("div", { role: "img", "aria-label": `Plot of address ${address}` });
-    const label = `Remove the plot of ${address}`;
+    this.body = h("div", { role: "img", "aria-label": `Plot of ${label}` });
     this.root = h("article", { class: "plot" },
-      h("header", {}, h("h3", { class: "mono dim" }, String(address)), this.output, this.extent,
-        h("button", { class: "quiet", type: "button", "aria-label": label, onclick: onRemove }, "✕")),
+      h("header", {}, h("h3", { class: "mono dim" }, label), this.output, this.extent,
+        h("button", { class: "quiet", type: "button", "aria-label": `Remove the plot of ${label}`, onclick: onRemove }, "✕")),
       this.body);
   }
 
-  take(value) {
-    this.times.push(now());
-    this.values.push(value);
-    if (this.times.length > MOST_POINTS) {
-      this.times.shift();
-      this.values.shift();
+  take(time) {
+    const value = this.panel.isStale ? null : this.panel.number(this.cell);
+    if (value === null || value === undefined) {
+      this.gap();
+      return;
     }
-    this.output.textContent = shortened(value);
-    const few = this.values.filter((each) => each !== undefined);
-    this.extent.textContent = `${shortened(Math.min(...few))} … ${shortened(Math.max(...few))}`;
+    this.history.take(time, value);
+    this.output.textContent = this.panel.text(this.cell) ?? shortened(value);
+    this.root.classList.remove("old");
+    this.describe();
+  }
+
+  gap() {
+    this.history.gap();
+    this.root.classList.add("old");
+    if (this.output.textContent === "") this.output.textContent = "–";
+    this.describe();
+  }
+
+  /** Shows the extremes and the gaps of the time span. */
+  describe() {
+    const start = now() - this.plots.span;
+    const [times, values] = this.history.points();
+    let [least, greatest] = [Infinity, -Infinity];
+    values.forEach((value, at) => {
+      if (value === null || (times[at + 1] ?? Infinity) < start) return;
+      least = Math.min(least, value);
+      greatest = Math.max(greatest, value);
+    });
+    const extent = least > greatest ? "" : `${shortened(least)} … ${shortened(greatest)}`;
+    const gaps = this.history.gaps().filter(([, end]) => end === null || end >= start);
+    const open = this.root.classList.contains("old");
+    this.extent.textContent = open ? `no value since ${clock(this.history.until || now())}` : extent;
+    const told = gaps.length === 0 ? "" : `, ${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"}`;
+    this.body.setAttribute("aria-label", `Plot of ${this.label}${told}`);
   }
 
   /** Creates the plot again, in the current colors. */
@@ -140,17 +226,38 @@ class Plot {
       scales: { x: { time: true }, y: { range: (_, low, high) => padded(low, high) } },
       series: [{}, { stroke: colour("--plot"), width: 1.75, points: { show: false }, paths: uPlot.paths.stepped({ align: 1 }) }],
       axes: [{ ...axis, size: 24, space: 80, values: (_, ticks) => ticks.map(clock) }, { ...axis, size: 58, space: 26, values: (_, ticks) => ticks.map((each) => short(each / this.scale)) }],
+      hooks: { drawClear: [(plot) => this.shade(plot)] },
     }, [[], []], this.body);
     this.draw();
   }
 
+  /** Colors the times without a value. */
+  shade(plot) {
+    const { left, width, top, height } = plot.bbox;
+    const right = left + width;
+    plot.ctx.save();
+    plot.ctx.fillStyle = colour("--warm");
+    for (const [start, end] of this.history.gaps()) {
+      const from = Math.max(left, plot.valToPos(start, "x", true));
+      const to = end === null ? right : Math.min(right, plot.valToPos(end, "x", true));
+      if (to > from) plot.ctx.fillRect(from, top, Math.max(to - from, 2), height);
+    }
+    plot.ctx.restore();
+  }
+
   draw() {
     const end = now();
-    this.scale = scaled(this.values);
-    const values = this.values.map((each) => each * this.scale);
+    const [allTimes, allValues] = this.history.points();
+    const start = end - this.plots.span;
+    let first = allTimes.findIndex((time) => time >= start);
+    first = Math.max(0, (first < 0 ? allTimes.length : first) - 1);
+    const times = allTimes.slice(first);
+    const values = allValues.slice(first);
+    this.scale = scaled(values);
+    const drawn = this.scale === 1 ? values : values.map((each) => (each === null ? null : each * this.scale));
     this.plot.batch(() => {
-      this.plot.setData([[...this.times, end], [...values, values.at(-1)]], false);
-      this.plot.setScale("x", { min: Math.max(end - SPAN, Math.min(this.times[0], end - 10)), max: end });
+      this.plot.setData([times, drawn], false);
+      this.plot.setScale("x", { min: Math.max(start, Math.min(times[0] ?? end, end - 10)), max: end });
     });
   }
 
@@ -178,7 +285,7 @@ function short(value) {
 
 /** Returns a factor for tiny values, because uPlot has no axis steps below 1e-16. */
 function scaled(values) {
-  const most = Math.max(...values.map(Math.abs));
+  const most = values.reduce((most, each) => Math.max(most, Math.abs(each ?? 0)), 0);
   return most > 0 && most < 1e-6 ? 10 ** Math.min(300, -Math.floor(Math.log10(most))) : 1;
 }
 

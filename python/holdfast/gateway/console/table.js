@@ -2,88 +2,112 @@
 
 import { $, h } from "./dom.js";
 import { binary, everyType, hex, modicon } from "./numbers.js";
+import { Panel } from "./panel.js";
+import { AREAS, areaOf } from "./standard.js";
 
-const MARKED = 1500;
+const NAMES = ["Coil", "Discrete input"];
+const SHORT = ["coil", "di", "hr", "ir"];
 
-/** Shows the values of a range and updates them. */
-export class Table {
+/** Shows the values of a range. Its cells have the numbers of the addresses. */
+export class Table extends Panel {
   /** `actions` has `write(address)`, or null if writes are not possible, and `plot(address)`. */
-  constructor(place, range, actions) {
-    this.range = range;
-    this.values = [];
-    this.texts = [];
+  constructor(part, actions) {
+    super(part);
     this.actions = actions;
-    this.cells = new Map();
-    const { host, port, unitId } = range.device;
-    this.where = `${host}:${port}, unit ${unitId}`;
-    this.age = h("p", { class: "age" });
-    this.root = range.ofBits ? this.bits() : this.registers();
-    place.replaceChildren(this.age, this.root);
-    this.stale(false);
+    this.shown = new Map();
+    this.fill(part.ofBits ? this.bits() : this.registers());
   }
 
-  /** Sets all values, and the texts of typed values. With `mark`, changes are marked. */
-  set(values, texts, mark = false) {
-    values.forEach((value, at) => this.put(at, value, mark));
-    (texts ?? []).forEach((text, index) => this.putTyped(index, text, mark));
-    this.stale(false);
+  placeOf(index) {
+    return index * this.part.width;
   }
 
-  put(at, value, mark = true) {
-    const before = this.values[at];
-    this.values[at] = value;
-    if (before === value) return;
-    const cells = this.cells.get(at);
-    if (this.range.ofBits) {
-      cells.bit.textContent = value ? "1" : "0";
-      cells.bit.classList.toggle("on", value);
-      cells.bit.setAttribute("aria-label", `${this.range.address + at} is ${value ? "on" : "off"}`);
-    } else {
-      cells.decimal.textContent = value;
-      cells.hex.textContent = hex(value);
-      cells.binary.textContent = binary(value);
-      cells.decimal.classList.toggle("zero", value === 0);
+  render(at, mark) {
+    const cells = this.shown.get(at);
+    const value = this.values[at];
+    if (value !== cells.value) {
+      if (this.part.ofBits) this.renderBit(cells.bit, this.part.address + at, value);
+      else this.renderRegister(cells, value);
+      if (mark && cells.value !== undefined) this.mark(cells.bit ?? cells.decimal);
+      cells.value = value;
     }
-    if (mark && before !== undefined) this.mark(cells.bit ?? cells.decimal);
+    if (cells.typed) this.renderTyped(cells.typed, at / this.part.width, mark);
   }
 
-  putTyped(index, text, mark = true) {
-    const before = this.texts[index];
-    this.texts[index] = text;
-    if (before === text) return;
-    const { typed } = this.cells.get(index * this.range.width) ?? {};
-    if (!typed) return;
-    typed.textContent = text;
-    typed.title = text;
-    if (mark && before !== undefined) this.mark(typed);
+  renderBit(bit, address, value) {
+    bit.textContent = value ? "1" : "0";
+    bit.classList.toggle("on", value);
+    // The name contains the visible text, so that it can be spoken to.
+    bit.setAttribute("aria-label", `${NAMES[this.part.area - 1]} ${address}: ${value ? "1, on" : "0, off"}`);
   }
 
-  mark(cell) {
-    cell.classList.add("changed");
-    clearTimeout(cell.fading);
-    cell.fading = setTimeout(() => cell.classList.remove("changed"), MARKED);
+  renderRegister(cells, value) {
+    cells.decimal.textContent = value;
+    cells.hex.textContent = hex(value);
+    cells.binary.textContent = binary(value);
+    cells.decimal.classList.toggle("zero", value === 0);
   }
 
-  /** Marks the values as stale or current. */
-  stale(is) {
-    this.root.classList.toggle("stale", is);
-    this.age.classList.toggle("old", is);
-    this.age.textContent = is ? `Stale values of ${this.where}.` : `Values of ${this.where}.`;
+  renderTyped(typed, index, mark) {
+    const text = this.texts[index] ?? "";
+    if (typed.textContent !== text) {
+      const before = typed.textContent;
+      typed.textContent = text;
+      if (mark && before !== "") this.mark(typed);
+    }
+    typed.title = this.errors.get(index) ?? text;
   }
 
   /** Returns the number to plot for an address: the typed value if one starts there. */
-  number(at) {
-    const { width, ofBits, type } = this.range;
+  number(address) {
+    const at = address - this.part.address;
+    const { width, ofBits, type } = this.part;
     if (ofBits) return Number(this.values[at]);
-    if (type.kind === "string" || type.kind === "bytes") return this.values[at];
-    if (type.kind === "bool" || type.kind === "bit") return Number(this.texts[at] === "true");
-    const text = at % width === 0 ? this.texts[at / width] : undefined;
+    if (at % width !== 0 || type.kind === "string" || type.kind === "bytes") return this.values[at] ?? null;
+    const text = this.texts[at / width] ?? "";
+    if (type.kind === "bool" || type.kind === "bit") return Number(text === "true");
     const number = Number(text);
-    return text === undefined || text === "" || Number.isNaN(number) ? this.values[at] : number;
+    return text === "" || !Number.isFinite(number) ? null : number;
+  }
+
+  /** Registers and bits have no text beside their number. */
+  text() {
+    return null;
+  }
+
+  cells() {
+    return Array.from({ length: this.part.quantity }, (_, at) => this.part.address + at);
+  }
+
+  label(address, isAlone) {
+    return isAlone ? String(address) : `${SHORT[this.part.area - 1]} ${address}`;
+  }
+
+  /** Returns the cells that an index of values belongs to: the start of its typed value. */
+  cellsOf(at) {
+    return [this.part.address + at - (at % this.part.width)];
+  }
+
+  records() {
+    const { area, address, quantity, type, order, ofBits, width } = this.part;
+    const areas = Object.keys(AREAS);
+    const rows = [];
+    for (let at = 0; at < quantity; at += width) {
+      const index = at / width;
+      const value = ofBits ? Number(this.values[at]) : this.texts[index];
+      rows.push(["", areas[area - 1], address + at, ofBits ? "bool" : type.name, ofBits ? "" : order, value ?? "", "", this.errors.get(index) ?? ""]);
+    }
+    return rows;
+  }
+
+  /** Returns what the write dialog needs of an address. */
+  target(address) {
+    const { area, ofBits } = this.part;
+    return { part: this.part, tag: null, area, address, ofBits };
   }
 
   registers() {
-    const { address, quantity, width, type, area } = this.range;
+    const { address, quantity, width, type, area } = this.part;
     const body = h("tbody", { role: "rowgroup" });
     for (let at = 0; at < quantity; at += 1) {
       const cells = {
@@ -94,7 +118,7 @@ export class Table {
       if (at % width === 0) {
         cells.typed = h("td", { role: "cell", class: "typed", rowSpan: width, "data-type": type.name });
       }
-      this.cells.set(at, cells);
+      this.shown.set(at, cells);
       body.append(h("tr", { role: "row", "data-address": address + at },
         h("th", { role: "rowheader", scope: "row" },
           String(address + at), h("span", { class: "modicon" }, modicon(area, address + at))),
@@ -102,12 +126,12 @@ export class Table {
     }
     const head = ["Address", "Decimal", "Hex", "Binary", type.name, ""].map((text) =>
       h("th", { role: "columnheader", scope: "col" }, text || h("span", { class: "unseen" }, "Actions")));
-    return h("table", { role: "table", class: "values", "aria-label": this.range.title },
+    return h("table", { role: "table", class: "values", "aria-label": this.part.title },
       h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, head)), body);
   }
 
   buttons(at) {
-    const address = this.range.address + at;
+    const address = this.part.address + at;
     const button = (text, label, onclick) =>
       h("button", { class: "quiet", type: "button", "aria-label": `${label} ${address}`, onclick }, text);
     const { write, plot } = this.actions;
@@ -118,8 +142,8 @@ export class Table {
   }
 
   bits() {
-    const field = h("div", { class: "bits", role: "group", "aria-label": this.range.title });
-    const { address, quantity } = this.range;
+    const field = h("div", { class: "bits", role: "group", "aria-label": this.part.title });
+    const { address, quantity } = this.part;
     for (let start = 0; start < quantity; start += 16) {
       const run = h("div", { class: "run" });
       for (let at = start; at < Math.min(start + 16, quantity); at += 1) run.append(this.bit(at));
@@ -129,17 +153,18 @@ export class Table {
   }
 
   bit(at) {
-    const address = this.range.address + at;
-    const act = this.actions.write ?? this.actions.plot;
-    const bit = h("button", { class: "bit", type: "button", title: `${address}`, onclick: () => act(address) });
-    this.cells.set(at, { bit });
+    const address = this.part.address + at;
+    const { write, plot } = this.actions;
+    const title = `${write ? "Write" : "Plot"} ${areaOf(this.part.area).title.toLowerCase()} ${address}`;
+    const bit = h("button", { class: "bit", type: "button", title, onclick: () => (write ?? plot)(address) });
+    this.shown.set(at, { bit });
     return bit;
   }
 
   /** Shows up to four registers in every type and byte order. */
   showTypes(at) {
     const own = this.values.slice(at, at + 4);
-    $("types-title").textContent = `All types from ${this.range.address + at}: ${own.map(hex).join(" ")}`;
+    $("types-title").textContent = `All types from ${this.part.address + at}: ${own.map(hex).join(" ")}`;
     $("types-table").replaceChildren(...everyType(own).map(([orders, rows]) => h("table", { class: "review" },
       h("thead", {}, h("tr", {}, ["Type", ...orders].map((each) => h("th", { scope: "col" }, each)))),
       h("tbody", {}, rows.map(([type, texts]) =>

@@ -1,54 +1,118 @@
-// The values view: reads or watches a range, and offers plots and writes.
+// The values view: reads or watches ranges and tag lists, and offers plots and writes.
 
-import { notice, post, stream } from "./api.js";
+import { failure, notice, stream } from "./api.js";
+import { save, stamp } from "./csv.js";
 import { $, h, say, show } from "./dom.js";
+import { Lists } from "./lists.js";
+import * as link from "./link.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
+import * as parts from "./parts.js";
 import { Plots } from "./plots.js";
 import { areaOf, LAST } from "./standard.js";
 import { Table } from "./table.js";
+import { TagTable } from "./tags.js";
 import { Writer } from "./writing.js";
 
+const PATH = "/api/modbus/watch/view";
 const RESUME = 1000;
+/** Streams of this browser. It allows six connections to a host; two are left for everything else. */
+const STREAMS = 4;
 const WRITTEN = { written: "Written", refused: "Not written", unknown: "Unknown whether it was written" };
 /** Errors after which a watch does not retry. */
 const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
+const FIELDS = ["area", "address", "quantity", "type", "size", "order", "letters", "interval"];
+const CSV = ["time", "part", "name", "area", "address", "type", "order", "value", "unit", "state", "error"];
+const CHECK = 1000;
 
 /** The values view. `may.write` is whether the gateway allows writes. */
 export class Values {
   constructor(may) {
     this.may = may;
     this.writer = new Writer();
-    this.device = this.table = this.plots = this.watching = this.reading = null;
+    this.lists = new Lists((part) => this.pin(part));
+    this.pinned = [];
+    this.panels = [];
+    this.device = this.plots = this.watching = this.reading = this.heard = null;
     $("range").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.read();
+      this.read(this.wanted());
     });
-    $("range").addEventListener("input", () => this.adapt());
+    $("range").addEventListener("input", () => {
+      this.adapt();
+      this.remember();
+    });
     $("type").addEventListener("change", () => {
       $("size").value = $("type").value === "bit" ? 0 : 20;
       this.adapt();
+      this.remember();
     });
     $("watch").addEventListener("click", () => {
       if (this.watching) this.stop();
-      else if ($("range").reportValidity()) this.watch(this.range());
+      else if ($("range").reportValidity()) this.watch(this.wanted());
     });
+    $("add-range").addEventListener("click", () => {
+      if ($("range").reportValidity()) this.pin(this.range());
+    });
+    $("add-tags").addEventListener("click", () => this.lists.ask());
+    $("save").addEventListener("click", () => this.save());
+    setInterval(() => this.check(), CHECK);
     this.adapt();
+  }
+
+  /** Fills in the view of the page's URL. Returns whether it is watched. */
+  async recall() {
+    const query = link.given();
+    for (const id of FIELDS) {
+      const value = query.get(id);
+      if (value !== null && (!$(id).options || [...$(id).options].some((each) => each.value === value))) $(id).value = value;
+    }
+    this.adapt();
+    for (const text of query.getAll("part")) {
+      try {
+        this.pinned.push(await parts.read(text));
+      } catch (error) {
+        say($("outcome"), `A part of the link can't be used: ${error.message}.`);
+      }
+    }
+    this.chips();
+    this.resumes = query.get("watch") === "1";
+    this.plotted = query.getAll("plot");
+    this.span = query.get("span");
+    return this.resumes;
+  }
+
+  /** Stores the view in the page's URL. */
+  async remember() {
+    const pinned = this.pinned;
+    const spelled = await Promise.all(pinned.map(parts.spelled));
+    if (this.pinned !== pinned) return;
+    link.put({
+      ...Object.fromEntries(FIELDS.map((id) => [id, $(id).disabled ? null : $(id).value])),
+      part: spelled,
+      watch: this.watching ? "1" : null,
+      plot: this.plots?.keys() ?? this.plotted ?? [],
+      span: this.plots ? String(this.plots.span) : this.span ?? null,
+    });
   }
 
   /** Selects a device, and removes the values of the previous one. */
   use(device) {
     this.device = device;
     this.plots?.end();
-    this.table = this.plots = null;
+    this.plots = null;
+    this.panels = [];
     $("table").replaceChildren(h("p", { class: "card empty" }, "Choose a range, then read or watch it."));
+    $("save").hidden = true;
     say($("outcome"));
+    if (this.resumes) this.watch(this.wanted());
+    this.resumes = false;
   }
 
   /** Deselects the device. The last values stay visible, marked as stale. */
   leave() {
     this.stop();
     this.device = null;
-    this.table?.stale(true);
+    this.panels.forEach((panel) => panel.stale());
   }
 
   /** Adapts the form to area and type, and validates it. */
@@ -87,73 +151,123 @@ export class Values {
     if (length <= most && length % this.type().width > 0) $("type").value = "uint16";
     $("quantity").value = whole(Math.min(length, most), this.type().width);
     this.adapt();
-    this.read(length > most ? `The range has ${length.toLocaleString("en")} addresses; one read covers only a part of it.` : null);
+    this.remember();
+    this.read([this.range()], length > most ? `The range has ${length.toLocaleString("en")} addresses; one read covers only a part of it.` : null);
   }
 
   /** Returns the range of the form, with the quantity rounded to whole values of the type. */
   range() {
-    const area = Number($("area").value);
-    const address = Number($("address").value);
     const type = this.type();
     const asked = Number($("quantity").value);
     const quantity = whole(asked, type.width);
     $("quantity").value = quantity;
-    return {
-      device: this.device,
-      area, address, quantity, type,
-      ofBits: area < 3,
-      width: type.width,
-      order: this.order(),
-      title: `${areaOf(area).title} ${address} to ${address + quantity - 1}`,
-      note: asked === quantity ? null : `Each ${type.name} has ${type.width} registers: ${quantity} instead of ${asked}.`,
-    };
+    const range = parts.range(Number($("area").value), Number($("address").value), quantity, type, this.order());
+    const note = asked === quantity ? null : `Each ${type.name} has ${type.width} registers: ${quantity} instead of ${asked}.`;
+    return { ...range, note };
   }
 
-  /** Converts a range to the fields of a request. */
-  request(range) {
-    const { device, area, address, quantity, ofBits, type, order } = range;
-    const typed = ofBits ? {} : { datatype: type.name, byteOrder: order };
-    return { ...device, functionCode: area, address, quantity, ...typed };
+  /** Returns the parts that are read and watched: those of the view, or the range of the form. */
+  wanted() {
+    return this.pinned.length > 0 ? this.pinned : [this.range()];
   }
 
-  async read(more = null) {
+  /** Adds a part to the view. */
+  pin(part) {
+    this.pinned = [...this.pinned, part];
+    this.repinned();
+  }
+
+  unpin(part) {
+    this.pinned = this.pinned.filter((each) => each !== part);
+    this.repinned();
+  }
+
+  repinned() {
+    this.plotted = [];
+    this.chips();
+    if (this.watching) this.watch(this.wanted());
+    else this.remember();
+  }
+
+  /** Shows the parts of the view. */
+  chips() {
+    const items = this.pinned.map((part) => {
+      const label = `Remove ${part.title} from the view`;
+      return h("li", {}, part.title, h("button", { class: "quiet", type: "button", "aria-label": label, onclick: () => this.unpin(part) }, "✕"));
+    });
+    $("parts").replaceChildren(...items);
+    $("parts").hidden = $("parts-help").hidden = items.length === 0;
+  }
+
+  /** Returns the options of a request for parts of the device. */
+  sent(wanted, more, signal) {
+    const body = JSON.stringify({ ...this.device, parts: wanted.map(parts.asked), ...more });
+    return { method: "POST", body, signal, patience: this.device.timeout * wanted.length };
+  }
+
+  /** Reads parts once. Returns the data of the event. */
+  async once(wanted, signal) {
+    let data = null;
+    await stream(PATH, this.sent(wanted, { once: true }, signal), (_, found) => (data = found));
+    if (data === null) throw failure("gateway_gone", "the connection to the gateway ended");
+    return data;
+  }
+
+  async read(wanted, more = null) {
     this.stop();
-    const range = this.range();
     const reading = new AbortController();
     this.reading = reading;
     say($("outcome"), "Reading…");
+    const note = wanted.length === 1 ? wanted[0].note ?? null : null;
     try {
       const began = performance.now();
-      const found = await post("/api/modbus/read", this.request(range), reading.signal);
+      const data = await this.once(wanted, reading.signal);
       if (this.reading !== reading) return;
-      this.show(range).set(found.values, found.typedText);
-      say($("outcome"), `${range.title}: read in ${Math.round(performance.now() - began)} ms.`, range.note, more);
+      const took = `read in ${Math.round(performance.now() - began)} ms.`;
+      const [first] = data.parts;
+      if (data.parts.length === 1 && first.error) throw failure(first.reason, first.error);
+      this.show(wanted, data);
+      this.take(data, false);
+      const failed = data.parts.filter((each) => each.error).length;
+      say($("outcome"), wanted.length === 1 ? `${wanted[0].title}: ${took}`
+        : `${wanted.length - failed} of ${wanted.length} parts: ${took}`, note, more);
     } catch (error) {
       if (this.reading !== reading) return;
-      this.table?.stale(true);
-      say($("outcome"), notice(error), range.note);
+      this.panels.forEach((panel) => panel.stale("The last read failed."));
+      say($("outcome"), notice(error), note);
     }
     this.reading = null;
   }
 
-  show(range) {
+  /** Shows tables for parts. */
+  show(wanted, data) {
     this.plots?.end();
     this.plots = null;
-    const writable = this.may.write && (range.area === 1 || range.area === 3);
-    this.table = new Table($("table"), range, {
-      write: writable ? (address) => this.write(range, address) : null,
-      plot: (address) => this.plot(address),
-    });
+    this.panels = wanted.map((each, at) => this.panel({ ...each, device: this.device }, data.parts[at].tags));
+    $("table").replaceChildren(...this.panels.map((panel) => panel.place));
+    if (wanted.length > 1) this.panels.forEach((panel) => (panel.heading.hidden = false));
+    this.wholes = wanted;
     $("only-reads").hidden = this.may.write;
-    return this.table;
+    $("save").hidden = false;
   }
 
-  async write(range, address) {
-    const outcome = await this.writer.ask(range, address);
+  panel(part, tags) {
+    const writes = this.may.write && (part.kind === "tags" || part.area === 1 || part.area === 3);
+    const actions = {
+      write: writes ? (cell) => this.write(panel, cell) : null,
+      plot: (cell) => this.plot(panel, cell),
+    };
+    const panel = part.kind === "tags" ? new TagTable(part, tags, actions) : new Table(part, actions);
+    return panel;
+  }
+
+  async write(panel, cell) {
+    const outcome = await this.writer.ask(panel.target(cell));
     if (outcome === null) return;
     const told = WRITTEN[outcome];
-    if (this.table?.range !== range || this.device !== range.device) {
-      say($("outcome"), `${told}: address ${address} of ${range.device.host}:${range.device.port}.`);
+    const { device } = panel.part;
+    if (!this.panels.includes(panel) || this.device !== device) {
+      say($("outcome"), `${told}: ${cell} of ${device.host}:${device.port}.`);
       return;
     }
     if (this.watching) {
@@ -161,69 +275,151 @@ export class Values {
       return;
     }
     try {
-      const found = await post("/api/modbus/read", this.request(range));
-      if (this.table?.range !== range || this.device !== range.device) return;
-      this.table.set(found.values, found.typedText, true);
+      const data = await this.once(this.wholes);
+      if (!this.panels.includes(panel) || this.device !== device) return;
+      this.take(data, true);
+      const own = data.parts[this.panels.indexOf(panel)];
+      if (own.error) throw failure(own.reason, own.error);
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
-      if (this.table?.range !== range) return;
-      this.table.stale(true);
+      if (!this.panels.includes(panel)) return;
+      panel.stale("Reading back failed.");
       say($("outcome"), notice(error, `${told}. Reading back failed.`));
     }
   }
 
-  /** Adds or removes the plot of an address. Starts a watch if necessary. */
-  plot(address) {
+  /** Adds or removes the plot of a value. Starts a watch if necessary. */
+  plot(panel, cell) {
+    const key = `${this.panels.indexOf(panel)}.${cell}`;
     if (!this.watching) {
       if (!$("interval").reportValidity()) return;
-      this.watch(this.table.range);
+      this.watch(this.wholes, [key]);
+    } else if (this.plots) {
+      this.plots.choose(key);
     }
-    this.wanted = address;
-    this.plots?.choose(address);
   }
 
-  /** Watches a range until it is stopped. Retries when the stream ends. */
-  async watch(range) {
+  /** Watches parts until it is stopped. Retries when the stream ends, and polls if there is none. */
+  async watch(wanted, plotted = this.plotted) {
     this.stop();
     const stopping = new AbortController();
     this.watching = stopping;
-    this.wanted = null;
-    this.interval = $("interval").value;
+    const signature = JSON.stringify(wanted.map(parts.asked));
+    this.plotted = [undefined, signature].includes(this.signature) ? plotted : [];
+    this.signature = signature;
+    this.interval = Number($("interval").value);
+    this.began = this.polls = false;
+    this.reported = "";
     this.plots?.end();
     this.plots = null;
     this.pressed(true);
+    this.remember();
     say($("outcome"), "Reading…");
-    const { unitId, ...rest } = this.request(range);
-    const query = new URLSearchParams({ ...rest, unitId, interval: this.interval });
-    let began = false;
     let told = null;
     while (this.watching === stopping) {
+      let streams = true;
+      const more = { interval: this.interval, maxStreams: STREAMS, describe: !this.began };
       try {
-        await stream(`/api/modbus/watch?${query}`, { signal: stopping.signal }, (name, data) => {
+        await stream(PATH, this.sent(wanted, more, stopping.signal), (name, data) => {
           if (this.watching !== stopping) return;
-          [began, told] = [true, null];
-          this.happened(range, name, data);
+          if (name === "view") {
+            streams = data.stream;
+            this.opened(wanted, data);
+          } else if (name === "change") {
+            this.take(data, true);
+          }
+          told = null;
         });
-        if (this.watching === stopping) told = this.interrupted(null, told);
+        if (this.watching !== stopping) return;
+        if (!streams) {
+          await pause(this.interval);
+          continue;
+        }
+        told = this.interrupted(null, told);
       } catch (error) {
         if (this.watching !== stopping) return;
-        if (!began || FINAL.has(error.reason)) {
+        if (!this.began || FINAL.has(error.reason)) {
           this.stop();
-          this.table?.stale(true);
+          this.panels.forEach((panel) => panel.stale("The watch has ended."));
           say($("outcome"), notice(error));
           return;
         }
         told = this.interrupted(error, told);
       }
-      await new Promise((resolve) => setTimeout(resolve, RESUME));
+      await pause(RESUME);
     }
+  }
+
+  /** Handles the first event of a stream. */
+  opened(wanted, data) {
+    const first = !this.began;
+    this.began = true;
+    if (first) {
+      const same = this.wholes === wanted && this.panels.length > 0 && this.panels[0].part.device === this.device;
+      if (!same) this.show(wanted, data);
+      this.plots = new Plots(this.panels, this.span, () => this.remember());
+    }
+    if (this.polls === data.stream || first || this.reported === null) {
+      this.polls = !data.stream;
+      this.reported = "";
+      this.report(data.parts.map(() => null), true);
+    }
+    this.take(data, true);
+    if (first) this.plotted?.forEach((key) => this.plots.choose(key));
+  }
+
+  /** Takes the values of an event. */
+  take(data, mark) {
+    const late = this.heard !== null && Date.now() - this.heard > this.patience();
+    if (late) this.plots?.gap();
+    this.heard = Date.now();
+    const isView = "stream" in data;
+    const changes = isView ? data.parts.map((each, part) => ({ ...each, part })) : data.parts;
+    const errors = this.panels.map((panel) => panel.error ?? null);
+    const changed = [];
+    for (const each of changes) {
+      const panel = this.panels[each.part];
+      if ("error" in each || isView) errors[each.part] = each.error ? failure(each.reason, each.error) : null;
+      if (isView && !each.values) continue;
+      const cells = isView ? panel.set(each, mark && panel.values.length > 0) : panel.change(each, mark);
+      changed.push(...cells.map((cell) => [panel, cell]));
+    }
+    this.panels.forEach((panel, at) => {
+      panel.error = errors[at];
+      if (errors[at]) panel.stale(this.watching ? "The last poll failed." : "The last read failed.", this.panels.length > 1 ? errors[at] : null);
+      else panel.fresh(data.time);
+    });
+    if (this.watching && this.plots) {
+      if (!isView) for (const [panel, cell] of changed) this.plots.changed(panel, cell);
+      this.plots.poll();
+    }
+    if (this.watching) this.report(errors);
+  }
+
+  /** Says what is watched, or why nothing is. Each reason is said once. */
+  report(errors, anew = false) {
+    const failed = errors.filter((each) => each !== null);
+    const all = failed.length === errors.length && failed.every((each) => each.message === failed[0].message);
+    const key = all ? failed[0].message : "watching";
+    if (key === this.reported && !anew) return;
+    this.reported = key;
+    if (all) {
+      say($("outcome"), notice(failed[0]), "Retrying…");
+      return;
+    }
+    const [first, ...others] = this.panels;
+    const what = others.length > 0 ? `${others.length + 1} parts` : first.part.kind === "tags" ? first.part.title : first.part.title.toLowerCase();
+    const polls = this.polls ? "Other tabs use the streams of this browser. This tab asks for each value, which changes nothing else." : null;
+    say($("outcome"), `Watching ${what}, every ${this.interval} ms.`, others.length > 0 ? null : first.part.note ?? null, polls);
   }
 
   /** Handles an interrupted watch. Shows each reason once. */
   interrupted(error, told) {
     const reason = error?.reason ?? "ended";
-    this.table?.stale(true);
+    this.panels.forEach((panel) => panel.stale("The gateway does not answer."));
+    this.plots?.gap();
+    this.reported = null;
     const gone = ["ended", "gateway_gone"];
     if (reason === told || (gone.includes(reason) && gone.includes(told))) return told;
     const goes = "The watch resumes automatically. Press Stop to end it.";
@@ -232,31 +428,27 @@ export class Values {
     return reason;
   }
 
-  happened(range, name, data) {
-    if (name === "problem") {
-      this.table?.stale(true);
-      const problem = Object.assign(new Error(data.error), { reason: data.reason });
-      say($("outcome"), notice(problem), "Retrying…");
-    } else if (name === "values") {
-      this.begin(range, data);
-    } else {
-      for (const { address, value } of data.changes) this.table.put(address - range.address, value);
-      for (const { index, text } of data.typed ?? []) this.table.putTyped(index, text);
-      const starts = (data.typed ?? []).map(({ index }) => range.address + index * range.width);
-      const bare = data.changes.map((each) => each.address);
-      for (const address of range.ofBits ? bare : new Set([...starts, ...bare.filter((each) => this.plots.shown.has(each))])) {
-        this.plots.changed(address);
-      }
-    }
+  /** The time in milliseconds after which values without an event are old. */
+  patience() {
+    return 3 * this.interval + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + 2000;
   }
 
-  begin(range, data) {
-    if (this.table?.range !== range) this.show(range);
-    this.table.set(data.values, data.typedText, true);
-    this.plots ??= new Plots(range, (address) => this.table.number(address - range.address));
-    if (this.wanted !== null) this.plots.choose(this.wanted);
-    this.wanted = null;
-    say($("outcome"), `Watching ${range.title.toLowerCase()}, every ${this.interval} ms.`, range.note);
+  /** Marks the values as old if the gateway is silent. */
+  check() {
+    if (!this.watching || !this.began || this.heard === null || Date.now() - this.heard <= this.patience()) return;
+    this.panels.forEach((panel) => panel.stale("No news from the gateway."));
+    this.plots?.gap();
+  }
+
+  /** Saves what is shown. */
+  save() {
+    const rows = this.panels.flatMap((panel) => {
+      const time = panel.time === null ? "" : new Date(panel.time).toISOString();
+      const state = panel.isStale ? "stale" : "current";
+      return panel.records().map(([name, area, address, type, order, value, unit, error]) =>
+        [time, panel.part.title, name, area, address, type, order, value, unit, state, error || (panel.error ? panel.error.message : "")]);
+    });
+    save(`values-${stamp()}.csv`, [CSV, ...rows]);
   }
 
   /** Stops reading and watching. The last values stay visible. */
@@ -266,8 +458,13 @@ export class Values {
     if (!this.watching) return;
     this.watching.abort();
     this.watching = null;
+    this.heard = null;
+    this.plotted = this.plots?.keys() ?? this.plotted;
+    this.span = this.plots ? String(this.plots.span) : this.span;
     this.plots?.stop();
     this.pressed(false);
+    this.panels.forEach((panel) => panel.stale("No longer watched."));
+    this.remember();
     say($("outcome"), "Stopped.");
   }
 
@@ -276,6 +473,8 @@ export class Values {
     $("watch").textContent = is ? "Stop" : "Watch";
   }
 }
+
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 /** Rounds a quantity down to whole values, at least one. */
 const whole = (quantity, width) => Math.max(width, Math.floor(quantity / width) * width);

@@ -1,18 +1,19 @@
 // The write dialog: asks for a value, shows it beside the current one, then writes it.
 
-import { notice, post, Problem } from "./api.js";
+import { notice, post, Problem, stream } from "./api.js";
 import { $, h, once } from "./dom.js";
-import { binary, bit, hex, literal, modicon, register } from "./numbers.js";
+import { binary, bit, hex, literal, modicon, register, separated } from "./numbers.js";
+import { placed } from "./parts.js";
 import { areaOf } from "./standard.js";
 
-const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with commas.";
+const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with semicolons.";
 const HELP = {
-  register: () => "Decimal, 0x… or 0b…. Separate values for consecutive registers with commas.",
+  register: () => "Decimal, 0x… or 0b…. Separate values for consecutive registers with semicolons.",
   string: ({ size }) => `Up to ${size} ASCII characters. Shorter text is padded with zeros.`,
-  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. Separate values for consecutive registers with commas.`,
+  bytes: ({ size }) => `${size} bytes in hex, such as 0a ff. Separate values for consecutive registers with semicolons.`,
   bit: () => "0, 1, on or off. This uses function 22. If the device does not support it, write the whole register.",
 };
-const TYPED_HELP = () => "Separate values for consecutive registers with commas.";
+const TYPED_HELP = () => "With a decimal point, as in 21.5. Separate values for consecutive registers with semicolons.";
 const MOST_REVIEWED = 16;
 
 /** Reasons of errors that occur before anything is sent to the device. */
@@ -46,21 +47,26 @@ export class Writer {
   }
 
   /**
-   * Opens the dialog for an address of a range. Resolves to `written`, `refused` or `unknown`, or
-   * to null when nothing was sent.
+   * Opens the dialog for an address of a range or a tag. Resolves to `written`, `refused` or
+   * `unknown`, or to null when nothing was sent.
    */
-  ask(range, address) {
-    const asked = { range, address, change: null, sending: null, outcome: null };
+  ask(target) {
+    const { part, tag, area, address, ofBits } = target;
+    const asked = { ...target, device: part.device, change: null, sending: null, outcome: null };
     this.asked = asked;
-    const { host, port, unitId } = range.device;
-    const what = range.ofBits ? "coil" : "holding register";
-    $("write-title").textContent = `Write ${what} ${address}`;
-    $("write-where").textContent = `${modicon(range.area, address)} of unit ${unitId} at ${host}:${port}`;
-    const forms = range.ofBits ? [["bit", "bit"]] : [["register", "plain register"], ["typed", range.type.name]];
+    const { host, port, unitId } = part.device;
+    const what = ofBits ? "coil" : "holding register";
+    $("write-title").textContent = tag ? `Write ${tag.name}` : `Write ${what} ${address}`;
+    $("write-where").textContent = `${tag ? placed(tag) : modicon(area, address)} of unit ${unitId} at ${host}:${port}`;
+    const forms = tag ? [["tag", "tag"]] : ofBits ? [["bit", "bit"]] : [["register", "plain register"], ["typed", part.type.name]];
     $("write-as").replaceChildren(...forms.map(([value, text]) => h("option", { value }, text)));
-    $("write-as-label").hidden = range.ofBits;
-    const plain = ["int16", "uint16"].includes(range.type.kind);
-    if (!plain && (address - range.address) % range.width === 0) $("write-as").value = forms.at(-1)[0];
+    $("write-as-label").hidden = ofBits || tag !== null;
+    const plain = !tag && ["int16", "uint16"].includes(part.type.kind);
+    if (!tag && !plain && (address - part.address) % part.width === 0) $("write-as").value = forms.at(-1)[0];
+    const states = Object.values(tag?.states ?? {});
+    $("write-states").replaceChildren(...states.map((value) => h("option", { value })));
+    if (states.length > 0) $("write-value").setAttribute("list", "write-states");
+    else $("write-value").removeAttribute("list");
     $("write-value").value = "";
     $("write-error").replaceChildren();
     this.back();
@@ -76,11 +82,11 @@ export class Writer {
   }
 
   help() {
-    const { range } = this.asked;
+    const { part, tag, ofBits } = this.asked;
     const typed = $("write-as").value === "typed";
-    const kind = typed ? range.type.kind : "register";
-    $("write-help").textContent = range.ofBits ? BITS_HELP : (HELP[kind] ?? TYPED_HELP)(range.type);
-    $("write-value").required = !(typed && kind === "string");
+    const kind = typed ? part.type.kind : "register";
+    $("write-help").textContent = tag ? tagHelp(tag) : ofBits ? BITS_HELP : (HELP[kind] ?? TYPED_HELP)(part.type);
+    $("write-value").required = !(typed && kind === "string") && !/^string/.test(tag?.type ?? "");
   }
 
   /** Returns to the first step. */
@@ -97,9 +103,15 @@ export class Writer {
     return this.asked === asked && this.dialog.open;
   }
 
+  /** Says what the dialog waits for. Until then, its button does nothing. */
+  wait(text) {
+    $("write-wait").textContent = text;
+  }
+
   step(asked) {
     return once($("write-go"), async () => {
       $("write-error").replaceChildren();
+      this.wait(asked.change ? "Writing…" : "Reading the current value…");
       try {
         if (!asked.change) {
           await this.review(asked);
@@ -111,20 +123,23 @@ export class Writer {
         if (this.isAbout(asked)) $("write-error").replaceChildren(error instanceof Problem ? notice(error) : error.message);
       } finally {
         asked.sending = null;
+        if (this.asked === asked) this.wait("");
       }
     });
   }
 
   /** Reads the current values, and shows them beside the new ones. */
   async review(asked) {
-    const change = wanted(asked.range, $("write-as").value, $("write-value").value);
+    const change = asked.tag
+      ? await ofTag(asked, $("write-value").value)
+      : wanted(asked.part, $("write-as").value, $("write-value").value);
     change.before = await this.read(asked, change);
     if (!this.isAbout(asked)) return;
     asked.change = change;
     const { form, step, shown, before } = change;
     $("write-review").replaceChildren(form === "register" && shown.length === 1
       ? table("by-row", [h("span", { class: "unseen" }, "When"), "Decimal", "Hex", "Binary"], forms(before[0], shown[0]))
-      : table("by-column", ["Address", "Now", "New"], shown.map((value, at) => [String(asked.address + at * step), inWords(before[at]), inWords(value)])));
+      : table("by-column", [asked.tag ? "Tag" : "Address", "Now", "New"], shown.map((value, at) => [asked.tag ? asked.tag.name : String(asked.address + at * step), inWords(before[at]), inWords(value)])));
     $("write-review").hidden = false;
     $("write-ask").hidden = true;
     $("write-go").textContent = "Write it";
@@ -154,11 +169,42 @@ export class Writer {
   }
 
   /** Reads the addresses of a change. */
-  async read({ range, address }, { count, typed }) {
-    const { most } = areaOf(range.area);
+  async read({ device, part, tag, area, address }, { count, typed }) {
+    if (tag) return readTag(part, tag);
+    const { most } = areaOf(area);
     if (count > most) throw new Error(`too many values: ${count}, at most ${most}`);
-    const found = await post("/api/modbus/read", { ...range.device, functionCode: range.area, address, quantity: count, ...typed });
+    const found = await post("/api/modbus/read", { ...device, functionCode: area, address, quantity: count, ...typed });
     return found.typedText ?? found.values;
+  }
+}
+
+function tagHelp({ unit, min, max, states, type }) {
+  const names = Object.values(states);
+  const limits = [min === null ? "" : `from ${min}`, max === null ? "" : `to ${max}`].filter(Boolean).join(" ");
+  return [
+    names.length > 0 ? `One of ${names.join(", ")}.` : type === "bool" || type.startsWith("bit") ? "0, 1, on or off." : "A number, with a decimal point.",
+    unit ? `In ${unit}.` : "",
+    limits ? `Allowed: ${limits}.` : "",
+  ].filter(Boolean).join(" ");
+}
+
+/** Reads the value of one tag as text. */
+async function readTag(part, tag) {
+  const body = JSON.stringify({ ...part.device, parts: [{ ...part.source, only: [tag.name] }], once: true, describe: false });
+  let own = null;
+  await stream("/api/modbus/watch/view", { method: "POST", body, patience: part.device.timeout }, (_, data) => ([own] = data.parts));
+  const error = own?.error ?? own?.errors?.[0];
+  if (own === null || error) throw new Problem(own?.reason ?? "exception", error ?? "the gateway sent no value");
+  return own.texts;
+}
+
+/** Lets the gateway check the value of a tag, which is scaled there. */
+async function ofTag({ part, tag }, text) {
+  try {
+    const { form, values, text: shown } = await post("/api/gateway/tags/value", { ...part.source, name: tag.name, value: text });
+    return { form, shown: [shown], json: values, step: 1, count: tag.count, typed: {} };
+  } catch (error) {
+    throw error.reason === "malformed" ? new Error(error.message) : error;
   }
 }
 
@@ -166,10 +212,11 @@ export class Writer {
 function wanted(range, form, text) {
   const { type, order } = range;
   if (form !== "typed") {
-    const shown = text.split(",").map(form === "bit" ? bit : register);
+    // Bits have no decimals, so a comma between them separates.
+    const shown = form === "bit" ? text.split(/[;,]/).map(bit) : separated(text).map(register);
     return { form, shown, json: shown, step: 1, count: shown.length, typed: {} };
   }
-  const parts = type.kind === "string" ? [text] : text.split(",");
+  const parts = type.kind === "string" ? [text] : type.kind === "bytes" ? text.split(/[;,]/) : separated(text);
   if (type.kind === "bit" && parts.length > 1) throw new Error("Write one bit at a time");
   const values = parts.map((part) => literal(part, type));
   return {
@@ -183,9 +230,10 @@ function wanted(range, form, text) {
 }
 
 /** Returns the path and the body of the request for a change. */
-function request({ range, address, change }) {
-  const about = { ...range.device, address };
+function request({ device, part: range, address, change }) {
+  const about = { ...device, address };
   const { form, json, typed } = change;
+  if (form === "mask") return ["/api/modbus/write/mask", { ...about, andMask: json[0], orMask: json[1] }];
   if (form === "typed" && range.type.kind === "bit") {
     const swapped = ["BADC", "DCBA"].includes(range.order) ? 8 : 0;
     const mask = 1 << (range.type.size ^ swapped);
@@ -195,7 +243,7 @@ function request({ range, address, change }) {
     const more = JSON.stringify({ ...about, ...typed });
     return ["/api/modbus/write/registers", `${more.slice(0, -1)},"values":[${json.join()}]}`];
   }
-  const [one, many] = form === "bit" ? ["coil", "coils"] : ["register", "registers"];
+  const [one, many] = form === "bit" || form === "coils" ? ["coil", "coils"] : ["register", "registers"];
   return json.length === 1
     ? [`/api/modbus/write/${one}`, { ...about, value: json[0] }]
     : [`/api/modbus/write/${many}`, { ...about, values: json }];

@@ -1,0 +1,93 @@
+// The history of a value: an hour, with a gap wherever there was no value.
+
+/** The longest time that is kept, in seconds. */
+export const SPAN = 3600;
+/** Newer points are all kept; of older ones, the extremes of each bucket. */
+const RECENT = 120;
+const BUCKET = 2;
+const SLACK = 500;
+const MOMENT = 0.001;
+
+/** Points in order of time; a value of null begins a gap. */
+export class History {
+  constructor() {
+    this.times = [];
+    this.values = [];
+    /** When the last value was confirmed. Later, nothing is known. */
+    this.until = 0;
+    this.compact = SLACK;
+  }
+
+  /** Takes the value that was read at a time in seconds. */
+  take(time, value) {
+    if (value !== this.values.at(-1)) this.push(time, value);
+    this.until = time;
+  }
+
+  /** Ends the line at the last confirmed value. */
+  gap() {
+    if (this.values.length === 0 || this.values.at(-1) === null) return;
+    this.push(this.until, this.values.at(-1));
+    this.push(this.until + MOMENT, null);
+  }
+
+  push(time, value) {
+    this.times.push(time);
+    this.values.push(value);
+    if (this.times.length >= this.compact) {
+      this.decimate(time);
+      this.compact = this.times.length + SLACK;
+    }
+  }
+
+  /** Forgets what is too old, and thins out what is no longer recent. */
+  decimate(now) {
+    const kept = [];
+    let at = this.times.findLastIndex((time) => time < now - SPAN);
+    at = Math.max(0, at);
+    while (at < this.times.length && this.times[at] < now - RECENT) {
+      const bucket = Math.floor(this.times[at] / BUCKET);
+      let end = at;
+      while (end < this.times.length && Math.floor(this.times[end] / BUCKET) === bucket) end += 1;
+      kept.push(...extremes(this.values, at, end));
+      at = end;
+    }
+    while (at < this.times.length) kept.push(at++);
+    this.times = kept.map((each) => this.times[each]);
+    this.values = kept.map((each) => this.values[each]);
+  }
+
+  /** Returns the points to draw: times, and values with null for gaps. */
+  points() {
+    const last = this.values.at(-1);
+    if (last === undefined || last === null) return [this.times, this.values];
+    return [[...this.times, this.until], [...this.values, last]];
+  }
+
+  /** Returns the gaps as pairs of times; the last one may have no end. */
+  gaps() {
+    const found = [];
+    this.values.forEach((value, at) => {
+      if (value === null) found.push([this.times[at], this.times[at + 1] ?? null]);
+    });
+    return found;
+  }
+}
+
+/** Returns the indexes of the first, least, greatest and last value from `start` to `end`, and of a gap. */
+function extremes(values, start, end) {
+  const found = new Set([start, end - 1]);
+  let least = -1;
+  let greatest = -1;
+  let gap = -1;
+  for (let at = start; at < end; at += 1) {
+    if (values[at] === null) {
+      if (gap < 0) gap = at;
+    } else {
+      if (least < 0 || values[at] < values[least]) least = at;
+      if (greatest < 0 || values[at] > values[greatest]) greatest = at;
+    }
+  }
+  for (const at of [least, greatest, gap]) if (at >= 0) found.add(at);
+  return [...found].sort((a, b) => a - b);
+}

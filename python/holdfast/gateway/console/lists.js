@@ -1,0 +1,64 @@
+// The dialog that adds a tag list to the view: a profile, a file, or pasted text.
+
+import { get, post } from "./api.js";
+import { $, h, once } from "./dom.js";
+import { list } from "./parts.js";
+
+/** Returns the format of a tag list. */
+const formatOf = (name, text) => (/\.csv$/i.test(name) || !/^\s*(order|tags)\s*:/m.test(text) ? "csv" : "yaml");
+
+/** The dialog for tag lists. `add` takes the part that was chosen. */
+export class Lists {
+  constructor(add) {
+    this.add = add;
+    this.dialog = $("tags-dialog");
+    this.name = "";
+    $("tags-file").addEventListener("change", async () => {
+      const [file] = $("tags-file").files;
+      if (!file) return;
+      this.name = file.name;
+      $("tags-text").value = await file.text();
+      $("tags-profile").value = "";
+      this.adapt();
+    });
+    $("tags-profile").addEventListener("change", () => this.adapt());
+    $("tags-cancel").addEventListener("click", () => this.dialog.close());
+    this.dialog.querySelector("form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      once($("tags-go"), () => this.take());
+    });
+  }
+
+  /** Opens the dialog, with the profiles of the configuration. */
+  async ask() {
+    this.name = "";
+    $("tags-file").value = $("tags-text").value = $("tags-error").textContent = "";
+    $("tags-profile").replaceChildren(h("option", { value: "" }, "None: the text below"));
+    this.adapt();
+    this.dialog.showModal();
+    const { profiles } = await get("/api/gateway/profiles").catch(() => ({ profiles: [] }));
+    $("tags-profile").append(...profiles.map(({ name, tags }) => h("option", { value: name }, `${name} (${tags} tags)`)));
+    this.adapt();
+  }
+
+  adapt() {
+    $("tags-profile").closest("label").hidden = $("tags-profile").options.length === 1;
+    $("tags-text").required = $("tags-profile").value === "";
+    for (const id of ["tags-file", "tags-text"]) $(id).closest("label").hidden = $("tags-profile").value !== "";
+  }
+
+  /** Lets the gateway check the list, and adds it. */
+  async take() {
+    const profile = $("tags-profile").value;
+    const text = $("tags-text").value;
+    const source = profile ? { profile } : { tags: text, format: formatOf(this.name, text) };
+    $("tags-error").textContent = "";
+    try {
+      const { tags } = await post("/api/gateway/tags", source);
+      this.dialog.close();
+      this.add(list(profile || this.name || `${tags.length} ${tags.length === 1 ? "tag" : "tags"}`, source));
+    } catch (error) {
+      $("tags-error").textContent = error.message;
+    }
+  }
+}

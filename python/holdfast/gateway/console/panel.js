@@ -1,0 +1,96 @@
+// What the tables of ranges and of tag lists have in common: values, errors, age, and marks.
+
+import { meaning } from "./api.js";
+import { h } from "./dom.js";
+
+const MARKED = 1500;
+
+/** The values of one part of a view. `render(index, mark)` shows one of them. */
+export class Panel {
+  constructor(part) {
+    this.part = part;
+    this.values = [];
+    this.texts = [];
+    this.errors = new Map();
+    this.isStale = true;
+    this.time = null;
+    const { host, port, unitId } = part.device;
+    this.where = `${host}:${port}, unit ${unitId}`;
+    this.heading = h("h3", { hidden: part.kind === "range" }, part.title);
+    this.age = h("p", { class: "age" });
+    this.why = h("p", { class: "why", hidden: true });
+    this.place = h("section", { class: "panel", "aria-label": part.title }, this.heading, this.age, this.why);
+  }
+
+  /** Adds the table. */
+  fill(root) {
+    this.root = root;
+    this.place.append(root);
+  }
+
+  /** Sets all values. With `mark`, changes are marked. */
+  set({ values, texts, errors }, mark) {
+    const all = (list) => list.map((each, index) => [index, each]);
+    const gone = [...this.errors.keys()].map((index) => [index, errors[index] ?? null]);
+    const there = Object.entries(errors).map(([index, error]) => [Number(index), error]);
+    return this.change({ values: all(values), texts: all(texts), errors: [...gone, ...there] }, mark);
+  }
+
+  /** Takes pairs of index and value. Returns the cells of the values that changed. */
+  change({ values = [], texts = [], errors = [] }, mark = true) {
+    const changed = new Set();
+    const take = (known, pairs) => {
+      for (const [index, value] of pairs) {
+        if (known[index] !== value) changed.add(index);
+        known[index] = value;
+      }
+    };
+    for (const [index, error] of errors) {
+      const place = this.placeOf(index);
+      if ((this.errors.get(index) ?? null) !== error) changed.add(place);
+      if (error === null) this.errors.delete(index);
+      else this.errors.set(index, error);
+    }
+    take(this.values, values);
+    const renamed = new Set();
+    for (const [index, text] of texts) {
+      if (this.texts[index] !== text) renamed.add(this.placeOf(index));
+      this.texts[index] = text;
+    }
+    const all = new Set([...changed, ...renamed]);
+    for (const index of all) this.render(index, mark);
+    return [...all].flatMap((index) => this.cellsOf(index));
+  }
+
+  /** Returns the index in `values` of an index in `texts`. */
+  placeOf(index) {
+    return index;
+  }
+
+  mark(cell) {
+    cell.classList.add("changed");
+    clearTimeout(cell.fading);
+    cell.fading = setTimeout(() => cell.classList.remove("changed"), MARKED);
+  }
+
+  /** Marks the values as current, as of a time in milliseconds. */
+  fresh(time) {
+    this.time = time;
+    this.isStale = false;
+    this.aged(`Values of ${this.where}.`, null);
+  }
+
+  /** Marks the values as stale, and shows what to do or why. */
+  stale(what = "Connect to read or write.", error = null) {
+    this.isStale = true;
+    this.aged(`Stale values of ${this.where}. ${what}`, error);
+  }
+
+  aged(text, error) {
+    this.root.classList.toggle("stale", this.isStale);
+    this.age.classList.toggle("old", this.isStale);
+    if (this.age.textContent !== text) this.age.textContent = text;
+    this.why.hidden = error === null;
+    if (error !== null) this.why.textContent = `${meaning(error)} (${error.message})`;
+  }
+}

@@ -1,0 +1,495 @@
+"""Views in the console: several parts, gaps, many tabs, links, and downloads, in a real browser."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from playwright.sync_api import expect
+
+from holdfast.tags import Tag, TagList
+from support import gateway_pages
+from support.fake_device import HANG_UP, FakeDevice, registers
+from support.gateway_pages import DESK, Opened, View, browsing, floats, opening
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from playwright.sync_api import Browser, Download, Page
+
+    import holdfast
+
+NARROW: Any = {"viewport": {"width": 320, "height": 640}, "has_touch": True}
+METER = """\
+tags:
+  room: {area: holding_registers, address: 4, scale: 0.1, unit: °C,
+         writable: true, min: 5, max: 300}
+  state: {area: holding_registers, address: 5, states: {0: off, 2: fault}, writable: true}
+  lamp: {area: coils, address: 2, writable: true}
+  absent: {area: input_registers, address: 5}
+"""
+TANK = TagList([Tag("level", "input_registers", 1002, "int16", unit="mm")])
+WATCHES = 7
+"""More tabs than the connections that a browser opens to one host."""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing() as launched:
+        yield launched
+
+
+@pytest.fixture
+def plant() -> holdfast.Memory:
+    return gateway_pages.plant()
+
+
+@pytest.fixture
+def opened(browser: Browser, plant: holdfast.Memory) -> Iterator[Opened]:
+    with opening(browser, plant, model="Feeder 7") as pages:
+        yield pages
+
+
+def add_tags(view: View, text: str) -> None:
+    view.button("Add tag list…").click()
+    view.page.get_by_role("textbox", name="YAML or CSV").fill(text)
+    view.button("Add").click()
+    expect(view.page.get_by_role("dialog")).to_be_hidden()
+
+
+def connected(opened: Opened, size: Any = DESK, **settings: Any) -> View:
+    view = opened(size, **settings)
+    view.connect()
+    view.says("The device responded")
+    return view
+
+
+def tag(view: View, name: str) -> Any:
+    """Returns the value of a tag in the table."""
+    return view.page.locator(f"tr[data-tag='{name}'] .typed")
+
+
+def saved(download: Download) -> list[dict[str, str]]:
+    text = Path(download.path()).read_text(encoding="utf-8-sig")
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+# Several parts.
+
+
+@pytest.mark.parametrize("size", [DESK, NARROW], ids=["desk", "narrow"])
+def test_ranges_and_tags_are_watched_in_one_stream(
+    opened: Opened, plant: holdfast.Memory, size: Any
+) -> None:
+    view = connected(opened, size, profiles={"tank": TANK})
+    view.choose(area="1", quantity="4", interval="50")
+    view.button("Add range to view").click()
+    add_tags(view, METER)
+    view.button("Add tag list…").click()
+    view.page.get_by_role("combobox", name="Profile of the configuration").select_option("tank")
+    view.button("Add").click()
+    plant.write("holding_registers", 4, [215, 2])
+    view.button("Watch").click()
+    view.says("Watching 3 parts, every 50 ms.")
+    expect(tag(view, "room")).to_have_text("21.5")
+    expect(tag(view, "state")).to_have_text("fault")
+    expect(tag(view, "absent")).to_contain_text("Illegal Data Address")
+    expect(tag(view, "level")).to_have_text("0")
+    expect(view.button("Coil 2: 1, on")).to_be_visible()
+    plant.write("holding_registers", 4, [220])
+    expect(tag(view, "room")).to_have_text("22.0")
+    plot = view.page.get_by_role("article").filter(
+        has=view.page.get_by_role("heading", name="room")
+    )
+    expect(plot.get_by_role("status")).to_have_text("22.0 °C")
+    assert len([url for url in view.requests if url.endswith("/watch/view")]) == 1
+    view.check()
+
+
+def test_a_part_is_removed_from_the_view(opened: Opened) -> None:
+    view = connected(opened)
+    view.choose(quantity="4", interval="50")
+    view.button("Add range to view").click()
+    add_tags(view, METER)
+    view.button("Watch").click()
+    view.says("Watching 2 parts")
+    view.button("Remove Holding registers 0 to 3 from the view").click()
+    view.says("Watching 4 tags, every 50 ms.")
+    expect(view.row(0)).to_have_count(0)
+
+
+def test_a_list_with_errors_is_not_added(opened: Opened) -> None:
+    view = connected(opened)
+    view.button("Add tag list…").click()
+    box = view.page.get_by_role("textbox", name="YAML or CSV")
+    box.fill("name,area,address,type\na,hr,0,uint99\n")
+    view.button("Add").click()
+    alert = view.page.get_by_role("alert").filter(has_text="tags:2: tags.a.type")
+    expect(alert).to_be_visible()
+    box.fill("name,area,address,type\na,hr,0,uint16\n")
+    view.button("Add").click()
+    expect(view.button("Remove 1 tag from the view")).to_be_visible()
+
+
+def test_a_file_is_added(opened: Opened, tmp_path: Path) -> None:
+    view = connected(opened)
+    view.button("Add tag list…").click()
+    file = tmp_path / "meter.yaml"
+    file.write_text(METER, encoding="utf-8")
+    view.page.locator("#tags-file").set_input_files(file)
+    expect(view.page.get_by_role("textbox", name="YAML or CSV")).to_have_value(METER)
+    view.button("Add").click()
+    view.button("Read").click()
+    view.says("meter.yaml: read in")
+    expect(tag(view, "room")).to_have_text("123.4")
+
+
+# Writing.
+
+
+def test_a_tag_is_written_in_its_unit(opened: Opened, plant: holdfast.Memory) -> None:
+    view = connected(opened)
+    add_tags(view, METER)
+    view.button("Read").click()
+    for text, says in (("21,5", "decimal comma"), ("301", "is outside 5.0 to 300.0")):
+        view.button("Write room").click()
+        view.page.get_by_role("textbox", name="New value").fill(text)
+        view.button("Review").click()
+        expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
+        expect(view.button("Write it")).to_be_hidden()
+        view.button("Cancel").click()
+    view.button("Write room").click()
+    view.says("In °C. Allowed: from 5 to 300.")
+    view.page.get_by_role("textbox", name="New value").fill("21.5")
+    view.button("Review").click()
+    expect(view.page.get_by_role("row", name="room 123.4 21.5")).to_be_visible()
+    assert plant.read("holding_registers", 4, 1) == [1234]
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 4, 1) == [215]
+    expect(tag(view, "room")).to_have_text("21.5")
+
+
+def test_states_and_bits_of_tags_are_written(opened: Opened, plant: holdfast.Memory) -> None:
+    view = connected(opened)
+    add_tags(view, METER)
+    view.button("Read").click()
+    for name, text in (("state", "fault"), ("lamp", "off")):
+        view.button(f"Write {name}").click()
+        view.page.locator("#write-value").fill(text)
+        view.button("Review").click()
+        view.button("Write it").click()
+        view.says("Written and read back")
+    assert plant.read("holding_registers", 5, 1) == [2]
+    assert plant.read("coils", 2, 1) == [0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "says"),
+    [
+        ("float32", "21,5", "“21,5” has a decimal comma. Write 21.5 for one value"),
+        ("uint16", "21,5", "has a decimal comma"),
+        ("float32", "1e40", "“1e40” does not fit float32"),
+        ("float32", "1e-60", "is too small for float32"),
+        ("float16", "65520", "does not fit float16"),
+        ("float64", "1e400", "does not fit float64"),
+        ("int16", "32768", "is not a valid int16"),
+    ],
+)
+def test_a_value_is_checked_before_it_is_reviewed(
+    opened: Opened, plant: holdfast.Memory, kind: str, text: str, says: str
+) -> None:
+    before = plant.read("holding_registers", 8, 8)
+    view = connected(opened)
+    view.choose(type=kind, address="8", quantity="4")
+    view.button("Read").click()
+    view.button("Write 8").click()
+    view.page.locator("#write-as").select_option("typed")
+    view.page.get_by_role("textbox", name="New value").fill(text)
+    view.button("Review").click()
+    expect(view.page.get_by_role("alert").filter(has_text=says)).to_be_visible()
+    expect(view.button("Write it")).to_be_hidden()
+    assert plant.read("holding_registers", 8, 8) == before
+
+
+def test_values_are_separated_by_semicolons(opened: Opened, plant: holdfast.Memory) -> None:
+    view = connected(opened)
+    view.choose(type="float16", address="8", quantity="4")
+    view.button("Read").click()
+    view.button("Write 8").click()
+    view.page.get_by_role("textbox", name="New value").fill("65504; -0.5;1e-7")
+    view.button("Review").click()
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 8, 3) == [0x7BFF, 0xB800, 0x0002]
+
+
+def test_a_dialog_that_waits_says_so(opened: Opened) -> None:
+    view = connected(opened)
+    view.choose(type="uint16")
+    view.button("Read").click()
+    view.says("read in")
+    view.page.route("**/api/modbus/read", lambda _: None)
+    view.button("Write 4").click()
+    view.page.get_by_role("textbox", name="New value").fill("5")
+    view.button("Review").click()
+    view.says("Reading the current value…")
+
+
+# Gaps and old values.
+
+
+class Meter:
+    """A device with one changing register, which can be switched off."""
+
+    def __init__(self) -> None:
+        self.value = 0
+        self.is_off = False
+
+    def __call__(self, pdu: bytes) -> Any:
+        self.value += 1
+        return HANG_UP if self.is_off else registers(pdu, self.value)
+
+
+def watched(opened: Opened, port: int) -> View:
+    """Watches the only register of a device."""
+    view = opened()
+    view.connect(port=port)
+    view.says("The device responded")
+    view.choose(type="uint16", quantity="1", interval="50")
+    view.button("Watch").click()
+    view.says("Watching holding registers 0 to 0")
+    return view
+
+
+def test_a_plot_has_a_gap_while_there_is_no_value(opened: Opened) -> None:
+    meter = Meter()
+    with FakeDevice(meter) as device:
+        view = watched(opened, device.port)
+        plot = view.page.get_by_role("article")
+        expect(view.page.get_by_role("img", name="Plot of 0", exact=True)).to_be_visible()
+        meter.is_off = True
+        view.says("Retrying…")
+        view.says("no value since")
+        expect(plot).to_have_class("plot old")
+        bold = "(each) => getComputedStyle(each).fontWeight"
+        assert plot.get_by_role("status").evaluate(bold) == "400"
+        view.says("Stale values of")
+        meter.is_off = False
+        expect(plot).to_have_class("plot")
+        view.says("Watching holding registers 0 to 0")
+        expect(view.page.get_by_role("img", name="Plot of 0, 1 gap")).to_be_visible()
+        with view.page.expect_download() as found:
+            view.button("Download plots as CSV").click()
+        rows = saved(found.value)
+        assert [row["name"] for row in rows] == ["0"] * len(rows)
+        missing = [at for at, row in enumerate(rows) if row["value"] == ""]
+        assert len(missing) == 1
+        assert 0 < missing[0] < len(rows) - 1
+        assert [row["time"] for row in rows] == sorted(row["time"] for row in rows)
+
+
+def test_a_plot_of_an_invalid_value_has_a_gap(opened: Opened, plant: holdfast.Memory) -> None:
+    plant.write("holding_registers", 0, [0x1234])
+    view = connected(opened)
+    view.choose(type="bcd16", quantity="1", interval="50")
+    view.button("Watch").click()
+    view.says("Watching")
+    view.button("Plot 0").click()
+    plot = view.page.get_by_role("article")
+    expect(plot.get_by_role("status")).to_have_text("1234")
+    plant.write("holding_registers", 0, [0x12AB])
+    view.says("no value since")
+    plant.write("holding_registers", 0, [0x0042])
+    expect(plot.get_by_role("status")).to_have_text("42")
+    expect(view.page.get_by_role("img", name="Plot of 0, 1 gap")).to_be_visible()
+
+
+HOUR = """
+async () => {
+  const { History } = await import("/console/history.js");
+  const history = new History();
+  for (let at = 0; at < 40000; at += 1) history.take(at / 10, at === 20000 ? 1e6 : at % 100);
+  const before = history.times.length;
+  history.gap();
+  history.take(4100, 7);
+  const [times, values] = history.points();
+  const most = Math.max(...values);
+  return { before, first: times[0], last: times.at(-1), most, gaps: history.gaps() };
+}
+"""
+
+
+def test_an_hour_is_kept_with_its_extremes(opened: Opened) -> None:
+    found = opened().page.evaluate(HOUR)
+    assert found["before"] < 12_000
+    assert found["first"] <= 400
+    assert (found["last"], found["most"]) == (4100, 1e6)
+    assert found["gaps"] == [[pytest.approx(3999.901), 4100]]
+
+
+# Many tabs.
+
+
+def test_more_tabs_than_connections_watch_and_write(opened: Opened, plant: holdfast.Memory) -> None:
+    view = connected(opened)
+    view.choose(type="uint16", address="4", quantity="2", interval="100")
+    view.button("Watch").click()
+    view.says("Watching")
+    link = view.page.url
+    pages: list[Page] = [view.page]
+    for _ in range(WATCHES - 1):
+        page = view.page.context.new_page()
+        page.goto(link)
+        expect(page.get_by_text("Watching holding registers 4 to 5")).to_be_visible()
+        pages.append(page)
+    last = pages[-1]
+    expect(last.get_by_text("Other tabs use the streams")).to_be_visible()
+    last.get_by_role("button", name="Write 4", exact=True).click()
+    last.get_by_role("textbox", name="New value").fill("4711")
+    last.get_by_role("button", name="Review", exact=True).click()
+    last.get_by_role("button", name="Write it", exact=True).click()
+    expect(last.get_by_text("Written. The watch continues.")).to_be_visible()
+    assert plant.read("holding_registers", 4, 1) == [4711]
+    for page in pages:
+        cell = page.locator("tr[data-address='4'] td").first
+        expect(cell).to_have_text("4711")
+    for page in pages[1:-1]:
+        page.close()
+    expect(last.get_by_text("Other tabs use the streams")).to_be_hidden()
+    expect(last.get_by_text("Watching holding registers 4 to 5")).to_be_visible()
+
+
+# The link.
+
+
+def test_the_whole_view_is_in_the_link(opened: Opened) -> None:
+    view = connected(opened)
+    view.choose(area="4", address="1000", quantity="4", type="bit", size="3", interval="150")
+    view.button("Add range to view").click()
+    add_tags(view, METER)
+    view.button("Watch").click()
+    view.says("Watching 2 parts, every 150 ms.")
+    view.button("Plot room").click()
+    view.page.get_by_role("combobox", name="Time span").select_option("3600")
+    expect(view.button("Remove the plot of room")).to_be_visible()
+    view.page.reload()
+    view.says("Watching 2 parts, every 150 ms.")
+    expect(view.button("Remove the plot of room")).to_be_visible()
+    expect(view.page.get_by_role("combobox", name="Time span")).to_have_value("3600")
+    expect(view.page.get_by_role("combobox", name="Area")).to_have_value("4")
+    expect(view.page.locator("#size")).to_have_value("3")
+    expect(view.page.locator("tr[data-address='1000'] .typed")).to_have_text("false")
+    expect(tag(view, "room")).to_have_text("123.4")
+    view.button("Stop").click()
+    view.page.reload()
+    expect(view.page.get_by_text("The device responded")).to_be_hidden()
+    view.button("Connect").click()
+    view.says("The device responded")
+    expect(view.page.locator("#size")).to_have_value("3")
+    expect(view.button("Remove 4 tags from the view")).to_be_visible()
+    expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
+
+
+def test_a_damaged_link_is_told(opened: Opened) -> None:
+    view = opened()
+    view.page.goto(
+        f"{view.gateway.url}/?again#part=yaml,x,AAAA&part=3,65530,10,uint16,ABCD&part=9,9"
+    )
+    view.connect()
+    view.says("The device responded")
+    expect(view.page.locator("#parts li")).to_have_count(0)
+    view.button("Read").click()
+    view.says("Holding registers 0 to 9: read in")
+
+
+# Downloads.
+
+
+def test_what_is_shown_is_downloaded(opened: Opened, plant: holdfast.Memory) -> None:
+    plant.write("holding_registers", 0, floats(21.5))
+    plant.write("holding_registers", 8, [0x3D31, 0])  # "=1"
+    view = connected(opened)
+    view.choose(quantity="4")
+    view.button("Add range to view").click()
+    view.choose(address="8", quantity="1", type="string", size="2")
+    view.button("Add range to view").click()
+    add_tags(view, METER)
+    view.button("Read").click()
+    view.says("3 of 3 parts: read in")
+    with view.page.expect_download() as found:
+        view.button("Download values as CSV").click()
+    rows = saved(found.value)
+    shown = [(row["name"], row["address"], row["value"], row["unit"], row["state"]) for row in rows]
+    assert shown[:2] == [("", "0", "21.5", "", "current"), ("", "2", "1.013", "", "current")]
+    assert ("", "8", "'=1", "", "current") in shown
+    assert ("room", "4", "123.4", "°C", "current") in shown
+    assert "Illegal Data Address" in rows[-1]["error"]
+    assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT[\d:.]+Z", row["time"]) for row in rows)
+
+
+# Narrow screens.
+
+
+@pytest.mark.parametrize("area", ["1", "3"])
+def test_nothing_is_cut_at_320_pixels(opened: Opened, area: str) -> None:
+    view = connected(opened, NARROW)
+    view.choose(area=area, quantity="40", interval="50")
+    view.button("Watch").click()
+    view.says("Watching")
+    view.page.get_by_role("tab", name="Map").click()
+    view.button("Map device").click()
+    view.says("Done in")
+    view.check()
+    view.page.get_by_role("tab", name="Values").click()
+    assert view.page.evaluate(CLIPPED) == []
+    assert view.page.evaluate(SMALL) == []
+
+
+CLIPPED = """
+[...document.querySelectorAll("button, input, select, h1, h3, p, label, td, th, output")]
+  .filter((each) => each.checkVisibility() && !each.closest(".unseen, .skip"))
+  .filter((each) => {
+    const box = each.getBoundingClientRect();
+    return box.width > 0 && (box.left < -1 || box.right > innerWidth + 1);
+  }).map((each) => each.outerHTML.slice(0, 100))
+"""
+SMALL = """
+[...document.querySelectorAll(".bit")].filter((each) => {
+  const box = each.getBoundingClientRect();
+  return box.width < 24 || box.height < 24;
+}).map((each) => each.outerHTML)
+"""
+"""Bits that are smaller than a target may be."""
+
+
+# The map.
+
+
+def test_a_map_tells_absent_from_not_asked_and_zooms(opened: Opened) -> None:
+    view = connected(opened)
+    view.page.get_by_role("tab", name="Map").click()
+    view.button("Map device").click()
+    view.says("Done in")
+    picture = view.page.get_by_role("article").filter(has_text="Holding registers")
+    name = re.compile("300 addresses in 1 ranges, [0-9,]+ asked and absent, [0-9,]+ not asked")
+    canvas = picture.get_by_role("img", name=name)
+    expect(canvas).to_be_visible()
+    expect(picture.get_by_text("64 addresses per cell")).to_be_visible()
+    canvas.click(position={"x": 2, "y": 2})
+    expect(picture.get_by_text("8 addresses per cell")).to_be_visible()
+    expect(picture.locator(".scale")).to_contain_text("8191")
+    view.button("Higher addresses: holding registers").click()
+    expect(picture.locator(".scale")).to_contain_text("4096")
+    view.button("Lower addresses: holding registers").click()
+    canvas.click(position={"x": 2, "y": 2})
+    expect(picture.get_by_text("1 address per cell")).to_be_visible()
+    canvas.hover(position={"x": 2, "y": 2})
+    expect(canvas).to_have_attribute("title", "0: 1 valid, 0 absent, 0 not asked")
+    for _ in range(2):
+        view.button("Zoom out: holding registers").click()
+    expect(picture.locator(".scale")).to_contain_text("65535")
