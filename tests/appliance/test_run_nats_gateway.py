@@ -152,6 +152,27 @@ def test_requests_need_a_token_where_there_are_some(run: Run, server: holdfast.S
     assert ask(appliance, "/read", read(server), "secret").status == 200
 
 
+PROFILES = """
+profiles:
+  tank:
+    tags:
+      level: {area: holding_registers, address: 5, scale: 0.1, unit: mm}
+"""
+
+
+def test_profiles_can_be_viewed_by_name(
+    run: Run, server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 5, [215])
+    appliance = run(gateway_section() + PROFILES)
+    target = {"host": "127.0.0.1", "port": server.address[1]}
+    body = {**target, "parts": [{"profile": "tank", "only": ["level"]}], "once": True}
+    answer = ask(appliance, "/watch/view", body)
+    assert answer.status == 200
+    data = answer.body.decode().partition("data: ")[2]
+    assert json.loads(data)["parts"][0]["texts"] == ["21.5"]
+
+
 def test_the_gateway_tells_its_figures(run: Run, server: holdfast.Server) -> None:
     appliance = run(gateway_section(access="read-write") + METRICS)
     ask(appliance, "/read", read(server))

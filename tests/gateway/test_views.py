@@ -162,6 +162,14 @@ def test_a_view_ends_after_one_event_if_asked(gateway: Running, server: holdfast
     assert "tags" not in event.data["parts"][1]
 
 
+def test_only_some_tags_are_read(gateway: Running, server: holdfast.Server) -> None:
+    part = {"tags": METER, "only": ["state", "voltage"]}
+    [found] = view(gateway, server.address[1], part, once=True).next("view")["parts"]
+    assert [tag["name"] for tag in found["tags"]] == ["state", "voltage"]
+    wrong = view(gateway, server.address[1], {"tags": METER, "only": ["stat"]})
+    assert wrong.status == 400
+
+
 def test_a_client_with_many_streams_gets_single_events(
     gateway: Running, server: holdfast.Server
 ) -> None:

@@ -148,8 +148,8 @@ class Picture {
     return h("span", { class: "zoom" },
       button("◀", "Lower addresses", () => this.move(-1)),
       button("▶", "Higher addresses", () => this.move(1)),
-      button("＋", "Zoom in", () => this.zoom(this.middle(), 1 / ZOOM)),
-      button("－", "Zoom out", () => this.zoom(this.middle(), ZOOM)));
+      button("+", "Zoom in", () => this.zoom(this.middle(), 1 / ZOOM)),
+      button("−", "Zoom out", () => this.zoom(this.middle(), ZOOM)));
   }
 
   get size() {
@@ -225,14 +225,19 @@ class Picture {
     const [soft, edge, accent, warm] = ["--line", "--edge", "--accent", "--warm-ink"].map(colour);
     const cells = Math.ceil(this.size / this.each);
     for (let cell = 0; cell < cells; cell += 1) {
-      const part = this.there[cell] / this.each;
       const [left, top] = [(cell % this.columns) * size, Math.floor(cell / this.columns) * height];
-      context.globalAlpha = part > 0 ? 0.4 + 0.6 * part : this.wrong[cell] > 0 ? 0.8 : 0.7;
-      context.fillStyle = part > 0 ? accent : this.wrong[cell] > 0 ? warm : this.missing[cell] > 0 ? edge : soft;
-      // What was asked and is absent is a small mark, so that it differs without its color too.
-      const isSmall = part === 0 && this.wrong[cell] === 0 && this.missing[cell] > 0;
-      const inset = isSmall ? Math.max(1, Math.floor(Math.min(size, height) / 4)) : 0;
-      context.fillRect(left + inset, top + inset, size - 1 - 2 * inset, Math.max(1, height - 1 - 2 * inset));
+      const fill = (style, alpha, side = 1) => {
+        const [wide, high] = [size - 1, height - 1].map((each) => Math.max(1, Math.round(each * side)));
+        context.globalAlpha = alpha;
+        context.fillStyle = style;
+        context.fillRect(left + ((size - 1 - wide) >> 1), top + ((height - 1 - high) >> 1), wide, high);
+      };
+      const [valid, absent] = [this.there[cell] / this.each, this.missing[cell] / this.each];
+      if (valid > 0) fill(accent, 0.4 + 0.6 * valid);
+      else if (this.wrong[cell] > 0) fill(warm, 0.8);
+      else fill(soft, 0.7);
+      // What was asked and is absent is a mark inside the cell, larger the more of it was asked.
+      if (valid === 0 && this.wrong[cell] === 0 && absent > 0) fill(edge, 0.9, Math.max(0.2, 0.65 * Math.sqrt(absent)));
     }
   }
 
