@@ -19,7 +19,7 @@ from support.gateway_pages import DESK, Opened, View, browsing, floats, opening
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from playwright.sync_api import Browser, Download, Page
+    from playwright.sync_api import Browser, Download, Page, Route
 
     import holdfast
 
@@ -186,6 +186,46 @@ def test_states_and_bits_of_tags_are_written(opened: Opened, plant: holdfast.Mem
         view.says("Written and read back")
     assert plant.read("holding_registers", 5, 1) == [2]
     assert plant.read("coils", 2, 1) == [0]
+
+
+def test_a_tag_whose_definition_has_changed_is_not_written(
+    opened: Opened, plant: holdfast.Memory
+) -> None:
+    def moved(route: Route) -> None:
+        answer = route.fetch()
+        found = answer.json()
+        found["tag"]["address"] = 9
+        route.fulfill(response=answer, json=found)
+
+    view = connected(opened)
+    add_tags(view, METER)
+    view.button("Read").click()
+    view.page.route("**/api/gateway/tags/value", moved)
+    view.button("Write room").click()
+    view.page.get_by_role("textbox", name="New value").fill("21.5")
+    view.button("Review").click()
+    told = view.page.get_by_role("alert").filter(has_text="another definition of room now")
+    expect(told).to_be_visible()
+    expect(view.button("Write it")).to_be_hidden()
+    assert plant.read("holding_registers", 4, 1) == [1234]
+
+
+def test_a_list_that_has_changed_is_shown_anew(opened: Opened) -> None:
+    def before(route: Route) -> None:
+        answer = route.fetch(post_data={**(route.request.post_data_json or {}), "once": True})
+        event = answer.text().replace('"name":"level"', '"name":"former"')
+        route.fulfill(response=answer, body=event.replace('"stream":false', '"stream":true'))
+
+    view = connected(opened, profiles={"tank": TANK})
+    view.page.route("**/api/modbus/watch/view", before)
+    view.button("Add tag list…").click()
+    view.page.get_by_role("combobox", name="Profile of the configuration").select_option("tank")
+    view.button("Add").click()
+    view.button("Watch").click()
+    expect(tag(view, "former")).to_have_text("0")
+    view.page.unroute("**/api/modbus/watch/view")
+    expect(tag(view, "level")).to_have_text("0")
+    expect(tag(view, "former")).to_have_count(0)
 
 
 @pytest.mark.parametrize(

@@ -200,7 +200,7 @@ def test_a_map_leaves_a_connection_to_the_browser(
     answer = gateway.ask("/map", body)
     assert (answer.status, answer.json["error"]) == (
         503,
-        "1 streams of this address are open, as maxStreams says",
+        "streams of this address: 1, which is maxStreams",
     )
 
 
@@ -290,6 +290,7 @@ def test_a_value_of_a_tag_is_encoded(
     answer = local(gateway, "/tags/value", {"tags": METER, "name": name, "value": text})
     found = answer.json
     assert (found["form"], found["values"], found["text"]) == (form, values, shown)
+    assert found["tag"]["name"] == name
 
 
 @pytest.mark.parametrize(

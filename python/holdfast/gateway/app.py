@@ -427,7 +427,7 @@ class App:
     def _require_stream(self, request: Request, most: int | None) -> None:
         """Raises `BadRequest` if the client has more than `most` streams, with the newest."""
         if most is not None and self._streams[host_of(request.peer)] > most:
-            raise BadRequest("busy", f"{most} streams of this address are open, as maxStreams says")
+            raise BadRequest("busy", f"streams of this address: {most}, which is maxStreams")
 
     def _local(self, endpoint: Local) -> Handler:
         """Returns the handler of an endpoint that asks no device."""

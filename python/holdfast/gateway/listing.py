@@ -66,6 +66,23 @@ _EXAMPLE = (
     "name,area,address,type,order,scale,offset,unit,writable\nsetpoint,hr,24,uint16,,0.1,,°C,true\n"
 )
 
+_SETPOINT: dict[str, Any] = {
+    "name": "setpoint",
+    "area": "holding_registers",
+    "address": 24,
+    "count": 1,
+    "type": "uint16",
+    "order": "ABCD",
+    "unit": "°C",
+    "scale": 0.1,
+    "offset": 0.0,
+    "writable": True,
+    "min": None,
+    "max": None,
+    "states": {},
+    "description": "",
+}
+
 ENDPOINTS = (
     Local(
         "/api/gateway/tags",
@@ -77,26 +94,7 @@ ENDPOINTS = (
         tagging.parse,
         {"tags": {"type": "array", "items": TAG}},
         {"tags": _EXAMPLE, "format": "csv"},
-        {
-            "tags": [
-                {
-                    "name": "setpoint",
-                    "area": "holding_registers",
-                    "address": 24,
-                    "count": 1,
-                    "type": "uint16",
-                    "order": "ABCD",
-                    "unit": "°C",
-                    "scale": 0.1,
-                    "offset": 0.0,
-                    "writable": True,
-                    "min": None,
-                    "max": None,
-                    "states": {},
-                    "description": "",
-                }
-            ]
-        },
+        {"tags": [_SETPOINT]},
     ),
     Local(
         "/api/gateway/tags/value",
@@ -107,6 +105,7 @@ ENDPOINTS = (
         (*tagging.LIST, tagging.NAME, tagging.VALUE),
         tagging.encode,
         {
+            "tag": TAG,
             "form": {
                 "enum": ["coils", "registers", "mask"],
                 "description": "What to write; for `mask`, `values` are the AND and the OR mask",
@@ -116,6 +115,12 @@ ENDPOINTS = (
             "text": TEXT,
         },
         {"tags": _EXAMPLE, "format": "csv", "name": "setpoint", "value": "21.5"},
-        {"form": "registers", "values": [215], "value": 21.5, "text": "21.5"},
+        {
+            "tag": _SETPOINT,
+            "form": "registers",
+            "values": [215],
+            "value": 21.5,
+            "text": "21.5",
+        },
     ),
 )

@@ -127,7 +127,7 @@ async def encode(given: Given, profiles: Mapping[str, TagList]) -> Answer:
         raise malformed(f"{name} can't be written: {reason}")
     try:
         raw = tag.raw(value_from(tag, text))
-        return {"success": True, **_written(tag, raw)}
+        return {"success": True, "tag": described(tag), **_written(tag, raw)}
     except ValueError as error:
         raise malformed(f"{name}: {error}") from None
 

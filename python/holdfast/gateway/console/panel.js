@@ -73,11 +73,12 @@ export class Panel {
     cell.fading = setTimeout(() => cell.classList.remove("changed"), MARKED);
   }
 
-  /** Marks the values as current, as of a time in milliseconds. */
-  fresh(time) {
+  /** Marks the values as current, as of a time in milliseconds. Values that are read once grow old. */
+  fresh(time, isOnce) {
     this.time = time;
     this.isStale = false;
-    this.aged(`Values of ${this.where}.`, null);
+    const at = isOnce ? `, read at ${new Date(time).toTimeString().slice(0, 8)}` : "";
+    this.aged(`Values of ${this.where}${at}.`, null);
   }
 
   /** Marks the values as stale, and shows what to do or why. */

@@ -66,3 +66,6 @@ export function placed(tag) {
   const offset = tag.offset === 0 ? "" : ` ${tag.offset < 0 ? "−" : "+"} ${Math.abs(tag.offset)}`;
   return `${tag.area.replace("_", " ")} ${tag.address} = ${modicon(functionOf(tag), tag.address)}, ${tag.type}${order}${scale}${offset}`;
 }
+
+/** Returns whether two descriptions of tags are equal. */
+export const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);

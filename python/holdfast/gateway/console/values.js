@@ -23,6 +23,8 @@ const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_p
 const FIELDS = ["area", "address", "quantity", "type", "size", "order", "letters", "interval"];
 const CSV = ["time", "part", "name", "area", "address", "type", "order", "value", "unit", "state", "error"];
 const CHECK = 1000;
+/** How long the first poll of a tag list may take, in milliseconds. */
+const LONG = 60_000;
 
 /** The values view. `may.write` is whether the gateway allows writes. */
 export class Values {
@@ -202,7 +204,8 @@ export class Values {
   /** Returns the options of a request for parts of the device. */
   sent(wanted, more, signal) {
     const body = JSON.stringify({ ...this.device, parts: wanted.map(parts.asked), ...more });
-    return { method: "POST", body, signal, patience: this.device.timeout * wanted.length };
+    const patience = wanted.reduce((sum, part) => sum + (part.kind === "tags" ? LONG : this.device.timeout), 0);
+    return { method: "POST", body, signal, patience };
   }
 
   /** Reads parts once. Returns the data of the event. */
@@ -243,7 +246,7 @@ export class Values {
   show(wanted, data) {
     this.plots?.end();
     this.plots = null;
-    this.panels = wanted.map((each, at) => this.panel({ ...each, device: this.device }, data.parts[at].tags));
+    this.panels = wanted.map((each, at) => this.panel(each, data.parts[at].tags));
     $("table").replaceChildren(...this.panels.map((panel) => panel.place));
     if (wanted.length > 1) this.panels.forEach((panel) => (panel.heading.hidden = false));
     this.wholes = wanted;
@@ -251,13 +254,15 @@ export class Values {
     $("save").hidden = false;
   }
 
-  panel(part, tags) {
+  panel(whole, tags) {
+    const part = { ...whole, device: this.device };
     const writes = this.may.write && (part.kind === "tags" || part.area === 1 || part.area === 3);
     const actions = {
       write: writes ? (cell) => this.write(panel, cell) : null,
       plot: (cell) => this.plot(panel, cell),
     };
     const panel = part.kind === "tags" ? new TagTable(part, tags, actions) : new Table(part, actions);
+    panel.whole = whole;
     return panel;
   }
 
@@ -277,8 +282,9 @@ export class Values {
     try {
       const data = await this.once(this.wholes);
       if (!this.panels.includes(panel) || this.device !== device) return;
+      if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
-      const own = data.parts[this.panels.indexOf(panel)];
+      const own = data.parts[this.wholes.indexOf(panel.whole)];
       if (own.error) throw failure(own.reason, own.error);
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
@@ -310,6 +316,7 @@ export class Values {
     this.signature = signature;
     this.interval = Number($("interval").value);
     this.began = this.polls = false;
+    this.took = 0;
     this.reported = "";
     this.plots?.end();
     this.plots = null;
@@ -319,7 +326,9 @@ export class Values {
     let told = null;
     while (this.watching === stopping) {
       let streams = true;
-      const more = { interval: this.interval, maxStreams: STREAMS, describe: !this.began };
+      // The profiles of the gateway may change at any time, other lists never do.
+      const describe = !this.polls || wanted.some((part) => part.source?.profile);
+      const more = { interval: this.interval, maxStreams: STREAMS, describe };
       try {
         await stream(PATH, this.sent(wanted, more, stopping.signal), (name, data) => {
           if (this.watching !== stopping) return;
@@ -355,9 +364,9 @@ export class Values {
   opened(wanted, data) {
     const first = !this.began;
     this.began = true;
-    if (first) {
+    if (first || !this.fits(data)) {
       const same = this.wholes === wanted && this.panels.length > 0 && this.panels[0].part.device === this.device;
-      if (!same) this.show(wanted, data);
+      if (!same || !this.fits(data)) this.show(wanted, data);
       this.plots = new Plots(this.panels, this.span, () => this.remember());
     }
     if (this.polls === data.stream || first || this.reported === null) {
@@ -369,11 +378,17 @@ export class Values {
     if (first) this.plotted?.forEach((key) => this.plots.choose(key));
   }
 
+  /** Returns whether the tables have the tags of an event. */
+  fits(data) {
+    return data.parts.every((each, at) => !each.tags || parts.same(each.tags, this.panels[at].tags));
+  }
+
   /** Takes the values of an event. */
   take(data, mark) {
     const late = this.heard !== null && Date.now() - this.heard > this.patience();
     if (late) this.plots?.gap();
     this.heard = Date.now();
+    this.took = data.rtt;
     const isView = "stream" in data;
     const changes = isView ? data.parts.map((each, part) => ({ ...each, part })) : data.parts;
     const errors = this.panels.map((panel) => panel.error ?? null);
@@ -388,7 +403,7 @@ export class Values {
     this.panels.forEach((panel, at) => {
       panel.error = errors[at];
       if (errors[at]) panel.stale(this.watching ? "The last poll failed." : "The last read failed.", this.panels.length > 1 ? errors[at] : null);
-      else panel.fresh(data.time);
+      else panel.fresh(data.time, this.watching === null);
     });
     if (this.watching && this.plots) {
       if (!isView) for (const [panel, cell] of changed) this.plots.changed(panel, cell);
@@ -430,7 +445,7 @@ export class Values {
 
   /** The time in milliseconds after which values without an event are old. */
   patience() {
-    return 3 * this.interval + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + 2000;
+    return 3 * (this.interval + this.took) + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + 2000;
   }
 
   /** Marks the values as old if the gateway is silent. */

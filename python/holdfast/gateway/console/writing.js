@@ -3,7 +3,7 @@
 import { notice, post, Problem, stream } from "./api.js";
 import { $, h, once } from "./dom.js";
 import { binary, bit, hex, literal, modicon, register, separated } from "./numbers.js";
-import { placed } from "./parts.js";
+import { placed, same } from "./parts.js";
 import { areaOf } from "./standard.js";
 
 const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with semicolons.";
@@ -201,7 +201,8 @@ async function readTag(part, tag) {
 /** Lets the gateway check the value of a tag, which is scaled there. */
 async function ofTag({ part, tag }, text) {
   try {
-    const { form, values, text: shown } = await post("/api/gateway/tags/value", { ...part.source, name: tag.name, value: text });
+    const { tag: now, form, values, text: shown } = await post("/api/gateway/tags/value", { ...part.source, name: tag.name, value: text });
+    if (!same(now, tag)) throw new Error(`The gateway has another definition of ${tag.name} now. Close this dialog and read the values again.`);
     return { form, shown: [shown], json: values, step: 1, count: tag.count, typed: {} };
   } catch (error) {
     throw error.reason === "malformed" ? new Error(error.message) : error;
@@ -252,9 +253,9 @@ function request({ device, part: range, address, change }) {
 /** Describes the values that were read back after a failed write. */
 function compared({ shown, before }, back) {
   if (back === null) return "Reading back failed: read the values before you continue.";
-  const same = (others) => back.every((value, at) => value === others[at]);
-  if (same(before)) return "Read back: unchanged.";
-  if (same(shown)) return "Read back: the new values are there.";
+  const equals = (others) => back.every((value, at) => value === others[at]);
+  if (equals(before)) return "Read back: unchanged.";
+  if (equals(shown)) return "Read back: the new values are there.";
   return `Read back: neither the old nor the new values, but ${back.slice(0, MOST_REVIEWED).map(inWords).join(", ")}.`;
 }
 
