@@ -162,7 +162,7 @@ def _view(limits: GatewayLimits) -> dict[str, Any]:
             viewing.fields(limits), {"A range and tags": {**EXAMPLE, "parts": parts}}
         ),
         "responses": {
-            "200": _stream(view="View", change="ViewChange"),
+            "200": stream_answer(view="View", change="ViewChange"),
             **_refusals(*BODY, *ASKING, *DEVICE),
             **FAILED,
         },
