@@ -14,7 +14,8 @@ from support.fake_device import FakeDevice, exception, registers
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from support.gateways import Running, Stream
+    from support.event_streams import EventStream
+    from support.gateways import Running
 
 SOON = 0.01
 """Seconds from poll to poll."""
@@ -36,7 +37,7 @@ def gateway() -> Iterator[Running]:
         yield started
 
 
-def view(gateway: Running, port: int, *parts: Any, **body: Any) -> Stream:
+def view(gateway: Running, port: int, *parts: Any, **body: Any) -> EventStream:
     usual = {"host": "127.0.0.1", "port": port, "interval": 10, "parts": parts}
     return gateway.stream("POST", "/watch/view", {**usual, **body})
 
@@ -45,7 +46,7 @@ def ranged(address: int, quantity: int = 1, function: int = 3, **more: Any) -> d
     return {"functionCode": function, "address": address, "quantity": quantity, **more}
 
 
-def changed(stream: Stream) -> Any:
+def changed(stream: EventStream) -> Any:
     """The parts of the next event that has a change."""
     while not (parts := stream.next("change")["parts"]):
         pass

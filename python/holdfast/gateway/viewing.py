@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from holdfast.client import Client
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
-    from holdfast.gateway.events import Stream
     from holdfast.gateway.settings import GatewayLimits
     from holdfast.tags import Tag, TagList
     from holdfast.tools.tag_reading import Reading
     from holdfast.types import Area
+    from holdfast.web.events import Stream
 
 PATH = "/api/modbus/watch/view"
 MAX_PARTS = 32
