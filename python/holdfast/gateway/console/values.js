@@ -13,6 +13,9 @@ import { Table } from "./table.js";
 import { TagTable } from "./tags.js";
 import { Writer } from "./writing.js";
 
+/** Milliseconds that news may be late. */
+const SLACK = 2 * 1000;
+
 const PATH = "/api/modbus/watch/view";
 const RESUME = 1000;
 /** Streams of this browser. It allows six connections to a host; two are left for everything else. */
@@ -445,7 +448,7 @@ export class Values {
 
   /** The time in milliseconds after which values without an event are old. */
   patience() {
-    return 3 * (this.interval + this.took) + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + 2000;
+    return 3 * (this.interval + this.took) + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + SLACK;
   }
 
   /** Marks the values as old if the gateway is silent. */
