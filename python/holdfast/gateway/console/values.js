@@ -482,6 +482,7 @@ export class Values {
     this.plots?.stop();
     this.pressed(false);
     this.panels.forEach((panel) => panel.stale("No longer watched."));
+    link.put({ watch: null }); // At once: a reload now must not watch again.
     this.remember();
     say($("outcome"), "Stopped.");
   }
