@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from holdfast.values import DoesNotFit, Field, Layout
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-numpy: Any = pytest.importorskip("numpy")
+numpy: Any = importlib.import_module("numpy")
 TWO = numpy.int64(2)
 SMALL = numpy.uint8(3)
 YES, NO = numpy.bool_(True), numpy.bool_(False)

@@ -12,7 +12,7 @@ import pytest
 
 from holdfast.config.outputs import InfluxConfig
 from holdfast.outputs import Buffer, Refused, Sending
-from holdfast.outputs import influx as module
+from holdfast.outputs import sending as module
 from holdfast.outputs.influx import Influx
 from holdfast.outputs.stored import Stored
 from holdfast.stop import Stop

@@ -121,7 +121,7 @@ def test_a_server_that_can_not_be_reached_is_an_error(own_nats: NatsServer) -> N
 def test_a_frozen_server_does_not_hold_up_a_stop(
     own_nats: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(output_module, "LAST", 0.05)
+    monkeypatch.setattr(module, "LAST", 0.05)
     monkeypatch.setattr(output_module, "TIMEOUT", 3600.0)
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     buffer, stop = Buffer(), Stop()

@@ -1,4 +1,4 @@
-"""Raw Ingest over TLS: whom a listener trusts, what a role may write, and what senders are told."""
+"""Raw Ingest over TLS: certificates, rights of roles, and the errors that senders get."""
 
 from __future__ import annotations
 

@@ -368,9 +368,7 @@ def gateway(
         tokens=tuple((token.name, bytes.fromhex(token.sha256)) for token in tokens),
         sources=settings.sources,
         limits=GatewayLimits(in_flight=settings.in_flight),
-        profiles={
-            name: TagList(profile.named().values()) for name, profile in (profiles or {}).items()
-        },
+        profiles=_tag_lists(profiles),
         tls=gateway_tls(settings),
     )
 
@@ -418,7 +416,6 @@ def scanner(
     limits = ScannerLimits(devices=settings.limits.devices, tags=settings.limits.tags)
     trust = NO_FILES if settings.device_tls is None else settings.device_tls.files
     given = settings.defaults
-    named = {name: TagList(each.named().values()) for name, each in (profiles or {}).items()}
     return Settings(
         nats_servers(settings),
         settings.prefix,
@@ -432,8 +429,12 @@ def scanner(
         publish_logs=settings.publish_logs,
         keep_subscriptions=settings.keep_subscriptions,
         dialect=settings.dialect,
-        profiles=named,
+        profiles=_tag_lists(profiles),
     )
+
+
+def _tag_lists(profiles: Mapping[str, ProfileConfig] | None) -> Mapping[str, TagList]:
+    return {name: profile.tag_list for name, profile in (profiles or {}).items()}
 
 
 def _endpoint(key: str, target: Target) -> _core.Endpoint:

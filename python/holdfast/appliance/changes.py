@@ -34,8 +34,12 @@ def fingerprints(config: Config) -> dict[str, str]:
     found = {key: fingerprint(getattr(config, key)) for key in SINGLE}
     for key in SEVERAL:
         for name, settings in getattr(config, key).items():
-            tags = list(config.tags(name)) if key == "devices" else []
-            found[f"{key}.{name}"] = fingerprint(settings, tags)
+            found[f"{key}.{name}"] = fingerprint(settings)
+    # The tags of a device are a part of it, but one profile is that of many devices.
+    profiles = {name: fingerprint(profile) for name, profile in config.profiles.items()}
+    for name, device in config.devices.items():
+        if device.profile is not None:
+            found[f"devices.{name}"] += profiles[device.profile]
     return found
 
 

@@ -212,7 +212,7 @@ def tags_of(file: Path, profile: str | None) -> TagList:
             f"{file} has no profile {profile!r}, allowed: {known}"
             f"{guess(profile, config.profiles) or '.'}"
         )
-    return TagList(config.profiles[profile].named().values())
+    return config.profiles[profile].tag_list
 
 
 def chosen(tags: TagList, only: Sequence[str]) -> TagList:

@@ -59,6 +59,8 @@ def _tag(data: dict[Any, Any], path: KeyPath, entry: dict[Any, Any], report: Rep
             report.add((*path, "tag" if key == "profile" else key), message, of_key=True)
             return None
     profiles, profile, name = mapping(data.get("profiles")), entry["profile"], entry["name"]
+    if not isinstance(profile, str) or not isinstance(name, str):
+        return None  # Reported by the model.
     if profile not in profiles:
         words = f"allowed: {listing(profiles) or 'none, there are no profiles'}"
         report.add((*path, "profile"), f"found {show(profile)}, {words}{guess(profile, profiles)}")
@@ -70,7 +72,7 @@ def _tag(data: dict[Any, Any], path: KeyPath, entry: dict[Any, Any], report: Rep
         return None
     of_profile = fitting(_PROFILE, profiles[profile])
     try:
-        return None if of_profile is None else of_profile.named()[name]
+        return None if of_profile is None else of_profile.tag_list[name]
     except TagError:
         return None  # Reported with the profile.
 
@@ -83,7 +85,10 @@ def _check_place(
     if tag.of_type.base == "bit":
         message = f"found the type {tag.type}, allowed: types of whole registers, and bool"
         report.add((*at, "type") if "tag" in entry else at, message)
-    memory = fitting(_MEMORY, mapping(data.get("memories")).get(entry.get("memory")))
+    name = entry.get("memory")
+    if not isinstance(name, str):
+        return  # Reported by the model.
+    memory = fitting(_MEMORY, mapping(data.get("memories")).get(name))
     if memory is None:
         return
     span = memory.areas().get(tag.area)

@@ -162,9 +162,12 @@ class Config(Model):
         """The tags of a device: those of its profile, and its own besides or in place of them."""
         settings = self.devices[device]
         profile = None if settings.profile is None else self.profiles[settings.profile]
+        tags = TagList() if profile is None else profile.tag_list
+        if not settings.tags:
+            return tags
         order = "ABCD" if profile is None else profile.order
         own = {name: tag.tag(name, order) for name, tag in settings.tags.items()}
-        return TagList({**({} if profile is None else profile.named()), **own}.values())
+        return TagList({**{tag.name: tag for tag in tags}, **own}.values())
 
     def mapped(self) -> dict[str, MappedTag]:
         """What the topics of the MQTT client write that have plain values."""
@@ -176,7 +179,7 @@ class Config(Model):
             return entry.tag.tag(entry.topic, "ABCD")
         assert entry.profile is not None, "checked before"
         assert entry.name is not None, "checked before"
-        return self.profiles[entry.profile].named()[entry.name]
+        return self.profiles[entry.profile].tag_list[entry.name]
 
     @property
     def profile_files(self) -> tuple[Path, ...]:

@@ -40,7 +40,7 @@ class BufferConfig(Model):
     file: Annotated[FilePath | None, NotNull()] = None
     """A file for what can't be sent, in an existing folder; it survives a restart."""
     max_bytes: Annotated[int, Field(ge=2**20, le=2**50)] = 2**30
-    """The bytes that the file may have; then the oldest values go."""
+    """The size in bytes at which the oldest values in the file are dropped."""
 
 
 class OutputConfig(Model):
@@ -104,7 +104,8 @@ class FileConfig(OutputConfig):
     format: Literal["csv", "jsonl", "influx", "sqlite"]
     """csv, JSON Lines, line protocol, or an SQLite database with the table readings."""
     max_bytes: Annotated[int, Field(ge=65536)] = 100 * 2**20
-    """The size in bytes at which a file of text is rotated, or old rows of a database go."""
+    """The size in bytes at which a file of text is rotated, or the oldest rows of a database are
+    removed."""
     keep: Annotated[int, Field(ge=0, le=1000)] = 10
     """How many rotated files of text to keep."""
 

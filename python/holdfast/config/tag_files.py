@@ -54,12 +54,12 @@ _TEXT = ("name", "type", "order", "unit", "description", "encoding")
 
 def load_tags(path: Path | str) -> TagList:
     """Reads a tag list. Raises `ConfigError` with every problem."""
-    return TagList(load_profile(Path(path), str(path)).named().values())
+    return load_profile(Path(path), str(path)).tag_list
 
 
 def parse_tags(text: str, file: str, *, is_csv: bool) -> TagList:
     """Parses a tag list; messages call it `file`. Raises `ConfigError` with every problem."""
-    return TagList(_profile(text, file, "tags", Path(), is_csv=is_csv).named().values())
+    return _profile(text, file, "tags", Path(), is_csv=is_csv).tag_list
 
 
 def load_profile(path: Path, file: str) -> ProfileConfig:

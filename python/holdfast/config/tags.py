@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Annotated, Any
 
 from pydantic import Field, Strict
@@ -10,7 +11,7 @@ from pydantic.config import JsonDict
 from holdfast.config.base import Model
 from holdfast.config.memories import Register
 from holdfast.config.scalars import NAME_KEYS, Name, NotNull, whole_number
-from holdfast.tags import Tag
+from holdfast.tags import Tag, TagList
 from holdfast.types import Area
 
 Number = Annotated[float, Field(allow_inf_nan=False), whole_number]
@@ -71,6 +72,7 @@ class ProfileConfig(Model):
     tags: dict[Name, TagConfig] = Field(min_length=1, json_schema_extra=NAME_KEYS)
     """The tags, by name."""
 
-    def named(self) -> dict[str, Tag]:
-        """The tags, by name. Raises `TagError`."""
-        return {name: tag.tag(name, self.order) for name, tag in self.tags.items()}
+    @cached_property
+    def tag_list(self) -> TagList:
+        """The tags; the same for all devices of the profile. Raises `TagError`."""
+        return TagList(tag.tag(name, self.order) for name, tag in self.tags.items())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
+from holdfast.tags.changing import differs
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -35,7 +37,7 @@ class Changes:
         if known is not None:
             before, at = known
             silent = self._heartbeat is None or 0 <= time - at < self._heartbeat
-            if silent and (value == before or not _differs(value, before, tag.deadband)):
+            if silent and not differs(value, before, tag.deadband):
                 return False
         self._last[key] = (value, time)
         return True
@@ -44,12 +46,3 @@ class Changes:
         """Publishes the next readings of these devices in any case."""
         gone = set(devices)
         self._last = {key: last for key, last in self._last.items() if key[0] not in gone}
-
-
-def _differs(value: Any, before: Any, deadband: float) -> bool:
-    if value is None or before is None or not deadband:
-        return bool(value != before)
-    if isinstance(value, list) and isinstance(before, list):
-        pairs = zip(value, before, strict=True)
-        return any(_differs(one, other, deadband) for one, other in pairs)
-    return bool(abs(value - before) > deadband)

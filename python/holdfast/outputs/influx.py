@@ -7,18 +7,16 @@ import contextlib
 import gzip
 import http.client
 import socket
-import threading
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
 from holdfast.net.addresses import joined
+from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, broker_context
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sending import LAST, Refused
+from holdfast.outputs.sending import Refused, soon_after
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from holdfast.config.outputs import InfluxConfig
     from holdfast.polling import Reading
     from holdfast.stop import Stop
@@ -53,7 +51,7 @@ class Influx:
 
     def until(self, stop: Stop) -> None:
         """Ends a request that waits for its answer soon after the stop. Called before all else."""
-        stop.then(self._end_soon)
+        soon_after(stop, self._end)
 
     def send(self, readings: list[Reading]) -> None:
         """Sends all values in one request; those without a value are left out."""
@@ -119,11 +117,6 @@ class Influx:
             raise
         return answer.status, text
 
-    def _end_soon(self) -> None:
-        timer = threading.Timer(LAST, self._end)
-        timer.daemon = True
-        timer.start()
-
     def _end(self) -> None:
         """Called by another thread: what waits for the socket gets an error."""
         self._has_ended = True
@@ -151,14 +144,8 @@ class Influx:
         """The credentials, read each time, so that a new token needs no restart."""
         settings = self._settings
         if settings.token_file is not None:
-            return {"Authorization": f"Token {_secret(settings.token_file)}"}
+            return {"Authorization": f"Token {read_secret(settings.token_file).strip()}"}
         if settings.username is not None and settings.password_file is not None:
-            pair = f"{settings.username}:{_secret(settings.password_file)}"
+            pair = f"{settings.username}:{read_secret(settings.password_file).strip()}"
             return {"Authorization": f"Basic {base64.b64encode(pair.encode()).decode()}"}
         return {}
-
-
-def _secret(file: Path) -> str:
-    with contextlib.suppress(UnicodeDecodeError):
-        return file.read_text(encoding="utf-8").strip()
-    raise OSError(f"{file}: not UTF-8")

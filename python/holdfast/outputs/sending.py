@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -59,6 +60,17 @@ class Interruptible(Protocol):
 
     def until(self, stop: Stop) -> None:
         """Takes the stop of the output. Called before all else."""
+
+
+def soon_after(stop: Stop, end: Callable[[], None]) -> None:
+    """Calls `end` in a thread of its own, `LAST` seconds after the stop: what waits must end."""
+
+    def begin() -> None:
+        timer = threading.Timer(LAST, end)
+        timer.daemon = True
+        timer.start()
+
+    stop.then(begin)
 
 
 class Sending:

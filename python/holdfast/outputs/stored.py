@@ -6,6 +6,7 @@ cost few writes.
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from typing import TYPE_CHECKING, Any
 
@@ -45,12 +46,9 @@ class Stored:
             self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
             self._db.execute(_CREATE)
-            row = self._db.execute(
-                "SELECT coalesce(sum(count), 0), coalesce(sum(length(data)), 0) FROM readings"
-            ).fetchone()
+            self._recount()
         except sqlite3.Error as error:
             raise OSError(f"{file}: {error}") from error
-        self.count, self._bytes = row
 
     def add(self, readings: Sequence[Reading]) -> int:
         """Stores readings durably. Returns how many old ones had to go for them."""
@@ -66,7 +64,8 @@ class Stored:
                     "INSERT INTO readings (count, data) VALUES (?, ?)", (len(readings), data)
                 )
         except sqlite3.Error as error:
-            self._recount()
+            with contextlib.suppress(sqlite3.Error):
+                self._recount()
             raise OSError(f"{self.file}: {error}") from error
         self.count += len(readings)
         self._bytes += len(data)
@@ -109,10 +108,7 @@ class Stored:
 
     def _recount(self) -> None:
         query = "SELECT coalesce(sum(count), 0), coalesce(sum(length(data)), 0) FROM readings"
-        try:
-            self.count, self._bytes = self._db.execute(query).fetchone()
-        except sqlite3.Error:
-            return
+        self.count, self._bytes = self._db.execute(query).fetchone()
 
     def _reading(
         self, device: str, name: str, value: Any, time: float, fault: int, undecoded: str | None

@@ -19,6 +19,7 @@ from nats.errors import Error
 
 from holdfast import logs
 from holdfast.config.scanning import PING_INTERVAL, PINGS_OUTSTANDING
+from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, Tls, broker_context
 from holdfast.scanner.credentials import Credentials
 from holdfast.scanner.receiving import SafeClient, TlsClient
@@ -69,9 +70,9 @@ class Servers:
         options: dict[str, Any] = {"servers": list(self.urls)}
         if self.user is not None:
             options["user"] = self.user
-            options["password"] = _secret(self.password_file) if self.password_file else ""
+            options["password"] = read_secret(self.password_file) if self.password_file else ""
         if self.token_file is not None:
-            options["token"] = _secret(self.token_file)
+            options["token"] = read_secret(self.token_file)
         if self.credentials is not None:
             credentials = Credentials(self.credentials)
             options["signature_cb"] = credentials.sign
@@ -89,13 +90,6 @@ class Ping:
     """Seconds between pings."""
     outstanding: int = PINGS_OUTSTANDING
     """Pings without an answer. When the next one is due, the client reconnects."""
-
-
-def _secret(file: Path) -> str:
-    try:
-        return file.read_text().removesuffix("\n").removesuffix("\r")
-    except UnicodeDecodeError:
-        raise OSError(f"{file} is not UTF-8 text") from None
 
 
 class Broker:

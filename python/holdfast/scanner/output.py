@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 from nats.errors import Error
 
 from holdfast.faults import fault_text, is_exception
-from holdfast.outputs.sending import LAST
+from holdfast.outputs.sending import soon_after
 from holdfast.scanner.receiving import SafeClient, TlsClient
 from holdfast.scanner.subjects import data_subject, names
 from holdfast.scanner.tags import datatype
@@ -56,7 +55,7 @@ class NatsOutput:
 
     def until(self, stop: Stop) -> None:
         """Ends a wait for the server soon after the stop. Called before all else."""
-        stop.then(self._end_soon)
+        soon_after(stop, self._end)
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes values, and states that have changed. The server has them when this returns."""
@@ -81,11 +80,6 @@ class NatsOutput:
     def status(self) -> dict[str, object]:
         """Where values go."""
         return {"servers": list(self._servers.urls), "prefix": self._prefix}
-
-    def _end_soon(self) -> None:
-        timer = threading.Timer(LAST, self._end)
-        timer.daemon = True
-        timer.start()
 
     def _end(self) -> None:
         """Called by another thread: what waits for the server gets an error."""

@@ -16,6 +16,7 @@ import msgspec
 from holdfast.scanner.groups import Group
 from holdfast.scanner.subjects import data_subject
 from holdfast.scanner.tags import clean
+from holdfast.tags.changing import differs
 from holdfast.tags.decoding import Places, Undecoded, decoder
 
 if TYPE_CHECKING:
@@ -172,7 +173,7 @@ class Publisher:
             else:
                 self.undecoded.pop(id, None)
             last = self._last.get(id, _UNKNOWN)
-            wanted = not part.change or _differs(value, last, deadband)
+            wanted = not part.change or differs(value, last, deadband)
             if wanted and id in self._last:
                 self._last[id] = value
             picked.append(wanted)
@@ -296,14 +297,3 @@ class _Due:
             return False
         self._last = due
         return True
-
-
-def _differs(value: Any, last: Any, deadband: float) -> bool:
-    """Returns whether a value differs; a number, by more than the deadband."""
-    if type(value) is list and type(last) is list:
-        pairs = zip(value, last, strict=True)
-        return any(_differs(one, other, deadband) for one, other in pairs)
-    if type(value) in (int, float) and type(last) in (int, float):
-        # The difference of two equal infinities is NaN, which is not greater than the deadband.
-        return bool(abs(value - last) > deadband)
-    return bool(value is not last and value != last)

@@ -21,8 +21,8 @@ pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// The shortest time between two reports about the same source.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);
 
-/// The most sources of datagrams that are told apart: their addresses may be forged. Further ones share
-/// one limit.
+/// Maximum number of UDP sources with limits of their own. Further sources share one limit, because
+/// senders can forge addresses.
 const MAX_SENDERS: usize = 4096;
 
 /// Sources that are kept before the idle ones are looked for.
