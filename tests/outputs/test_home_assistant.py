@@ -67,7 +67,9 @@ def test_each_kind_of_tag_is_a_valid_entity(of: Tag, component: str) -> None:
     assert found(of).component == component
 
 
-@pytest.mark.parametrize("unit", [*(unit for units in UNITS.values() for unit in units), "%", ""])
+@pytest.mark.parametrize(
+    "unit", sorted({unit for units in UNITS.values() for unit in units} | {"%", ""})
+)
 def test_units_have_a_class_that_takes_them(unit: str) -> None:
     """The parser checks the combination."""
     assert found(tag(unit=unit)).config.get("unit_of_measurement", "") == unit

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import signal
 import socket
@@ -80,6 +81,9 @@ class Broker(ABC):
     def freeze(self) -> None:
         """Suspends the process; its connections stay open."""
         self._signal(signal.SIGSTOP)
+        assert self._process is not None
+        # Its threads run on until the system has stopped them all.
+        os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
 
     def thaw(self) -> None:
         """Resumes the process."""

@@ -12,6 +12,7 @@ and check sums of a lock file. It is kept in `.cache/peers`.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import json
@@ -190,8 +191,10 @@ def made(name: str, sources: Sequence[Path], install: Callable[[Path], None]) ->
     for source in sources:
         digest.update(f"{source.name}\0".encode() + source.read_bytes())
     folder = CACHE / f"{name}-{digest.hexdigest()[:16]}"
-    if not folder.exists():
-        CACHE.mkdir(parents=True, exist_ok=True)
+    CACHE.mkdir(parents=True, exist_ok=True)
+    with alone(CACHE / f"{name}.lock"):
+        if folder.exists():
+            return folder
         with tempfile.TemporaryDirectory(dir=CACHE, prefix=f"{name}-") as building:
             whole = Path(building) / "whole"
             whole.mkdir()
@@ -200,9 +203,16 @@ def made(name: str, sources: Sequence[Path], install: Callable[[Path], None]) ->
             except BuildFailed as failure:
                 FAILURES[name] = str(failure)
                 missing(FAILURES[name])
-            with contextlib.suppress(FileExistsError):
-                whole.rename(folder)
+            whole.rename(folder)
     return folder
+
+
+@contextlib.contextmanager
+def alone(file: Path) -> Iterator[None]:
+    """Waits until no other process is inside with the same file."""
+    with file.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def built(command: Sequence[str], folder: Path, environment: dict[str, str] | None = None) -> None:

@@ -39,7 +39,8 @@ class Terminal:
         self._own, theirs = pty.openpty()
         try:
             self._resize(lines, columns)
-            settings = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "COLUMNS")}
+            unwanted = ("NO_COLOR", "COLUMNS", "LINES")
+            settings = {k: v for k, v in os.environ.items() if k not in unwanted}
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "holdfast", *arguments],
                 stdin=theirs,

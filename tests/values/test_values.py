@@ -406,7 +406,7 @@ def test_a_register_is_an_integer_of_16_bits(register: Any, text: str, form: Any
         (array("d", [1, 2]), "a buffer of format 'd', dimensions 1"),
         (memoryview(bytes(4)).cast("B", (2, 2)), "a buffer of format 'B', dimensions 2"),
     ],
-    ids=repr,
+    ids=lambda each: each if isinstance(each, str) else type(each).__name__,
 )
 def test_what_is_no_sequence_of_registers_is_a_type_error(registers: Any, found: str) -> None:
     allowed = "allowed: a sequence of integers, bytes, or a buffer of bytes or of unsigned 16"
