@@ -137,14 +137,16 @@ def test_what_can_not_be_decoded_says_why(
 def test_a_value_is_written_between_two_reads(
     device: holdfast.Server, memory: holdfast.Memory, poller: Poller
 ) -> None:
-    scaled = Tag("t", "holding_registers", 5, scale=0.1, min=5, max=30)
-    poller.add(url(device), TagList([scaled, Tag("in", "input_registers", 0)]), name="oven")
+    scaled = Tag("t", "holding_registers", 5, scale=0.1, writable=True, min=5, max=30)
+    others = [Tag("in", "input_registers", 0), Tag("fixed", "holding_registers", 6)]
+    poller.add(url(device), TagList([scaled, *others]), name="oven")
     poller.write("oven", "t", 19.5)
     assert memory.read("holding_registers", 5, 1) == [195]
     for tag, value, error in (
         ("t", 31, ValueError),
         ("t", 19.55, ValueError),
         ("in", 1, ValueError),
+        ("fixed", 1, ValueError),
         ("x", 1, KeyError),
     ):
         with pytest.raises(error):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core
@@ -122,14 +123,14 @@ class Poller:
         """Writes a value, or the name of a state, between two reads of the device.
 
         Returns when the device has confirmed it. Raises `KeyError` for an unknown device or tag,
-        `ValueError` for a tag that is not writable or a value that does not fit, `WriteFailed`, and
-        `RuntimeError` after `close`.
+        `ValueError` for a tag that is not `writable` or a value that does not fit, `WriteFailed`,
+        and `RuntimeError` after `close`.
         """
         of = next((each for each in self._readers[name].tags if each.name == tag), None)
         if of is None:
             raise KeyError(tag)
-        if (flaw := of.unwritable) is not None:
-            raise ValueError(flaw)
+        if not of.writable:
+            raise ValueError(of.unwritable or f"{tag}: writable is not true in the tag list")
         raw = of.raw(value)
         [request] = write_typed(
             of.area, of.address, raw, of.type, of.order, of.encoding, split=False
@@ -215,7 +216,9 @@ def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
         if isinstance(tag, Tag):
             yield tag
         elif isinstance(tag, tuple) and 2 <= len(tag) <= 4:
-            yield Tag(name, *tag)
+            # Only a tag list says what may not be written.
+            made = Tag(name, *tag)
+            yield made if made.unwritable else replace(made, writable=True)
         else:
             found = f"the tag {name} is {tag!r}"
             raise ValueError(f"{found}, allowed: a Tag, or (area, address, type, order)")
