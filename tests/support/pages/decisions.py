@@ -1,0 +1,142 @@
+"""What is done with each code block of the pages."""
+
+from __future__ import annotations
+
+import functools
+import json
+from typing import TYPE_CHECKING
+
+from support.pages import checks, commands, comparing, configurations, python_code
+from support.pages.blocks import SHELL
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from support.pages.blocks import Block
+    from support.pages.stage import Stage
+
+    Decision = Callable[[Block, Stage], None]
+
+
+def drawing(_: Block, __: Stage) -> None:
+    """Not run: a drawing, or a screen that changes."""
+
+
+def elsewhere(test: str) -> Decision:
+    """Another test runs it; it must exist."""
+
+    def named(_: Block, __: Stage) -> None:
+        file, name = test.split("::")
+        assert f"def {name}(" in (ROOT / "tests" / file).read_text(), f"there is no {test}"
+
+    return named
+
+
+def greeting(block: Block, stage: Stage) -> None:
+    """The greeting of the appliance of the stage."""
+    found = stage.there(stage.names["plant"].greeting)
+    comparing.alike(found.replace("python -m holdfast", ".venv/bin/holdfast"), block.text)
+
+
+def diagnostics(block: Block, stage: Stage) -> None:
+    """What `stage.names["diagnostics"]` gets."""
+    comparing.same_shape(stage.names["diagnostics"](), json.loads(block.text))
+
+
+MMA = elsewhere("importing/test_mma.py::test_the_example_of_the_page_is_what_the_command_makes")
+TLS = elsewhere("docs/test_tls_page.py::test_the_walk_through_serves_two_roles")
+CLIENT = elsewhere("client/test_client.py::test_the_examples_of_the_page_print_what_it_says")
+PROGRAM = elsewhere("client/test_client.py::test_the_program_of_the_page_prints_what_it_says")
+VALUES = elsewhere("docs/test_values_page.py::test_the_examples_of_the_page_print_what_it_says")
+LETTERS = elsewhere(
+    "docs/test_values_page.py::test_the_picture_of_four_letters_is_what_encode_makes"
+)
+ROUTES = elsewhere("docs/test_routes_page.py::test_the_commands_of_the_page_print_what_it_says")
+ECS = elsewhere("docs/test_security_events_page.py::test_the_example_is_what_is_logged")
+FILEBEAT = elsewhere(
+    "docs/test_security_events_page.py::test_the_configuration_of_filebeat_is_yaml"
+)
+ADAPTER = "examples/adapter/"
+
+DECISIONS: dict[tuple[str, str], Decision] = {
+    ("README.md", "examples/plant.yaml is served:"): greeting,
+    ("docs/adapters.md", '"""An adapter'): functools.partial(
+        checks.in_file, f"{ADAPTER}holdfast_datagrams.py"
+    ),
+    ("docs/adapters.md", "[project.entry-points"): functools.partial(
+        checks.in_file, f"{ADAPTER}pyproject.toml"
+    ),
+    ("docs/adapters.md", "adapters:"): checks.adapter,
+    ("docs/architecture.md", "              writers"): drawing,
+    ("docs/architecture.md", "socket ─►"): drawing,
+    ("docs/architecture.md", "connection.rs ─►"): drawing,
+    ("docs/architecture.md", "body ─► msgspec"): drawing,
+    ("docs/audit.md", '{"time":'): checks.audit_lines,
+    ("docs/cli.md", "REST at http://127.0.0.1:5080   every"): drawing,
+    ("docs/client.md", ">>> import holdfast"): CLIENT,
+    ("docs/client.md", ">>> with holdfast.SyncClient"): CLIENT,
+    ("docs/client.md", "import asyncio"): PROGRAM,
+    ("docs/client.md", "[[11], [22], [33]]"): PROGRAM,
+    ("docs/client.md", "ModbusError\n├──"): checks.errors,
+    ("docs/gateway.md", "event: "): checks.gateway_events,
+    ("docs/metrics.md", "scrape_configs:"): checks.scrape,
+    ("docs/metrics.md", "- {alert: "): checks.alerts,
+    ("docs/modbus-tls.md", "holdfast cert ca"): TLS,
+    ("docs/modbus-tls.md", "$ holdfast write 'tls://"): TLS,
+    ("docs/moving-from-mma.md", "memory:"): MMA,
+    ("docs/moving-from-mma.md", "# Made by"): MMA,
+    ("docs/mqtt.md", "2026-11-21T"): checks.log_lines,
+    ("docs/mqtt.md", '{"connected": true'): diagnostics,
+    ("docs/operations.md", "[Service]"): checks.unit_file,
+    ("docs/operations.md", "2026-11-21T"): checks.log_lines,
+    ("docs/outputs.md", '{"status":"accepted"'): checks.set_replies,
+    ("docs/outputs.md", "sqlite3 "): checks.sql,
+    ("docs/rest.md", "id: 41"): checks.gateway_events,
+    ("docs/rest.md", "2026-11-21T"): checks.log_lines,
+    ("docs/routes.md", "$ holdfast "): ROUTES,
+    ("docs/routes.md", '{"time":'): checks.audit_lines,
+    ("docs/scanner.md", "modbus."): checks.scanner_messages,
+    ("docs/security-events.md", '{"@timestamp"'): ECS,
+    ("docs/security-events.md", "filebeat.inputs:"): FILEBEAT,
+    ("docs/security-events.md", "<localfile>"): checks.xml,
+    ("docs/values.md", ">>> "): VALUES,
+    ("docs/values.md", "                        uint32"): LETTERS,
+    ("docs/values.md", "CDABGHEF  registers"): checks.orders,
+}
+"""By page and the first words of a block."""
+
+BY_LANGUAGE: dict[str, Decision] = {
+    "csv": checks.table,
+    "json": comparing.reply,
+    "python": python_code.python,
+    "yaml": configurations.loaded,
+}
+
+NOT_RUN: dict[tuple[str, str], str] = {
+    ("docs/benchmarks.md", "make bench"): "takes minutes; its options are checked",
+    ("docs/gateway.md", "holdfast gateway --allow 192.168.0.0/24 --https-cert"): "as the first one",
+    ("docs/gateway.md", "holdfast gateway --allow 10.0.0.0/24 --tls-ca"): "as the first one",
+    ("docs/gateway.md", "curl -s http://127.0.0.1:8090/api/modbus/connect"): "needs 10.0.0.5",
+    ("README.md", "make "): "builds everything; its targets are checked",
+    ("docs/moving-from-mma.md", "make "): "builds everything; its targets are checked",
+    ("docs/moving-from-tentacle.md", "make "): "builds everything; its targets are checked",
+    ("docs/moving-from-tentacle.md", "nats pub"): "needs the program nats",
+}
+"""Commands that are only parsed, by page and their first words, and the reason."""
+
+
+def decision(block: Block) -> Decision | None:
+    """What is done with a block; `None` if that is not decided."""
+    for (page, start), chosen in DECISIONS.items():
+        if page == block.page and block.text.startswith(start):
+            return chosen
+    if block.language in SHELL:
+        return shell
+    return BY_LANGUAGE.get(block.language)
+
+
+def shell(block: Block, stage: Stage) -> None:
+    """Runs the commands of a block; those of `NOT_RUN` are only parsed."""
+    starts = [start for page, start in NOT_RUN if page == block.page]
+    commands.run_all(block, stage, lambda command: command.text.startswith(tuple(starts)))

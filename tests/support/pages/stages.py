@@ -1,0 +1,518 @@
+"""The devices, appliances, brokers and files that the examples of each page need."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import holdfast
+from support import wire
+from support.brokers import Mosquitto, NatsServer
+from support.cli import done
+from support.machine import tool
+from support.pages.configurations import put_certificates
+from support.paths import DOCS, EXAMPLES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from support.pages.stage import Stage
+
+HEATER = "examples/tags/heater.yaml"
+SECRET = "secret"
+SHA256 = "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b"
+
+
+def everywhere(stage: Stage) -> None:
+    """The examples of the repository, certificates, and the programs."""
+    shutil.copytree(EXAMPLES, stage.folder / "examples")
+    put_certificates(stage.folder)
+    stage.program()
+    stage.file(".curlrc", "silent\n")
+    stage.environment |= {
+        "CURL_HOME": str(stage.folder),
+        "HOME": str(stage.folder),
+        "TOKEN": SECRET,
+    }
+    file = stage.folder / "examples" / "plant.yaml"
+    file.write_text(stage.here(file.read_text()))
+
+
+def plant(stage: Stage) -> None:
+    """`make run`, with a client that changes some registers."""
+    stage.names["plant"] = stage.serve("run", "examples/plant.yaml")
+    client = stage.enter_context(holdfast.SyncClient(stage.here("tcp://127.0.0.1:5020")))
+    client.write("holding_registers", 20, "PUMP-01", "string:8")
+    numbers = itertools.count()
+
+    def change() -> None:
+        number = next(numbers)
+        value = 21.4 + math.sin(number / 9) / 100
+        client.write("holding_registers", 100, value, "float32", "CDAB")
+        client.write("holding_registers", 110, 100000 + number, "uint32")
+
+    change()
+    stage.repeat(change)
+
+
+def heater(stage: Stage, port: str = "5020") -> None:
+    """`holdfast simulate examples/tags/heater.yaml`."""
+    stage.serve("simulate", HEATER, "--every", "0.1", "--port", str(stage.port(port)))
+
+
+def readme(stage: Stage) -> None:
+    plant(stage)
+    stage.file(
+        "plant.yaml",
+        """\
+memories:
+  plant: {holding_registers: 70000}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: localhost:502
+    acces: read-write
+    rules:
+      - {sources: [10.0.0.1/8], units: {1: plnt}, access: rw}
+""",
+    )
+
+
+def audit(stage: Stage) -> None:
+    """An audit log with one line of each kind of the page."""
+    drive = stage.enter_context(
+        holdfast.Server(
+            {1: holdfast.Memory(holding_registers=9)}, bind="127.0.0.1:0", access="read-write"
+        )
+    )
+    stage.appliance(
+        f"""\
+memories: {{plant: {{id: 3, coils: 8, holding_registers: 16}}}}
+devices: {{drive: {{url: "tcp://127.0.0.1:{stage.keep(drive.address[1])}", unit: 1}}}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:5020
+    rules:
+      - sources: [127.0.0.0/8]
+        units: {{1: plant, 7: {{route: drive}}}}
+        access: read-write
+  raw:
+    type: raw-ingest
+    format: crc
+    bind: 127.0.0.1:9000
+    rules: [{{sources: [127.0.0.0/8], memories: [plant], areas: [coils]}}]
+rest:
+  bind: 127.0.0.1:8080
+  sources: [127.0.0.0/8]
+  tokens:
+    - {{name: edge, sha256: {SHA256}, memories: [plant], areas: [coils], access: read-write}}
+audit: {{file: audit.log}}
+"""
+    )
+    with holdfast.SyncClient(stage.here("tcp://127.0.0.1:5020")) as client:
+        client.write_registers(2, [7, 8])
+        client.unit = 7
+        client.write_register(5, 4660)
+    done("raw-send", stage.here("127.0.0.1:9000"), "coils", "0", "1", "0", "1", "--memory-id", "3")
+    post(stage, "ingest", {"memory": "plant", "area": "coils", "address": 1, "values": [1, 0]})
+    file = stage.folder / "audit.log"
+    wire.until(lambda: file.read_text().count("\n") >= 6, "the log is written")
+    stage.names["audit_log"] = file.read_text()
+
+    def delete(text: str) -> None:
+        if "not intact" in text:
+            lines = stage.names["audit_log"].splitlines(keepends=True)
+            file.write_text("".join(lines[:2] + lines[4:]))
+
+    stage.before = delete
+
+
+def post(stage: Stage, path: str, body: Any, secret: str = SECRET) -> None:
+    address = stage.here("http://127.0.0.1:8080")
+    request = urllib.request.Request(
+        f"{address}/api/v1/{path}",
+        json.dumps(body).encode(),
+        {"Content-Type": "application/json", "Authorization": f"Bearer {secret}"},
+    )
+    with urllib.request.urlopen(request, timeout=wire.DEADLINE) as response:
+        response.read()
+
+
+def command_line(stage: Stage) -> None:
+    """The plant; the heater for commands with its tags or addresses."""
+    stage.replaced |= {
+        "--every 0.5": "--every 0.1",
+        "--every 1": "--every 0.1",
+        "--seconds 3": "--seconds 0.3",
+        "--times 3 --json": "--times 3 --json --every 0.1",
+        "--times 4": "--times 4 --every 0.1",
+    }
+    plant(stage)
+    plants = stage.replaced.pop("5020")
+    heater(stage)
+    heaters = stage.replaced["5020"]
+    for folder in (
+        ".local/share/bash-completion/completions",
+        ".zfunc",
+        ".config/fish/completions",
+    ):
+        (stage.folder / folder).mkdir(parents=True)
+
+    def choose(text: str) -> None:
+        stage.replaced["5020"] = heaters if re.search(r"heater\.yaml|\bir:\d", text) else plants
+
+    stage.before = choose
+
+
+WRONG = """\
+memories:
+  plant_a:
+    coils: 16
+    holding_register: 4096
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:502
+    rules:
+      - sources: [10.0.0.1/24]
+        units: {1: plant_b}
+        access: rw
+"""
+RIGHT = """\
+memories: {plant: {holding_registers: 100}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:0
+    rules: [{sources: [127.0.0.0/8, 10.0.0.7], units: {1: plant}, access: read-write}]
+"""
+
+
+def configuration(stage: Stage) -> None:
+    def put(text: str) -> None:
+        stage.file("plant.yaml", WRONG if "problems" in text else RIGHT)
+        stage.file("plant_a.csv", "area,address,value\nholding_registers,0,850\n")
+
+    stage.before = put
+
+
+def devices(stage: Stage) -> None:
+    stage.file(
+        "plant.yaml",
+        """\
+devices:
+  burner:
+    url: tcp://127.0.0.1:5502
+    unit: 3
+    interval: 1
+    max_gap: 8
+    forward: [{url: "raw://127.0.0.1:9000", unit: 1}]
+    reads:
+      - {area: holding_registers, address: 100, count: 4}
+      - {area: holding_registers, address: 110, count: 8}
+      - {area: coils, address: 0, count: 10}
+""",
+    )
+    stage.replaced["127.0.0.1:5502"] = "127.0.0.1:5502"  # Nothing is sent.
+
+
+def gateway(stage: Stage) -> None:
+    """A device with changing registers."""
+    memory = holdfast.Memory(holding_registers=100)
+    memory.write("holding_registers", 4, [16812, 59743, 16256, 64926])
+    bind = stage.here("127.0.0.1:5020")
+    stage.enter_context(holdfast.Server({1: memory}, bind=bind, access="read-write"))
+    values = itertools.count(1)
+    changed = [0]
+
+    def change() -> None:
+        value = next(values) % 60000
+        memory.write("holding_registers", changed[0], [value] * (2 - changed[0]))
+
+    def choose(text: str) -> None:
+        changed[0] = 1 if "/watch/view" in text else 0
+
+    stage.before = choose
+    change()
+    stage.repeat(change)
+
+
+def library(stage: Stage) -> None:
+    """Two devices."""
+    stage.replaced["interval=1"] = "interval=0.1"
+    stage.file("meter.yaml", "tags: {power: {area: holding_registers, address: 2}}\n")
+    for port in ("5020", "5021"):
+        memory = holdfast.Memory(holding_registers=100)
+        bind = f"127.0.0.1:{stage.port(port)}"
+        stage.enter_context(holdfast.Server({1: memory}, bind=bind, access="read-only"))
+    stage.names["holdfast"] = holdfast
+
+
+def metrics(stage: Stage) -> None:
+    """A sealed memory that was read once, and two refused requests."""
+    stage.appliance(
+        f"""\
+memories:
+  plant_a: {{coils: 8, holding_registers: 10, seal: {{area: coils, address: 0}}}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:5020
+    rules: [{{sources: [127.0.0.0/8], units: {{1: plant_a}}, access: read-only}}]
+rest:
+  bind: 127.0.0.1:8080
+  sources: [127.0.0.0/8]
+  tokens:
+    - {{name: edge, sha256: {SHA256}, memories: [plant_a], areas: [coils], access: read-write}}
+metrics: {{bind: 127.0.0.1:9464, sources: [127.0.0.0/8]}}
+"""
+    )
+    with (
+        holdfast.SyncClient(stage.here("tcp://127.0.0.1:5020")) as client,
+        pytest.raises(holdfast.ModbusException),
+    ):
+        client.read_holding_registers(0, 1)
+    body = {"memory": "plant_a", "area": "coils", "address": 0, "values": [2]}
+    for secret in (SECRET, "wrong"):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            post(stage, "ingest", body, secret)
+        refused.value.close()
+
+
+def tls(stage: Stage) -> None:
+    """A certificate with a wrong role; a listener with the certificates of OpenSSL."""
+    extension = "1.3.6.1.4.1.50316.802.1=ASN1:PRINTABLESTRING:operator"
+    added = ["-addext", "basicConstraints=critical,CA:FALSE", "-addext", extension]
+    command = f"{tool('openssl')} req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes"
+    subject = ["-subj", "/CN=plc", "-keyout", "plc.key", "-out", "plc.pem", *added]
+    subprocess.run([*command.split(), *subject], check=True, capture_output=True)
+
+    def serve(text: str) -> None:
+        if text.startswith("openssl s_client"):
+            stage.appliance(
+                """\
+memories: {plant: {holding_registers: 100}}
+listeners:
+  secure:
+    type: modbus-tls
+    bind: 127.0.0.1:802
+    tls: {cert_file: server.pem, key_file: server.key, ca_file: ca.pem}
+    rules:
+      - {sources: [127.0.0.0/8], roles: [operator], units: {1: plant}, access: read-only}
+"""
+            )
+
+    stage.before = serve
+
+
+def client(stage: Stage) -> None:
+    """A device with TLS in place of 10.0.0.5:802."""
+    memory = holdfast.Memory(coils=8)
+    rule = holdfast.Rule({1: memory}, access="read-only", sources=["127.0.0.0/8"], roles=[""])
+    files = holdfast.ServerTls(cert_file="server.pem", key_file="server.key", ca_file="ca.pem")
+    server = holdfast.Server(bind="tls://127.0.0.1:0", rules=[rule], tls=files)
+    stage.enter_context(server)
+    stage.replaced["10.0.0.5:802"] = f"127.0.0.1:{server.address[1]}"
+
+
+def importing(stage: Stage) -> None:
+    """A configuration of each of the other programs."""
+    page = (DOCS / "moving-from-mma.md").read_text()
+    stage.file("config.yaml", page.split("```yaml\n")[1].split("```")[0])
+    stage.file(
+        "replicator.yaml",
+        """\
+replicator:
+  units:
+    - id: pump
+      source: {endpoint: "127.0.0.1:5502", unit_id: 7, timeout_ms: 1500}
+      reads: [{fc: 3, address: 999, quantity: 30}]
+      targets: [{id: 2, endpoint: "127.0.0.1:501", memories: [{memory_id: 1, offsets: {}}]}]
+      poll: {interval_ms: 250}
+""",
+    )
+
+
+def mqtt(stage: Stage) -> None:
+    """A broker, and an appliance that takes messages of `plant/ingest`."""
+    broker = mosquitto(stage)
+    stage.appliance(
+        f"""\
+memories: {{plant: {{input_registers: 100}}}}
+rest: {{bind: 127.0.0.1:8080, sources: [127.0.0.0/8], tokens: none}}
+mqtt:
+  url: {broker.url}
+  client_id: plant-a
+  subscriptions: [{{topic: plant/ingest, qos: 1, memories: [plant], areas: [input_registers]}}]
+"""
+    )
+
+    def diagnostics() -> Any:
+        address = stage.here("http://127.0.0.1:8080")
+        with urllib.request.urlopen(f"{address}/api/v1/diagnostics/mqtt") as response:
+            return json.load(response)
+
+    stage.names["diagnostics"] = diagnostics
+    wire.until(lambda: diagnostics()["topics"][0]["granted"] == 1, "it has subscribed")
+
+
+def mosquitto(stage: Stage) -> Mosquitto:
+    """A broker, which the programs of Mosquitto use."""
+    folder = stage.folder / "broker"
+    folder.mkdir()
+    broker = Mosquitto(folder)
+    stage.callback(broker.kill)
+    stage.keep(broker.port)
+    for program in ("mosquitto_pub", "mosquitto_rr"):
+        stage.replaced[program] = f"{program} -p {broker.port}"
+    return broker
+
+
+def outputs(stage: Stage) -> None:
+    """Two devices whose values go to files and a broker, and can be set."""
+    broker = mosquitto(stage)
+    memory = holdfast.Memory(holding_registers=100)
+    server = stage.enter_context(
+        holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write")
+    )
+    url = f"tcp://127.0.0.1:{stage.keep(server.address[1])}"
+    stage.appliance(
+        f"""\
+profiles:
+  meter: {{tags: {{power: {{area: holding_registers, address: 10}}}}}}
+  boiler:
+    tags:
+      setpoint: {{area: holding_registers, address: 0, scale: 0.1, writable: true, min: 5, max: 30}}
+      mode: {{area: holding_registers, address: 1, states: {{0: off, 1: running}}, writable: true}}
+devices:
+  meter_1: {{url: "{url}", profile: meter, interval: 0.1}}
+  boiler: {{url: "{url}", profile: boiler, interval: 0.1}}
+outputs:
+  home: {{type: mqtt, url: "{broker.url}", topic: "plant/{{device}}/{{tag}}", writes: true}}
+  base: {{type: file, file: values.db, format: sqlite}}
+"""
+    )
+    wire.until(lambda: "plant/boiler/setpoint/set (" in broker.log, "it takes values")
+
+
+def raw_ingest(stage: Stage) -> None:
+    """The first appliance of the page; listeners for the format `crc` and for TLS."""
+    stage.replaced["10.0.2.9"] = "127.0.0.1"
+    for name in ("ca.pem", "holdfast.pem", "holdfast.key"):
+        (stage.folder / name).unlink()
+    done("cert", "ca", "Plant authority")
+    done("cert", "server", "holdfast", "--san", "127.0.0.1")
+    done("cert", "client", "line-1", "--role", "line")
+    page = (DOCS / "raw-ingest.md").read_text()
+    text = page.split("```yaml\n")[1].split("```")[0]
+    for port in ("9000", "9001", "8900"):
+        stage.port(port)
+    stage.appliance(
+        text.replace("input_registers: 128}", "input_registers: 128, holding_registers: 100}")
+        + """
+  crc:
+    type: raw-ingest
+    format: crc
+    bind: 127.0.0.1:9001
+    rules: [{sources: [127.0.0.0/8], memories: [plant], areas: [discrete_inputs]}]
+  secure:
+    type: raw-ingest
+    bind: 127.0.0.1:8900
+    tls: {cert_file: holdfast.pem, key_file: holdfast.key, ca_file: ca.pem}
+    rules:
+      - {sources: [127.0.0.0/8], roles: [line], units: {1: plant}, areas: [holding_registers]}
+"""
+    )
+
+
+def rest(stage: Stage) -> None:
+    """A memory and a token as on the page, and a listener with connections."""
+    appliance = stage.appliance(
+        f"""\
+memories:
+  plant_a: {{holding_registers: 100, input_registers: {{start: 1000, size: 100}}}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:5020
+    rules: [{{sources: [127.0.0.0/8], units: {{1: plant_a}}, access: read-write}}]
+rest:
+  bind: 127.0.0.1:8080
+  sources: [127.0.0.0/8]
+  tokens:
+    - name: edge
+      sha256: {SHA256}
+      memories: [plant_a]
+      areas: [holding_registers, input_registers]
+      access: read-write
+      manage: true
+"""
+    )
+    for _ in range(18):
+        stage.enter_context(wire.Connection(("127.0.0.1", stage.port("5020"))))
+    numbers = itertools.count(201)
+
+    def change() -> None:
+        number = next(numbers) % 60000
+        appliance.memories["plant_a"].write("holding_registers", 1, [number] * 3)
+
+    def follow(text: str) -> None:
+        if text.startswith("curl -N"):
+            stage.repeat(change)
+
+    stage.before = follow
+
+
+def scanner(stage: Stage) -> None:
+    """NATS in place of `localhost:4222`."""
+    folder = stage.folder / "nats-server"
+    folder.mkdir()
+    server = NatsServer(folder)
+    stage.callback(server.kill)
+    stage.replaced["4222"] = str(server.port)
+
+
+def operations(stage: Stage) -> None:
+    stage.file("plant.yaml", RIGHT)
+
+
+def tags(stage: Stage) -> None:
+    stage.file(
+        "wrong.yaml",
+        "order: CDAB\ntags:\n  power: {area: input_registers, address: 2, type: float23}\n",
+    )
+
+
+STAGES: dict[str, Callable[[Stage], None]] = {
+    "README.md": readme,
+    "docs/audit.md": audit,
+    "docs/cli.md": command_line,
+    "docs/client.md": client,
+    "docs/config.md": configuration,
+    "docs/describe.md": plant,
+    "docs/devices.md": devices,
+    "docs/gateway.md": gateway,
+    "docs/library.md": library,
+    "docs/metrics.md": metrics,
+    "docs/modbus-tls.md": tls,
+    "docs/moving-from-mma.md": importing,
+    "docs/moving-from-tentacle.md": scanner,
+    "docs/mqtt.md": mqtt,
+    "docs/operations.md": operations,
+    "docs/outputs.md": outputs,
+    "docs/raw-ingest.md": raw_ingest,
+    "docs/rest.md": rest,
+    "docs/routes.md": audit,
+    "docs/tags.md": tags,
+}
+"""What a page needs besides `everywhere`."""
