@@ -30,6 +30,14 @@ pub enum Refusal {
     Mirrored,
     #[error("only registers can be masked")]
     NotRegisters,
+    #[error("what keeps the memory can't be reached, and nothing was written")]
+    Unavailable,
+    #[error("the write can't be stored, and was not carried out")]
+    NotStored,
+    #[error("the write was sent, but not confirmed: it may still be carried out")]
+    NotConfirmed,
+    #[error("the memories are not kept together, so they can't be written in one step")]
+    NotOneStep,
 }
 
 /// One operation of a batch was refused, so none of the batch was carried out.
@@ -39,4 +47,12 @@ pub struct Refused {
     /// The index of the refused operation, from 0.
     pub index: usize,
     pub refusal: Refusal,
+}
+
+impl Refused {
+    /// Why the only operation was refused.
+    pub(crate) fn alone(self) -> Refusal {
+        debug_assert_eq!(self.index, 0, "there is one operation");
+        self.refusal
+    }
 }

@@ -12,6 +12,9 @@
 //!   keeps a list of locks, and flattens a large batch before it takes them. A write to a memory
 //!   with observers is copied into their queues.
 //!
+//! * If a memory has a journal, the journal alone changes it: every write becomes a step, which the
+//!   journal carries out when it has kept it.
+//!
 //! It does no I/O, has no clock, and knows no protocol: an address is a number, a bit is a bit, a
 //! register is two bytes.
 
@@ -20,15 +23,18 @@
 mod area;
 mod batch;
 mod bits;
+mod carry_out;
 mod error;
 mod follower;
 mod memory;
 mod observer;
 mod operation;
+mod step;
 
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
 pub use follower::{Change, Follower};
-pub use memory::{Gate, GateMode, Memory, Mirrored, check_across, write_across};
+pub use memory::{Contents, Gate, GateMode, Memory, Mirrored, check_across, write_across};
 pub use observer::{WriteQueue, Written};
 pub use operation::{Access, Read, Write};
+pub use step::{Action, Done, Journal, Operation, Outcome, Step, StepWrite};

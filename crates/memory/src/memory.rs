@@ -2,7 +2,7 @@
 
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use crate::area::{Area, Layout, Span};
 use crate::batch::{self, Run};
@@ -10,6 +10,7 @@ use crate::bits;
 use crate::error::{LayoutError, Refusal, Refused};
 use crate::observer::{Observers, WriteQueue};
 use crate::operation::{Access, Read, Write};
+use crate::step::{Action, Done, Journal, Operation, Step, StepWrite, wait};
 
 /// Items that [`Access::Mirror`] alone writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,6 +34,15 @@ pub enum GateMode {
     Once,
     /// The memory is sealed whenever the gate bit is 0.
     Level,
+}
+
+/// Which ranges may be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Ranges {
+    /// Those that are not reserved for [`Access::Mirror`], unless that is the access.
+    Unreserved,
+    /// All: where a step was checked before.
+    All,
 }
 
 /// The bit that opens a sealed memory.
@@ -59,7 +69,17 @@ pub struct Memory {
     layout: Layout,
     gate: Option<Gate>,
     mirrored: RwLock<Vec<Mirrored>>,
+    /// What carries out the writes in place of the memory, and the number of the memory in it.
+    journal: OnceLock<(Arc<dyn Journal>, u16)>,
     content: RwLock<Content>,
+}
+
+/// A copy of what a memory contains.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Contents {
+    /// The bytes of all areas, in the order of [`Area::ALL`].
+    pub areas: [Box<[u8]>; 4],
+    pub sealed: bool,
 }
 
 #[derive(Debug)]
@@ -97,6 +117,7 @@ impl Memory {
             layout,
             gate,
             mirrored: RwLock::default(),
+            journal: OnceLock::new(),
             content: RwLock::new(Content {
                 areas,
                 sealed: gate.is_some(),
@@ -129,10 +150,109 @@ impl Memory {
         Ok(())
     }
 
-    fn is_mirrored(&self, access: Access, area: Area, address: u16, count: usize) -> bool {
+    fn is_reserved(
+        &self,
+        access: Access,
+        area: Area,
+        address: u16,
+        count: usize,
+        ranges: Ranges,
+    ) -> bool {
         let mirrored = || self.mirrored.read().unwrap_or_else(PoisonError::into_inner);
-        access != Access::Mirror
+        ranges == Ranges::Unreserved
+            && access != Access::Mirror
             && mirrored().iter().any(|range| range.overlaps(area, address, count))
+    }
+
+    /// Lets a journal carry out all writes from now on. Whoever writes waits for it; to not wait, use
+    /// [`Memory::submit`].
+    ///
+    /// # Panics
+    /// The memory has a journal already.
+    pub fn keep_in(&self, journal: Arc<dyn Journal>, member: u16) {
+        assert!(self.journal.set((journal, member)).is_ok(), "a memory has one journal");
+    }
+
+    /// Whether writes are carried out by a journal.
+    #[inline]
+    pub fn has_journal(&self) -> bool {
+        self.journal.get().is_some()
+    }
+
+    /// Gives a write to the journal, without waiting for it.
+    ///
+    /// # Errors
+    /// As [`Memory::write`], [`Memory::mask_write`] and [`Memory::write_then_read`], if that is known
+    /// already. Then `done` is not called.
+    ///
+    /// # Panics
+    /// The memory has no journal.
+    pub fn submit(
+        &self,
+        access: Access,
+        operation: Operation<'_>,
+        done: Done,
+    ) -> Result<(), Refusal> {
+        self.shared().admit(access)?;
+        let Some((journal, member)) = self.journal.get() else { panic!("there is no journal") };
+        let member = *member;
+        let action = match operation {
+            Operation::Write(write) => {
+                self.writable(access, &[write], Ranges::Unreserved).map_err(Refused::alone)?;
+                Action::Write(vec![StepWrite::new(member, &write)])
+            }
+            Operation::Mask { area, address, and_mask, or_mask } => {
+                self.maskable(access, area, address, Ranges::Unreserved)?;
+                Action::Mask { member, area, address, and_mask, or_mask }
+            }
+            Operation::WriteThenRead { write, area, address, count } => {
+                self.writable(access, &[write], Ranges::Unreserved).map_err(Refused::alone)?;
+                self.holds(area, address, count)?;
+                Action::WriteThenRead {
+                    write: StepWrite::new(member, &write),
+                    area,
+                    address,
+                    count,
+                }
+            }
+        };
+        journal.submit(Step { access, action }, done);
+        Ok(())
+    }
+
+    /// Copies the contents of several memories at one moment.
+    pub fn contents(memories: &[Arc<Memory>]) -> Vec<Contents> {
+        let mut ranked: Vec<(usize, &Arc<Memory>)> = memories.iter().enumerate().collect();
+        ranked.sort_by_key(|(_, memory)| memory.rank);
+        let locked: Vec<_> = ranked.iter().map(|(at, memory)| (*at, memory.shared())).collect();
+        let mut copies: Vec<(usize, Contents)> = locked
+            .iter()
+            .map(|(at, content)| {
+                (*at, Contents { areas: content.areas.clone(), sealed: content.sealed })
+            })
+            .collect();
+        copies.sort_by_key(|(at, _)| *at);
+        copies.into_iter().map(|(_, copy)| copy).collect()
+    }
+
+    /// How many writes were carried out: equal numbers mean equal contents.
+    pub fn writes(&self) -> u64 {
+        self.shared().writes
+    }
+
+    /// Puts earlier contents in place of the present ones, before anybody uses the memory. Observers
+    /// don't see it.
+    ///
+    /// # Panics
+    /// The length of an area differs, or the contents are sealed and the memory has no gate.
+    pub fn restore(&self, contents: &Contents) {
+        let mut content = self.exclusive();
+        assert!(self.gate.is_some() || !contents.sealed, "a memory without a gate is never sealed");
+        for (area, restored) in content.areas.iter_mut().zip(&contents.areas) {
+            area.copy_from_slice(restored);
+        }
+        content.sealed = contents.sealed;
+        content.writes += 1;
     }
 
     pub fn sealed(&self) -> bool {
@@ -219,12 +339,22 @@ impl Memory {
     /// # Errors
     /// As [`Memory::write`], with the index of the first write that was refused.
     pub fn write_many(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
-        let valid = self.writable(access, writes);
+        if self.has_journal() {
+            return self.write_many_by_journal(access, writes);
+        }
+        let valid = self.writable(access, writes, Ranges::Unreserved);
         let mut content = self.exclusive();
         content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
         valid?;
         self.apply(access, &mut content, writes);
         Ok(())
+    }
+
+    #[cold]
+    fn write_many_by_journal(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
+        self.shared().admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
+        let writes: Vec<(&Memory, Write)> = writes.iter().map(|write| (self, *write)).collect();
+        write_across(access, &writes)
     }
 
     /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, atomically.
@@ -239,11 +369,34 @@ impl Memory {
         and_mask: u16,
         or_mask: u16,
     ) -> Result<(), Refusal> {
-        let offset = match self.span(area).offset(address, 1) {
-            _ if area.is_bits() => Err(Refusal::NotRegisters),
-            Some(_) if self.is_mirrored(access, area, address, 1) => Err(Refusal::Mirrored),
-            offset => offset.ok_or(Refusal::OutOfRange),
-        };
+        if self.has_journal() {
+            let operation = Operation::Mask { area, address, and_mask, or_mask };
+            return self.wait(access, operation).map(drop);
+        }
+        let valid = self.maskable(access, area, address, Ranges::Unreserved);
+        self.mask(access, valid, (area, address), (and_mask, or_mask))
+    }
+
+    /// As [`Memory::mask_write`], by a journal.
+    pub(crate) fn carry_out_mask(
+        &self,
+        access: Access,
+        area: Area,
+        address: u16,
+        and_mask: u16,
+        or_mask: u16,
+    ) -> Result<(), Refusal> {
+        let valid = self.maskable(access, area, address, Ranges::All);
+        self.mask(access, valid, (area, address), (and_mask, or_mask))
+    }
+
+    fn mask(
+        &self,
+        access: Access,
+        offset: Result<usize, Refusal>,
+        (area, address): (Area, u16),
+        (and_mask, or_mask): (u16, u16),
+    ) -> Result<(), Refusal> {
         let mut content = self.exclusive();
         content.admit(access)?;
         let offset = offset? * 2;
@@ -265,8 +418,35 @@ impl Memory {
         write: Write<'_>,
         read: Read<'_>,
     ) -> Result<(), Refusal> {
+        if self.has_journal() {
+            let Read { area, address, count, out } = read;
+            let bytes =
+                self.wait(access, Operation::WriteThenRead { write, area, address, count })?;
+            let fits = out.len() == bytes.len();
+            return fits.then(|| out.copy_from_slice(&bytes)).ok_or(Refusal::WrongLength);
+        }
+        self.change_then_read(access, write, read, Ranges::Unreserved)
+    }
+
+    /// As [`Memory::write_then_read`], by a journal.
+    pub(crate) fn carry_out_then_read(
+        &self,
+        access: Access,
+        write: Write<'_>,
+        read: Read<'_>,
+    ) -> Result<(), Refusal> {
+        self.change_then_read(access, write, read, Ranges::All)
+    }
+
+    fn change_then_read(
+        &self,
+        access: Access,
+        write: Write<'_>,
+        read: Read<'_>,
+        ranges: Ranges,
+    ) -> Result<(), Refusal> {
         let writes = [write];
-        let valid = self.writable(access, &writes);
+        let valid = self.writable(access, &writes, ranges);
         let offset = self.readable(&read);
         let mut content = self.exclusive();
         content.admit(access)?;
@@ -275,6 +455,28 @@ impl Memory {
         self.apply(access, &mut content, &writes);
         content.copy_out(offset, read);
         Ok(())
+    }
+
+    /// Lets the journal carry out a write, and waits for it.
+    #[cold]
+    fn wait(&self, access: Access, operation: Operation<'_>) -> Result<Vec<u8>, Refusal> {
+        let alone = |refusal| Refused { index: 0, refusal };
+        wait(|done| self.submit(access, operation, done).map_err(alone)).map_err(Refused::alone)
+    }
+
+    /// Checks a mask write, without the lock. Returns the offset of the register.
+    fn maskable(
+        &self,
+        access: Access,
+        area: Area,
+        address: u16,
+        ranges: Ranges,
+    ) -> Result<usize, Refusal> {
+        match self.span(area).offset(address, 1) {
+            _ if area.is_bits() => Err(Refusal::NotRegisters),
+            Some(_) if self.is_reserved(access, area, address, 1, ranges) => Err(Refusal::Mirrored),
+            offset => offset.ok_or(Refusal::OutOfRange),
+        }
     }
 
     /// Checks a read, without the lock.
@@ -286,7 +488,12 @@ impl Memory {
     }
 
     /// Checks writes, without the lock.
-    fn writable(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
+    fn writable(
+        &self,
+        access: Access,
+        writes: &[Write<'_>],
+        ranges: Ranges,
+    ) -> Result<(), Refused> {
         for (index, write) in writes.iter().enumerate() {
             let fits = write.count > 0 && write.bytes.len() == write.area.byte_len(write.count);
             let refusal = if !fits {
@@ -295,7 +502,7 @@ impl Memory {
                 Refusal::OutOfRange
             } else if access == Access::Client && self.gate.is_some_and(|gate| gate.is_in(write)) {
                 Refusal::GateBit
-            } else if self.is_mirrored(access, write.area, write.address, write.count) {
+            } else if self.is_reserved(access, write.area, write.address, write.count, ranges) {
                 Refusal::Mirrored
             } else {
                 continue;
@@ -392,10 +599,53 @@ impl Content {
 ///
 /// # Errors
 /// `WrongLength`, `OutOfRange` or `GateBit`, with the index of the first write that fails one of
-/// these checks. Then [`Refusal::Sealed`] (for a client), with the index of the first write to a
-/// sealed memory. Nothing has changed then.
+/// these checks. Then [`Refusal::NotOneStep`] where a memory has another journal than the first, and
+/// [`Refusal::Sealed`] (for a client), with the index of the first write to a sealed memory. Nothing
+/// has changed then. If the memories have a journal, see also [`Journal::submit`].
 pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     check_across(access, writes)?;
+    if writes.iter().any(|(memory, _)| memory.has_journal()) {
+        return wait(|done| submit_across(access, writes, done)).map(drop);
+    }
+    write_checked(access, writes)
+}
+
+/// As [`write_across`], by a journal.
+pub(crate) fn carry_out_across(
+    access: Access,
+    writes: &[(&Memory, Write<'_>)],
+) -> Result<(), Refused> {
+    for (index, (memory, write)) in writes.iter().enumerate() {
+        memory
+            .writable(access, std::slice::from_ref(write), Ranges::All)
+            .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
+    }
+    write_checked(access, writes)
+}
+
+/// Gives writes that were checked to the journal of their memories, as one step.
+#[cold]
+fn submit_across(
+    access: Access,
+    writes: &[(&Memory, Write<'_>)],
+    done: Done,
+) -> Result<(), Refused> {
+    let Some((journal, _)) = writes.first().and_then(|(memory, _)| memory.journal.get()) else {
+        return Err(Refused { index: 0, refusal: Refusal::NotOneStep });
+    };
+    let mut step = Vec::with_capacity(writes.len());
+    for (index, (memory, write)) in writes.iter().enumerate() {
+        let place = memory.journal.get().filter(|(other, _)| Arc::ptr_eq(other, journal));
+        let refused = |refusal| Refused { index, refusal };
+        let (_, member) = place.ok_or(refused(Refusal::NotOneStep))?;
+        memory.shared().admit(access).map_err(refused)?;
+        step.push(StepWrite::new(*member, write));
+    }
+    journal.submit(Step { access, action: Action::Write(step) }, done);
+    Ok(())
+}
+
+fn write_checked(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     let mut placed: Vec<Placed> = writes
         .iter()
         .enumerate()
@@ -419,14 +669,14 @@ pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(
     apply_across(access, &runs)
 }
 
-/// Checks what [`write_across`] checks before it takes the locks: everything but seals.
+/// Checks what [`write_across`] checks before it takes the locks: everything but seals and journals.
 ///
 /// # Errors
-/// As [`write_across`], without [`Refusal::Sealed`].
+/// As [`write_across`], without [`Refusal::Sealed`] and [`Refusal::NotOneStep`].
 pub fn check_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     for (index, (memory, write)) in writes.iter().enumerate() {
         memory
-            .writable(access, std::slice::from_ref(write))
+            .writable(access, std::slice::from_ref(write), Ranges::Unreserved)
             .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
     }
     Ok(())

@@ -2,9 +2,11 @@
 //! result on both, refusals included.
 
 use std::collections::BTreeMap;
+use std::sync::{Arc, Weak};
 
 use holdfast_memory::{
-    Access, Area, Gate, GateMode, Layout, Memory, Read, Refusal, Refused, Span, Write, write_across,
+    Access, Area, Done, Gate, GateMode, Journal, Layout, Memory, Mirrored, Operation, Read,
+    Refusal, Refused, Span, Step as Kept, Write, write_across,
 };
 use proptest::prelude::*;
 
@@ -135,6 +137,25 @@ impl Model {
             .iter()
             .map(|&(area, ..)| self.areas[area as usize].values().copied().collect())
             .collect()
+    }
+}
+
+/// A journal that carries out each step at once.
+#[derive(Debug)]
+struct AtOnce(Vec<Weak<Memory>>);
+
+impl Journal for AtOnce {
+    fn submit(&self, step: Kept, done: Done) {
+        let members: Vec<_> = self.0.iter().map(|memory| memory.upgrade().unwrap()).collect();
+        done(step.carry_out(&members));
+    }
+}
+
+/// Lets one journal carry out the writes to all of these memories.
+fn keep(memories: &[Arc<Memory>]) {
+    let journal: Arc<dyn Journal> = Arc::new(AtOnce(memories.iter().map(Arc::downgrade).collect()));
+    for (member, memory) in (0..).zip(memories) {
+        memory.keep_in(Arc::clone(&journal), member);
     }
 }
 
@@ -303,8 +324,12 @@ proptest! {
     fn memory_and_model_agree(
         gate in a_gate(),
         steps in prop::collection::vec(a_step(), 1..60),
+        is_kept in any::<bool>(),
     ) {
-        let memory = Memory::new(layout(), gate).unwrap();
+        let memory = Arc::new(Memory::new(layout(), gate).unwrap());
+        if is_kept {
+            keep(std::slice::from_ref(&memory));
+        }
         let mut model = Model::new(&layout(), gate);
         for step in steps {
             take(&memory, &mut model, step);
@@ -324,8 +349,12 @@ proptest! {
             prop::collection::vec((0..3usize, some_values()), 8..120),
         ],
         bad in prop::collection::vec((any::<prop::sample::Index>(), a_bad_write()), 0..3),
+        are_kept in any::<bool>(),
     ) {
-        let memories = gates.map(|gate| Memory::new(layout(), gate).unwrap());
+        let memories = gates.map(|gate| Arc::new(Memory::new(layout(), gate).unwrap()));
+        if are_kept {
+            keep(&memories);
+        }
         let mut models = gates.map(|gate| Model::new(&layout(), gate));
         for (which, write) in &earlier {
             let _ = models[*which].write(Access::Ingest, std::slice::from_ref(write));
@@ -340,9 +369,9 @@ proptest! {
         let writes: Vec<(&Memory, Write)> = batch
             .iter()
             .zip(&packed)
-            .map(|((which, write), bytes)| (&memories[*which], write.packed(bytes)))
+            .map(|((which, write), bytes)| (&*memories[*which], write.packed(bytes)))
             .collect();
-        let changes = memories.each_ref().map(Memory::seal_changes);
+        let changes = memories.each_ref().map(|memory| memory.seal_changes());
 
         let done = write_across(access, &writes);
 
@@ -353,7 +382,7 @@ proptest! {
             prop_assert_eq!(contents(memory), model.contents());
         }
         if done.is_err() {
-            prop_assert_eq!(memories.each_ref().map(Memory::seal_changes), changes);
+            prop_assert_eq!(memories.each_ref().map(|memory| memory.seal_changes()), changes);
         }
     }
 }
@@ -382,4 +411,78 @@ fn a_gate_outside_its_area_is_refused() {
     assert!(Memory::new(layout(), gate(Area::Coils, 2)).is_err());
     assert!(Memory::new(layout(), gate(Area::HoldingRegisters, 65_500)).is_err());
     assert!(Memory::new(layout(), gate(Area::Coils, 42)).is_ok());
+}
+
+#[test]
+fn memories_of_different_journals_are_not_written_in_one_step() {
+    let [one, other, alone] = [(); 3].map(|()| Arc::new(Memory::new(layout(), None).unwrap()));
+    keep(std::slice::from_ref(&one));
+    keep(std::slice::from_ref(&other));
+    let write = Write { area: Area::Coils, address: 3, count: 1, bytes: &[1] };
+    for (batch, index) in
+        [([&one, &other], 1), ([&one, &alone], 1), ([&alone, &one], 0), ([&other, &one], 1)]
+    {
+        let writes = batch.map(|memory| (&**memory, write));
+        let refused = Refused { index, refusal: Refusal::NotOneStep };
+        assert_eq!(write_across(Access::Ingest, &writes), Err(refused));
+    }
+    for memory in [one, other, alone] {
+        assert_eq!(contents(&memory)[0], vec![0; 40]);
+    }
+}
+
+#[test]
+fn reserved_ranges_are_settled_when_a_step_is_given_to_the_journal() {
+    let memory = Arc::new(Memory::new(layout(), None).unwrap());
+    keep(std::slice::from_ref(&memory));
+    memory.mirror(vec![Mirrored { area: Area::Coils, address: 10, count: 5 }]).unwrap();
+    let write = Write { area: Area::Coils, address: 12, count: 1, bytes: &[1] };
+    let never = || -> Done { Box::new(|_| panic!("nothing is submitted")) };
+    for access in [Access::Client, Access::Ingest] {
+        let refused = memory.submit(access, Operation::Write(write), never());
+        assert_eq!(refused, Err(Refusal::Mirrored));
+        assert_eq!(memory.write(access, write), Err(Refusal::Mirrored));
+    }
+    memory.write(Access::Mirror, write).unwrap();
+    assert_eq!(read(&memory, Access::Client, Area::Coils, 12, 1), Ok(vec![1]));
+    // On another node, the range may be reserved.
+    memory.mirror(vec![Mirrored { area: Area::Coils, address: 3, count: 40 }]).unwrap();
+    let step = Kept {
+        access: Access::Client,
+        action: holdfast_memory::Action::Write(vec![holdfast_memory::StepWrite {
+            member: 0,
+            area: Area::Coils,
+            address: 3,
+            count: 1,
+            bytes: vec![1],
+        }]),
+    };
+    assert_eq!(step.carry_out(std::slice::from_ref(&memory)), Ok(Vec::new()));
+}
+
+#[test]
+fn a_step_without_an_outcome_is_not_confirmed() {
+    #[derive(Debug)]
+    struct Forgetful;
+    impl Journal for Forgetful {
+        fn submit(&self, _: Kept, done: Done) {
+            drop(done);
+        }
+    }
+    let memory = Memory::new(layout(), None).unwrap();
+    memory.keep_in(Arc::new(Forgetful), 0);
+    let write = Write { area: Area::Coils, address: 3, count: 1, bytes: &[1] };
+    assert_eq!(memory.write(Access::Client, write), Err(Refusal::NotConfirmed));
+}
+
+#[test]
+fn contents_can_be_copied_and_restored() {
+    let gate = Gate { area: Area::Coils, address: 3, mode: GateMode::Level };
+    let [before, after] = [(); 2].map(|()| Arc::new(Memory::new(layout(), Some(gate)).unwrap()));
+    let write = Write { area: Area::Coils, address: 3, count: 9, bytes: &[0xFF, 1] };
+    before.write(Access::Ingest, write).unwrap();
+    let copied = Memory::contents(&[Arc::clone(&before), Arc::clone(&after)]);
+    assert_ne!(copied[0], copied[1]);
+    after.restore(&copied[0]);
+    assert_eq!((contents(&after), after.sealed()), (contents(&before), false));
 }

@@ -111,6 +111,10 @@ codes! {
         Extra = 12, "extra";
         /// The receiver must record the write, and can't.
         Unrecorded = 13, "unrecorded";
+        /// The receiver must keep the write, and can't.
+        NotStored = 14, "not_stored";
+        /// The write was passed on, and not confirmed: it may still be carried out.
+        NotConfirmed = 15, "not_confirmed";
     }
 }
 

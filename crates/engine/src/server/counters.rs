@@ -44,7 +44,7 @@ pub struct PacketCounters {
     pub dropped_bytes: Counter,
     /// Memory of packets that are not complete, in bytes.
     pub held_bytes: Gauge,
-    refused: [Counter; 14],
+    refused: [Counter; Refusal::NotConfirmed as usize + 1],
 }
 
 impl PacketCounters {

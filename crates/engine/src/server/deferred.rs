@@ -37,6 +37,8 @@ pub(super) struct Waiting {
     request: Vec<u8>,
     reply: Expected,
     permit: Option<Permit>,
+    /// Whether a journal carries it out. Those of a connection are carried out in their order.
+    is_step: bool,
 }
 
 enum Expected {
@@ -48,7 +50,7 @@ enum Expected {
 pub(super) struct Completed {
     pub(super) tag: u16,
     pub(super) unit_id: u8,
-    /// What the request was passed on to; `None` if it was refused.
+    /// The device that the request was passed on to; `None` if it was refused, or is of a memory.
     pub(super) route: Option<Arc<str>>,
     pub(super) request: Vec<u8>,
     /// A PDU; empty when there is no reply.
@@ -94,6 +96,12 @@ impl Deferred {
             None if self.is_empty() => return Deferral::Now,
             Some(place @ Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => place,
             Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
+            Some(place @ Elsewhere::Journal(_))
+                if self.waiting.len() < MAX_WAITING
+                    && self.waiting.iter().all(|waiting| waiting.is_step) =>
+            {
+                place
+            }
             _ => return Deferral::Wait,
         };
         let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
@@ -102,11 +110,12 @@ impl Deferred {
         let sent = unit_server.forward(rights, place, &asker, unit_id, request, permitted);
         let refused = RefusedRequest::before_device(unit_id, request, &sent);
         let (route, reply) = match sent {
-            Ok((route, coming)) => (Some(route), Expected::Coming(coming)),
+            Ok((route, coming)) => (route, Expected::Coming(coming)),
             Err(code) => (None, Expected::Known(exception(request, code.code()))),
         };
+        let is_step = matches!(place, Elsewhere::Journal(_));
         let request = request.to_vec();
-        self.waiting.push_back(Waiting { tag, unit_id, route, request, reply, permit });
+        self.waiting.push_back(Waiting { tag, unit_id, route, request, reply, permit, is_step });
         Deferral::Later(refused)
     }
 
@@ -145,7 +154,7 @@ impl Deferred {
             let Poll::Ready(reply) = Pin::new(coming).poll(context) else { return Poll::Pending };
             first.reply = Expected::Known(come(unit_server, &first.request, reply.ok()));
         }
-        let Some(Waiting { tag, unit_id, route, request, reply, permit }) =
+        let Some(Waiting { tag, unit_id, route, request, reply, permit, .. }) =
             self.waiting.pop_front()
         else {
             unreachable!("there is a first request")
@@ -158,7 +167,7 @@ impl Deferred {
 impl Waiting {
     /// Waits for the reply. `None` if the request was not sent.
     pub(super) async fn complete(self, unit_server: &UnitServer) -> Option<Completed> {
-        let Waiting { tag, unit_id, route, request, reply, permit } = self;
+        let Waiting { tag, unit_id, route, request, reply, permit, .. } = self;
         let reply = match reply {
             Expected::Coming(coming) => come(unit_server, &request, Some(coming.await.ok()?)),
             Expected::Known(reply) => reply,

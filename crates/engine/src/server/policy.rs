@@ -43,6 +43,8 @@ pub enum Elsewhere {
     Device(Route),
     /// Writes into some ranges of its memory are passed on.
     Mirror(Arc<Passage>),
+    /// Writes are carried out by the journal of its memory.
+    Journal(Arc<Memory>),
 }
 
 /// The rights of some peers.
@@ -157,8 +159,10 @@ pub struct PeerRights {
 struct UnitRights {
     /// `None` if all requests go elsewhere.
     memory: Option<Arc<Memory>>,
-    /// `None` if the memory answers everything.
+    /// `None` if the memory answers everything, or only its journal carries out writes.
     elsewhere: Option<Elsewhere>,
+    /// [`Elsewhere::Journal`], if the memory has one.
+    journal: Option<Elsewhere>,
     functions: Codes,
     access: AccessMode,
     /// `None` if there is no limit.
@@ -203,7 +207,10 @@ impl PeerRights {
                 let of_device = matches!(elsewhere, Some(Elsewhere::Device(_)));
                 let codes = Codes::of(allowed, access, of_device);
                 functions = functions.with(codes);
-                *place = Some(UnitRights { memory, elsewhere, functions: codes, access, ranges });
+                let has_journal = |memory: &&Arc<Memory>| memory.has_journal();
+                let journal = memory.as_ref().filter(has_journal).cloned().map(Elsewhere::Journal);
+                let functions = codes;
+                *place = Some(UnitRights { memory, elsewhere, journal, functions, access, ranges });
             }
             if rule.units.is_empty() && rule.elsewhere.is_empty() {
                 functions = functions.with(Codes::of(&rule.functions, rule.access, false));
@@ -227,6 +234,12 @@ impl PeerRights {
     #[inline]
     pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&Elsewhere> {
         self.unit(unit_id)?.elsewhere.as_ref()
+    }
+
+    /// Where writes to a unit id go that are not passed on to a device.
+    #[inline]
+    pub(crate) fn journal(&self, unit_id: u8) -> Option<&Elsewhere> {
+        self.unit(unit_id)?.journal.as_ref()
     }
 
     /// The ranges that requests to a unit id must be inside, if they are limited.

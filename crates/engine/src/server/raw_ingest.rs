@@ -12,12 +12,12 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_memory::{Access, Area, Memory, Write};
+use holdfast_memory::{Access, Area, Memory, Operation, Refusal as MemoryRefusal, Write};
 use holdfast_protocol::raw_ingest::{DONE, Format, Header, REFUSED, Refusal};
 use ipnet::IpNet;
 use socket2::SockRef;
 use tokio::net::TcpStream;
-use tokio::sync::watch;
+use tokio::sync::{oneshot, watch};
 use tokio::task::yield_now;
 use tokio::time::{Instant, timeout_at};
 
@@ -362,26 +362,55 @@ impl RawIngest {
         }
     }
 
-    /// Writes a complete packet, atomically.
-    fn write(
+    /// Writes a complete packet, atomically. Waits for the journal of the memory, if it has one.
+    async fn write(
+        &self,
+        context: &ListenerContext,
+        peer: &Peer,
+        packet: (Header, &Memory, &[u8]),
+    ) -> Result<(), Refusal> {
+        let (header, memory, payload) = packet;
+        if !memory.has_journal() {
+            return self.write_at_once(context, peer, packet);
+        }
+        let permit = context.permit_packet(payload).ok_or(Refusal::Unrecorded)?;
+        let (done, outcome) = oneshot::channel();
+        let kept = Box::new(|outcome| {
+            let _ = done.send(outcome);
+        });
+        memory
+            .submit(Access::Ingest, Operation::Write(writing(&header, payload)), kept)
+            .map_err(refusal)?;
+        let outcome = outcome.await.map_err(|_| Refusal::NotConfirmed)?;
+        outcome.map_err(|refused| refusal(refused.refusal))?;
+        self.accepted(context, peer, (header, payload), permit);
+        Ok(())
+    }
+
+    /// Writes a complete packet to a memory without a journal.
+    fn write_at_once(
         &self,
         context: &ListenerContext,
         peer: &Peer,
         (header, memory, payload): (Header, &Memory, &[u8]),
     ) -> Result<(), Refusal> {
-        let (address, count) = (header.address, header.count.get());
-        let write = Write {
-            area: of_packet(header.area),
-            address,
-            count: usize::from(count),
-            bytes: payload,
-        };
+        debug_assert!(!memory.has_journal(), "a journal would block the thread");
         let permit = context.permit_packet(payload).ok_or(Refusal::Unrecorded)?;
-        memory.write(Access::Ingest, write).map_err(|_| Refusal::Range)?;
-        self.packets.accepted.add();
-        self.packets.values.add_many(u64::from(count));
-        self.audit(context, peer, (Some(header), payload), Ok(permit));
+        memory.write(Access::Ingest, writing(&header, payload)).map_err(refusal)?;
+        self.accepted(context, peer, (header, payload), permit);
         Ok(())
+    }
+
+    fn accepted(
+        &self,
+        context: &ListenerContext,
+        peer: &Peer,
+        (header, payload): (Header, &[u8]),
+        permit: Permit,
+    ) {
+        self.packets.accepted.add();
+        self.packets.values.add_many(u64::from(header.count.get()));
+        self.audit(context, peer, (Some(header), payload), Ok(permit));
     }
 
     /// Receives a packet. The inner error is a refusal; the outer one says why no reply is due.
@@ -443,16 +472,21 @@ impl RawIngest {
             }
             Ok(judged) => judged,
         };
-        let written = judged.and_then(|()| match self.judge(&sending.rights, &sending.bytes)? {
-            Packet::Whole { header, memory, payload } => {
-                self.write(&context, &sending.peer, (header, memory, payload))
+        let written = match judged.and_then(|()| self.judge(&sending.rights, &sending.bytes)) {
+            Ok(Packet::Whole { header, memory, payload }) => {
+                self.write(&context, &sending.peer, (header, memory, payload)).await
             }
-            Packet::Incomplete { .. } => Err(Refusal::Short),
-        });
+            Ok(Packet::Incomplete { .. }) => Err(Refusal::Short),
+            Err(refusal) => Err(refusal),
+        };
         sending.ticket.set_amid_packet(false);
         if let Err(refusal) = written {
             self.refuse(&context, &sending.peer, &sending.bytes, refusal);
             sending.bytes.clear();
+            if refusal == Refusal::NotConfirmed {
+                context.ended(Kind::Closed, sending.peer.clone());
+                return sending.end();
+            }
             send_last(&mut sending.stream, &mut sending.unsent, REFUSED);
             drain(sending.stream.socket(), usize::MAX, stop).await;
         } else {
@@ -493,7 +527,8 @@ impl RawIngest {
                 sending.rights = renewed;
             }
             let waiting = &sending.bytes[answered..];
-            let refusal = match self.first_of(&context, &sending.peer, &sending.rights, waiting) {
+            let first = self.first_of(&context, &sending.peer, &sending.rights, waiting).await;
+            let refusal = match first {
                 Ok(Some((len, reply))) => {
                     answered += len;
                     accepted |= reply == DONE;
@@ -559,6 +594,9 @@ impl RawIngest {
             self.refuse(&context, &sending.peer, &sending.bytes[answered..], refusal);
             sending.bytes.clear();
             answered = 0;
+            if refusal == Refusal::NotConfirmed {
+                break;
+            }
             let _ = self.reply(&mut sending, REFUSED).await;
             sending.end();
             drain(sending.stream.socket(), usize::MAX, stop).await;
@@ -596,7 +634,7 @@ impl RawIngest {
 
     /// Writes the packet that `bytes` begin with. Returns its length and the reply, `None` while more
     /// bytes are needed, and the refusal that ends the connection.
-    fn first_of(
+    async fn first_of(
         &self,
         context: &ListenerContext,
         peer: &Peer,
@@ -615,7 +653,7 @@ impl RawIngest {
         let written = match self.judge(rights, packet) {
             Ok(Packet::Incomplete { .. }) => return Ok(None),
             Ok(Packet::Whole { header, memory, payload }) => {
-                self.write(context, peer, (header, memory, payload))
+                self.write(context, peer, (header, memory, payload)).await
             }
             Err(refusal) => Err(refusal),
         };
@@ -627,7 +665,8 @@ impl RawIngest {
                 | Refusal::Memory
                 | Refusal::NotGranted
                 | Refusal::Range
-                | Refusal::Unrecorded),
+                | Refusal::Unrecorded
+                | Refusal::NotStored),
             ) if continues => {
                 self.refuse(context, peer, packet, refusal);
                 Ok(Some((len, REFUSED)))
@@ -706,7 +745,8 @@ impl Service for RawIngest {
         if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
             && len < CHUNK
             && !is_slowed
-            && self.write(context, &peer, (header, memory, payload)).is_ok()
+            && !memory.has_journal()
+            && self.write_at_once(context, &peer, (header, memory, payload)).is_ok()
         {
             let dropped = RawIngest::confirm(&mut connection.stream, &mut Vec::new());
             self.drop_bytes(context, &peer, dropped);
@@ -748,6 +788,19 @@ impl Service for RawIngest {
         let peer = connection.peer.ip();
         let renewal = Box::new(move || live.get().rights(peer));
         self.serve_packets(context, self.sending(connection), renewal, stop).await;
+    }
+}
+
+fn writing<'p>(header: &Header, payload: &'p [u8]) -> Write<'p> {
+    let (area, count) = (of_packet(header.area), usize::from(header.count.get()));
+    Write { area, address: header.address, count, bytes: payload }
+}
+
+fn refusal(refused: MemoryRefusal) -> Refusal {
+    match refused {
+        MemoryRefusal::Unavailable | MemoryRefusal::NotStored => Refusal::NotStored,
+        MemoryRefusal::NotConfirmed => Refusal::NotConfirmed,
+        _ => Refusal::Range,
     }
 }
 

@@ -255,9 +255,7 @@ impl ModbusSerial {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted);
             self.note_refused(context, RefusedRequest::before_device(unit_id, request, &sent));
             let (route, answered) = match sent {
-                Ok((route, coming)) => {
-                    (Some(route), come(&self.unit_server, request, coming.await.ok()))
-                }
+                Ok((route, coming)) => (route, come(&self.unit_server, request, coming.await.ok())),
                 Err(code) => (None, exception(request, code.code())),
             };
             if let Some(auditor) = &context.auditor {

@@ -165,7 +165,7 @@ impl ModbusUdp {
     ) {
         let reply = come(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
-            let passed = (Some(&route), &request[..], &reply[..]);
+            let passed = (route.as_ref(), &request[..], &reply[..]);
             let peer = meta.addr.into();
             auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed, permit);
         }
@@ -286,7 +286,7 @@ struct Completed {
     tag: u16,
     unit_id: u8,
     meta: RecvMeta,
-    route: Arc<str>,
+    route: Option<Arc<str>>,
     request: Vec<u8>,
     reply: Option<Vec<u8>>,
     permit: Option<Permit>,

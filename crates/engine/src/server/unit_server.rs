@@ -9,14 +9,17 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use holdfast_memory::{Access, Area, Memory, Read, Refusal, Write};
+use holdfast_memory::{Access, Area, Memory, Write};
 use holdfast_protocol::pdu::{
     self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
 
 use super::counters::{Bus, Counters};
+use super::functions::is_write;
 use super::identity::Identity;
+use super::journal;
 use super::live::Live;
+use super::memory_operations::{exception_of, reading, writing};
 use super::policy::{Elsewhere, PeerRights};
 use crate::link::{Asker, Coming};
 
@@ -103,13 +106,15 @@ impl UnitServer {
         unit_id: u8,
         request: &[u8],
     ) -> Option<&'r Elsewhere> {
-        rights.elsewhere(unit_id).filter(|place| match place {
+        let takes = |place: &&Elsewhere| match place {
             Elsewhere::Device(_) => !self.refuses_silence(request),
             Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.takes(request),
-        })
+            Elsewhere::Journal(_) => !self.is_silent(unit_id) && is_write(request),
+        };
+        rights.elsewhere(unit_id).filter(takes).or_else(|| rights.journal(unit_id).filter(takes))
     }
 
-    /// Sends a request on its way to a device. Returns also the name of what it was passed on to.
+    /// Sends a request on its way to a device or a journal. Returns also the name of the device.
     ///
     /// # Errors
     /// The exception to answer it with.
@@ -121,7 +126,7 @@ impl UnitServer {
         unit_id: u8,
         request: &[u8],
         permitted: bool,
-    ) -> Result<(Arc<str>, Coming), ExceptionCode> {
+    ) -> Result<(Option<Arc<str>>, Coming), ExceptionCode> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         let sent = match place {
@@ -133,10 +138,18 @@ impl UnitServer {
             Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
                 Err(out_of_ranges(&passage.memory))
             }
-            Elsewhere::Device(route) => {
-                route.ask(asker, unit_id, request).map(|coming| (Arc::clone(&route.name), coming))
+            Elsewhere::Journal(memory) if outside(rights, unit_id, request) => {
+                Err(out_of_ranges(memory))
             }
-            Elsewhere::Mirror(passage) => passage.ask(request),
+            Elsewhere::Device(route) => route
+                .ask(asker, unit_id, request)
+                .map(|coming| (Some(Arc::clone(&route.name)), coming)),
+            Elsewhere::Mirror(passage) => {
+                passage.ask(request).map(|(device, coming)| (Some(device), coming))
+            }
+            Elsewhere::Journal(memory) => {
+                journal::ask(memory, request).map(|coming| (None, coming))
+            }
         };
         sent.inspect_err(|code| self.counters.exception(*code))
     }
@@ -269,7 +282,7 @@ impl UnitServer {
                 let area = Area::HoldingRegisters;
                 let done = memory.mask_write(Access::Client, area, address, and_mask, or_mask);
                 let answered = |()| reply::mask_write_register(address, and_mask, or_mask, reply);
-                done.map_err(exception).map(answered)
+                done.map_err(exception_of).map(answered)
             }
             Request::ReadWriteMultipleRegisters { read, write_address, registers } => {
                 let area = Area::HoldingRegisters;
@@ -280,7 +293,7 @@ impl UnitServer {
                     writing(area, write_address, count, bytes),
                     reading(area, read, out),
                 );
-                done.map_err(exception).map(|()| len)
+                done.map_err(exception_of).map(|()| len)
             }
             _ if memory.sealed() => Err(ExceptionCode::ServerDeviceBusy),
             Request::Diagnostics(asked) => {
@@ -378,14 +391,6 @@ fn out_of_ranges(memory: &Memory) -> ExceptionCode {
     }
 }
 
-fn reading<const MAX: u16>(area: Area, range: Range<MAX>, out: &mut [u8]) -> Read<'_> {
-    Read { area, address: range.address(), count: usize::from(range.quantity()), out }
-}
-
-fn writing(area: Area, address: u16, count: u16, bytes: &[u8]) -> Write<'_> {
-    Write { area, address, count: usize::from(count), bytes }
-}
-
 #[inline]
 fn read<const MAX: u16>(
     memory: &Memory,
@@ -393,20 +398,10 @@ fn read<const MAX: u16>(
     range: Range<MAX>,
     (out, len): (&mut [u8], usize),
 ) -> Result<usize, ExceptionCode> {
-    memory.read(Access::Client, reading(area, range, out)).map_err(exception).map(|()| len)
+    memory.read(Access::Client, reading(area, range, out)).map_err(exception_of).map(|()| len)
 }
 
 #[inline]
 fn write(memory: &Memory, write: Write<'_>) -> Result<(), ExceptionCode> {
-    memory.write(Access::Client, write).map_err(exception)
-}
-
-fn exception(refusal: Refusal) -> ExceptionCode {
-    match refusal {
-        Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
-        Refusal::OutOfRange | Refusal::GateBit | Refusal::Mirrored => {
-            ExceptionCode::IllegalDataAddress
-        }
-        Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
-    }
+    memory.write(Access::Client, write).map_err(exception_of)
 }

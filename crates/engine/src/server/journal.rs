@@ -1,0 +1,92 @@
+//! Writes of Modbus requests that the journal of a memory carries out: their replies come when the
+//! journal has kept them.
+
+use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Write};
+use holdfast_protocol::pdu::{self, ExceptionCode, Request, reply};
+
+use super::memory_operations::{exception_of, writing};
+use crate::link::{Coming, ReplyTo, coming, exception};
+
+/// Gives a write to the journal.
+///
+/// # Errors
+/// The exception to refuse it with.
+///
+/// # Panics
+/// The memory has no journal, or the request is no write.
+pub(super) fn ask(memory: &Memory, pdu: &[u8]) -> Result<Coming, ExceptionCode> {
+    let request = Request::parse(pdu)?;
+    let (to, coming) = coming();
+    let answer = Answer { request: pdu.to_vec(), to: Some(to) };
+    let submit = |operation| {
+        memory.submit(Access::Client, operation, Box::new(|outcome| answer.send(outcome)))
+    };
+    let registers = Area::HoldingRegisters;
+    match request {
+        Request::WriteSingleCoil { address, value } => {
+            submit(Operation::Write(writing(Area::Coils, address, 1, &[u8::from(value)])))
+        }
+        Request::WriteSingleRegister { address, value } => {
+            submit(Operation::Write(writing(registers, address, 1, &value.to_be_bytes())))
+        }
+        Request::WriteMultipleCoils { address, bits } => {
+            let write = writing(Area::Coils, address, bits.quantity(), bits.as_bytes());
+            submit(Operation::Write(write))
+        }
+        Request::WriteMultipleRegisters { address, registers: new } => {
+            submit(Operation::Write(writing(registers, address, new.quantity(), new.as_bytes())))
+        }
+        Request::MaskWriteRegister { address, and_mask, or_mask } => {
+            submit(Operation::Mask { area: registers, address, and_mask, or_mask })
+        }
+        Request::ReadWriteMultipleRegisters { read, write_address, registers: new } => {
+            let write: Write = writing(registers, write_address, new.quantity(), new.as_bytes());
+            let (address, count) = (read.address(), read.quantity().into());
+            submit(Operation::WriteThenRead { write, area: registers, address, count })
+        }
+        _ => unreachable!("only writes go to a journal"),
+    }
+    .map_err(exception_of)?;
+    Ok(coming)
+}
+
+/// The answer to a write. If it is dropped, nobody knows what became of the write.
+struct Answer {
+    request: Vec<u8>,
+    to: Option<ReplyTo>,
+}
+
+impl Answer {
+    fn send(mut self, outcome: Outcome) {
+        let mut buffer = [0; pdu::MAX_LEN];
+        let reply = match (&outcome, Request::parse(&self.request)) {
+            (Err(refused), _) => exception(&self.request, exception_of(refused.refusal).code()),
+            (Ok(bytes), Ok(Request::ReadWriteMultipleRegisters { read, .. })) => {
+                let (out, len) = reply::read_write_multiple_registers(read, &mut buffer);
+                out.copy_from_slice(bytes);
+                buffer[..len].to_vec()
+            }
+            (Ok(_), Ok(Request::WriteMultipleCoils { address, bits })) => {
+                let len = reply::write_multiple_coils(address, bits, &mut buffer);
+                buffer[..len].to_vec()
+            }
+            (Ok(_), Ok(Request::WriteMultipleRegisters { address, registers })) => {
+                let len = reply::write_multiple_registers(address, registers, &mut buffer);
+                buffer[..len].to_vec()
+            }
+            // The reply repeats the request.
+            (Ok(_), _) => std::mem::take(&mut self.request),
+        };
+        if let Some(to) = self.to.take() {
+            to.send(reply);
+        }
+    }
+}
+
+impl Drop for Answer {
+    fn drop(&mut self) {
+        if let Some(to) = self.to.take() {
+            to.send(exception(&self.request, ExceptionCode::ServerDeviceFailure.code()));
+        }
+    }
+}

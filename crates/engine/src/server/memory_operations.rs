@@ -1,0 +1,25 @@
+//! What requests ask of a memory, and the exceptions that its refusals become.
+
+use holdfast_memory::{Area, Read, Refusal, Write};
+use holdfast_protocol::pdu::{ExceptionCode, Range};
+
+pub(super) fn reading<const MAX: u16>(area: Area, range: Range<MAX>, out: &mut [u8]) -> Read<'_> {
+    Read { area, address: range.address(), count: usize::from(range.quantity()), out }
+}
+
+pub(super) fn writing(area: Area, address: u16, count: u16, bytes: &[u8]) -> Write<'_> {
+    Write { area, address, count: usize::from(count), bytes }
+}
+
+pub(super) fn exception_of(refusal: Refusal) -> ExceptionCode {
+    match refusal {
+        Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
+        Refusal::OutOfRange | Refusal::GateBit | Refusal::Mirrored => {
+            ExceptionCode::IllegalDataAddress
+        }
+        Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
+        Refusal::Unavailable => ExceptionCode::ServerDeviceBusy,
+        Refusal::NotStored | Refusal::NotConfirmed => ExceptionCode::ServerDeviceFailure,
+        Refusal::NotOneStep => unreachable!("a request writes to one memory"),
+    }
+}
