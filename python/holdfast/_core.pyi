@@ -13,6 +13,7 @@ from holdfast.types import (
     Extent,
     Forward,
     ListenerCounters,
+    MemoryFileStatus,
     NarrowedRights,
     PolledBlock,
     Seal,
@@ -43,6 +44,7 @@ __all__ = [
     "Link",
     "Listener",
     "Memory",
+    "MemoryFile",
     "OutOfRange",
     "Passage",
     "PolledDevice",
@@ -59,6 +61,7 @@ __all__ = [
     "encode_raw_ingest",
     "pack_raw_ingest",
     "plan_blocks",
+    "read_memory_file",
     "tell_disabled",
     "write_across",
 ]
@@ -128,6 +131,10 @@ class Memory:
         """Whether the memory is sealed, so Modbus clients receive exception 06."""
 
     @property
+    def waits(self) -> bool:
+        """Whether a write waits until it is kept: in a file, or in a log."""
+
+    @property
     def seal_changes(self) -> tuple[int, int]:
         """How often the seal opened, and how often it closed again."""
 
@@ -150,7 +157,9 @@ class Memory:
         """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
 
         Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
-        unknown area, `TypeError` for a value of another type. An error changes nothing.
+        unknown area, `TypeError` for a value of another type, `OSError` if the memory is kept in a
+        file or a log that can't be written. An error changes nothing, except that a log may still
+        carry out a write that it did not confirm in time.
         """
 
     def write_many(self, writes: Sequence[tuple[Area, int, Iterable[int]]]) -> None:
@@ -175,6 +184,56 @@ class Memory:
         callback that writes to the same memory is called for that write as well, unless
         `clients_only` is set. Close the result to end the calls; they also end with the program.
         """
+
+@final
+class MemoryFile:
+    """A file that keeps the contents of memories, by their names.
+
+    Opens or creates the file, and loads contents into the memories before anybody uses them. With
+    `sync` 0, it stores every write before it is answered; otherwise it stores changes every `sync`
+    seconds, with one thread.
+
+    Raises `OSError` for a file that is damaged, locked by another process, not writable, of
+    another program, or of a newer version; the file and the memories are unchanged then. Raises
+    `ValueError` for memories that can't be kept together.
+    """
+
+    def __new__(
+        cls, path: str | PathLike[str], memories: Sequence[tuple[str, Memory]], sync: float
+    ) -> MemoryFile: ...
+    @property
+    def loaded(self) -> list[str]:
+        """The names of the memories whose contents come from the file."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """Areas that were resized, and memories in the file that are not given."""
+
+    def start(self) -> None:
+        """Stores what the memories contain, and goes on storing. A second call does nothing.
+
+        Raises `OSError` if the contents can't be stored.
+        """
+
+    def stop(self) -> None:
+        """Stores what is left, and closes the file. A second call does nothing.
+
+        With `sync` 0, writes are refused from now on. Raises `OSError` if the last contents are not
+        stored.
+        """
+
+    def status(self) -> MemoryFileStatus:
+        """How storing goes."""
+
+def read_memory_file(
+    path: str | PathLike[str],
+) -> dict[str, dict[Area, tuple[int, int, bytes]]]:
+    """Checks a file without changing it, and returns the areas of its memories.
+
+    An area is its first address, its size, and its bytes. Registers are big-endian; bits are
+    packed, least significant bit first, and the last byte is padded with 0. Raises the `OSError`s
+    of `MemoryFile`.
+    """
 
 @final
 class Follower:

@@ -96,6 +96,23 @@ ThreadHeartbeat: TypeAlias = tuple[str, float, int | None]
 """A thread's name, seconds since its last heartbeat, and its number in the system, if known."""
 
 
+class MemoryFileStatus(TypedDict):
+    """How storing memories in their file goes.
+
+    `failing`: why contents can't be stored at present. `stored_at`: when they were last stored, in
+    seconds since 1970. `commits`: transactions. `pending`: writes that wait to be stored.
+    `refused`: writes that were refused because they could not be stored. `bytes`: size of the file.
+    """
+
+    failing: str | None
+    stored_at: float | None
+    commits: int
+    pending: int
+    refused: int
+    last_commit_seconds: float
+    bytes: int
+
+
 class ConnectionCounters(TypedDict):
     """Connections of one listener: `open` is the current number, the others count outcomes."""
 

@@ -142,5 +142,9 @@ const fn reason(refusal: Refusal) -> &'static str {
         Refusal::WrongLength => "wrong_length",
         Refusal::Mirrored => "mirrored",
         Refusal::NotRegisters => "not_registers",
+        Refusal::Unavailable => "log_unavailable",
+        Refusal::NotStored => "not_stored",
+        Refusal::NotConfirmed => "not_confirmed",
+        Refusal::NotOneStep => "not_one_step",
     }
 }

@@ -17,6 +17,7 @@ mod link;
 mod listed;
 mod listener;
 mod memory;
+mod memory_file;
 mod peer;
 mod poller;
 mod raw_ingest;
@@ -46,6 +47,8 @@ mod _core {
     use super::listener::{Listener, RawRule, Rule, ServerTls};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange};
+    #[pymodule_export]
+    use super::memory_file::{MemoryFile, read_memory_file};
     #[pymodule_export]
     use super::poller::{PolledDevice, Poller, Results, plan_blocks, tell_disabled};
     #[pymodule_export]

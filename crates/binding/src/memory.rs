@@ -5,7 +5,7 @@ use std::sync::Arc;
 use holdfast_memory::{
     Access, Area, Gate, GateMode, Layout, Memory as Core, Mirrored, Read, Refusal, Span, Write,
 };
-use pyo3::exceptions::{PyIndexError, PyOverflowError, PyTypeError, PyValueError};
+use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyInt, PyList, PyString};
 
@@ -108,6 +108,12 @@ impl Memory {
         py.detach(|| self.core.sealed())
     }
 
+    /// Whether a write waits until it is kept: in a file, or in a log.
+    #[getter]
+    fn waits(&self) -> bool {
+        self.core.has_journal()
+    }
+
     /// How often the seal opened, and how often it closed again.
     #[getter]
     fn seal_changes(&self, py: Python<'_>) -> (u64, u64) {
@@ -151,7 +157,9 @@ impl Memory {
     /// Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
     ///
     /// Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range or an
-    /// unknown area, `TypeError` for a value of another type. An error changes nothing.
+    /// unknown area, `TypeError` for a value of another type, `OSError` if the memory is kept in a
+    /// file or a log that can't be written. An error changes nothing, except that a log may still
+    /// carry out a write that it did not confirm in time.
     fn write(
         &self,
         py: Python<'_>,
@@ -279,6 +287,9 @@ impl Range {
         match refusal {
             Refusal::OutOfRange => {
                 out_of_range(memory, self.area, i128::from(self.address), self.count as i128)
+            }
+            kept @ (Refusal::Unavailable | Refusal::NotStored | Refusal::NotConfirmed) => {
+                PyOSError::new_err(kept.to_string())
             }
             other => PyValueError::new_err(other.to_string()),
         }

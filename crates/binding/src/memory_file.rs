@@ -1,0 +1,102 @@
+//! `MemoryFile`: a file that keeps memories.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::UNIX_EPOCH;
+
+use holdfast_journal::file::{FileError, FileOnDisk, Member, MemoryFile as Core, Options, read};
+use holdfast_memory::Area;
+use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+
+use crate::arguments::seconds;
+use crate::memory::Memory;
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct MemoryFile {
+    path: PathBuf,
+    core: Core,
+}
+
+#[pymethods]
+impl MemoryFile {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        path: PathBuf,
+        memories: Vec<(String, PyRef<'_, Memory>)>,
+        sync: f64,
+    ) -> PyResult<MemoryFile> {
+        let options = Options::new(seconds("sync", sync)?);
+        let members = memories
+            .iter()
+            .map(|(name, memory)| Member { name: name.clone(), memory: Arc::clone(&memory.core) });
+        let members = members.collect();
+        let disk = Arc::new(FileOnDisk::new(&path));
+        match py.detach(|| Core::open(disk, members, options)) {
+            Ok(core) => Ok(MemoryFile { path, core }),
+            Err(error) => Err(raised(&path, error)),
+        }
+    }
+
+    #[getter]
+    fn loaded(&self) -> Vec<String> {
+        self.core.loaded().to_vec()
+    }
+
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.core.warnings().to_vec()
+    }
+
+    fn start(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.core.start()).map_err(|error| raised(&self.path, error))
+    }
+
+    fn stop(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.core.stop()).map_err(|error| raised(&self.path, error))
+    }
+
+    fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let status = py.detach(|| self.core.status());
+        let since_1970 = |at: std::time::SystemTime| {
+            at.duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+        };
+        let shown = PyDict::new(py);
+        shown.set_item("failing", status.failing)?;
+        shown.set_item("stored_at", status.stored_at.map(since_1970))?;
+        shown.set_item("commits", status.commits)?;
+        shown.set_item("pending", status.pending)?;
+        shown.set_item("refused", status.refused)?;
+        shown.set_item("last_commit_seconds", status.last_commit.as_secs_f64())?;
+        shown.set_item("bytes", status.bytes)?;
+        Ok(shown)
+    }
+}
+
+/// Checks a file without changing it, and returns the memories in it.
+#[pyfunction]
+pub fn read_memory_file(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyDict>> {
+    let memories = py.detach(|| read(&path)).map_err(|error| raised(&path, error))?;
+    let shown = PyDict::new(py);
+    for kept in memories {
+        let areas = PyDict::new(py);
+        for (area, bytes) in Area::ALL.into_iter().zip(&kept.areas) {
+            let span = kept.layout.span(area);
+            if span.size() > 0 {
+                let values = (span.start(), span.size(), PyBytes::new(py, bytes));
+                areas.set_item(area.name(), values)?;
+            }
+        }
+        shown.set_item(kept.name, areas)?;
+    }
+    Ok(shown)
+}
+
+fn raised(path: &Path, error: FileError) -> PyErr {
+    match error {
+        FileError::Memories(message) => PyValueError::new_err(message),
+        error => PyOSError::new_err(format!("{}: {error}", path.display())),
+    }
+}

@@ -1,0 +1,175 @@
+//! Where a file is, and how another one takes its place.
+
+use std::fmt;
+use std::fs;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use redb::backends::FileBackend;
+use redb::{Builder, Database};
+
+use super::error::FileError;
+use super::overlay::Overlay;
+
+/// A place for one file.
+pub trait Disk: fmt::Debug + Send + Sync {
+    /// The number of bytes of the file; `None` if there is no file.
+    ///
+    /// # Errors
+    /// [`FileError::Io`], and [`FileError::Foreign`] for a directory or a device.
+    fn size(&self) -> Result<Option<u64>, FileError>;
+
+    /// Opens the file, which exists.
+    ///
+    /// # Errors
+    /// Those of redb.
+    fn open(&self, builder: &Builder) -> Result<Database, FileError>;
+
+    /// Opens the file such that nothing in it changes.
+    ///
+    /// # Errors
+    /// Those of redb.
+    fn open_unchanged(&self, builder: &Builder) -> Result<Database, FileError>;
+
+    /// Creates an empty database beside the file.
+    ///
+    /// # Errors
+    /// Those of redb.
+    fn create(&self, builder: &Builder) -> Result<Database, FileError>;
+
+    /// Puts what was created in the place of the file, durably. Unless `replace` is set, there must not
+    /// be a file yet.
+    ///
+    /// # Errors
+    /// [`FileError::Io`]. The file is the old one or the new one then.
+    fn install(&self, replace: bool) -> Result<(), FileError>;
+
+    /// Removes what was created, unless it is in place.
+    fn discard(&self);
+}
+
+const MAGIC: &[u8] = b"redb";
+
+/// A file of the file system.
+#[derive(Debug)]
+pub struct FileOnDisk {
+    path: PathBuf,
+    /// Is created first. The name is of this process: two that start at once don't share it.
+    beside: PathBuf,
+}
+
+impl FileOnDisk {
+    pub fn new(path: &Path) -> FileOnDisk {
+        // A link to the file stays one when another file takes its place.
+        let path = fs::canonicalize(path).or_else(|_| std::path::absolute(path));
+        let path = path.unwrap_or_default();
+        let mut beside = path.as_os_str().to_owned();
+        beside.push(format!(".{}.new", std::process::id()));
+        FileOnDisk { path, beside: beside.into() }
+    }
+
+    /// Removes what processes left beside the file that were killed while they created one. Whoever
+    /// creates one now does not have this file open, and fails.
+    fn sweep(&self) {
+        let (Some(folder), Some(name)) = (self.path.parent(), self.path.file_name()) else {
+            return;
+        };
+        let prefix = format!("{}.", name.to_string_lossy());
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            let found = entry.file_name();
+            let process = found.to_str().and_then(|found| found.strip_prefix(&*prefix));
+            let process = process.and_then(|rest| rest.strip_suffix(".new"));
+            if process.is_some_and(|process| process.parse::<u32>().is_ok()) {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    }
+
+    /// The first bytes of the file.
+    fn begin(&self) -> io::Result<Vec<u8>> {
+        let mut begin = Vec::new();
+        fs::File::open(&self.path)?.take(MAGIC.len() as u64).read_to_end(&mut begin)?;
+        Ok(begin)
+    }
+
+    fn put_in_place(&self, replace: bool) -> io::Result<()> {
+        if replace {
+            fs::set_permissions(&self.beside, fs::metadata(&self.path)?.permissions())?;
+            fs::rename(&self.beside, &self.path)?;
+        } else {
+            // Unlike a rename, a link never replaces the file of another process.
+            match fs::hard_link(&self.beside, &self.path) {
+                // If the removal fails, the next process does it.
+                Ok(()) => drop(fs::remove_file(&self.beside)),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return Err(error),
+                // Not every file system has links.
+                Err(_) => fs::rename(&self.beside, &self.path)?,
+            }
+        }
+        self.sync_folder()
+    }
+
+    #[cfg(unix)]
+    fn sync_folder(&self) -> io::Result<()> {
+        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        fs::File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
+    }
+
+    /// Windows has no way to sync a folder.
+    #[cfg(not(unix))]
+    fn sync_folder(&self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Disk for FileOnDisk {
+    fn size(&self) -> Result<Option<u64>, FileError> {
+        let found = match fs::metadata(&self.path) {
+            Ok(found) => found,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(error.into()),
+        };
+        if !found.is_file() {
+            let what = if found.is_dir() { "a directory" } else { "not a regular file" };
+            return Err(FileError::Foreign(what.to_owned()));
+        }
+        Ok(Some(found.len()))
+    }
+
+    fn open(&self, builder: &Builder) -> Result<Database, FileError> {
+        let database = builder.open(&self.path)?;
+        self.sweep();
+        Ok(database)
+    }
+
+    fn open_unchanged(&self, builder: &Builder) -> Result<Database, FileError> {
+        // On Windows, a file that is locked can't be read. Then redb finds the lock.
+        if let Ok(begin) = self.begin()
+            && begin != MAGIC
+        {
+            return Err(FileError::Foreign(format!("it begins with {}", begin.escape_ascii())));
+        }
+        let file = FileBackend::new(fs::File::open(&self.path)?)?;
+        Ok(builder.create_with_backend(Overlay::new(file))?)
+    }
+
+    fn create(&self, builder: &Builder) -> Result<Database, FileError> {
+        match fs::remove_file(&self.beside) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error.into()),
+            _ => {}
+        }
+        Ok(builder.create(&self.beside)?)
+    }
+
+    fn install(&self, replace: bool) -> Result<(), FileError> {
+        self.put_in_place(replace).map_err(|error| match error.kind() {
+            io::ErrorKind::AlreadyExists => FileError::Locked,
+            _ => error.into(),
+        })
+    }
+
+    fn discard(&self) {
+        // Usually it is in place or was never created.
+        let _ = fs::remove_file(&self.beside);
+    }
+}

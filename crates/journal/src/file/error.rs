@@ -1,0 +1,88 @@
+//! Why a file can't be used. Whoever shows an error puts the name of the file in front.
+
+use std::io;
+
+use redb::{CommitError, DatabaseError, StorageError, TableError, TransactionError};
+use thiserror::Error;
+
+/// Why a file can't be used.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum FileError {
+    #[error(
+        "the file is damaged: {0}. Restore it from a backup; to start without its contents, move it away"
+    )]
+    Damaged(String),
+    #[error("the file is in use by another process")]
+    Locked,
+    #[error("not a file of memories: {0}")]
+    Foreign(String),
+    #[error("the file has format version {found}, allowed is {allowed}: it is of a newer release")]
+    Newer { found: u64, allowed: u64 },
+    #[error("{0}")]
+    Io(#[from] io::Error),
+    /// The memories can't be kept in one file.
+    #[error("{0}")]
+    Memories(String),
+}
+
+impl FileError {
+    pub(super) fn damaged(what: impl Into<String>) -> FileError {
+        FileError::Damaged(what.into())
+    }
+}
+
+impl From<StorageError> for FileError {
+    fn from(error: StorageError) -> FileError {
+        match error {
+            StorageError::Io(error) => match error.kind() {
+                io::ErrorKind::InvalidData | io::ErrorKind::UnexpectedEof => {
+                    FileError::Damaged(error.to_string())
+                }
+                _ => FileError::Io(error),
+            },
+            StorageError::Corrupted(what) => FileError::Damaged(what),
+            other => FileError::Io(io::Error::other(other.to_string())),
+        }
+    }
+}
+
+impl From<DatabaseError> for FileError {
+    fn from(error: DatabaseError) -> FileError {
+        match error {
+            DatabaseError::DatabaseAlreadyOpen => FileError::Locked,
+            DatabaseError::Storage(error) => error.into(),
+            DatabaseError::UpgradeRequired(version) => {
+                FileError::Foreign(format!("a redb file of format {version}"))
+            }
+            other => FileError::Damaged(other.to_string()),
+        }
+    }
+}
+
+impl From<TransactionError> for FileError {
+    fn from(error: TransactionError) -> FileError {
+        match error {
+            TransactionError::Storage(error) => error.into(),
+            other => FileError::Io(io::Error::other(other.to_string())),
+        }
+    }
+}
+
+impl From<CommitError> for FileError {
+    fn from(error: CommitError) -> FileError {
+        match error {
+            CommitError::Storage(error) => error.into(),
+            other => FileError::Io(io::Error::other(other.to_string())),
+        }
+    }
+}
+
+impl From<TableError> for FileError {
+    fn from(error: TableError) -> FileError {
+        match error {
+            TableError::Storage(error) => error.into(),
+            other => FileError::Foreign(format!("a redb file of another program: {other}")),
+        }
+    }
+}

@@ -1,0 +1,268 @@
+//! Memories and their file: loading, and the thread that stores.
+
+use std::io;
+use std::mem;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::process;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use holdfast_memory::{Contents, GateMode, Memory};
+
+use super::disk::Disk;
+use super::error::FileError;
+use super::image::{Changes, Image, Kept, layout_of};
+use super::periodic::{Periodic, writes};
+use super::queue::{Limits, Queue};
+use super::status::Status;
+use super::steps::Steps;
+use super::store::Store;
+
+/// A memory, and its name in the file.
+#[derive(Debug, Clone)]
+pub struct Member {
+    pub name: String,
+    pub memory: Arc<Memory>,
+}
+
+/// How contents are stored.
+#[derive(Debug, Clone, Copy)]
+pub struct Options {
+    /// Contents are stored after this time; with 0, before a write is answered.
+    pub sync: Duration,
+    /// With `sync` 0: how many steps, and how many bytes of steps, may wait.
+    pub max_steps: usize,
+    pub max_bytes: usize,
+    /// How long after an I/O error the next attempt follows if there is no step.
+    pub retry: Duration,
+}
+
+impl Options {
+    pub const fn new(sync: Duration) -> Options {
+        Options { sync, max_steps: 4096, max_bytes: 16 << 20, retry: Duration::from_secs(1) }
+    }
+}
+
+/// Memories that a file keeps.
+#[derive(Debug)]
+pub struct MemoryFile {
+    members: Vec<Member>,
+    options: Options,
+    loaded: Vec<String>,
+    warnings: Vec<String>,
+    queue: Arc<Queue>,
+    status: Arc<Mutex<Status>>,
+    /// How many writes to the memories are in the file, with a `sync` above 0.
+    stored: Arc<AtomicU64>,
+    /// The process that opened the file. A forked child must not touch it.
+    process: u32,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+enum State {
+    Loaded(Box<Store>),
+    Running(JoinHandle<Result<(), FileError>>),
+    Stopped,
+}
+
+impl MemoryFile {
+    /// Opens or creates the file, and loads contents into the memories before anybody uses them. With
+    /// `sync` 0 it becomes their journal; until [`MemoryFile::start`], it carries out writes at once.
+    ///
+    /// # Errors
+    /// [`FileError`], for a file that can't be used, and for memories that can't be kept in one file.
+    /// Nothing has changed then.
+    pub fn open(
+        disk: Arc<dyn Disk>,
+        members: Vec<Member>,
+        options: Options,
+    ) -> Result<MemoryFile, FileError> {
+        check(&members)?;
+        let status = Arc::new(Mutex::new(Status::default()));
+        let store = Store::open(disk, Arc::clone(&status))?;
+        let (mut loaded, mut warnings) = (Vec::new(), Vec::new());
+        for Member { name, memory } in &members {
+            if let Some(kept) = store.image().named(name) {
+                warnings.extend(kept.resizings(layout_of(memory)));
+                memory.restore(&sealed_again(kept, memory));
+                loaded.push(name.clone());
+            }
+        }
+        for kept in store.image().memories() {
+            if members.iter().all(|member| member.name != kept.name) {
+                let name = &kept.name;
+                warnings
+                    .push(format!("{name}: is in the file but not configured, and stays there"));
+            }
+        }
+        let memories: Vec<_> = members.iter().map(|member| Arc::clone(&member.memory)).collect();
+        let limits = Limits { steps: options.max_steps, bytes: options.max_bytes };
+        let queue = Arc::new(Queue::new(memories, limits, Arc::clone(&status)));
+        if options.sync.is_zero() {
+            for (number, member) in (0..).zip(&members) {
+                member.memory.keep_in(Arc::clone(&queue) as _, number);
+            }
+        }
+        let state = Mutex::new(State::Loaded(Box::new(store)));
+        let (process, stored) = (process::id(), Arc::default());
+        Ok(MemoryFile { members, options, loaded, warnings, queue, status, stored, process, state })
+    }
+
+    /// The names of the memories whose contents come from the file.
+    pub fn loaded(&self) -> &[String] {
+        &self.loaded
+    }
+
+    /// What is unusual about the file, in sentences.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// Stores what the memories contain, and goes on storing. A second call does nothing.
+    ///
+    /// # Errors
+    /// [`FileError`] if the contents can't be stored. They are then still not stored.
+    pub fn start(&self) -> Result<(), FileError> {
+        let mut state = self.state();
+        let State::Loaded(store) = &mut *state else { return Ok(()) };
+        let memories: Vec<_> = self.members.iter().map(|m| Arc::clone(&m.memory)).collect();
+        let mut ids = Vec::new();
+        self.queue.begin(|| {
+            self.stored.store(writes(&memories), Ordering::Relaxed);
+            let changes;
+            (changes, ids) = first_changes(store.image(), &self.members)?;
+            store.store(changes)
+        })?;
+        let State::Loaded(store) = mem::replace(&mut *state, State::Stopped) else {
+            unreachable!("the state is locked")
+        };
+        let (queue, retry) = (Arc::clone(&self.queue), self.options.retry);
+        let keeping: Box<dyn FnOnce() -> Result<(), FileError> + Send> =
+            if self.options.sync.is_zero() {
+                let steps = Steps::new(*store, memories, ids, queue, retry);
+                Box::new(|| steps.run())
+            } else {
+                let (sync, stored) = (self.options.sync, Arc::clone(&self.stored));
+                let periodic = Periodic { store: *store, memories, ids, queue, sync, stored };
+                Box::new(|| periodic.run())
+            };
+        let (queue, status) = (Arc::clone(&self.queue), Arc::clone(&self.status));
+        let thread = thread::Builder::new().name("memory file".to_owned()).spawn(move || {
+            let ended = catch_unwind(AssertUnwindSafe(keeping)).unwrap_or_else(|_| {
+                let error = FileError::Io(io::Error::other("the thread that stores has panicked"));
+                lock(&status).failing = Some(error.to_string());
+                Err(error)
+            });
+            queue.end();
+            ended
+        });
+        *state = State::Running(thread.inspect_err(|_| self.queue.end())?);
+        Ok(())
+    }
+
+    /// Stores what is left, and closes the file. Steps are refused from now on. A second call does
+    /// nothing.
+    ///
+    /// # Errors
+    /// [`FileError`] if the last contents are not stored.
+    pub fn stop(&self) -> Result<(), FileError> {
+        if self.process != process::id() {
+            return Ok(());
+        }
+        let mut state = self.state();
+        let stopped = mem::replace(&mut *state, State::Stopped);
+        self.queue.stop();
+        match stopped {
+            State::Loaded(store) => store.close(),
+            State::Running(thread) => thread.join().unwrap_or(Ok(())),
+            State::Stopped => Ok(()),
+        }
+    }
+
+    pub fn status(&self) -> Status {
+        let pending = if self.options.sync.is_zero() {
+            self.queue.waiting() as u64
+        } else {
+            let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
+            written.saturating_sub(self.stored.load(Ordering::Relaxed))
+        };
+        Status { pending, ..lock(&self.status).clone() }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        lock(&self.state)
+    }
+}
+
+impl Drop for MemoryFile {
+    fn drop(&mut self) {
+        if self.process != process::id() {
+            // The file belongs to the parent, and the thread does not exist here.
+            let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
+            return mem::forget(mem::replace(state, State::Stopped));
+        }
+        // Whoever wants to know whether the last contents are stored calls it before.
+        let _ = self.stop();
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Checks that memories can be kept in one file.
+fn check(members: &[Member]) -> Result<(), FileError> {
+    for (number, Member { name, memory }) in members.iter().enumerate() {
+        let twice = members[..number]
+            .iter()
+            .any(|other| other.name == *name || Arc::ptr_eq(&other.memory, memory));
+        if twice {
+            return Err(FileError::Memories(format!("memory {name} is given twice")));
+        }
+        if memory.has_journal() {
+            return Err(FileError::Memories(format!("memory {name} is kept elsewhere already")));
+        }
+    }
+    Ok(())
+}
+
+/// The contents of a memory from the file. Nobody knows how old they are: a memory with a gate that
+/// opens once is sealed again, and its gate bit is 0, because the next write would open it otherwise.
+fn sealed_again(kept: &Kept, memory: &Memory) -> Contents {
+    let mut areas = kept.resized(layout_of(memory));
+    let Some(gate) = memory.gate() else { return Contents { areas, sealed: false } };
+    let bit = usize::from(gate.address - memory.span(gate.area).start());
+    let (byte, mask) = (&mut areas[gate.area as usize][bit / 8], 1 << (bit % 8));
+    let sealed = match gate.mode {
+        GateMode::Once => {
+            *byte &= !mask;
+            true
+        }
+        GateMode::Level => *byte & mask == 0,
+    };
+    Contents { areas, sealed }
+}
+
+/// What the file lacks of the memories, and their numbers in it.
+fn first_changes(image: &Image, members: &[Member]) -> Result<(Changes, Vec<u16>), FileError> {
+    let memories: Vec<_> = members.iter().map(|member| Arc::clone(&member.memory)).collect();
+    let (mut changes, mut ids) = (Changes::default(), Vec::new());
+    let mut free = image.free_ids();
+    for (Member { name, memory }, contents) in members.iter().zip(Memory::contents(&memories)) {
+        let (kept, layout) = (image.named(name), layout_of(memory));
+        let id = kept.map(|kept| kept.id).or_else(|| free.next()).ok_or_else(|| {
+            FileError::Memories(format!("no place for memory {name}: the file has 65536 memories"))
+        })?;
+        if kept.is_some_and(|kept| kept.layout == layout) {
+            changes.pages.extend(image.differing(id, &contents));
+        } else {
+            let areas = contents.areas;
+            changes.memories.push(Kept { name: name.clone(), id, layout, areas });
+        }
+        ids.push(id);
+    }
+    Ok((changes, ids))
+}

@@ -1,0 +1,52 @@
+//! A file that keeps the contents of memories over restarts.
+//!
+//! The rules this module keeps:
+//!
+//! * The file is always the contents of its memories at one moment: a transaction of redb stores whole
+//!   steps, and several memories in one.
+//! * With `sync` 0, a step is answered after the transaction that stores it, and the memories change
+//!   between the two. A step that can't be stored changes nothing.
+//! * Nobody knows what an I/O error leaves on the disk. So the next transaction writes a new file and
+//!   puts it in the place of the old one.
+//! * A file that is not entirely as it was stored is refused, and not changed. It is never replaced by
+//!   an empty one.
+
+mod disk;
+mod error;
+mod image;
+mod keeper;
+mod overlay;
+mod periodic;
+mod queue;
+mod status;
+mod steps;
+mod store;
+
+use std::path::Path;
+
+pub use disk::{Disk, FileOnDisk};
+pub use error::FileError;
+pub use image::Kept;
+pub use keeper::{Member, MemoryFile, Options};
+pub use overlay::Overlay;
+pub use status::Status;
+pub use store::VERSION;
+
+/// Checks a file and returns what it contains, without changing it.
+///
+/// # Errors
+/// As [`MemoryFile::open`], and [`FileError::Io`] for a file that does not exist.
+pub fn read(path: &Path) -> Result<Vec<Kept>, FileError> {
+    read_from(&FileOnDisk::new(path))
+}
+
+/// As [`read`], from any disk.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_from(disk: &dyn Disk) -> Result<Vec<Kept>, FileError> {
+    match disk.size()? {
+        Some(len) => Ok(store::inspect(disk, len)?.into_memories()),
+        None => Err(FileError::Io(std::io::ErrorKind::NotFound.into())),
+    }
+}

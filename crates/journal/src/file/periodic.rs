@@ -1,0 +1,55 @@
+//! Storing every few seconds what has changed.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use holdfast_memory::Memory;
+
+use super::error::FileError;
+use super::image::Changes;
+use super::queue::{Next, Queue};
+use super::store::Store;
+
+pub(super) struct Periodic {
+    pub store: Store,
+    pub memories: Vec<Arc<Memory>>,
+    /// Their numbers in the file.
+    pub ids: Vec<u16>,
+    /// No step ever waits in it.
+    pub queue: Arc<Queue>,
+    pub sync: Duration,
+    /// How many writes to the memories are in the file.
+    pub stored: Arc<AtomicU64>,
+}
+
+impl Periodic {
+    pub fn run(mut self) -> Result<(), FileError> {
+        while let Next::Idle = self.queue.next(Some(self.sync)) {
+            // The status has the error, and the next attempt may succeed.
+            let _ = self.store_changes();
+        }
+        self.store_changes()?;
+        self.store.close()
+    }
+
+    fn store_changes(&mut self) -> Result<(), FileError> {
+        // Writes after this are in the contents, perhaps, and stored again.
+        let written = writes(&self.memories);
+        if written == self.stored.load(Ordering::Relaxed) && !self.store.in_doubt() {
+            return Ok(());
+        }
+        let image = self.store.image();
+        let contents = Memory::contents(&self.memories);
+        let pages = self.ids.iter().zip(&contents);
+        let pages = pages.flat_map(|(id, contents)| image.differing(*id, contents)).collect();
+        self.store.store(Changes { memories: Vec::new(), pages })?;
+        self.stored.store(written, Ordering::Relaxed);
+        Ok(())
+    }
+}
+
+/// How many writes were carried out.
+pub(super) fn writes(memories: &[Arc<Memory>]) -> u64 {
+    memories.iter().map(|memory| memory.writes()).sum()
+}

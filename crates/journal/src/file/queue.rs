@@ -1,0 +1,179 @@
+//! The steps that wait to be stored.
+
+use std::mem;
+use std::process;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use holdfast_memory::{Action, Done, Journal, Memory, Refusal, Refused, Step};
+
+use super::status::Status;
+
+/// A step, and who receives its outcome.
+pub(super) type Waiting = (Step, Done);
+
+/// The journal of the memories of a file.
+#[derive(Debug)]
+pub(super) struct Queue {
+    state: Mutex<State>,
+    changed: Condvar,
+    limits: Limits,
+    status: Arc<Mutex<Status>>,
+    /// A forked child has no thread that takes steps.
+    process: u32,
+}
+
+/// How much may wait.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Limits {
+    pub steps: usize,
+    pub bytes: usize,
+}
+
+struct State {
+    phase: Phase,
+    waiting: Vec<Waiting>,
+    bytes: usize,
+}
+
+#[derive(Debug)]
+enum Phase {
+    /// Nothing is stored yet: steps are carried out at once.
+    Loading(Vec<Arc<Memory>>),
+    Running,
+    /// Steps that wait are stored, others refused.
+    Stopping,
+    Ended,
+}
+
+/// What is to be done next.
+pub(super) enum Next {
+    Steps(Vec<Waiting>),
+    /// Nothing happened in the given time.
+    Idle,
+    /// Nothing waits any more, and nothing will.
+    Stop,
+}
+
+impl Queue {
+    pub fn new(memories: Vec<Arc<Memory>>, limits: Limits, status: Arc<Mutex<Status>>) -> Queue {
+        let state = State { phase: Phase::Loading(memories), waiting: Vec::new(), bytes: 0 };
+        let (state, process) = (Mutex::new(state), process::id());
+        Queue { state, changed: Condvar::new(), limits, status, process }
+    }
+
+    /// Lets steps wait from now on, if `store` stores what the memories contain now.
+    pub fn begin<E>(&self, store: impl FnOnce() -> Result<(), E>) -> Result<(), E> {
+        let mut state = self.state();
+        if matches!(state.phase, Phase::Loading(_)) {
+            store()?;
+            state.phase = Phase::Running;
+        }
+        Ok(())
+    }
+
+    /// Refuses steps from now on. Those that wait are still stored.
+    pub fn stop(&self) {
+        let mut state = self.state();
+        state.phase = match state.phase {
+            Phase::Running | Phase::Stopping => Phase::Stopping,
+            Phase::Loading(_) | Phase::Ended => Phase::Ended,
+        };
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Refuses all steps, also those that wait.
+    pub fn end(&self) {
+        let mut state = self.state();
+        state.phase = Phase::Ended;
+        state.bytes = 0;
+        let waiting = mem::take(&mut state.waiting);
+        drop(state);
+        self.refuse(waiting.into_iter().map(|(_, done)| done), Refusal::Unavailable);
+    }
+
+    /// Waits until there is something to do, or for this time.
+    pub fn next(&self, timeout: Option<Duration>) -> Next {
+        let is_idle =
+            |state: &mut State| state.waiting.is_empty() && matches!(state.phase, Phase::Running);
+        let state = self.state();
+        let mut state = match timeout {
+            Some(timeout) => {
+                self.changed
+                    .wait_timeout_while(state, timeout, is_idle)
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .0
+            }
+            None => self.changed.wait_while(state, is_idle).unwrap_or_else(PoisonError::into_inner),
+        };
+        if !state.waiting.is_empty() {
+            state.bytes = 0;
+            return Next::Steps(mem::take(&mut state.waiting));
+        }
+        if is_idle(&mut state) { Next::Idle } else { Next::Stop }
+    }
+
+    pub fn waiting(&self) -> usize {
+        self.state().waiting.len()
+    }
+
+    /// Answers and counts steps that were not carried out.
+    pub fn refuse(&self, steps: impl ExactSizeIterator<Item = Done>, refusal: Refusal) {
+        self.status.lock().unwrap_or_else(PoisonError::into_inner).refused += steps.len() as u64;
+        for done in steps {
+            done(Err(Refused { index: 0, refusal }));
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Journal for Queue {
+    fn submit(&self, step: Step, done: Done) {
+        if self.process != process::id() {
+            return done(Err(Refused { index: 0, refusal: Refusal::Unavailable }));
+        }
+        let mut state = self.state();
+        let refusal = match &state.phase {
+            Phase::Loading(memories) => {
+                let outcome = step.carry_out(memories);
+                drop(state);
+                return done(outcome);
+            }
+            Phase::Stopping | Phase::Ended => Refusal::Unavailable,
+            Phase::Running => {
+                let bytes = state.bytes + size(&step);
+                if state.waiting.len() < self.limits.steps && bytes <= self.limits.bytes {
+                    state.bytes = bytes;
+                    state.waiting.push((step, done));
+                    drop(state);
+                    return self.changed.notify_one();
+                }
+                Refusal::NotStored
+            }
+        };
+        drop(state);
+        self.refuse(std::iter::once(done), refusal);
+    }
+}
+
+/// About how many bytes a step needs.
+fn size(step: &Step) -> usize {
+    let writes = match &step.action {
+        Action::Write(writes) => &writes[..],
+        Action::Mask { .. } => &[],
+        Action::WriteThenRead { write, .. } => std::slice::from_ref(write),
+    };
+    let of_writes = writes.iter().map(|write| mem::size_of_val(write) + write.bytes.len());
+    mem::size_of::<Waiting>() + of_writes.sum::<usize>()
+}
+
+impl std::fmt::Debug for State {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let State { phase, waiting, bytes } = self;
+        write!(f, "{phase:?}, {} steps of {bytes} bytes", waiting.len())
+    }
+}

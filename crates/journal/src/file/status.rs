@@ -1,0 +1,22 @@
+//! How storing goes.
+
+use std::time::{Duration, SystemTime};
+
+/// How storing goes.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Status {
+    /// Why the contents can't be stored at present.
+    pub failing: Option<String>,
+    /// When contents were last stored.
+    pub stored_at: Option<SystemTime>,
+    /// How many transactions were stored.
+    pub commits: u64,
+    /// How many writes wait to be stored.
+    pub pending: u64,
+    /// How many writes were refused because they could not be stored.
+    pub refused: u64,
+    /// How long the last transaction took.
+    pub last_commit: Duration,
+    /// The size of the file.
+    pub bytes: u64,
+}

@@ -1,0 +1,266 @@
+//! The file as a database: its tables, and transactions.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Instant, SystemTime};
+
+use redb::{
+    Builder, Database, ReadableDatabase, ReadableTable, TableDefinition, TableError,
+    WriteTransaction,
+};
+
+use super::disk::Disk;
+use super::error::FileError;
+use super::image::{self, Changes, Image, Kept, Page};
+use super::status::Status;
+
+/// The version of the format.
+pub const VERSION: u64 = 1;
+
+const ABOUT: TableDefinition<&str, u64> = TableDefinition::new("holdfast");
+const FORMAT: &str = "format";
+/// The record of each memory, by name, with its checksum.
+const MEMORIES: TableDefinition<&str, &[u8]> = TableDefinition::new("memories");
+/// Memory, area and number of a page; its bytes, with their checksum.
+const PAGES: TableDefinition<(u16, u8, u16), &[u8]> = TableDefinition::new("pages");
+
+/// redb keeps pages in memory, and the image is there already.
+const CACHE: usize = 1 << 20;
+
+/// An open file.
+#[derive(Debug)]
+pub(super) struct Store {
+    disk: Arc<dyn Disk>,
+    database: Database,
+    /// What the file contains, unless it is in doubt.
+    image: Image,
+    /// The last transaction failed: nobody knows what the file contains.
+    in_doubt: bool,
+    status: Arc<Mutex<Status>>,
+}
+
+impl Store {
+    /// Opens the file, or creates one without memories.
+    ///
+    /// # Errors
+    /// As [`super::MemoryFile::open`].
+    pub fn open(disk: Arc<dyn Disk>, status: Arc<Mutex<Status>>) -> Result<Store, FileError> {
+        let (database, image) = match disk.size()? {
+            Some(len) => {
+                inspect(&*disk, len)?;
+                guarded(|| {
+                    let database = disk.open(&builder())?;
+                    let image = contents(&database)?;
+                    Ok((database, image))
+                })?
+            }
+            None => (create(&*disk, &Image::default(), false)?, Image::default()),
+        };
+        let store = Store { disk, database, image, in_doubt: false, status };
+        store.note(|status| status.bytes = store.bytes());
+        Ok(store)
+    }
+
+    pub fn image(&self) -> &Image {
+        &self.image
+    }
+
+    pub const fn in_doubt(&self) -> bool {
+        self.in_doubt
+    }
+
+    /// Stores changes durably, in one transaction.
+    ///
+    /// # Errors
+    /// [`FileError`]. The image is unchanged then, and the next call writes a new file.
+    pub fn store(&mut self, changes: Changes) -> Result<(), FileError> {
+        if changes.is_empty() && !self.in_doubt {
+            return Ok(());
+        }
+        let began = Instant::now();
+        let stored = self.try_store(changes);
+        let bytes = self.bytes();
+        self.note(|status| match &stored {
+            Ok(()) => {
+                status.failing = None;
+                status.stored_at = Some(SystemTime::now());
+                status.commits += 1;
+                status.last_commit = began.elapsed();
+                status.bytes = bytes;
+            }
+            Err(error) => status.failing = Some(error.to_string()),
+        });
+        stored
+    }
+
+    fn try_store(&mut self, changes: Changes) -> Result<(), FileError> {
+        if self.in_doubt {
+            let mut image = self.image.clone();
+            image.apply(changes);
+            self.database = create(&*self.disk, &image, true)?;
+            self.image = image;
+            self.in_doubt = false;
+            return Ok(());
+        }
+        // Also true if it panics.
+        self.in_doubt = true;
+        let transaction = self.database.begin_write()?;
+        write(&transaction, &changes)?;
+        transaction.commit()?;
+        self.in_doubt = false;
+        self.image.apply(changes);
+        Ok(())
+    }
+
+    /// Closes the file.
+    ///
+    /// # Errors
+    /// [`FileError`], also if the last contents are not stored.
+    pub fn close(mut self) -> Result<(), FileError> {
+        self.store(Changes::default())?;
+        Ok(self.database.close()?)
+    }
+
+    fn bytes(&self) -> u64 {
+        self.disk.size().ok().flatten().unwrap_or_default()
+    }
+
+    fn note(&self, change: impl FnOnce(&mut Status)) {
+        change(&mut self.status.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+}
+
+/// Checks the file and returns what it contains, without changing it.
+///
+/// # Errors
+/// As [`super::read`].
+pub(super) fn inspect(disk: &dyn Disk, len: u64) -> Result<Image, FileError> {
+    if len == 0 {
+        return Err(FileError::damaged("it has 0 bytes"));
+    }
+    guarded(|| contents(&disk.open_unchanged(&builder())?))
+}
+
+fn builder() -> Builder {
+    let mut builder = Database::builder();
+    builder.set_cache_size(CACHE).set_check_integrity_on_open(true);
+    builder
+}
+
+/// A database that is damaged in ways that redb does not expect may panic in it.
+fn guarded<T>(open: impl FnOnce() -> Result<T, FileError>) -> Result<T, FileError> {
+    catch_unwind(AssertUnwindSafe(open))
+        .unwrap_or_else(|_| Err(FileError::damaged("its structure is invalid")))
+}
+
+/// Writes a new file and puts it in place.
+fn create(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Database, FileError> {
+    create_beside(disk, image, replace).inspect_err(|_| disk.discard())
+}
+
+fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Database, FileError> {
+    let database = disk.create(&builder())?;
+    let transaction = database.begin_write()?;
+    transaction.open_table(ABOUT)?.insert(FORMAT, VERSION)?;
+    let memories = image.memories().to_vec();
+    write(&transaction, &Changes { memories, pages: Vec::new() })?;
+    transaction.commit()?;
+    disk.install(replace)?;
+    Ok(database)
+}
+
+fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileError> {
+    let mut records = transaction.open_table(MEMORIES)?;
+    let mut pages = transaction.open_table(PAGES)?;
+    for kept in &changes.memories {
+        let record = image::encode(kept.id, kept.layout);
+        records.insert(&*kept.name, &*with_checksum(kept.name.as_bytes(), &record))?;
+        pages.retain_in((kept.id, 0, 0)..=(kept.id, u8::MAX, u16::MAX), |_, _| false)?;
+        for (area, number, bytes) in kept.pages() {
+            let key = (kept.id, area, number);
+            pages.insert(key, &*with_checksum(&place(key), bytes))?;
+        }
+    }
+    for Page { memory, area, number, bytes } in &changes.pages {
+        let key = (*memory, *area, *number);
+        pages.insert(key, &*with_checksum(&place(key), bytes))?;
+    }
+    Ok(())
+}
+
+/// Reads all that a database contains, and checks it.
+fn contents(database: &Database) -> Result<Image, FileError> {
+    let transaction = database.begin_read()?;
+    let about = match transaction.open_table(ABOUT) {
+        Err(TableError::TableDoesNotExist(_)) => {
+            return Err(FileError::Foreign("a redb file of another program".to_owned()));
+        }
+        about => about?,
+    };
+    match about.get(FORMAT)?.map(|version| version.value()) {
+        Some(VERSION) => {}
+        Some(found) if found > VERSION => {
+            return Err(FileError::Newer { found, allowed: VERSION });
+        }
+        _ => return Err(FileError::damaged("it has no format version")),
+    }
+    let mut memories: Vec<Kept> = Vec::new();
+    for entry in transaction.open_table(MEMORIES)?.iter()? {
+        let (name, record) = entry?;
+        let name = name.value();
+        let record = checked(name.as_bytes(), record.value())
+            .ok_or_else(|| FileError::damaged(format!("wrong checksum of memory {name}")))?;
+        memories.push(image::decode(name, record)?);
+    }
+    memories.sort_by_key(|kept| kept.id);
+    if memories.windows(2).any(|pair| pair[0].id == pair[1].id) {
+        return Err(FileError::damaged("two memories have one number"));
+    }
+    let pages = transaction.open_table(PAGES)?;
+    let mut entries = pages.iter()?;
+    for kept in &mut memories {
+        for (area, bytes) in (0..).zip(&mut kept.areas) {
+            for (number, page) in (0..).zip(bytes.chunks_mut(image::PAGE)) {
+                let key = (kept.id, area, number);
+                let damaged =
+                    |what| FileError::damaged(format!("{what} {number} of memory {}", kept.name));
+                let Some(entry) = entries.next() else { return Err(damaged("there is no page")) };
+                let (found, stored) = entry?;
+                let stored = checked(&place(key), stored.value());
+                match stored.filter(|stored| found.value() == key && stored.len() == page.len()) {
+                    Some(stored) => page.copy_from_slice(stored),
+                    None => return Err(damaged("wrong checksum of page")),
+                }
+            }
+        }
+    }
+    if entries.next().is_some() {
+        return Err(FileError::damaged("it has pages of no memory"));
+    }
+    Ok(Image::new(memories))
+}
+
+fn place((memory, area, number): (u16, u8, u16)) -> [u8; 5] {
+    let ([a, b], [c, d]) = (memory.to_be_bytes(), number.to_be_bytes());
+    [a, b, area, c, d]
+}
+
+/// Bytes, and the checksum of them and of what they belong to.
+fn with_checksum(to: &[u8], bytes: &[u8]) -> Vec<u8> {
+    let mut stored = bytes.to_vec();
+    stored.extend(checksum(to, bytes).to_be_bytes());
+    stored
+}
+
+/// The bytes, if their checksum is right.
+fn checked<'a>(to: &[u8], stored: &'a [u8]) -> Option<&'a [u8]> {
+    let (bytes, found) = stored.split_last_chunk()?;
+    (checksum(to, bytes) == u32::from_be_bytes(*found)).then_some(bytes)
+}
+
+fn checksum(to: &[u8], bytes: &[u8]) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(to);
+    hasher.update(bytes);
+    hasher.finalize()
+}

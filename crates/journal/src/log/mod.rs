@@ -1,0 +1,1 @@
+//! A log of writes that several machines share, in NATS JetStream.
