@@ -60,6 +60,7 @@ NAME ?= server
 # Long runs of tests that `make test` does in short.
 torture: .venv/core.stamp .venv/dev.stamp
 	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-engine --test route
+	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-journal
 	HOLDFAST_TORTURE=1 $(BIN)/pytest tests/server/test_slow_connections.py tests/outputs/test_mqtt_outage.py
 
 bench: .venv/core.stamp .venv/dev.stamp

@@ -1,0 +1,363 @@
+//! Storing, loading, and what becomes of steps.
+
+mod support;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use holdfast_journal::file::{Disk, FileError, FileOnDisk, MemoryFile, Options};
+use holdfast_memory::{
+    Access, Area, Gate, GateMode, Layout, Memory, Refusal, Span, Write, write_across,
+};
+use support::sim::SimDisk;
+use support::{
+    REGISTERS, at_once, contents, get, keep, layout, member, memory, set, submit, until,
+};
+
+const REFUSED: Result<(), Refusal> = Err(Refusal::Unavailable);
+
+fn folder(name: &str) -> std::path::PathBuf {
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).unwrap();
+    folder
+}
+
+#[test]
+fn contents_survive_a_restart() {
+    for sync in [Duration::ZERO, Duration::from_secs(3600)] {
+        let path = folder(&format!("restart{}", sync.as_secs())).join("memories.redb");
+        let disk = Arc::new(FileOnDisk::new(&path));
+        let layout = layout(9, 1000);
+        let (one, two) = (memory(layout, None), memory(layout, None));
+        let file = keep(&disk, &[("one", &one), ("two", &two)], Options::new(sync)).unwrap();
+        assert!(file.loaded().is_empty());
+        set(&one, 999, 7).unwrap();
+        set(&two, 128, 0xfffe).unwrap();
+        let coils = Write { area: Area::Coils, address: 7, count: 2, bytes: &[3] };
+        one.write(Access::Client, coils).unwrap();
+        assert_eq!(one.has_journal(), sync.is_zero());
+        file.stop().unwrap();
+        file.stop().unwrap();
+        let stored = [contents(&one), contents(&two)];
+        if sync.is_zero() {
+            assert_eq!(set(&one, 0, 1), REFUSED);
+            assert_eq!(get(&one, 0), 0);
+        }
+        let (one, two) = (memory(layout, None), memory(layout, None));
+        let members = vec![member("one", &one), member("two", &two)];
+        let file = MemoryFile::open(disk, members, Options::new(sync)).unwrap();
+        assert_eq!(file.loaded(), ["one", "two"]);
+        assert!(file.warnings().is_empty());
+        assert_eq!([contents(&one), contents(&two)], stored);
+        let names: Vec<_> = std::fs::read_dir(path.parent().unwrap()).unwrap().collect();
+        assert_eq!(names.len(), 1, "{names:?}");
+    }
+}
+
+#[test]
+fn what_killed_processes_left_is_removed() {
+    let folder = folder("left");
+    let path = folder.join("memories.redb");
+    let names =
+        ["memories.redb.77.new", "memories.redb.x.new", "memories.redb.new", "other.77.new"];
+    for _ in 0..2 {
+        for name in names {
+            std::fs::write(folder.join(name), "half").unwrap();
+        }
+        let one = memory(layout(0, 10), None);
+        keep(&Arc::new(FileOnDisk::new(&path)), &[("one", &one)], at_once()).unwrap();
+    }
+    let left = names.map(|name| folder.join(name).exists());
+    assert_eq!(left, [false, true, true, true]);
+}
+
+#[test]
+fn a_file_that_takes_the_place_of_another_has_its_permissions() {
+    let path = folder("permissions").join("memories.redb");
+    let disk = Arc::new(FileOnDisk::new(&path));
+    let one = memory(layout(0, 10), None);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    let mut permissions = std::fs::metadata(&path).unwrap().permissions();
+    private(&mut permissions);
+    std::fs::set_permissions(&path, permissions).unwrap();
+    let permissions = std::fs::metadata(&path).unwrap().permissions();
+    disk.create(&redb::Database::builder()).unwrap().close().unwrap();
+    disk.install(true).unwrap();
+    assert_eq!(std::fs::metadata(&path).unwrap().permissions(), permissions);
+    file.stop().unwrap();
+}
+
+#[cfg(unix)]
+fn private(permissions: &mut std::fs::Permissions) {
+    std::os::unix::fs::PermissionsExt::set_mode(permissions, 0o600);
+}
+
+#[cfg(not(unix))]
+fn private(_: &mut std::fs::Permissions) {}
+
+#[test]
+fn what_is_written_before_the_start_is_stored_by_it() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 10), None);
+    let file = MemoryFile::open(Arc::clone(&disk) as _, vec![member("one", &one)], at_once());
+    let file = file.unwrap();
+    set(&one, 3, 33).unwrap();
+    assert_eq!(file.status().commits, 0);
+    file.start().unwrap();
+    assert_eq!(file.status().commits, 1);
+    let two = memory(layout(0, 10), None);
+    let disk = Arc::new(SimDisk::with_file(disk.bytes()));
+    keep(&disk, &[("one", &two)], at_once()).unwrap();
+    assert_eq!(get(&two, 3), 33);
+}
+
+#[test]
+fn a_process_that_ends_before_the_start_leaves_no_contents() {
+    let disk = Arc::new(SimDisk::default());
+    for _ in 0..2 {
+        let one = memory(layout(0, 10), None);
+        let members = vec![member("one", &one)];
+        let file = MemoryFile::open(Arc::clone(&disk) as _, members, at_once()).unwrap();
+        assert!(file.loaded().is_empty());
+    }
+}
+
+#[test]
+fn a_write_that_changes_nothing_is_not_stored() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 10), None);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    set(&one, 3, 33).unwrap();
+    let (commits, syncs) = (file.status().commits, disk.syncs());
+    for _ in 0..100 {
+        set(&one, 3, 33).unwrap();
+    }
+    assert_eq!((file.status().commits, disk.syncs()), (commits, syncs));
+    set(&one, 3, 34).unwrap();
+    assert_eq!(file.status().commits, commits + 1);
+}
+
+#[test]
+fn steps_that_wait_are_stored_together() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    let commits = file.status().commits;
+    disk.hold(true);
+    let mut coming = vec![submit(&one, 0, 1)];
+    until("the first step", || disk.is_blocking());
+    coming.extend((1..500).map(|address| submit(&one, address, 1)));
+    assert_eq!(file.status().pending, 499);
+    assert_eq!(get(&one, 0), 0, "nothing changes before it is stored");
+    disk.hold(false);
+    for outcome in coming {
+        outcome.recv().unwrap().unwrap();
+    }
+    assert_eq!(file.status().commits, commits + 2);
+}
+
+#[test]
+fn the_queue_is_bounded_in_steps_and_bytes() {
+    for (max_steps, max_bytes) in [(10, usize::MAX), (usize::MAX, 4000)] {
+        let disk = Arc::new(SimDisk::default());
+        let one = memory(layout(0, 1000), None);
+        let options = Options { max_steps, max_bytes, ..at_once() };
+        let file = keep(&disk, &[("one", &one)], options).unwrap();
+        disk.hold(true);
+        let mut coming = vec![submit(&one, 0, 1)];
+        until("the first step", || disk.is_blocking());
+        coming.extend((1..1000).map(|address| submit(&one, address, 1)));
+        let full = coming.iter().position(|outcome| outcome.try_recv().is_ok()).unwrap();
+        assert!((2..=60).contains(&full), "{full}");
+        disk.hold(false);
+        for (address, outcome) in (0..).zip(&coming) {
+            // One refusal was received above.
+            if usize::from(address) != full {
+                assert_eq!(outcome.recv().unwrap().is_ok(), usize::from(address) < full);
+            }
+            assert_eq!(get(&one, address), u16::from(usize::from(address) < full));
+        }
+        assert_eq!(file.status().refused, 1000 - full as u64);
+        set(&one, 999, 1).unwrap();
+    }
+}
+
+#[test]
+fn stopping_answers_what_waits() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = Arc::new(keep(&disk, &[("one", &one)], at_once()).unwrap());
+    disk.hold(true);
+    let mut coming = vec![submit(&one, 0, 1)];
+    until("the first step", || disk.is_blocking());
+    coming.extend((1..10).map(|address| submit(&one, address, 1)));
+    let stopping = std::thread::spawn({
+        let file = Arc::clone(&file);
+        move || file.stop()
+    });
+    until("stop", || submit(&one, 0, 1).try_recv().is_ok_and(|outcome| outcome.is_err()));
+    disk.hold(false);
+    stopping.join().unwrap().unwrap();
+    for outcome in coming {
+        outcome.recv().unwrap().unwrap();
+    }
+    assert_eq!(set(&one, 20, 1), REFUSED);
+    let two = memory(layout(0, 1000), None);
+    keep(&Arc::new(SimDisk::with_file(disk.bytes())), &[("one", &two)], at_once()).unwrap();
+    assert_eq!(contents(&two), contents(&one));
+}
+
+#[test]
+fn refused_steps_are_not_stored_and_change_nothing() {
+    let disk = Arc::new(SimDisk::default());
+    let gate = Gate { area: Area::Coils, address: 0, mode: GateMode::Level };
+    let one = memory(layout(8, 10), Some(gate));
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    let commits = file.status().commits;
+    let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &[1, 1] };
+    assert_eq!(one.write(Access::Client, write), Err(Refusal::Sealed));
+    let outside = Write { address: 10, ..write };
+    assert_eq!(one.write(Access::Ingest, outside), Err(Refusal::OutOfRange));
+    assert_eq!(file.status().commits, commits);
+    assert_eq!(file.status().refused, 0);
+}
+
+#[test]
+fn a_batch_across_memories_is_one_transaction() {
+    let disk = Arc::new(SimDisk::default());
+    let (one, two) = (memory(layout(0, 10), None), memory(layout(0, 10), None));
+    let file = keep(&disk, &[("one", &one), ("two", &two)], at_once()).unwrap();
+    let commits = file.status().commits;
+    let write = Write { area: REGISTERS, address: 4, count: 1, bytes: &[1, 1] };
+    write_across(Access::Ingest, &[(&one, write), (&two, write)]).unwrap();
+    assert_eq!(file.status().commits, commits + 1);
+    assert_eq!((get(&one, 4), get(&two, 4)), (0x101, 0x101));
+    let other = memory(layout(0, 10), None);
+    let refused = write_across(Access::Ingest, &[(&one, write), (&other, write)]);
+    assert_eq!(refused.unwrap_err().refusal, Refusal::NotOneStep);
+}
+
+#[test]
+fn a_seal_is_closed_again_by_a_restart() {
+    for mode in [GateMode::Once, GateMode::Level] {
+        let disk = Arc::new(SimDisk::default());
+        let gate = Gate { area: Area::Coils, address: 9, mode };
+        let one = memory(layout(20, 10), Some(gate));
+        let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+        set(&one, 0, 5).unwrap();
+        let open = Write { area: Area::Coils, address: 8, count: 3, bytes: &[7] };
+        one.write(Access::Ingest, open).unwrap();
+        assert!(!one.sealed());
+        file.stop().unwrap();
+        for _ in 0..2 {
+            let again = memory(layout(20, 10), Some(gate));
+            let file = keep(&disk, &[("one", &again)], at_once()).unwrap();
+            assert_eq!(again.sealed(), mode == GateMode::Once);
+            assert_eq!(get(&again, 0), 5);
+            let bits = contents(&again).areas[0][1];
+            assert_eq!(bits, if mode == GateMode::Once { 0b101 } else { 0b111 });
+            set(&again, 1, 6).unwrap();
+            assert_eq!(again.sealed(), mode == GateMode::Once, "an ingest alone opens nothing");
+            file.stop().unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_resized_area_keeps_the_addresses_of_both() {
+    let disk = Arc::new(SimDisk::default());
+    let span = |start, size| Span::new(start, size).unwrap();
+    let before = Layout::default()
+        .with(REGISTERS, span(100, 50))
+        .with(Area::Coils, span(3, 40))
+        .with(Area::InputRegisters, span(0, 4));
+    let one = memory(before, None);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    for address in 100..150 {
+        set(&one, address, address).unwrap();
+    }
+    let coils = Write { area: Area::Coils, address: 12, count: 3, bytes: &[0b101] };
+    one.write(Access::Ingest, coils).unwrap();
+    file.stop().unwrap();
+    let after = Layout::default()
+        .with(REGISTERS, span(120, 1000))
+        .with(Area::Coils, span(10, 5))
+        .with(Area::DiscreteInputs, span(0, 8));
+    for round in 0..2 {
+        let one = memory(after, None);
+        let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+        for address in 120..1120 {
+            assert_eq!(get(&one, address), if address < 150 { address } else { 0 });
+        }
+        assert_eq!(*contents(&one).areas[0], [0b10100]);
+        let expected = [
+            "one: coils had addresses 3-42 and now has addresses 10-14: addresses 10-14 are kept",
+            "one: discrete_inputs had no addresses and now has addresses 0-7: no address is kept",
+            "one: holding_registers had addresses 100-149 and now has addresses 120-1119: \
+             addresses 120-149 are kept",
+            "one: input_registers had addresses 0-3 and now has no addresses: no address is kept",
+        ];
+        assert_eq!(file.warnings(), if round == 0 { &expected[..] } else { &[] });
+        file.stop().unwrap();
+    }
+}
+
+#[test]
+fn a_memory_that_is_not_configured_stays_in_the_file() {
+    let disk = Arc::new(SimDisk::default());
+    let (one, two) = (memory(layout(0, 10), None), memory(layout(0, 10), None));
+    let file = keep(&disk, &[("one", &one), ("two", &two)], at_once()).unwrap();
+    set(&one, 1, 11).unwrap();
+    set(&two, 2, 22).unwrap();
+    file.stop().unwrap();
+    let two = memory(layout(0, 10), None);
+    let three = memory(layout(0, 10), None);
+    let file = keep(&disk, &[("three", &three), ("two", &two)], at_once()).unwrap();
+    assert_eq!(file.loaded(), ["two"]);
+    assert_eq!(file.warnings(), ["one: is in the file but not configured, and stays there"]);
+    set(&three, 3, 33).unwrap();
+    disk.set_broken(true);
+    assert_eq!(set(&three, 3, 0), Err(Refusal::NotStored));
+    disk.set_broken(false);
+    set(&two, 4, 44).unwrap();
+    file.stop().unwrap();
+    let memories: Vec<Arc<Memory>> = (0..3).map(|_| memory(layout(0, 10), None)).collect();
+    let named = [("one", &memories[0]), ("two", &memories[1]), ("three", &memories[2])];
+    let file = keep(&disk, &named, at_once()).unwrap();
+    assert_eq!(file.loaded(), ["one", "two", "three"]);
+    assert_eq!(get(&memories[0], 1), 11);
+    assert_eq!((get(&memories[1], 2), get(&memories[1], 4)), (22, 44));
+    assert_eq!(get(&memories[2], 3), 33);
+}
+
+#[test]
+fn memories_that_cannot_be_kept_together_are_refused() {
+    let disk = Arc::new(SimDisk::default());
+    let (one, two) = (memory(layout(0, 10), None), memory(layout(0, 10), None));
+    for members in [[("a", &one), ("a", &two)], [("a", &one), ("b", &one)]] {
+        let error = keep(&disk, &members, at_once()).unwrap_err();
+        assert!(matches!(error, FileError::Memories(_)), "{error}");
+    }
+    let _file = keep(&disk, &[("a", &one)], at_once()).unwrap();
+    let other = Arc::new(SimDisk::default());
+    let error = keep(&other, &[("a", &one)], at_once()).unwrap_err();
+    assert_eq!(error.to_string(), "memory a is kept elsewhere already");
+}
+
+#[test]
+fn with_a_time_writes_are_not_held_up() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 10), None);
+    let file = keep(&disk, &[("one", &one)], Options::new(Duration::from_millis(1))).unwrap();
+    disk.hold(true);
+    for value in 1..1000 {
+        set(&one, 0, value).unwrap();
+    }
+    assert!(file.status().pending > 0);
+    disk.hold(false);
+    until("storing", || file.status().pending == 0);
+    let again = memory(layout(0, 10), None);
+    keep(&Arc::new(SimDisk::with_file(disk.bytes())), &[("one", &again)], at_once()).unwrap();
+    assert_eq!(get(&again, 0), 999);
+}

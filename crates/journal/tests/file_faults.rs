@@ -1,0 +1,297 @@
+//! Full disks, I/O errors, and threads that panic.
+
+mod support;
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use holdfast_journal::file::{Disk, FileError, FileOnDisk, MemoryFile, Options};
+use holdfast_memory::{Access, Memory, Operation, Refusal, Write};
+use redb::backends::FileBackend;
+use redb::{Builder, Database, StorageBackend};
+use support::sim::SimDisk;
+use support::{
+    REGISTERS, at_once, contents, get, keep, layout, member, memory, set, submit, until,
+};
+
+const NOT_STORED: Result<(), Refusal> = Err(Refusal::NotStored);
+
+/// What a restart finds.
+fn stored(disk: &SimDisk) -> Arc<Memory> {
+    let found = memory(layout(0, 1000), None);
+    let disk = Arc::new(SimDisk::with_file(disk.bytes()));
+    let file = keep(&disk, &[("one", &found)], at_once()).unwrap();
+    file.stop().unwrap();
+    found
+}
+
+/// Storing again begins with the next step only.
+fn patient() -> Options {
+    Options { retry: Duration::from_secs(3600), ..at_once() }
+}
+
+#[test]
+fn an_io_error_refuses_steps_and_changes_nothing() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&disk, &[("one", &one)], patient()).unwrap();
+    set(&one, 0, 1).unwrap();
+    let (before, writes) = (contents(&one), one.writes());
+    disk.set_broken(true);
+    for value in 2..20 {
+        assert_eq!(set(&one, 0, value), NOT_STORED);
+    }
+    assert_eq!(one.mask_write(Access::Client, REGISTERS, 0, 0, 3), NOT_STORED);
+    assert_eq!(contents(&one), before);
+    assert_eq!(one.writes(), writes);
+    let status = file.status();
+    assert_eq!((status.failing.as_deref(), status.refused), (Some("the disk is broken"), 19));
+    assert_eq!(stored(&disk).writes(), 1);
+    disk.set_broken(false);
+    set(&one, 1, 7).unwrap();
+    assert_eq!(file.status().failing, None);
+    file.stop().unwrap();
+    assert_eq!((get(&one, 0), get(&one, 1)), (1, 7));
+    assert_eq!(contents(&stored(&disk)), contents(&one));
+}
+
+#[test]
+fn all_steps_of_a_group_that_cannot_be_stored_are_refused() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&disk, &[("one", &one)], patient()).unwrap();
+    disk.hold(true);
+    let mut coming = vec![submit(&one, 0, 1)];
+    until("the first step", || disk.is_blocking());
+    coming.extend((1..50).map(|address| submit(&one, address, 1)));
+    disk.set_broken(true);
+    disk.hold(false);
+    for outcome in coming {
+        assert_eq!(outcome.recv().unwrap().unwrap_err().refusal, Refusal::NotStored);
+    }
+    assert_eq!(file.status().refused, 50);
+    disk.set_broken(false);
+    assert!(contents(&one).areas[2].iter().all(|byte| *byte == 0));
+    set(&one, 60, 1).unwrap();
+    assert_eq!(contents(&stored(&disk)), contents(&one));
+}
+
+#[test]
+fn storing_recovers_without_a_step() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let options = Options { retry: Duration::from_millis(1), ..at_once() };
+    let file = keep(&disk, &[("one", &one)], options).unwrap();
+    disk.set_broken(true);
+    assert_eq!(set(&one, 0, 2), NOT_STORED);
+    disk.set_broken(false);
+    until("recovery", || file.status().failing.is_none());
+    assert_eq!(get(&stored(&disk), 0), 0);
+}
+
+#[test]
+fn a_full_disk_refuses_steps_until_there_is_room() {
+    let disk = Arc::new(SimDisk::default());
+    let memories: Vec<_> = (0..40).map(|_| memory(layout(0, 65_536), None)).collect();
+    let names: Vec<_> = (0..40).map(|number| number.to_string()).collect();
+    let named: Vec<_> = names.iter().map(|name| &**name).zip(&memories).collect();
+    let file = keep(&disk, &named, patient()).unwrap();
+    let size = file.status().bytes;
+    disk.set_capacity(Some(size));
+    let all = |memory: &Memory, value: u8| {
+        let bytes = [value; 65_536 * 2];
+        memory.write(
+            Access::Ingest,
+            Write { area: REGISTERS, address: 0, count: 65_536, bytes: &bytes },
+        )
+    };
+    let mut results = (1..=3).flat_map(|value| memories.iter().map(move |one| (one, value)));
+    let full = results.find_map(|(one, value)| all(one, value).err().map(|refusal| (one, refusal)));
+    // Free pages may be enough for everything.
+    if let Some((one, refusal)) = full {
+        assert_eq!(refusal, Refusal::NotStored);
+        assert!(file.status().failing.is_some());
+        disk.set_capacity(None);
+        all(one, 9).unwrap();
+    }
+    assert_eq!(file.status().failing, None);
+    disk.set_capacity(Some(1 << 16));
+    disk.set_broken(true);
+    assert_eq!(set(&memories[0], 0, 77), NOT_STORED);
+    disk.set_broken(false);
+    assert_eq!(set(&memories[0], 0, 77), NOT_STORED);
+    assert_eq!(file.status().failing.as_deref(), Some("no storage space"));
+    disk.set_capacity(None);
+    set(&memories[0], 0, 77).unwrap();
+    file.stop().unwrap();
+    let found: Vec<_> = (0..40).map(|_| memory(layout(0, 65_536), None)).collect();
+    let named: Vec<_> = names.iter().map(|name| &**name).zip(&found).collect();
+    let file = keep(&disk, &named, at_once()).unwrap();
+    assert_eq!(file.loaded().len(), 40);
+    assert_eq!(Memory::contents(&found), Memory::contents(&memories));
+}
+
+/// A real file that fails until another takes its place.
+#[derive(Debug)]
+struct Failing {
+    disk: FileOnDisk,
+    path: PathBuf,
+    fails: Arc<AtomicBool>,
+}
+
+#[derive(Debug)]
+struct FailingBackend {
+    file: FileBackend,
+    fails: Arc<AtomicBool>,
+}
+
+impl StorageBackend for FailingBackend {
+    fn len(&self) -> io::Result<u64> {
+        self.file.len()
+    }
+
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        self.file.read(offset, out)
+    }
+
+    fn set_len(&self, len: u64) -> io::Result<()> {
+        self.file.set_len(len)
+    }
+
+    fn sync_data(&self) -> io::Result<()> {
+        if self.fails.load(Ordering::SeqCst) {
+            return Err(io::Error::other("no sync"));
+        }
+        self.file.sync_data()
+    }
+
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        self.file.write(offset, data)
+    }
+}
+
+impl Disk for Failing {
+    fn size(&self) -> Result<Option<u64>, FileError> {
+        self.disk.size()
+    }
+
+    fn open(&self, builder: &Builder) -> Result<Database, FileError> {
+        let file = std::fs::File::options().read(true).write(true).open(&self.path)?;
+        let (file, fails) = (FileBackend::new(file)?, Arc::clone(&self.fails));
+        Ok(builder.create_with_backend(FailingBackend { file, fails })?)
+    }
+
+    fn open_unchanged(&self, builder: &Builder) -> Result<Database, FileError> {
+        self.disk.open_unchanged(builder)
+    }
+
+    fn create(&self, builder: &Builder) -> Result<Database, FileError> {
+        self.disk.create(builder)
+    }
+
+    fn install(&self, replace: bool) -> Result<(), FileError> {
+        self.disk.install(replace)
+    }
+
+    fn discard(&self) {
+        self.disk.discard();
+    }
+}
+
+#[test]
+fn a_real_file_is_replaced_after_an_error_and_stays_locked() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("replaced");
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).unwrap();
+    let path = folder.join("memories.redb");
+    let other = || Arc::new(FileOnDisk::new(&path));
+    let one = memory(layout(0, 1000), None);
+    keep(&other(), &[("one", &one)], patient()).unwrap().stop().unwrap();
+
+    let (disk, fails) = (FileOnDisk::new(&path), Arc::new(AtomicBool::new(false)));
+    let failing = Failing { disk, path: path.clone(), fails: Arc::clone(&fails) };
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&Arc::new(failing), &[("one", &one)], patient()).unwrap();
+    set(&one, 0, 1).unwrap();
+    fails.store(true, Ordering::SeqCst);
+    assert_eq!(set(&one, 0, 2), NOT_STORED);
+    assert_eq!(file.status().failing.as_deref(), Some("no sync"));
+    set(&one, 1, 3).unwrap();
+    assert_eq!(file.status().failing, None);
+    let two = memory(layout(0, 1000), None);
+    let locked = keep(&other(), &[("one", &two)], patient()).unwrap_err();
+    assert!(matches!(locked, FileError::Locked), "{locked}");
+    file.stop().unwrap();
+    keep(&other(), &[("one", &two)], patient()).unwrap();
+    assert_eq!(contents(&two), contents(&one));
+    assert_eq!((get(&two, 0), get(&two, 1)), (1, 3));
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+}
+
+#[test]
+fn with_a_time_a_memory_goes_on_and_is_stored_when_the_disk_is_back() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&disk, &[("one", &one)], Options::new(Duration::from_millis(1))).unwrap();
+    disk.set_broken(true);
+    set(&one, 0, 5).unwrap();
+    until("the error", || file.status().failing.is_some());
+    set(&one, 1, 6).unwrap();
+    assert!(file.status().pending > 0);
+    disk.set_broken(false);
+    until("recovery", || file.status().failing.is_none() && file.status().pending == 0);
+    assert_eq!(contents(&stored(&disk)), contents(&one));
+    disk.set_broken(true);
+    set(&one, 2, 7).unwrap();
+    assert_eq!(file.stop().unwrap_err().to_string(), "the disk is broken");
+    file.stop().unwrap();
+}
+
+#[test]
+fn a_stop_says_that_the_file_is_in_doubt() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&disk, &[("one", &one)], patient()).unwrap();
+    disk.set_broken(true);
+    assert_eq!(set(&one, 0, 5), NOT_STORED);
+    assert_eq!(file.stop().unwrap_err().to_string(), "the disk is broken");
+}
+
+#[test]
+fn a_start_that_cannot_store_is_an_error_and_can_be_repeated() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let members = vec![member("one", &one)];
+    let file = MemoryFile::open(Arc::clone(&disk) as _, members, at_once()).unwrap();
+    disk.set_broken(true);
+    file.start().unwrap_err();
+    disk.set_broken(false);
+    set(&one, 0, 5).unwrap();
+    file.start().unwrap();
+    assert_eq!(contents(&stored(&disk)), contents(&one));
+}
+
+#[test]
+fn a_thread_that_panics_leaves_nobody_waiting() {
+    let disk = Arc::new(SimDisk::default());
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&disk, &[("one", &one)], at_once()).unwrap();
+    disk.hold(true);
+    let first = submit(&one, 0, 1);
+    until("the first step", || disk.is_blocking());
+    let bytes = [0, 1];
+    let write = Write { area: REGISTERS, address: 1, count: 1, bytes: &bytes };
+    let panicking = Box::new(|_| panic!("a receiver that panics"));
+    one.submit(Access::Ingest, Operation::Write(write), panicking).unwrap();
+    let behind = submit(&one, 2, 1);
+    disk.hold(false);
+    first.recv().unwrap().unwrap();
+    // It was stored, but nobody can say so: its receiver is dropped.
+    behind.recv().unwrap_err();
+    until("the end", || set(&one, 3, 1) == Err(Refusal::Unavailable));
+    assert!(file.status().failing.unwrap().contains("panicked"));
+    file.stop().unwrap_err();
+}
