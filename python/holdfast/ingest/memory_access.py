@@ -86,6 +86,13 @@ class Written:
 MAX_REASONS = 64
 """The most reasons that are counted apart: adapters of other packages have their own."""
 
+KEEPING = {
+    "not_stored": "the file of the memory can't be written; nothing has changed",
+    "log_unavailable": "the log of the memory can't be reached; nothing has changed",
+    "not_confirmed": "the log did not confirm the write in time; it may still be carried out",
+}
+"""Why memories that are kept refuse writes."""
+
 OTHER = "other"
 """The reason under which all others are counted."""
 
@@ -134,8 +141,8 @@ class MemoryAccess:
 
     @property
     def may_wait(self) -> bool:
-        """Whether a write can take as long as a device needs to answer."""
-        return bool(self._passages)
+        """Whether a write can take as long as a device, a disk or a log needs to answer."""
+        return bool(self._passages) or any(memory.waits for memory in self.memories.values())
 
     def ingest(self, body: bytes | bytearray | memoryview, grant: Grant, peer: str) -> Written:
         """Carries out JSON: one command, or an array of commands. Raises `Refused`."""
@@ -206,9 +213,7 @@ class MemoryAccess:
             )
 
     def note(self, refused: Refused, who: str, peer: str) -> None:
-        """Counts and logs a refusal without auditing it, such as the refusal of a read."""
-        with self._lock:
-            self._counts.refuse(refused.reason)
+        """Logs and counts a refusal without auditing it, such as the refusal of a read."""
         logs.refused(
             "ingest_refused",
             kind=(self.name, refused.reason),
@@ -218,6 +223,8 @@ class MemoryAccess:
             **refused.where,
             reason=refused.reason,
         )
+        with self._lock:
+            self._counts.refuse(refused.reason)
 
     def counts(self) -> dict[str, object]:
         """Returns the counters."""
@@ -357,6 +364,11 @@ class MemoryAccess:
                 found = f"{_of(index)}{len(values)} from address {_shown(address)} of {area}"
                 detail = f"{found} overlap a range that mirrors a device"
                 return Refused("mirrored", detail, **where)
+            case "not_one_step":
+                detail = f"{_of(index)}{memory} and the memories before it are not kept together"
+                return Refused("not_one_step", f"{detail}, so no step writes all of them", **where)
+            case "not_stored" | "log_unavailable" | "not_confirmed":
+                return Refused(refused.reason, KEEPING[refused.reason], **where)
             case "invalid_value" | "invalid_type" if refused.index is not None:
                 shown = _shown(values[refused.index])
                 wrong = "outside" if refused.reason == "invalid_value" else "not"

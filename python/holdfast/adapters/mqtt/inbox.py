@@ -36,11 +36,7 @@ class Inbox:
 
     def take(self, message: Publish) -> dict[str, object]:
         """Carries out a message. Returns the answer for its sender."""
-        answer = self._answer(message)
         self.received += 1
-        return answer
-
-    def _answer(self, message: Publish) -> dict[str, object]:
         topic = message.topic
         shown = topic if len(topic) <= MAX_TOPIC else f"{topic[:MAX_TOPIC]}…"
         peer = f"{self._broker} {shown}"

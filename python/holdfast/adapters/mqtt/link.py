@@ -1,7 +1,8 @@
-"""One connection to a broker: paho's client with three changes.
+"""One connection to a broker: paho's client with four changes.
 
 - A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
   sends PUBREC before it delivers the message, so a crash between the two would lose the message.
+- A message that a memory can't keep at the moment is not acknowledged, and the connection ends.
 - The properties of a message are parsed here, in linear time.
 - A packet over the size limit is not kept in memory while it arrives.
 
@@ -16,6 +17,7 @@ from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from holdfast.adapters.mqtt.inbox import MAX_BYTES
+from holdfast.ingest import KEEPING
 from holdfast.mqtt.client import BrokerClient
 from holdfast.mqtt.packets import MAX_PROPERTIES, parse_publish
 
@@ -123,6 +125,10 @@ class BrokerConnection(BrokerClient):
         if message.qos == 2 and message.identifier in self._unreleased:
             return self._send_pubrec(message.identifier)
         result = self._inbox.take(message)
+        if message.qos and result.get("reason") in KEEPING:
+            # Without an acknowledgement, the broker sends the message again after a reconnect.
+            self.trouble = str(result["detail"])
+            return MQTTErrorCode.MQTT_ERR_CONN_LOST
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
         if message.qos == 1:
             code = self._send_puback(message.identifier)

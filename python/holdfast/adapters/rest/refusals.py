@@ -7,8 +7,9 @@ from holdfast.web.refusals import Refusal, Refusals
 REFUSALS = Refusals(
     Refusal(
         400,
-        ("invalid_value", "malformed", "invalid_area", "out_of_range"),
-        "The JSON, a parameter, an area, an address or a value is invalid",
+        ("invalid_value", "malformed", "invalid_area", "out_of_range", "not_one_step"),
+        "The JSON, a parameter, an area, an address or a value is invalid, or the memories of a "
+        "batch are not kept together",
         "values[2] is 70000, outside 0..65535",
     ),
     Refusal(
@@ -61,10 +62,16 @@ REFUSALS = Refusals(
     ),
     Refusal(
         503,
-        ("unrecorded", "busy"),
-        "The audit log can't be written, and no write is carried out without a record; or too many "
-        "change streams are open",
+        ("unrecorded", "not_stored", "log_unavailable", "busy"),
+        "The audit log, the file or the log of the memory can't be written, and nothing has "
+        "changed; or too many change streams are open",
         "the audit log can't be written, and no write is carried out without a record",
+    ),
+    Refusal(
+        504,
+        ("not_confirmed",),
+        "The log of the memory did not confirm the write in time; it may still be carried out",
+        "the log did not confirm the write in time; it may still be carried out",
     ),
     Refusal(
         415,
@@ -81,4 +88,13 @@ MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 """Refusals of a range by the memory access."""
 
 STREAM = ("busy",)
-VALUES = ("invalid_value", "mirrored", "device_refused", "unrecorded")
+VALUES = (
+    "invalid_value",
+    "mirrored",
+    "device_refused",
+    "unrecorded",
+    "not_one_step",
+    "not_stored",
+    "log_unavailable",
+    "not_confirmed",
+)

@@ -1,0 +1,47 @@
+"""Messages for a memory whose file can't be written."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast._core import MemoryFile
+from support import wire
+from support.mqtt_rig import Rig, command, subscription, text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    """The memory `plant` is in a file that is closed; writes are refused."""
+    with Rig(tmp_path) as started:
+        file = MemoryFile(tmp_path / "plant.redb", [("plant", started.memory)], 0)
+        file.start()
+        file.stop()
+        yield started
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+def test_a_message_is_delivered_until_it_is_kept(rig: Rig, qos: int) -> None:
+    broker = rig.broker()
+    running = rig.connected(broker, subscription(qos=qos))
+    rig.probe(broker).publish("plant/ingest", text(command([7])), qos=qos)
+    wire.until(lambda: running.status()["reconnects"] >= 2, "it is tried again")
+    assert rig.memory_access.counts()["refused"] == {
+        "log_unavailable": running.status()["received"]
+    }
+    assert "can't be reached" in str(running.status()["last_error"])
+    assert rig.registers(0, 1) == [0]
+
+
+def test_a_message_without_acknowledgement_is_lost(rig: Rig) -> None:
+    broker = rig.broker()
+    running = rig.connected(broker, subscription(qos=0))
+    rig.probe(broker).publish("plant/ingest", text(command([7])), qos=0)
+    running.wait_until_received(1)
+    assert rig.memory_access.counts()["refused"] == {"log_unavailable": 1}
+    assert running.status()["reconnects"] == 0
