@@ -51,6 +51,10 @@ GROUPS = {
             "holdfast.cli.sessions:sessions",
             "List the connections of a running appliance.",
         ),
+        "memory": (
+            "holdfast.cli.memory:memory",
+            "Verify, export and import files that keep memories.",
+        ),
         "audit": ("holdfast.cli.audit:audit", "Verify audit logs."),
         "schema": ("holdfast.cli.schema:schema", "Print the JSON Schema of a configuration."),
         "import": ("holdfast.cli.import_:import_", "Convert the configuration of another program."),

@@ -1,0 +1,152 @@
+"""`holdfast memory`: verifies, exports and imports files that keep memories."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from holdfast.cli.configuration import WRONG
+from holdfast.cli.suggesting import SuggestingGroup
+from holdfast.config import ConfigError
+from holdfast.config.initial import KINDS, parse
+from holdfast.config.source import read_text
+from holdfast.config.words import guess, listing
+from holdfast.tools import memory_file
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+    from holdfast.tools.memory_file import KeptArea
+    from holdfast.types import Area
+
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.group(cls=SuggestingGroup, epilog="Example: holdfast memory verify setpoints.redb")
+def memory() -> None:
+    """Verify, export and import files that keep memories.
+
+    A file is in use while the appliance runs: stop it first, or work on a copy.
+    """
+
+
+def _of_memory(command: Callable[..., Any]) -> Callable[..., Any]:
+    return click.option("--memory", "name", metavar="NAME", help="Required if there are several.")(
+        command
+    )
+
+
+@memory.command(epilog="Example: holdfast memory verify setpoints.redb")
+@click.argument("file", type=FILE)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
+def verify(file: Path, as_json: bool) -> None:
+    """Check every page of FILE, and list its memories. Exit code 2: the file is not usable."""
+    found = _contents(file)
+    if as_json:
+        shown = {
+            name: {
+                area: {"start": kept.start, "size": len(kept.values)}
+                for area, kept in areas.items()
+            }
+            for name, areas in found.items()
+        }
+        click.echo(json.dumps({"file": str(file), "memories": shown}, indent=2))
+        return
+    click.echo("intact")
+    for name, areas in found.items():
+        for area, kept in areas.items():
+            set_ = sum(map(bool, kept.values))
+            last = kept.addresses.stop - 1
+            click.echo(f"{name}: {area} {kept.start} to {last}, {set_:,} not 0")
+
+
+@memory.command(epilog="Example: holdfast memory export setpoints.redb --output setpoints.csv")
+@click.argument("file", type=FILE)
+@_of_memory
+@click.option(
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="A .csv, .yaml or .yml file. Default: CSV on standard output.",
+)
+@click.option("--zeros", is_flag=True, help="Include values that are 0.")
+def export(file: Path, name: str | None, output: Path | None, zeros: bool) -> None:
+    """Print the values of a memory in FILE, in the format of `initial`."""
+    kind = ".csv" if output is None else _kind(output)
+    areas = _chosen(_contents(file), name, file)
+    lines = memory_file.csv_lines if kind == ".csv" else memory_file.yaml_lines
+    text = "".join(f"{line}\n" for line in lines(areas, zeros=zeros))
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as error:
+        _fail(f"{output}: {error.strerror or error}")
+
+
+@memory.command("import", epilog="Example: holdfast memory import setpoints.redb setpoints.csv")
+@click.argument("file", type=FILE)
+@click.argument("values", type=FILE)
+@_of_memory
+@click.option("--merge", is_flag=True, help="Keep values that VALUES does not have.")
+def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
+    """Store VALUES in a memory of FILE; all its other values become 0.
+
+    VALUES is a .csv or .yaml file in the format of `initial`. It is checked completely first.
+    """
+    _kind(values)
+    found = _contents(file)
+    areas = _chosen(found, name, file)
+    try:
+        text = read_text(values, str(values), "YAML or CSV")
+        spans = {area: kept.addresses for area, kept in areas.items()}
+        runs, problems = parse(text, str(values), dict(spans), None)
+    except ConfigError as error:
+        runs, problems = (), list(error.problems)
+    if problems:
+        _fail("\n".join(str(problem) for problem in problems))
+    chosen = next(each for each, kept in found.items() if kept is areas)
+    try:
+        memory_file.replace(file, chosen, runs, merge=merge)
+    except OSError as error:
+        _fail(str(error))
+    count = sum(len(run.values) for run in runs)
+    click.echo(f"{chosen}: {count:,} values stored in {file}")
+
+
+def _contents(file: Path) -> dict[str, dict[Area, KeptArea]]:
+    try:
+        return memory_file.contents(file)
+    except OSError as error:
+        _fail(str(error))
+
+
+def _chosen(
+    found: dict[str, dict[Area, KeptArea]], name: str | None, file: Path
+) -> dict[Area, KeptArea]:
+    if name is None and len(found) == 1:
+        return next(iter(found.values()))
+    if name is None:
+        raise click.UsageError(f"{file} has several memories, add --memory: {listing(found)}")
+    if name not in found:
+        known = f"allowed: {listing(found)}{guess(name, found) or '.'}"
+        raise click.UsageError(f"{file} has no memory {name!r}, {known}")
+    return found[name]
+
+
+def _kind(file: Path) -> str:
+    kind = file.suffix.lower()
+    if kind not in KINDS:
+        raise click.UsageError(f"found {file.name}, allowed: a file with one of {listing(KINDS)}")
+    return kind
+
+
+def _fail(message: str) -> NoReturn:
+    click.echo(f"holdfast: {message}", err=True)
+    sys.exit(WRONG)

@@ -1,0 +1,133 @@
+"""`holdfast memory`: files that keep memories, while no appliance uses them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+import holdfast
+from holdfast._core import MemoryFile
+from support.cli import answer, done, invoke, usage_error
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    """A file with one memory."""
+    path = tmp_path / "plant.redb"
+    keep(path, plant=[7, 0, 8])
+    return str(path)
+
+
+def keep(path: Path, **memories: list[int]) -> None:
+    made = {name: holdfast.Memory(coils=10, holding_registers=(50, 20)) for name in memories}
+    kept = MemoryFile(path, list(made.items()), 0)
+    for name, memory in made.items():
+        memory.write("holding_registers", 60, memories[name])
+        memory.write("coils", 9, [1])
+    kept.start()
+    kept.stop()
+
+
+def registers(path: str, memory: str = "plant") -> list[int]:
+    loaded = holdfast.Memory(coils=10, holding_registers=(50, 20))
+    MemoryFile(path, [(memory, loaded)], 1).stop()
+    return [*loaded.read("holding_registers", 60, 3), *loaded.read("coils", 9, 1)]
+
+
+def test_a_file_is_verified(file: str) -> None:
+    assert done("memory", "verify", file) == [
+        "intact",
+        "plant: coils 0 to 9, 1 not 0",
+        "plant: holding_registers 50 to 69, 2 not 0",
+    ]
+    areas = {"coils": {"start": 0, "size": 10}, "holding_registers": {"start": 50, "size": 20}}
+    assert answer("memory", "verify", file) == {"file": file, "memories": {"plant": areas}}
+
+
+def test_a_damaged_file_is_named(file: str, tmp_path: Path) -> None:
+    data = bytearray((tmp_path / "plant.redb").read_bytes())
+    at = data.index(bytes([0, 7, 0, 0, 0, 8]))
+    data[at] ^= 1
+    (tmp_path / "plant.redb").write_bytes(data)
+    for arguments in (["verify", file], ["export", file], ["import", file, str(__file__)]):
+        if arguments[0] == "import":
+            (tmp_path / "v.csv").write_text("coils,1,1\n")
+            arguments[2] = str(tmp_path / "v.csv")
+        result = invoke("memory", *arguments)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr.startswith(f"holdfast: {file}: the file is damaged")
+    assert (tmp_path / "plant.redb").read_bytes() == data
+
+
+def test_a_file_in_use_is_refused(file: str) -> None:
+    memory = holdfast.Memory(coils=10, holding_registers=(50, 20))
+    used = MemoryFile(file, [("plant", memory)], 0)
+    result = invoke("memory", "verify", file)
+    assert result.exit_code == 2
+    assert "in use by another process" in result.stderr
+    used.stop()
+
+
+@pytest.mark.parametrize("kind", ["csv", "yaml"])
+@pytest.mark.parametrize("zeros", [[], ["--zeros"]])
+def test_what_is_exported_can_be_imported(
+    file: str, tmp_path: Path, kind: str, zeros: list[str]
+) -> None:
+    values = str(tmp_path / f"values.{kind}")
+    assert done("memory", "export", file, "--output", values, *zeros) == []
+    keep(tmp_path / "other.redb", other=[1, 2, 3])
+    other = str(tmp_path / "other.redb")
+    [told] = done("memory", "import", other, values)
+    assert told == f"other: {30 if zeros else 3} values stored in {other}"
+    assert registers(other, "other") == [7, 0, 8, 1]
+
+
+def test_values_are_merged_on_request(file: str, tmp_path: Path) -> None:
+    (tmp_path / "v.csv").write_text("area,address,value\nholding_registers,61,5\n")
+    done("memory", "import", file, str(tmp_path / "v.csv"), "--merge")
+    assert registers(file) == [7, 5, 8, 1]
+    done("memory", "import", file, str(tmp_path / "v.csv"))
+    assert registers(file) == [0, 5, 0, 0]
+
+
+def test_the_export_is_csv_on_standard_output(file: str) -> None:
+    assert done("memory", "export", file) == [
+        "area,address,value",
+        "coils,9,1",
+        "holding_registers,60,7",
+        "holding_registers,62,8",
+    ]
+
+
+def test_wrong_values_change_nothing(file: str, tmp_path: Path) -> None:
+    values = tmp_path / "v.csv"
+    values.write_text("holding_registers,60,1\nholding_registers,70,1\ncoils,3,2\n")
+    result = invoke("memory", "import", file, str(values))
+    assert result.exit_code == 2
+    assert result.stderr.splitlines() == [
+        f"holdfast: {values}:2: found address 70, allowed in holding_registers: 50 to 69",
+        f"{values}:3: found 2, allowed in coils: 0 or 1",
+    ]
+    assert registers(file) == [7, 0, 8, 1]
+
+
+def test_with_several_memories_one_is_named(tmp_path: Path) -> None:
+    file = str(tmp_path / "two.redb")
+    keep(tmp_path / "two.redb", first=[1, 0, 0], second=[2, 0, 0])
+    assert usage_error("memory", "export", file).endswith("add --memory: first, second")
+    message = usage_error("memory", "export", file, "--memory", "secnd")
+    assert "has no memory 'secnd', allowed: first, second; did you mean 'second'?" in message
+    assert "holding_registers,60,2" in done("memory", "export", file, "--memory", "second")
+    values = tmp_path / "v.csv"
+    values.write_text("holding_registers,60,9\n")
+    done("memory", "import", file, str(values), "--memory", "second")
+    assert (registers(file, "first")[0], registers(file, "second")[0]) == (1, 9)
+
+
+def test_a_form_is_chosen_by_its_ending(file: str, tmp_path: Path) -> None:
+    message = usage_error("memory", "export", file, "--output", str(tmp_path / "v.txt"))
+    assert message.endswith("found v.txt, allowed: a file with one of .csv, .yaml, .yml")
