@@ -100,6 +100,8 @@ EVENTS: Mapping[str, Meaning] = {
     "started": Meaning(("process",), ("start",), "success"),
     "stopped": Meaning(("process",), ("end",), "success"),
     "shutdown_asked": Meaning(("process",), ("end",), "success"),
+    "memory_file_failing": _NOT_STORED,
+    "memory_file_back": _STORED,
     "thread_stalled": _UNHEALTHY,
     "thread_back": _HEALTHY,
     # The logs themselves

@@ -701,6 +701,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "HttpsConfig": ["cert_file", "key_file"],
         "IdentityConfig": None,
         "InfluxConfig": ["type", "url"],
+        "KeepConfig": ["file"],
         "LinkConfig": ["url"],
         "LogConfig": None,
         "MappingConfig": ["topic", "memory"],

@@ -172,6 +172,7 @@ class Figures(Collector):
             "Log lines that were dropped because nobody read them.",
             stats["log_dropped"],
         )
+        yield from _of_memory_files(stats["memory_files"])
         if stats["audit"] is not None:
             yield CounterMetricFamily(
                 "holdfast_audit_lines", "Lines written to the audit log.", stats["audit"]["lines"]
@@ -224,6 +225,26 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
             yield from _numbers(f"{name}[{index}]", item)
     elif isinstance(value, int | float):
         yield name, float(value)
+
+
+def _of_memory_files(files: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    if not files:
+        return
+    failing = _gauge("memory_file_failing", "1 if the file could not be written last time.", "file")
+    stored = _gauge(
+        "memory_file_stored_timestamp_seconds", "Unix time of the last step on the disk.", "file"
+    )
+    commits = _counter("memory_file_commits", "Times that writes were put on the disk.", "file")
+    refused = _counter("memory_file_refused", "Writes refused because of the disk.", "file")
+    size = _gauge("memory_file_bytes", "Size of the file.", "file")
+    for name, told in files.items():
+        failing.add_metric([name], told["failing"] is not None)
+        if told["stored_at"] is not None:
+            stored.add_metric([name], told["stored_at"])
+        commits.add_metric([name], told["commits"])
+        refused.add_metric([name], told["refused"])
+        size.add_metric([name], told["bytes"])
+    yield from (failing, stored, commits, refused, size)
 
 
 def _of_audit(audit: Mapping[str, Any]) -> Iterator[Metric]:

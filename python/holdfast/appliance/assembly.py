@@ -79,16 +79,19 @@ SPREAD = 10.0
 
 
 def memory(settings: MemoryConfig) -> Memory:
-    """Creates the memory that the settings describe, with its initial values."""
+    """Creates the memory that the settings describe, with all values 0."""
     seal = settings.seal
-    made = _core.Memory(
+    return _core.Memory(
         **{area: (span.start, span.size) for area, span in settings.areas().items()},
         seal=None if seal is None else (seal.area, seal.address, seal.mode),
     )
+
+
+def fill(made: Memory, settings: MemoryConfig) -> None:
+    """Writes the initial values."""
     writes = [(run.area, run.address, run.values) for run in settings.initial_values]
     if writes:
         made.write_many(writes)
-    return made
 
 
 def identity(settings: IdentityConfig) -> Identity:

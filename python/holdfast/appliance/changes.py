@@ -56,6 +56,11 @@ def restarts(before: Config, now: Config) -> list[str]:
             reasons.append(f"memories.{name}: removed; its values would be lost")
         elif _layout(memory) != _layout(now.memories[name]):
             reasons.append(f"memories.{name}: areas or seal changed")
+        elif memory.keep != now.memories[name].keep:
+            reasons.append(f"memories.{name}: keep changed")
+    for name, memory in now.memories.items():
+        if name not in before.memories and memory.keep is not None:
+            reasons.append(f"memories.{name}: added with keep")
     known = {link.url: link for link in before.links.values()}
     for name, link in now.links.items():
         if link.url in known and _waiting(known[link.url]) != _waiting(link):

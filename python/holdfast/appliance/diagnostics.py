@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from holdfast._core import Engine, Link, Memory, Poller
+    from holdfast.appliance.kept import KeptMemories
     from holdfast.appliance.liveness import Liveness
     from holdfast.appliance.supervision import Supervisor
     from holdfast.appliance.tag_values import TagValues
@@ -34,6 +35,9 @@ class Diagnostics:
         self._liveness = liveness
         self._began = time.monotonic()
         self.adapters: dict[str, tuple[Supervisor, MemoryAccess | None]] = {}
+        self.kept: KeptMemories | None = None
+        """The files that keep memories."""
+
         self.audit: Audit | None = None
         self.poller: Poller | None = None
         self.values: TagValues | None = None
@@ -61,7 +65,7 @@ class Diagnostics:
         }
 
     def stats(self) -> dict[str, Any]:
-        """Returns all counters of listeners, devices, links, adapters, log, audit log, threads."""
+        """Returns all counters: of listeners, devices, links, adapters, logs, threads, files."""
         return {
             "uptime": round(time.monotonic() - self._began, 3),
             "listeners": self._engine.counters(),
@@ -70,6 +74,7 @@ class Diagnostics:
             "adapters": {name: self.adapter(name) for name in self.adapters},
             "events_lost": self._engine.lost_events,
             "log_dropped": logs.dropped(),
+            "memory_files": {} if self.kept is None else self.kept.status(),
             "audit": None if self.audit is None else self.audit.counts(),
             "threads": self._liveness.threads(),
             "certificates": self.expiries.certificates,

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from holdfast import _core, logs
 from holdfast.adapters import foreign
-from holdfast.appliance import assembly, auditing, changes, configured_certificates, receivers
+from holdfast.appliance import assembly, auditing, changes, configured_certificates, kept, receivers
 from holdfast.appliance.diagnostics import Diagnostics, configured
 from holdfast.appliance.expiring import Expiring
+from holdfast.appliance.kept import KeptMemories
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.output_site import OutputSite
 from holdfast.appliance.supervision import STOP_TIMEOUT, Supervisor
@@ -103,15 +104,20 @@ class Appliance:
     def __init__(self, config: Config, *, retries_ports: bool = True) -> None:
         self.config = config
         self._retries_ports = retries_ports
-        self.memories = {
-            name: assembly.memory(settings) for name, settings in config.memories.items()
-        }
+        self.memories = {name: kept.made(config, name) for name in config.memories}
         self._running: _Running | None = None
+        self._was_started = False
 
     def start(self) -> Self:
         """Binds the listeners and serves. Raises `RuntimeError` if already running."""
         if self._running is not None:
             raise RuntimeError("the appliance is already running")
+        if self._was_started:
+            # The contents of memories that are kept come from their files again.
+            for name, settings in self.config.memories.items():
+                if settings.keep is not None:
+                    self.memories[name] = kept.made(self.config, name)
+        self._was_started = True
         self._running = _Running(self.config, self.memories, retries_ports=self._retries_ports)
         logs.write(
             logging.INFO, "started", version=_core.__version__, sha256=self.config.sha256 or "-"
@@ -224,9 +230,11 @@ class _Running:
         # Missing adapters and unusable TLS files are reported before any socket is opened.
         _check_parts(config)
         self._https = _loaded_https(config)
-        assembly.mirror(config, memories)
-        disabled = self._tell_disabled()
         with ExitStack() as undo:
+            self._kept = KeptMemories(config, memories)
+            undo.callback(self._kept.stop)
+            assembly.mirror(config, memories)
+            disabled = self._tell_disabled()
             self._audit = auditing.opened(config)
             if self._audit is not None:
                 undo.callback(auditing.closed, self._audit, config)
@@ -254,6 +262,7 @@ class _Running:
                     self._poller.add(device)
             self.liveness = Liveness(self._heartbeats)
             self.diagnostics = Diagnostics(memories, self._engine, self.liveness)
+            self.diagnostics.kept = self._kept
             self.diagnostics.audit = self._audit
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
@@ -292,6 +301,7 @@ class _Running:
             self._writes.join(STOP_TIMEOUT)
         for port in self._ports.values():
             port.close()
+        self._kept.stop()
         if self._recorder is not None:
             self._recorder.finish()
         if self._audit is not None:
@@ -325,6 +335,7 @@ class _Running:
         self._looked = now
         logs.tell_held_back()
         self.liveness.check()
+        self._kept.check()
         self._expiring.check(self.diagnostics.expiries)
         interval = _review_interval(self._config)
         if interval is not None and now - self._reviewed >= interval:
@@ -461,11 +472,7 @@ class _Running:
         changed = changes.differences(self._fingerprints, fingerprints)
         https = _loaded_https(config)
         known = self._memories
-        added = {
-            name: assembly.memory(settings)
-            for name, settings in config.memories.items()
-            if name not in known
-        }
+        added = {name: kept.made(config, name) for name in config.memories if name not in known}
         memories = {**known, **added}
         with ExitStack() as undo:
             ports = self._taken_over_ports(config, undo)
@@ -563,8 +570,8 @@ class _Running:
             else:
                 self._poller.add(device)
         for name in [*(polled - now), *devices]:
-            for kept in (self._health, self._plan_errors, self._unstored):
-                kept.pop(name, None)
+            for told in (self._health, self._plan_errors, self._unstored):
+                told.pop(name, None)
             self._forwarded = {key: at for key, at in self._forwarded.items() if key[0] != name}
             self._unreachable = {key for key in self._unreachable if key[0] != name}
         self._health |= dict.fromkeys(devices, "unknown")

@@ -17,6 +17,7 @@ from holdfast import logs
 from holdfast.adapters.foreign import UnknownAdapter
 from holdfast.appliance import Appliance, assembly
 from holdfast.appliance.control import Control
+from holdfast.appliance.kept import UnusableFile
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit, load_whole
@@ -103,6 +104,9 @@ def serve(
     appliance = Appliance(config, retries_ports=retries_ports)
     try:
         appliance.start()
+    except UnusableFile as error:
+        click.echo(f"holdfast: {error}", err=True)
+        sys.exit(WRONG)
     except OSError as error:
         click.echo(f"holdfast: {explained(error)}", err=True)
         sys.exit(1)

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, PrivateAttr
 
 from holdfast.config.base import Model
 from holdfast.config.initial import InitialRun
-from holdfast.config.scalars import FilePath, NotNull
+from holdfast.config.scalars import FilePath, NotNull, whole_number
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.types import AREAS, Area, BitArea
 
@@ -51,6 +51,18 @@ class Seal(Model):
     """once: stays open until a restart. level: sealed whenever the gate bit is 0."""
 
 
+class KeepConfig(Model):
+    """A file that keeps the contents of a memory over restarts."""
+
+    own_files = ("file",)
+
+    file: FilePath
+    """The file, in an existing folder. Memories that are written together share one."""
+    sync: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False), whole_number] = 1
+    """0: every write is on the disk before its reply. Otherwise the seconds of writes that a crash
+    or a power cut may cost; a clean stop loses nothing."""
+
+
 class MemoryConfig(Model):
     """Four areas of bits and registers. An omitted area does not exist."""
 
@@ -68,6 +80,9 @@ class MemoryConfig(Model):
     """Seals the memory at the start, until its gate bit is 1."""
     initial: Annotated[FilePath | None, NotNull()] = None
     """A .csv file with lines of area,address,value, or a .yaml file, with initial values."""
+
+    keep: Annotated[KeepConfig | None, NotNull()] = None
+    """Keeps the contents over restarts; `initial` then applies only to the first start."""
 
     _initial_values: tuple[InitialRun, ...] = PrivateAttr(default=())
 

@@ -70,6 +70,7 @@ class MemoryChecks:
             if isinstance(memory, dict):
                 self._memory(("memories", name), memory)
         self._ids(mapping(memories))
+        self._files(mapping(memories))
 
     def _memory(self, path: KeyPath, memory: dict[Any, Any]) -> None:
         layout: Layout = {
@@ -125,6 +126,27 @@ class MemoryChecks:
         runs, problems = initial.parse(text, shown, layout, gate)
         self.values[self.folder / file] = runs
         self.problems_elsewhere += problems
+
+    def _files(self, memories: dict[Any, Any]) -> None:
+        """Memories in one file are written together, so they have the same sync."""
+        first: dict[str, tuple[str, object]] = {}
+        for name, memory in memories.items():
+            keep = mapping(mapping(memory).get("keep"))
+            file, sync = keep.get("file"), keep.get("sync", 1)
+            if not isinstance(file, str) or not file:
+                continue
+            path: KeyPath = ("memories", name, "keep")
+            found = str(self.folder / file)
+            if not Path(found).parent.is_dir():
+                self.report.add((*path, "file"), f"found {show(file)}, whose folder does not exist")
+            elif Path(found).is_dir():
+                self.report.add((*path, "file"), f"found {show(file)}, which is a folder")
+            elif found in first and first[found][1] != sync:
+                other = first[found][0]
+                allowed = f"{show(first[found][1])}, as {other} has for the file"
+                message = f"found {show(sync)}, allowed: {allowed}"
+                self.report.add((*path, "sync"), message)
+            first.setdefault(found, (str(name), sync))
 
     def _ids(self, memories: dict[Any, Any]) -> None:
         owners = Owners(self.report, "id")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast._core import MemoryFile
 from support import wire
 from support.brokers import Mosquitto, NatsServer
 from support.cli import done
@@ -482,6 +483,14 @@ def scanner(stage: Stage) -> None:
     stage.replaced["4222"] = str(server.port)
 
 
+def durability(stage: Stage) -> None:
+    memory = holdfast.Memory(holding_registers=1000)
+    memory.write("holding_registers", 10, [7, 8])
+    file = MemoryFile(stage.folder / "setpoints.redb", [("setpoints", memory)], 0)
+    file.start()
+    file.stop()
+
+
 def operations(stage: Stage) -> None:
     stage.file("plant.yaml", RIGHT)
 
@@ -501,6 +510,7 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/config.md": configuration,
     "docs/describe.md": plant,
     "docs/devices.md": devices,
+    "docs/durability.md": durability,
     "docs/gateway.md": gateway,
     "docs/library.md": library,
     "docs/metrics.md": metrics,

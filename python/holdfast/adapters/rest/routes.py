@@ -224,7 +224,7 @@ ROUTES = (
         "stats",
         "Get all counters since the start",
         json_answer(
-            "Counters of listeners, devices, adapters, log and audit log; threads",
+            "Counters of listeners, devices, adapters, logs and files of memories; threads",
             ref("Stats"),
             {
                 "uptime": 3600.25,
@@ -277,6 +277,17 @@ ROUTES = (
                 },
                 "events_lost": 0,
                 "log_dropped": 0,
+                "memory_files": {
+                    "/var/lib/holdfast/setpoints.redb": {
+                        "failing": None,
+                        "stored_at": 1893456000.0,
+                        "commits": 12,
+                        "pending": 0,
+                        "refused": 0,
+                        "last_commit_seconds": 0.004,
+                        "bytes": 73728,
+                    }
+                },
                 "audit": None,
                 "threads": {"holdfast-io-0": {"heartbeat_age": 0.4, "cpu": 12.5}},
                 "certificates": {"/etc/holdfast/server.pem": 1893456000.0},

@@ -160,6 +160,36 @@ DIAGNOSTICS: dict[str, Schema] = {
             },
             "events_lost": COUNTER,
             "log_dropped": COUNTER,
+            "memory_files": {
+                "type": "object",
+                "description": "By path: the files that keep memories",
+                "additionalProperties": {
+                    "type": "object",
+                    "required": [
+                        "failing",
+                        "stored_at",
+                        "commits",
+                        "pending",
+                        "refused",
+                        "last_commit_seconds",
+                        "bytes",
+                    ],
+                    "properties": {
+                        "failing": TEXT_OR_NULL
+                        | {"description": "Why the file can't be written at present"},
+                        "stored_at": {
+                            "type": ["number", "null"],
+                            "description": "Unix time of the last step on the disk",
+                        },
+                        "commits": COUNTER,
+                        "pending": COUNTER | {"description": "Writes that are not on the disk"},
+                        "refused": COUNTER | {"description": "Writes refused by the disk"},
+                        "last_commit_seconds": {"type": "number"},
+                        "bytes": COUNTER | {"description": "Size of the file"},
+                    },
+                    "additionalProperties": False,
+                },
+            },
             "audit": {
                 "type": ["object", "null"],
                 "required": ["lines", "failed", "waiting", "failing", "copies"],

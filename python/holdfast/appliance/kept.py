@@ -1,0 +1,93 @@
+"""The files that keep memories over restarts: opened before anything listens, closed last."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from holdfast import _core, logs
+from holdfast.appliance import assembly
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from holdfast.config import Config
+
+
+class UnusableFile(OSError):
+    """A file of memories is damaged, in use, or can't be written."""
+
+
+class KeptMemories:
+    """The files of one configuration. The constructor opens all of them or none."""
+
+    def __init__(self, config: Config, memories: Mapping[str, _core.Memory]) -> None:
+        """Loads the contents of the memories. Raises `UnusableFile`."""
+        self._files: dict[Path, _core.MemoryFile] = {}
+        self._failing: dict[Path, str | None] = {}
+        try:
+            for path, names in _files(config).items():
+                self._open(path, names, config, memories)
+        except OSError as error:
+            self.stop()
+            raise UnusableFile(str(error)) from None
+        except BaseException:
+            self.stop()
+            raise
+
+    def _open(
+        self, path: Path, names: list[str], config: Config, memories: Mapping[str, _core.Memory]
+    ) -> None:
+        keep = config.memories[names[0]].keep
+        assert keep is not None, "the memory is kept"
+        file = _core.MemoryFile(str(path), [(name, memories[name]) for name in names], keep.sync)
+        self._files[path] = file
+        for warning in file.warnings:
+            logs.write(logging.WARNING, "memory_file_differs", file=path, warning=warning)
+        for name in names:
+            if name not in file.loaded:
+                assembly.fill(memories[name], config.memories[name])
+        file.start()
+        loaded = ",".join(file.loaded) or "-"
+        logs.write(logging.INFO, "memory_file", file=path, loaded=loaded, sync=keep.sync)
+
+    def status(self) -> dict[str, dict[str, Any]]:
+        """The state and the counters of each file."""
+        return {str(path): dict(file.status()) for path, file in self._files.items()}
+
+    def check(self) -> None:
+        """Logs files that can't be written any more, and those that can again."""
+        for path, file in self._files.items():
+            error = file.status()["failing"]
+            if error is not None and self._failing.get(path) is None:
+                logs.write(logging.ERROR, "memory_file_failing", file=path, error=error)
+            elif error is None and self._failing.get(path) is not None:
+                logs.write(logging.INFO, "memory_file_back", file=path)
+            self._failing[path] = error
+
+    def stop(self) -> None:
+        """Stores what is left, and closes the files."""
+        for path, file in self._files.items():
+            try:
+                file.stop()
+            except OSError as error:
+                logs.write(logging.ERROR, "memory_file_failing", file=path, error=error)
+
+
+def made(config: Config, name: str) -> _core.Memory:
+    """Creates a memory with its initial values; a memory that is kept gets its values later."""
+    settings = config.memories[name]
+    memory = assembly.memory(settings)
+    if settings.keep is None:
+        assembly.fill(memory, settings)
+    return memory
+
+
+def _files(config: Config) -> dict[Path, list[str]]:
+    """The names of the memories in each file."""
+    files: dict[Path, list[str]] = {}
+    for name, settings in config.memories.items():
+        if settings.keep is not None:
+            files.setdefault(settings.keep.file, []).append(name)
+    return files
