@@ -145,6 +145,8 @@ const fn reason(refusal: Refusal) -> &'static str {
         Refusal::Unavailable => "log_unavailable",
         Refusal::NotStored => "not_stored",
         Refusal::NotConfirmed => "not_confirmed",
+        Refusal::Behind => "log_behind",
+        Refusal::Differs => "contents_differ",
         Refusal::NotOneStep => "not_one_step",
     }
 }

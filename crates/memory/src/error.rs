@@ -36,6 +36,10 @@ pub enum Refusal {
     NotStored,
     #[error("the write was sent, but not confirmed: it may still be carried out")]
     NotConfirmed,
+    #[error("the memory has had no contact with its log for too long")]
+    Behind,
+    #[error("the contents are not those that the log leads to")]
+    Differs,
     #[error("the memories are not kept together, so they can't be written in one step")]
     NotOneStep,
 }

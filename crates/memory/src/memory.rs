@@ -85,13 +85,20 @@ pub struct Contents {
 #[derive(Debug)]
 struct Content {
     areas: [Box<[u8]>; 4],
-    sealed: bool,
+    /// [`SEALED`], [`GUARDED`], both or 0.
+    door: u8,
     /// How many times the seal opened, and how many times it closed again.
     seal_changes: (u64, u64),
     /// How many writes were carried out, each in one step.
     writes: u64,
     observers: Observers,
 }
+
+/// Clients are refused.
+const SEALED: u8 = 1;
+
+/// The journal is asked before each access.
+const GUARDED: u8 = 2;
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
 
@@ -120,7 +127,7 @@ impl Memory {
             journal: OnceLock::new(),
             content: RwLock::new(Content {
                 areas,
-                sealed: gate.is_some(),
+                door: if gate.is_some() { SEALED } else { 0 },
                 seal_changes: (0, 0),
                 writes: 0,
                 observers: Observers::default(),
@@ -170,7 +177,24 @@ impl Memory {
     /// # Panics
     /// The memory has a journal already.
     pub fn keep_in(&self, journal: Arc<dyn Journal>, member: u16) {
+        let guards = journal.guards();
         assert!(self.journal.set((journal, member)).is_ok(), "a memory has one journal");
+        if guards {
+            self.exclusive().door |= GUARDED;
+        }
+    }
+
+    /// Whether the seal and the journal admit an access.
+    fn admit(&self, content: &Content, access: Access) -> Result<(), Refusal> {
+        if content.door == 0 { Ok(()) } else { self.judge(content, access) }
+    }
+
+    fn judge(&self, content: &Content, access: Access) -> Result<(), Refusal> {
+        content.admit(access)?;
+        match self.journal.get() {
+            Some((journal, _)) if content.door & GUARDED != 0 => journal.admit(),
+            _ => Ok(()),
+        }
     }
 
     /// Whether writes are carried out by a journal.
@@ -193,7 +217,7 @@ impl Memory {
         operation: Operation<'_>,
         done: Done,
     ) -> Result<(), Refusal> {
-        self.shared().admit(access)?;
+        self.admit(&self.shared(), access)?;
         let Some((journal, member)) = self.journal.get() else { panic!("there is no journal") };
         let member = *member;
         let action = match operation {
@@ -228,7 +252,7 @@ impl Memory {
         let mut copies: Vec<(usize, Contents)> = locked
             .iter()
             .map(|(at, content)| {
-                (*at, Contents { areas: content.areas.clone(), sealed: content.sealed })
+                (*at, Contents { areas: content.areas.clone(), sealed: content.sealed() })
             })
             .collect();
         copies.sort_by_key(|(at, _)| *at);
@@ -240,8 +264,7 @@ impl Memory {
         self.shared().writes
     }
 
-    /// Puts earlier contents in place of the present ones, before anybody uses the memory. Observers
-    /// don't see it.
+    /// Puts other contents in place of the present ones. Observers don't see it.
     ///
     /// # Panics
     /// The length of an area differs, or the contents are sealed and the memory has no gate.
@@ -251,12 +274,12 @@ impl Memory {
         for (area, restored) in content.areas.iter_mut().zip(&contents.areas) {
             area.copy_from_slice(restored);
         }
-        content.sealed = contents.sealed;
+        content.seal(contents.sealed);
         content.writes += 1;
     }
 
     pub fn sealed(&self) -> bool {
-        self.shared().sealed
+        self.shared().sealed()
     }
 
     /// How many times the seal opened, and how many times it closed again.
@@ -271,7 +294,7 @@ impl Memory {
     pub fn read(&self, access: Access, read: Read<'_>) -> Result<(), Refusal> {
         let offset = self.readable(&read);
         let content = self.shared();
-        content.admit(access)?;
+        self.admit(&content, access)?;
         content.copy_out(offset?, read);
         Ok(())
     }
@@ -282,7 +305,7 @@ impl Memory {
     /// As [`Memory::read`], with the index of the first range that was refused.
     pub fn read_many(&self, access: Access, reads: &mut [Read<'_>]) -> Result<(), Refused> {
         let content = self.shared();
-        content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
+        self.admit(&content, access).map_err(|refusal| Refused { index: 0, refusal })?;
         for (index, read) in reads.iter().enumerate() {
             self.readable(read).map_err(|refusal| Refused { index, refusal })?;
         }
@@ -352,7 +375,7 @@ impl Memory {
 
     #[cold]
     fn write_many_by_journal(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
-        self.shared().admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
+        self.admit(&self.shared(), access).map_err(|refusal| Refused { index: 0, refusal })?;
         let writes: Vec<(&Memory, Write)> = writes.iter().map(|write| (self, *write)).collect();
         write_across(access, &writes)
     }
@@ -546,15 +569,15 @@ impl Memory {
             let offset = usize::from(gate.address - self.span(gate.area).start());
             let open = bits::get(&content.areas[gate.area.index()], offset);
             let sealed = match gate.mode {
-                GateMode::Once => content.sealed && !open,
+                GateMode::Once => content.sealed() && !open,
                 GateMode::Level => !open,
             };
-            match (content.sealed, sealed) {
+            match (content.sealed(), sealed) {
                 (true, false) => content.seal_changes.0 += 1,
                 (false, true) => content.seal_changes.1 += 1,
                 _ => {}
             }
-            content.sealed = sealed;
+            content.seal(sealed);
         }
     }
 
@@ -570,8 +593,17 @@ impl Memory {
 }
 
 impl Content {
+    const fn sealed(&self) -> bool {
+        self.door & SEALED != 0
+    }
+
+    const fn seal(&mut self, sealed: bool) {
+        self.door = self.door & !SEALED | if sealed { SEALED } else { 0 };
+    }
+
+    /// Whether the seal admits a write.
     fn admit(&self, access: Access) -> Result<(), Refusal> {
-        if self.sealed && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
+        if self.sealed() && access == Access::Client { Err(Refusal::Sealed) } else { Ok(()) }
     }
 
     /// Counts a write that was carried out, and passes it to the observers.
@@ -638,7 +670,7 @@ fn submit_across(
         let place = memory.journal.get().filter(|(other, _)| Arc::ptr_eq(other, journal));
         let refused = |refusal| Refused { index, refusal };
         let (_, member) = place.ok_or(refused(Refusal::NotOneStep))?;
-        memory.shared().admit(access).map_err(refused)?;
+        memory.admit(&memory.shared(), access).map_err(refused)?;
         step.push(StepWrite::new(*member, write));
     }
     journal.submit(Step { access, action: Action::Write(step) }, done);
@@ -786,5 +818,87 @@ mod tests {
         assert_eq!(memory.write(Access::Ingest, write), Err(Refusal::Mirrored));
         memory.mirror(Vec::new()).unwrap();
         memory.write(Access::Ingest, write).unwrap();
+    }
+
+    /// Carries out each step at once, and refuses accesses while it has a refusal.
+    #[derive(Debug)]
+    struct Guard {
+        guards: bool,
+        refusal: std::sync::Mutex<Option<Refusal>>,
+        members: std::sync::Weak<Memory>,
+    }
+
+    impl Journal for Guard {
+        fn submit(&self, step: Step, done: Done) {
+            done(step.carry_out(&[self.members.upgrade().unwrap()]));
+        }
+
+        fn guards(&self) -> bool {
+            self.guards
+        }
+
+        fn admit(&self) -> Result<(), Refusal> {
+            self.refusal.lock().unwrap().map_or(Ok(()), Err)
+        }
+    }
+
+    #[test]
+    fn a_journal_that_guards_is_asked_before_each_access_but_not_by_its_own_steps() {
+        for guards in [true, false] {
+            let memory = Arc::new(mirroring());
+            memory.mirror(Vec::new()).unwrap();
+            let (refusal, members) = (std::sync::Mutex::default(), Arc::downgrade(&memory));
+            let guard = Arc::new(Guard { guards, refusal, members });
+            memory.keep_in(Arc::clone(&guard) as Arc<dyn Journal>, 0);
+            let write = writing(REGISTERS, 0, &[1, 2]);
+            memory.write(Access::Client, write).unwrap();
+            *guard.refusal.lock().unwrap() = Some(Refusal::Behind);
+            let expected = if guards { Err(Refusal::Behind) } else { Ok(()) };
+            for access in [Access::Client, Access::Ingest, Access::Mirror] {
+                let mut out = [[0; 2]; 3];
+                let [one, many, then] =
+                    out.each_mut().map(|out| Read { area: REGISTERS, address: 0, count: 1, out });
+                assert_eq!(memory.read(access, one), expected);
+                let many = memory.read_many(access, &mut [many]).map_err(Refused::alone);
+                assert_eq!(many, expected);
+                assert_eq!(memory.write_then_read(access, write, then), expected);
+                assert_eq!(memory.write(access, write), expected);
+                assert_eq!(memory.mask_write(access, REGISTERS, 0, 1, 1), expected);
+                let across = write_across(access, &[(&memory, write)]).map_err(Refused::alone);
+                assert_eq!(across, expected);
+            }
+            let step = StepWrite::new(0, &writing(REGISTERS, 0, &[3, 4]));
+            let step = Step { access: Access::Client, action: Action::Write(vec![step]) };
+            step.carry_out(&[Arc::clone(&memory)]).unwrap();
+            *guard.refusal.lock().unwrap() = None;
+            let mut out = [0; 2];
+            let read = Read { area: REGISTERS, address: 0, count: 1, out: &mut out };
+            memory.read(Access::Client, read).unwrap();
+            assert_eq!(out, [3, 4]);
+        }
+    }
+
+    #[test]
+    fn the_seal_of_a_guarded_memory_still_opens_and_closes() {
+        let span = Span::new(0, 20).unwrap();
+        let layout = Layout::default().with(Area::Coils, span);
+        let gate = Gate { area: Area::Coils, address: 3, mode: GateMode::Level };
+        let memory = Arc::new(Memory::new(layout, Some(gate)).unwrap());
+        let (refusal, members) = (std::sync::Mutex::default(), Arc::downgrade(&memory));
+        let guard = Arc::new(Guard { guards: true, refusal, members });
+        memory.keep_in(Arc::clone(&guard) as Arc<dyn Journal>, 0);
+        let read = || {
+            let mut out = [0];
+            let read = Read { area: Area::Coils, address: 0, count: 1, out: &mut out };
+            memory.read(Access::Client, read)
+        };
+        assert_eq!(read(), Err(Refusal::Sealed));
+        memory.write(Access::Ingest, writing(Area::Coils, 3, &[1])).unwrap();
+        assert_eq!((read(), memory.sealed()), (Ok(()), false));
+        *guard.refusal.lock().unwrap() = Some(Refusal::Differs);
+        assert_eq!(read(), Err(Refusal::Differs));
+        *guard.refusal.lock().unwrap() = None;
+        memory.write(Access::Ingest, writing(Area::Coils, 3, &[0])).unwrap();
+        assert_eq!((read(), memory.sealed()), (Err(Refusal::Sealed), true));
     }
 }

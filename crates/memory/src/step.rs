@@ -52,6 +52,20 @@ pub trait Journal: fmt::Debug + Send + Sync {
     /// Besides the refusals of a memory, the outcome may be [`Refusal::Unavailable`],
     /// [`Refusal::NotStored`] or [`Refusal::NotConfirmed`].
     fn submit(&self, step: Step, done: Done);
+
+    /// Whether [`Journal::admit`] is asked before each access. Asked once.
+    fn guards(&self) -> bool {
+        false
+    }
+
+    /// Whether the memories may be read and written now. Called with the lock of a memory, for each
+    /// read.
+    ///
+    /// # Errors
+    /// [`Refusal::Behind`] or [`Refusal::Differs`].
+    fn admit(&self) -> Result<(), Refusal> {
+        Ok(())
+    }
 }
 
 /// A write to one memory that is carried out later.

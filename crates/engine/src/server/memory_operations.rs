@@ -18,8 +18,10 @@ pub(super) fn exception_of(refusal: Refusal) -> ExceptionCode {
             ExceptionCode::IllegalDataAddress
         }
         Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
-        Refusal::Unavailable => ExceptionCode::ServerDeviceBusy,
-        Refusal::NotStored | Refusal::NotConfirmed => ExceptionCode::ServerDeviceFailure,
+        Refusal::Unavailable | Refusal::Behind => ExceptionCode::ServerDeviceBusy,
+        Refusal::NotStored | Refusal::NotConfirmed | Refusal::Differs => {
+            ExceptionCode::ServerDeviceFailure
+        }
         Refusal::NotOneStep => unreachable!("a request writes to one memory"),
     }
 }

@@ -798,7 +798,10 @@ fn writing<'p>(header: &Header, payload: &'p [u8]) -> Write<'p> {
 
 fn refusal(refused: MemoryRefusal) -> Refusal {
     match refused {
-        MemoryRefusal::Unavailable | MemoryRefusal::NotStored => Refusal::NotStored,
+        MemoryRefusal::Unavailable
+        | MemoryRefusal::NotStored
+        | MemoryRefusal::Behind
+        | MemoryRefusal::Differs => Refusal::NotStored,
         MemoryRefusal::NotConfirmed => Refusal::NotConfirmed,
         _ => Refusal::Range,
     }
