@@ -3,5 +3,6 @@
 
 #![forbid(unsafe_code)]
 
+pub mod encoding;
 pub mod file;
 pub mod log;

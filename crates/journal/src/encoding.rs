@@ -1,0 +1,204 @@
+//! Steps as bytes, so that a file or a log can hold them.
+//!
+//! An encoded step begins with its version. Numbers are little-endian. The number of bytes of a
+//! range follows from its area and count.
+
+use std::sync::Arc;
+
+use holdfast_memory::{Access, Action, Area, Memory, Step, StepWrite};
+use thiserror::Error;
+
+/// The version that [`encode`] writes. Others are not decoded.
+pub const VERSION: u8 = 1;
+
+/// Why bytes are not a step for some memories.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub enum DecodeError {
+    #[error("the version is {0}, supported is {VERSION}")]
+    Version(u8),
+    #[error("the bytes end within the step")]
+    Short,
+    #[error("{0} bytes follow the step")]
+    Long(usize),
+    #[error("{what} is {found}, which is not defined")]
+    Unknown { what: &'static str, found: u8 },
+    #[error("memory {0} does not exist")]
+    Member(u16),
+    #[error("{} {address} + {count} are outside memory {member}", area.name())]
+    Range { member: u16, area: Area, address: u16, count: u32 },
+    #[error("a mask applies to registers, not to {}", .0.name())]
+    Mask(Area),
+}
+
+/// Appends a step that is valid for its memories.
+///
+/// # Panics
+/// The number of bytes of a range does not match its count.
+pub fn encode(step: &Step, out: &mut Vec<u8>) {
+    out.push(VERSION);
+    out.push(match step.access {
+        Access::Client => 0,
+        Access::Ingest => 1,
+        Access::Mirror => 2,
+    });
+    match &step.action {
+        Action::Write(writes) => {
+            out.push(0);
+            for write in writes {
+                encode_write(write, out);
+            }
+        }
+        &Action::Mask { member, area, address, and_mask, or_mask } => {
+            out.push(1);
+            encode_place(member, area, address, out);
+            out.extend_from_slice(&and_mask.to_le_bytes());
+            out.extend_from_slice(&or_mask.to_le_bytes());
+        }
+        &Action::WriteThenRead { ref write, area, address, count } => {
+            out.push(2);
+            encode_place(write.member, area, address, out);
+            out.extend_from_slice(&encoded_count(count).to_le_bytes());
+            encode_write(write, out);
+        }
+    }
+}
+
+fn encode_write(write: &StepWrite, out: &mut Vec<u8>) {
+    let StepWrite { member, area, address, count, ref bytes } = *write;
+    assert_eq!(bytes.len(), area.byte_len(count), "the bytes of a range match its count");
+    encode_place(member, area, address, out);
+    out.extend_from_slice(&encoded_count(count).to_le_bytes());
+    out.extend_from_slice(bytes);
+}
+
+fn encode_place(member: u16, area: Area, address: u16, out: &mut Vec<u8>) {
+    out.extend_from_slice(&member.to_le_bytes());
+    out.push(match area {
+        Area::Coils => 0,
+        Area::DiscreteInputs => 1,
+        Area::HoldingRegisters => 2,
+        Area::InputRegisters => 3,
+    });
+    out.extend_from_slice(&address.to_le_bytes());
+}
+
+fn encoded_count(count: usize) -> u32 {
+    u32::try_from(count).expect("a range is inside an area")
+}
+
+/// Decodes a step for these memories: all of its members exist, and hold its ranges.
+///
+/// # Errors
+/// [`DecodeError`], for all other bytes.
+pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError> {
+    let mut rest = Rest { bytes, members };
+    let version = rest.byte()?;
+    if version != VERSION {
+        return Err(DecodeError::Version(version));
+    }
+    let access = match rest.byte()? {
+        0 => Access::Client,
+        1 => Access::Ingest,
+        2 => Access::Mirror,
+        found => return Err(DecodeError::Unknown { what: "the access", found }),
+    };
+    let action = match rest.byte()? {
+        0 => {
+            let mut writes = Vec::new();
+            while !rest.bytes.is_empty() {
+                writes.push(rest.write()?);
+            }
+            Action::Write(writes)
+        }
+        1 => {
+            let (member, area, address) = rest.place()?;
+            if area.is_bits() {
+                return Err(DecodeError::Mask(area));
+            }
+            rest.holds((member, area, address), 1)?;
+            Action::Mask { member, area, address, and_mask: rest.u16()?, or_mask: rest.u16()? }
+        }
+        2 => {
+            let place = rest.place()?;
+            let count = rest.u32()?;
+            rest.holds(place, count)?;
+            let write = rest.write()?;
+            let (member, area, address) = place;
+            if member != write.member {
+                return Err(DecodeError::Member(member));
+            }
+            Action::WriteThenRead { write, area, address, count: count as usize }
+        }
+        found => return Err(DecodeError::Unknown { what: "the action", found }),
+    };
+    match rest.bytes.len() {
+        0 => Ok(Step { access, action }),
+        extra => Err(DecodeError::Long(extra)),
+    }
+}
+
+/// Bytes that are not decoded yet.
+struct Rest<'a> {
+    bytes: &'a [u8],
+    members: &'a [Arc<Memory>],
+}
+
+impl<'a> Rest<'a> {
+    fn take(&mut self, len: usize) -> Result<&'a [u8], DecodeError> {
+        let (taken, rest) = self.bytes.split_at_checked(len).ok_or(DecodeError::Short)?;
+        self.bytes = rest;
+        Ok(taken)
+    }
+
+    fn array<const LEN: usize>(&mut self) -> Result<[u8; LEN], DecodeError> {
+        let (taken, rest) = self.bytes.split_first_chunk().ok_or(DecodeError::Short)?;
+        self.bytes = rest;
+        Ok(*taken)
+    }
+
+    fn byte(&mut self) -> Result<u8, DecodeError> {
+        self.array::<1>().map(|[byte]| byte)
+    }
+
+    fn u16(&mut self) -> Result<u16, DecodeError> {
+        self.array().map(u16::from_le_bytes)
+    }
+
+    fn u32(&mut self) -> Result<u32, DecodeError> {
+        self.array().map(u32::from_le_bytes)
+    }
+
+    fn place(&mut self) -> Result<(u16, Area, u16), DecodeError> {
+        let member = self.u16()?;
+        let area = match self.byte()? {
+            0 => Area::Coils,
+            1 => Area::DiscreteInputs,
+            2 => Area::HoldingRegisters,
+            3 => Area::InputRegisters,
+            found => return Err(DecodeError::Unknown { what: "the area", found }),
+        };
+        Ok((member, area, self.u16()?))
+    }
+
+    fn holds(
+        &self,
+        (member, area, address): (u16, Area, u16),
+        count: u32,
+    ) -> Result<(), DecodeError> {
+        let memory = self.members.get(usize::from(member)).ok_or(DecodeError::Member(member))?;
+        if count == 0 || !memory.span(area).holds(address, count as usize) {
+            return Err(DecodeError::Range { member, area, address, count });
+        }
+        Ok(())
+    }
+
+    fn write(&mut self) -> Result<StepWrite, DecodeError> {
+        let place = self.place()?;
+        let count = self.u32()?;
+        self.holds(place, count)?;
+        let (member, area, address) = place;
+        let count = count as usize;
+        let bytes = self.take(area.byte_len(count))?.to_vec();
+        Ok(StepWrite { member, area, address, count, bytes })
+    }
+}
