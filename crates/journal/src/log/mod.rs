@@ -1,1 +1,191 @@
 //! A log of writes that several machines share, in NATS JetStream.
+//!
+//! A write is a step, and the stream of the log has all steps in one order. Each node applies them in
+//! that order. The node where a step comes from answers when it has applied it:
+//!
+//! ```text
+//! submit ─► shared.rs    waits, with other steps
+//!           session.rs   publishes all that wait as one message
+//!                        the stream: one place in the order
+//!           state.rs     applies the message, on all nodes
+//! done   ◄─ sent.rs      the outcome of the step
+//! ```
+
+mod connection;
+mod digests;
+mod error;
+mod follower;
+mod layout;
+mod message;
+mod sent;
+mod session;
+mod settings;
+mod shared;
+mod state;
+mod status;
+mod store;
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use holdfast_memory::{Journal, Memory};
+
+pub use error::LogError;
+pub use follower::{Follower, Next, Record, Until};
+pub use message::Origin;
+pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
+pub use status::{Digest, Event, Node, Phase, Status};
+
+use session::Node as Session;
+use shared::Shared;
+
+/// The journal of memories that several nodes share.
+#[derive(Debug)]
+pub struct Log {
+    settings: Arc<Settings>,
+    members: Vec<(String, Arc<Memory>)>,
+    shared: Arc<Shared>,
+    process: u32,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+impl Log {
+    /// Makes the log the journal of these memories. Until it has caught up, writes are refused.
+    ///
+    /// What the memories contain now is what a new log begins with. The contents of an existing log
+    /// replace it.
+    ///
+    /// # Errors
+    /// [`LogError::Settings`].
+    pub fn new(settings: Settings, memories: Vec<(String, Arc<Memory>)>) -> Result<Log, LogError> {
+        settings.check()?;
+        let mut members = memories;
+        members.sort_by(|(one, _), (other, _)| one.cmp(other));
+        check(&members)?;
+        let settings = Arc::new(settings);
+        let shared = Arc::new(Shared::new(&settings));
+        for (member, (_, memory)) in members.iter().enumerate() {
+            let journal: Arc<dyn Journal> = Arc::clone(&shared) as _;
+            memory.keep_in(journal, member as u16);
+        }
+        let (process, thread) = (std::process::id(), Mutex::default());
+        Ok(Log { settings, members, shared, process, thread })
+    }
+
+    /// Starts the thread of the log. A second call does nothing.
+    ///
+    /// # Errors
+    /// [`LogError::Thread`].
+    pub fn start(&self) -> Result<(), LogError> {
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        if thread.is_some() {
+            return Ok(());
+        }
+        let members = self.members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
+        let fingerprint = layout::fingerprint(&self.members);
+        let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
+        let session = Session::new(settings, fingerprint, shared, members);
+        let name = format!("log {}", self.settings.name);
+        let started = std::thread::Builder::new().name(name).spawn(move || session.run());
+        *thread = Some(started.map_err(|error| LogError::Thread(error.to_string()))?);
+        Ok(())
+    }
+
+    /// Waits until the log has caught up, at most for this time. Returns whether it has.
+    ///
+    /// # Errors
+    /// The error with which it failed.
+    pub fn wait_until_caught_up(&self, timeout: Duration) -> Result<bool, LogError> {
+        let view = self.shared.wait(timeout, |view| view.phase != Phase::Starting);
+        match view.phase {
+            Phase::Failed(error) => Err(error),
+            Phase::Running => Ok(true),
+            Phase::Starting | Phase::Stopped => Ok(false),
+        }
+    }
+
+    /// The error that says why the log did not catch up within a time.
+    pub fn no_connection(&self, within: Duration) -> LogError {
+        let last = self.shared.view().last_error;
+        LogError::NoConnection { within, last: last.unwrap_or_else(|| "catching up".to_owned()) }
+    }
+
+    /// Refuses writes from now on, waits for those that were sent, and ends the thread.
+    pub fn stop(&self) {
+        if self.process != std::process::id() {
+            return;
+        }
+        self.shared.stop();
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(thread) = thread.take() {
+            let ended = thread.join();
+            debug_assert!(ended.is_ok() || std::thread::panicking(), "the thread panicked");
+        }
+    }
+
+    pub fn status(&self) -> Status {
+        let (view, counters) = (self.shared.view(), &self.shared.counters);
+        let sequence = counters.sequence.get();
+        let nodes = view.nodes.into_iter().map(|(name, node)| Node {
+            name,
+            sequence: node.sequence,
+            stored: node.stored,
+            digest: node.digest,
+        });
+        Status {
+            phase: view.phase,
+            server: view.server,
+            last_error: view.last_error,
+            contact_age: self.shared.contact_age(),
+            sequence,
+            last_sequence: counters.last_sequence.get().max(sequence),
+            steps: counters.steps.get(),
+            unavailable: counters.unavailable.get(),
+            not_confirmed: counters.not_confirmed.get(),
+            not_stored: counters.not_stored.get(),
+            refused: counters.refused.get(),
+            stale: counters.stale.get(),
+            ignored: counters.ignored.get(),
+            replicas: view.replicas,
+            digest: view.digest,
+            snapshot: view.snapshot,
+            nodes: nodes.collect(),
+        }
+    }
+
+    /// Takes what has happened. If that is nothing, waits for it, at most for this time.
+    pub fn take_events(&self, timeout: Duration) -> Vec<Event> {
+        self.shared.take_events(timeout)
+    }
+}
+
+impl Drop for Log {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+fn check(members: &[(String, Arc<Memory>)]) -> Result<(), LogError> {
+    let refused = |text: String| Err(LogError::Settings(text));
+    if members.is_empty() {
+        return refused("memories are empty, at least one is required".to_owned());
+    }
+    if members.len() > usize::from(u16::MAX) {
+        return refused(format!("there are {} memories, 65535 are allowed", members.len()));
+    }
+    let mut names = BTreeSet::new();
+    for (name, memory) in members {
+        if name.is_empty() || name.contains(['\n', ':']) {
+            return refused(format!("memory {name:?}: a name with a colon or a line break"));
+        }
+        if !names.insert(name) {
+            return refused(format!("memory {name:?} is named twice"));
+        }
+        if memory.has_journal() {
+            return refused(format!("memory {name:?} is kept elsewhere already"));
+        }
+    }
+    Ok(())
+}

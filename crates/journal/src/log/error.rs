@@ -1,0 +1,80 @@
+//! Why a log does not work.
+
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+
+use thiserror::Error;
+
+/// Why a log can't be used.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum LogError {
+    /// A setting is wrong, or a file of the settings can't be used.
+    #[error("{0}")]
+    Settings(String),
+    #[error("no connection to the log within {} s: {last}", .within.as_secs_f64())]
+    NoConnection { within: Duration, last: String },
+    #[error("the layout differs from that of the log: {0}")]
+    Layout(String),
+    #[error("{what} has version {found}, supported is {supported}: update this node")]
+    Version { what: &'static str, found: u8, supported: u8 },
+    #[error("{0}")]
+    Snapshot(String),
+    /// The stream is not the one that this node has applied.
+    #[error("{0}")]
+    Replaced(String),
+    #[error("another process writes to the log as node {0:?}: names of nodes must be unique")]
+    NameTaken(String),
+    #[error(
+        "the contents at sequence {sequence} have digest {found}, {other}: this node has applied \
+         something wrongly, restart it to load a snapshot"
+    )]
+    Differs { sequence: u64, found: String, other: String },
+    #[error("the thread of the log could not be started: {0}")]
+    Thread(String),
+}
+
+impl LogError {
+    /// The kind, as one word.
+    pub const fn kind(&self) -> &'static str {
+        match self {
+            LogError::Settings(_) => "settings",
+            LogError::NoConnection { .. } => "no_connection",
+            LogError::Layout(_) => "layout",
+            LogError::Version { .. } => "version",
+            LogError::Snapshot(_) => "snapshot",
+            LogError::Replaced(_) => "replaced",
+            LogError::NameTaken(_) => "name_taken",
+            LogError::Differs { .. } => "differs",
+            LogError::Thread(_) => "thread",
+        }
+    }
+
+    pub(super) fn file(path: &Path, error: &io::Error) -> LogError {
+        LogError::Settings(format!("{}: {error}", path.display()))
+    }
+}
+
+/// Why a session with the servers ended.
+#[derive(Debug)]
+pub(super) enum End {
+    /// The owner has stopped the log.
+    Stopped,
+    /// Something that passes: another session is tried.
+    Lost(String),
+    /// The log can't go on.
+    Fatal(LogError),
+}
+
+impl From<LogError> for End {
+    fn from(error: LogError) -> End {
+        End::Fatal(error)
+    }
+}
+
+impl End {
+    /// What a server could not do for now.
+    pub(super) fn lost(what: &str, error: impl std::fmt::Display) -> End {
+        End::Lost(format!("{what}: {error}"))
+    }
+}

@@ -1,0 +1,234 @@
+//! Rebuilds what a log leads to, in memories of its own, without writing.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_nats::jetstream;
+use async_nats::jetstream::consumer::pull;
+use futures_util::StreamExt;
+use holdfast_memory::{Memory, Step};
+
+use super::connection::connect;
+use super::error::{End, LogError};
+use super::layout::fingerprint;
+use super::message::{self, Origin};
+use super::settings::Settings;
+use super::state::{Place, State, digest_of};
+use super::store::{Pointer, Snapshot, Store};
+
+/// How often the server shows that it has no messages.
+const HEARTBEAT: Duration = Duration::from_secs(5);
+
+/// Where to end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Until {
+    Sequence(u64),
+    /// Nanoseconds of Unix time: the last message that was stored until then.
+    Time(i64),
+    /// The last message there is now.
+    Now,
+    /// Never: what comes is followed.
+    Forever,
+}
+
+/// A message that was applied.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Record {
+    pub sequence: u64,
+    /// When the stream stored it, in nanoseconds of Unix time.
+    pub stored: i64,
+    /// `None` if it is not of a node. Then it has no steps.
+    pub origin: Option<Origin>,
+    pub steps: Vec<Step>,
+    /// Whether it changed anything: a message that was sent twice does so once.
+    pub fresh: bool,
+}
+
+/// Reads a log from a snapshot on.
+pub struct Follower {
+    runtime: tokio::runtime::Runtime,
+    reading: Reading,
+    until: Until,
+    last: u64,
+    ended: bool,
+}
+
+/// What [`Follower::next`] found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Next {
+    Record(Record),
+    /// Nothing came within the time.
+    Nothing,
+    /// All is applied.
+    End,
+}
+
+struct Reading {
+    state: State,
+    messages: pull::Stream,
+}
+
+impl Follower {
+    /// Connects, and loads the newest snapshot that is not behind the end. The contents of the
+    /// memories are replaced.
+    ///
+    /// # Errors
+    /// [`LogError`]; also if the stream does not reach back that far.
+    pub fn open(
+        settings: &Settings,
+        mut members: Vec<(String, Arc<Memory>)>,
+        until: Until,
+        timeout: Duration,
+    ) -> Result<Follower, LogError> {
+        settings.check()?;
+        members.sort_by(|(one, _), (other, _)| one.cmp(other));
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .map_err(|error| LogError::Thread(error.to_string()))?;
+        let opening = async {
+            let name = format!("holdfast replay {}", settings.name);
+            let connected = connect(&settings.servers, name).await?;
+            let context = jetstream::new(connected.client);
+            let store = Store::open(&context, settings, &fingerprint(&members), false).await?;
+            let last = store.stream.cached_info().state.last_sequence;
+            let Some((_, pointer)) = store.pointer().await? else {
+                return Err(LogError::Snapshot("the log has no snapshot".to_owned()).into());
+            };
+            let members = members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
+            Ok((read(&store, &pointer, members, until).await?, last))
+        };
+        let timed = async { tokio::time::timeout(timeout, opening).await };
+        let last = "the servers do not answer".to_owned();
+        match runtime.block_on(timed) {
+            Ok(Ok((reading, last))) => Ok(Follower { runtime, reading, until, last, ended: false }),
+            Ok(Err(End::Fatal(error))) => Err(error),
+            Ok(Err(End::Lost(last))) => Err(LogError::NoConnection { within: timeout, last }),
+            Ok(Err(End::Stopped)) | Err(_) => Err(LogError::NoConnection { within: timeout, last }),
+        }
+    }
+
+    /// Applies the next message, if one comes within this time.
+    ///
+    /// # Errors
+    /// [`LogError`]. The follower is at its end then.
+    pub fn next(&mut self, timeout: Duration) -> Result<Next, LogError> {
+        let end = match self.until {
+            Until::Sequence(end) => Some(end.min(self.last)),
+            Until::Now => Some(self.last),
+            // Without messages until then, the last one known is the end.
+            Until::Time(_) => Some(self.last),
+            Until::Forever => None,
+        };
+        if self.ended || end.is_some_and(|end| self.reading.state.place.sequence >= end) {
+            self.ended = true;
+            return Ok(Next::End);
+        }
+        let next = self.reading.next(self.until);
+        let timed = async { tokio::time::timeout(timeout, next).await };
+        match self.runtime.block_on(timed) {
+            Err(_) => Ok(Next::Nothing),
+            Ok(Ok(Some(record))) => Ok(Next::Record(record)),
+            Ok(Ok(None)) => {
+                self.ended = true;
+                Ok(Next::End)
+            }
+            Ok(Err(End::Fatal(error))) => {
+                self.ended = true;
+                Err(error)
+            }
+            Ok(Err(End::Lost(last))) => {
+                self.ended = true;
+                Err(LogError::NoConnection { within: timeout, last })
+            }
+            Ok(Err(End::Stopped)) => Ok(Next::End),
+        }
+    }
+
+    /// The sequence that was applied last.
+    pub fn sequence(&self) -> u64 {
+        self.reading.state.place.sequence
+    }
+
+    /// The digest of the contents, as nodes compare it.
+    pub fn digest(&self) -> String {
+        digest_of(&self.reading.state.encode())
+    }
+}
+
+impl Reading {
+    /// `None` at a message that was stored after the end.
+    async fn next(&mut self, until: Until) -> Result<Option<Record>, End> {
+        let next = self.state.place.sequence + 1;
+        loop {
+            let message = match self.messages.next().await {
+                Some(Ok(message)) => message,
+                Some(Err(error)) => return Err(End::lost("reading the stream", error)),
+                None => return Err(End::Lost("the consumer has ended".to_owned())),
+            };
+            let info = message.info().map_err(|error| End::lost("a message", error))?;
+            let stored = info.published.unix_timestamp_nanos() as i64;
+            let place = Place { sequence: info.stream_sequence, stored };
+            if place.sequence < next {
+                continue;
+            }
+            if place.sequence > next {
+                let text = format!("sequence {} came in place of {next}", place.sequence);
+                return Err(LogError::Snapshot(text).into());
+            }
+            if matches!(until, Until::Time(end) if stored > end) {
+                return Ok(None);
+            }
+            let decoded = message::decode(&message.payload, &self.state.members).ok();
+            let applied = self.state.apply(place, &message.payload)?;
+            let fresh = matches!(applied, super::state::Applied::Fresh(..));
+            let (origin, steps) =
+                decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();
+            let sequence = place.sequence;
+            return Ok(Some(Record { sequence, stored, origin, steps, fresh }));
+        }
+    }
+}
+
+async fn read(
+    store: &Store,
+    pointer: &Pointer,
+    members: Vec<Arc<Memory>>,
+    until: Until,
+) -> Result<Reading, End> {
+    let reaches = |snapshot: &&Snapshot| match until {
+        Until::Sequence(end) => snapshot.sequence <= end,
+        Until::Time(end) => snapshot.stored <= end,
+        Until::Now | Until::Forever => true,
+    };
+    let known = [Some(&pointer.newest), pointer.previous.as_ref()];
+    let Some(snapshot) = known.into_iter().flatten().find(reaches) else {
+        let oldest = pointer.previous.as_ref().unwrap_or(&pointer.newest);
+        let text = format!("the log reaches back to sequence {}", oldest.sequence);
+        return Err(LogError::Snapshot(text).into());
+    };
+    let mut state = State::new(members);
+    store.load(snapshot, &mut state).await?;
+    let messages = store.messages(state.place.sequence + 1, HEARTBEAT).await?;
+    Ok(Reading { state, messages })
+}
+
+/// The digest that the log leads to at a sequence.
+pub(super) async fn digest_at(
+    store: &Store,
+    pointer: &Pointer,
+    members: Vec<Arc<Memory>>,
+    sequence: u64,
+) -> Result<String, String> {
+    let until = Until::Sequence(sequence);
+    let text = |end: End| match end {
+        End::Stopped => "the log was stopped".to_owned(),
+        End::Lost(reason) => reason,
+        End::Fatal(error) => error.to_string(),
+    };
+    let mut reading = read(store, pointer, members, until).await.map_err(text)?;
+    while reading.state.place.sequence < sequence {
+        reading.next(until).await.map_err(text)?;
+    }
+    Ok(digest_of(&reading.state.encode()))
+}

@@ -1,0 +1,139 @@
+//! Messages of this node that were sent, until they are applied.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use holdfast_memory::{Done, Outcome, Refusal};
+
+use super::shared::refuse;
+use super::status::Counters;
+
+/// The most messages of a session that are on their way.
+pub(super) const MOST: usize = 256;
+
+/// The most messages whose time is over, or that have no steps, that are remembered.
+const REMEMBERED: usize = 4096;
+
+#[derive(Default)]
+pub(super) struct Sent {
+    messages: VecDeque<Message>,
+    /// How many messages have steps that were not answered.
+    open: usize,
+}
+
+struct Message {
+    counter: u64,
+    payload: Bytes,
+    /// Empty if there are no steps, and when they were answered.
+    steps: Vec<Done>,
+    first_sent: Instant,
+    times: u32,
+    until: Instant,
+}
+
+impl Sent {
+    pub(super) fn has_room(&self) -> bool {
+        self.open < MOST
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.open == 0
+    }
+
+    pub(super) fn push(&mut self, counter: u64, payload: Bytes, steps: Vec<Done>, until: Instant) {
+        debug_assert!(self.messages.back().is_none_or(|last| last.counter < counter));
+        if self.messages.len() >= REMEMBERED && self.messages.front().is_some_and(Message::is_told)
+        {
+            self.messages.pop_front();
+        }
+        self.open += usize::from(!steps.is_empty());
+        let first_sent = Instant::now();
+        self.messages.push_back(Message { counter, payload, steps, first_sent, times: 1, until });
+    }
+
+    /// A message was applied. Returns when it was sent first. Those before it will never be.
+    pub(super) fn applied(
+        &mut self,
+        counter: u64,
+        outcomes: Vec<Outcome>,
+        counters: &Counters,
+    ) -> Option<Instant> {
+        while self.messages.front().is_some_and(|first| first.counter < counter) {
+            if let Some(message) = self.messages.pop_front() {
+                self.told(&message);
+                counters.unavailable.add(message.steps.len() as u64);
+                message.steps.into_iter().for_each(|done| refuse(done, Refusal::Unavailable));
+            }
+        }
+        self.messages.front().filter(|first| first.counter == counter)?;
+        let message = self.messages.pop_front()?;
+        self.told(&message);
+        let refused = outcomes.iter().filter(|outcome| outcome.is_err()).count() as u64;
+        counters.refused.add(refused);
+        counters.steps.add(outcomes.len() as u64 - refused);
+        for (done, outcome) in message.steps.into_iter().zip(outcomes) {
+            done(outcome);
+        }
+        Some(message.first_sent)
+    }
+
+    /// The servers had nobody who takes the message, so nothing has stored it.
+    pub(super) fn not_taken(&mut self, counter: u64, counters: &Counters) {
+        self.answer(counter, Refusal::Unavailable, &counters.unavailable);
+    }
+
+    /// The servers refused the message. Whether it was stored is not known for sure.
+    pub(super) fn not_stored(&mut self, counter: u64, counters: &Counters) {
+        self.answer(counter, Refusal::NotConfirmed, &counters.not_confirmed);
+    }
+
+    fn answer(&mut self, counter: u64, refusal: Refusal, counted: &super::status::Counter) {
+        let message = self.messages.iter_mut().find(|message| message.counter == counter);
+        // A message that was sent twice may have been stored the other time.
+        let Some(message) = message.filter(|message| message.times == 1) else { return };
+        let steps = std::mem::take(&mut message.steps);
+        self.open -= usize::from(!steps.is_empty());
+        counted.add(steps.len() as u64);
+        steps.into_iter().for_each(|done| refuse(done, refusal));
+    }
+
+    /// Answers steps that were not confirmed in time.
+    pub(super) fn expire(&mut self, now: Instant, counters: &Counters) {
+        for message in &mut self.messages {
+            if message.until > now {
+                break;
+            }
+            let steps = std::mem::take(&mut message.steps);
+            self.open -= usize::from(!steps.is_empty());
+            counters.not_confirmed.add(steps.len() as u64);
+            steps.into_iter().for_each(|done| refuse(done, Refusal::NotConfirmed));
+        }
+    }
+
+    /// Messages whose outcome nobody was told, to send them again in a new session. The others are
+    /// forgotten: they are never sent again.
+    pub(super) fn again(&mut self) -> Vec<(u64, Bytes)> {
+        self.messages.retain(|message| !message.is_told());
+        self.messages
+            .iter_mut()
+            .map(|message| {
+                message.times += 1;
+                (message.counter, message.payload.clone())
+            })
+            .collect()
+    }
+
+    fn told(&mut self, message: &Message) {
+        self.open -= usize::from(!message.is_told());
+    }
+}
+
+impl Message {
+    fn is_told(&self) -> bool {
+        self.steps.is_empty()
+    }
+}
+
+/// How often deadlines are looked at.
+pub(super) const LOOK: Duration = Duration::from_millis(20);

@@ -1,0 +1,159 @@
+//! Settings of a log, and what they allow.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::error::LogError;
+
+/// Where the servers are, and how to connect to them. Files are read again for each connection.
+#[derive(Debug, Clone)]
+pub struct Servers {
+    pub urls: Vec<String>,
+    pub login: Login,
+    pub tls: Option<Tls>,
+    /// How long one attempt to connect may take.
+    pub connect_timeout: Duration,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Login {
+    #[default]
+    None,
+    User {
+        name: String,
+        password_file: Option<PathBuf>,
+    },
+    Token {
+        file: PathBuf,
+    },
+    /// A file with a JWT and a seed, as `nsc` writes it.
+    Credentials {
+        file: PathBuf,
+    },
+}
+
+/// TLS with the servers.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Tls {
+    /// The trusted authorities, in place of those of the system.
+    pub ca: Option<PathBuf>,
+    /// The certificate and the key of this client.
+    pub own: Option<(PathBuf, PathBuf)>,
+}
+
+/// What reads do without contact with the log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WhenBehind {
+    Serve,
+    /// After `max_lag`, reads are refused with [`Refusal::Behind`](holdfast_memory::Refusal).
+    Refuse,
+}
+
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// The name of the log: all nodes with this name share the same contents.
+    pub name: String,
+    /// The name of this node, unique in the log.
+    pub node: String,
+    pub servers: Servers,
+    /// Of the stream, if this node creates it: 1, 3 or 5.
+    pub replicas: usize,
+    /// How long a write waits for its confirmation.
+    pub write_timeout: Duration,
+    pub when_behind: WhenBehind,
+    pub max_lag: Duration,
+    /// A snapshot is taken after so many steps.
+    pub snapshot_steps: u64,
+    /// A snapshot is taken after this time, if anything was applied.
+    pub snapshot_after: Duration,
+    /// Digests are compared at sequences that are multiples of this.
+    pub digest_every: u64,
+    /// The most steps that wait to be sent.
+    pub queue: usize,
+    /// Writes are answered when they are sent. Tests use it to show what then goes wrong.
+    #[doc(hidden)]
+    pub answers_early: bool,
+}
+
+impl Settings {
+    pub fn new(name: &str, node: &str, urls: Vec<String>) -> Settings {
+        Settings {
+            name: name.to_owned(),
+            node: node.to_owned(),
+            servers: Servers {
+                urls,
+                login: Login::None,
+                tls: None,
+                connect_timeout: Duration::from_secs(2),
+            },
+            replicas: 1,
+            write_timeout: Duration::from_secs(1),
+            when_behind: WhenBehind::Serve,
+            max_lag: Duration::from_secs(5),
+            snapshot_steps: 100_000,
+            snapshot_after: Duration::from_secs(600),
+            digest_every: 10_000,
+            queue: 4096,
+            answers_early: false,
+        }
+    }
+
+    /// # Errors
+    /// [`LogError::Settings`], which names the setting.
+    pub fn check(&self) -> Result<(), LogError> {
+        let refused = |text: String| Err(LogError::Settings(text));
+        for (what, name) in [("name", &self.name), ("node", &self.node)] {
+            if !is_word(name) {
+                return refused(format!(
+                    "{what} is {name:?}, allowed are 1 to {MAX_NAME} letters, digits, - and _"
+                ));
+            }
+        }
+        if self.servers.urls.is_empty() {
+            return refused("servers are empty, at least one URL is required".to_owned());
+        }
+        if !matches!(self.replicas, 1 | 3 | 5) {
+            return refused(format!("replicas is {}, allowed are 1, 3, 5", self.replicas));
+        }
+        for (what, found) in [
+            ("snapshot_steps", self.snapshot_steps),
+            ("digest_steps", self.digest_every),
+            ("queue", self.queue as u64),
+        ] {
+            if found == 0 {
+                return refused(format!("{what} is 0, at least 1 is required"));
+            }
+        }
+        for (what, found) in [
+            ("write_timeout", self.write_timeout),
+            ("max_lag", self.max_lag),
+            ("snapshot_seconds", self.snapshot_after),
+        ] {
+            if found < SHORTEST {
+                let (found, least) = (found.as_secs_f64(), SHORTEST.as_secs_f64());
+                return refused(format!("{what} is {found} s, at least {least} s is required"));
+            }
+        }
+        Ok(())
+    }
+
+    /// How often a node without writes proves its contact with the log.
+    pub(super) fn tick(&self) -> Duration {
+        self.max_lag / 4
+    }
+
+    /// How long a session may have no contact before another one is tried.
+    pub(super) fn silence(&self) -> Duration {
+        (self.tick() * 3).max(Duration::from_secs(2))
+    }
+}
+
+const MAX_NAME: usize = 64;
+
+const SHORTEST: Duration = Duration::from_millis(50);
+
+/// Whether a name can be part of a subject, of a stream's name and of a key.
+pub(super) fn is_word(name: &str) -> bool {
+    let is_allowed = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'_');
+    (1..=MAX_NAME).contains(&name.len()) && name.bytes().all(is_allowed)
+}

@@ -1,0 +1,275 @@
+//! What the thread of a log shares with those who write, read and look at it.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use holdfast_memory::{Done, Journal, Refusal, Refused, Step};
+use tokio::sync::Notify;
+
+use super::error::LogError;
+use super::settings::{Settings, WhenBehind};
+use super::status::{Counters, Event, NodeView, Phase, View};
+use crate::encoding;
+
+/// The most bytes of steps that wait to be sent.
+const QUEUE_BYTES: usize = 64 << 20;
+
+/// The most events that nobody has taken. Then the oldest are dropped.
+const EVENTS: usize = 1000;
+
+const OPEN: u8 = 0;
+const DIFFERS: u8 = 1;
+const LOADING: u8 = 2;
+
+pub(super) struct Shared {
+    began: Instant,
+    refuses: bool,
+    max_lag: Duration,
+    write_timeout: Duration,
+    capacity: usize,
+    /// What the contents are fit for: [`OPEN`], [`DIFFERS`] or [`LOADING`].
+    door: AtomicU8,
+    /// The contents have been current at this time, in nanoseconds since `began`. 0 means never.
+    contact: AtomicU64,
+    /// The longest encoded step that the servers accept.
+    longest: AtomicUsize,
+    stopping: AtomicBool,
+    queue: Mutex<Queue>,
+    pub(super) arrived: Notify,
+    pub(super) counters: Counters,
+    progress: Mutex<Progress>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Queue {
+    open: bool,
+    steps: VecDeque<Waiting>,
+    bytes: usize,
+}
+
+/// A step that was not sent yet.
+pub(super) struct Waiting {
+    pub(super) bytes: Vec<u8>,
+    pub(super) done: Done,
+    pub(super) until: Instant,
+}
+
+#[derive(Default)]
+struct Progress {
+    view: View,
+    events: VecDeque<Event>,
+}
+
+impl fmt::Debug for Shared {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("Shared").finish_non_exhaustive()
+    }
+}
+
+impl Journal for Shared {
+    fn submit(&self, step: Step, done: Done) {
+        let mut bytes = Vec::new();
+        encoding::encode(&step, &mut bytes);
+        if bytes.len() > self.longest.load(Ordering::Relaxed) {
+            self.counters.not_stored.add(1);
+            return refuse(done, Refusal::NotStored);
+        }
+        let mut queue = lock(&self.queue);
+        let fits = queue.steps.len() < self.capacity && queue.bytes + bytes.len() <= QUEUE_BYTES;
+        if !queue.open || !fits {
+            drop(queue);
+            self.counters.unavailable.add(1);
+            return refuse(done, Refusal::Unavailable);
+        }
+        queue.bytes += bytes.len();
+        let until = Instant::now() + self.write_timeout;
+        queue.steps.push_back(Waiting { bytes, done, until });
+        drop(queue);
+        self.arrived.notify_one();
+    }
+
+    fn guards(&self) -> bool {
+        true
+    }
+
+    fn admit(&self) -> Result<(), Refusal> {
+        match self.door.load(Ordering::Acquire) {
+            OPEN if self.refuses && self.is_behind() => Err(Refusal::Behind),
+            OPEN => Ok(()),
+            LOADING => Err(Refusal::Behind),
+            _ => Err(Refusal::Differs),
+        }
+    }
+}
+
+impl Shared {
+    pub(super) fn new(settings: &Settings) -> Shared {
+        Shared {
+            began: Instant::now(),
+            refuses: settings.when_behind == WhenBehind::Refuse,
+            max_lag: settings.max_lag,
+            write_timeout: settings.write_timeout,
+            capacity: settings.queue,
+            door: AtomicU8::new(OPEN),
+            contact: AtomicU64::new(0),
+            longest: AtomicUsize::new(usize::MAX),
+            stopping: AtomicBool::new(false),
+            queue: Mutex::default(),
+            arrived: Notify::new(),
+            counters: Counters::default(),
+            progress: Mutex::default(),
+            changed: Condvar::new(),
+        }
+    }
+
+    /// The clock is asked at each read: a process that was stopped notices it then.
+    fn is_behind(&self) -> bool {
+        self.contact_age().is_none_or(|age| age > self.max_lag)
+    }
+
+    /// How long ago the contents were current for sure.
+    pub(super) fn contact_age(&self) -> Option<Duration> {
+        let contact = self.contact.load(Ordering::Acquire);
+        let age = || self.began.elapsed().saturating_sub(Duration::from_nanos(contact));
+        (contact > 0).then(age)
+    }
+
+    /// The contents have all that the log had at this time.
+    pub(super) fn contact(&self, at: Instant) {
+        let since = at.saturating_duration_since(self.began).as_nanos();
+        self.contact.fetch_max(u64::try_from(since).unwrap_or(u64::MAX).max(1), Ordering::Release);
+    }
+
+    /// Takes steps from now on.
+    pub(super) fn open(&self, longest: usize) {
+        self.longest.store(longest, Ordering::Relaxed);
+        lock(&self.queue).open = !self.is_stopping();
+    }
+
+    /// Refuses steps from now on, and those that were not sent.
+    pub(super) fn close(&self) {
+        let mut queue = lock(&self.queue);
+        queue.open = false;
+        queue.bytes = 0;
+        let steps = std::mem::take(&mut queue.steps);
+        drop(queue);
+        self.counters.unavailable.add(steps.len() as u64);
+        for waiting in steps {
+            refuse(waiting.done, Refusal::Unavailable);
+        }
+    }
+
+    /// Refuses steps that have waited too long and were not sent.
+    pub(super) fn expire(&self, now: Instant) {
+        let mut late = Vec::new();
+        let mut queue = lock(&self.queue);
+        while queue.steps.front().is_some_and(|first| first.until <= now) {
+            if let Some(waiting) = queue.steps.pop_front() {
+                queue.bytes -= waiting.bytes.len();
+                late.push(waiting.done);
+            }
+        }
+        drop(queue);
+        self.counters.unavailable.add(late.len() as u64);
+        for done in late {
+            refuse(done, Refusal::Unavailable);
+        }
+    }
+
+    /// Takes steps for one message: as many as `room` has bytes for, and at least one.
+    pub(super) fn take(&self, room: usize) -> Vec<Waiting> {
+        let mut queue = lock(&self.queue);
+        let (mut count, mut len) = (0, 0);
+        for waiting in &queue.steps {
+            len += waiting.bytes.len() + 4;
+            if count > 0 && len > room {
+                break;
+            }
+            count += 1;
+        }
+        let taken: Vec<Waiting> = queue.steps.drain(..count).collect();
+        queue.bytes -= taken.iter().map(|waiting| waiting.bytes.len()).sum::<usize>();
+        taken
+    }
+
+    /// While contents are replaced, nobody reads.
+    pub(super) fn loading(&self, is: bool) {
+        let (from, to) = if is { (OPEN, LOADING) } else { (LOADING, OPEN) };
+        // If the contents differ, they stay unfit.
+        let _ = self.door.compare_exchange(from, to, Ordering::AcqRel, Ordering::Acquire);
+    }
+
+    pub(super) fn stop(&self) {
+        self.stopping.store(true, Ordering::Release);
+        self.close();
+        self.arrived.notify_one();
+    }
+
+    pub(super) fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Acquire)
+    }
+
+    /// The log can't go on. If it has served, its contents are not to be used any more.
+    pub(super) fn fail(&self, error: LogError) {
+        self.door.store(DIFFERS, Ordering::Release);
+        self.event(Event::new(
+            "log_failed",
+            &[("kind", error.kind()), ("reason", &error.to_string())],
+        ));
+        self.update(|view| view.phase = Phase::Failed(error));
+    }
+
+    pub(super) fn event(&self, event: Event) {
+        let mut progress = lock(&self.progress);
+        if progress.events.len() == EVENTS {
+            progress.events.pop_front();
+        }
+        progress.events.push_back(event);
+        drop(progress);
+        self.changed.notify_all();
+    }
+
+    pub(super) fn update(&self, change: impl FnOnce(&mut View)) {
+        change(&mut lock(&self.progress).view);
+        self.changed.notify_all();
+    }
+
+    /// Changes what is known of a node. Nobody waits for that.
+    pub(super) fn update_node(&self, node: String, change: impl FnOnce(&mut NodeView)) {
+        change(lock(&self.progress).view.nodes.entry(node).or_default());
+    }
+
+    pub(super) fn view(&self) -> View {
+        lock(&self.progress).view.clone()
+    }
+
+    /// Waits until the view is as wanted, at most for this time. Returns it.
+    pub(super) fn wait(&self, timeout: Duration, wanted: impl Fn(&View) -> bool) -> View {
+        let progress = lock(&self.progress);
+        let waited =
+            self.changed.wait_timeout_while(progress, timeout, |progress| !wanted(&progress.view));
+        waited.unwrap_or_else(PoisonError::into_inner).0.view.clone()
+    }
+
+    /// Takes all events. If there are none, waits for one, at most for this time.
+    pub(super) fn take_events(&self, timeout: Duration) -> Vec<Event> {
+        let progress = lock(&self.progress);
+        let waited = self
+            .changed
+            .wait_timeout_while(progress, timeout, |progress| progress.events.is_empty());
+        let mut progress = waited.unwrap_or_else(PoisonError::into_inner).0;
+        progress.events.drain(..).collect()
+    }
+}
+
+pub(super) fn refuse(done: Done, refusal: Refusal) {
+    done(Err(Refused { index: 0, refusal }));
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,197 @@
+//! What the messages of a log lead to: contents, and what was applied of each origin. Equal on all
+//! nodes after the same sequence.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use aws_lc_rs::digest::{SHA256, digest};
+use holdfast_memory::{Area, Contents, Memory, Outcome};
+
+use super::error::LogError;
+use super::message::{self, Message, MessageError, Origin, VERSION};
+use super::settings::is_word;
+
+const MARK: [u8; 3] = *b"HFS";
+
+#[derive(Debug)]
+pub(super) struct State {
+    pub(super) members: Vec<Arc<Memory>>,
+    pub(super) place: Place,
+    /// How many steps were applied since the log began.
+    pub(super) steps: u64,
+    /// The start and the last counter that were applied of each node.
+    origins: BTreeMap<String, (u64, u64)>,
+}
+
+/// A message of the stream.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Place {
+    /// 0 before the first message.
+    pub(super) sequence: u64,
+    /// When the stream has stored it, in nanoseconds of Unix time.
+    pub(super) stored: i64,
+}
+
+/// What became of a message.
+#[derive(Debug)]
+pub(super) enum Applied {
+    Fresh(Origin, Vec<Outcome>),
+    /// It was applied before, or a later one of the same node was.
+    Stale(Origin),
+    /// It is not of a node.
+    Ignored(MessageError),
+}
+
+impl State {
+    /// The state before the first message, with the contents that the memories have.
+    pub(super) fn new(members: Vec<Arc<Memory>>) -> State {
+        State { members, place: Place::default(), steps: 0, origins: BTreeMap::new() }
+    }
+
+    /// The last start of a node that was applied.
+    pub(super) fn last_start(&self, node: &str) -> u64 {
+        self.origins.get(node).map_or(0, |(start, _)| *start)
+    }
+
+    /// Applies the next message.
+    ///
+    /// # Errors
+    /// [`LogError::Version`]: nobody knows what the message does.
+    pub(super) fn apply(&mut self, place: Place, payload: &[u8]) -> Result<Applied, LogError> {
+        debug_assert_eq!(place.sequence, self.place.sequence + 1, "messages are applied in order");
+        let Message { origin, steps } = match message::decode(payload, &self.members) {
+            Ok(message) => message,
+            Err(MessageError::Version(found)) => {
+                let what = "a message of the log";
+                return Err(LogError::Version { what, found, supported: VERSION });
+            }
+            Err(error) => {
+                self.place = place;
+                return Ok(Applied::Ignored(error));
+            }
+        };
+        self.place = place;
+        let now = (origin.start, origin.counter);
+        if self.origins.get(&origin.node).is_some_and(|last| *last >= now) {
+            return Ok(Applied::Stale(origin));
+        }
+        self.origins.insert(origin.node.clone(), now);
+        self.steps += steps.len() as u64;
+        let outcomes = steps.iter().map(|step| step.carry_out(&self.members)).collect();
+        Ok(Applied::Fresh(origin, outcomes))
+    }
+
+    pub(super) fn encode(&self) -> Vec<u8> {
+        let contents = Memory::contents(&self.members);
+        let len: usize =
+            contents.iter().flat_map(|contents| &contents.areas).map(|area| area.len() + 8).sum();
+        let mut out = Vec::with_capacity(len + 64 + self.origins.len() * 96);
+        out.extend_from_slice(&MARK);
+        out.push(VERSION);
+        out.extend_from_slice(&self.place.sequence.to_le_bytes());
+        out.extend_from_slice(&self.place.stored.to_le_bytes());
+        out.extend_from_slice(&self.steps.to_le_bytes());
+        out.extend_from_slice(&(self.origins.len() as u32).to_le_bytes());
+        for (node, (start, counter)) in &self.origins {
+            out.push(node.len() as u8);
+            out.extend_from_slice(node.as_bytes());
+            out.extend_from_slice(&start.to_le_bytes());
+            out.extend_from_slice(&counter.to_le_bytes());
+        }
+        out.extend_from_slice(&(contents.len() as u32).to_le_bytes());
+        for Contents { areas, sealed } in &contents {
+            out.push(u8::from(*sealed));
+            for area in areas {
+                out.extend_from_slice(&(area.len() as u32).to_le_bytes());
+                out.extend_from_slice(area);
+            }
+        }
+        out
+    }
+
+    /// Puts an encoded state in place of this one, if it fits the memories.
+    ///
+    /// # Errors
+    /// [`LogError::Version`], or [`LogError::Snapshot`]. Nothing has changed then.
+    pub(super) fn load(&mut self, bytes: &[u8]) -> Result<(), LogError> {
+        let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
+        let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
+        let (&found, bytes) = bytes.split_first().ok_or_else(malformed)?;
+        if found != VERSION {
+            let what = "the snapshot of the log";
+            return Err(LogError::Version { what, found, supported: VERSION });
+        }
+        let mut rest = Rest(bytes);
+        let loaded = rest.state(&self.members).filter(|_| rest.0.is_empty());
+        let (place, steps, origins, contents) = loaded.ok_or_else(malformed)?;
+        for (memory, contents) in self.members.iter().zip(&contents) {
+            memory.restore(contents);
+        }
+        (self.place, self.steps, self.origins) = (place, steps, origins);
+        Ok(())
+    }
+}
+
+/// The SHA-256 of an encoded state, as text.
+pub(super) fn digest_of(encoded: &[u8]) -> String {
+    let digest = digest(&SHA256, encoded);
+    digest.as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+type Loaded = (Place, u64, BTreeMap<String, (u64, u64)>, Vec<Contents>);
+
+struct Rest<'a>(&'a [u8]);
+
+impl<'a> Rest<'a> {
+    fn take(&mut self, len: usize) -> Option<&'a [u8]> {
+        let (taken, rest) = self.0.split_at_checked(len)?;
+        self.0 = rest;
+        Some(taken)
+    }
+
+    fn array<const LEN: usize>(&mut self) -> Option<[u8; LEN]> {
+        self.take(LEN)?.try_into().ok()
+    }
+
+    fn u64(&mut self) -> Option<u64> {
+        self.array().map(u64::from_le_bytes)
+    }
+
+    fn u32(&mut self) -> Option<u32> {
+        self.array().map(u32::from_le_bytes)
+    }
+
+    fn state(&mut self, members: &[Arc<Memory>]) -> Option<Loaded> {
+        let place = Place { sequence: self.u64()?, stored: self.u64()? as i64 };
+        let steps = self.u64()?;
+        let mut origins = BTreeMap::new();
+        for _ in 0..self.u32()? {
+            let [len] = self.array()?;
+            let node = str::from_utf8(self.take(usize::from(len))?).ok()?;
+            origins.insert(is_word(node).then(|| node.to_owned())?, (self.u64()?, self.u64()?));
+        }
+        if self.u32()? as usize != members.len() {
+            return None;
+        }
+        let contents = members.iter().map(|memory| self.contents(memory)).collect::<Option<_>>()?;
+        Some((place, steps, origins, contents))
+    }
+
+    fn contents(&mut self, memory: &Memory) -> Option<Contents> {
+        let sealed = match self.array()? {
+            [0] => false,
+            [1] if memory.gate().is_some() => true,
+            _ => return None,
+        };
+        let mut area = |area: Area| {
+            let expected = area.byte_len(memory.span(area).size() as usize);
+            let fits = self.u32()? as usize == expected;
+            fits.then(|| self.take(expected)).flatten().map(Box::from)
+        };
+        let [coils, inputs, holding, input] = Area::ALL;
+        Some(Contents {
+            areas: [area(coils)?, area(inputs)?, area(holding)?, area(input)?],
+            sealed,
+        })
+    }
+}

@@ -1,0 +1,133 @@
+//! What a log shows of itself: counters, a view of its state, and events.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use super::error::LogError;
+
+#[derive(Debug, Default)]
+pub(super) struct Counter(AtomicU64);
+
+impl Counter {
+    pub(super) fn add(&self, count: u64) {
+        self.0.fetch_add(count, Ordering::Relaxed);
+    }
+
+    pub(super) fn set(&self, value: u64) {
+        self.0.store(value, Ordering::Relaxed);
+    }
+
+    pub(super) fn get(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Counters {
+    pub(super) sequence: Counter,
+    pub(super) last_sequence: Counter,
+    pub(super) steps: Counter,
+    pub(super) unavailable: Counter,
+    pub(super) not_confirmed: Counter,
+    pub(super) not_stored: Counter,
+    pub(super) refused: Counter,
+    pub(super) stale: Counter,
+    pub(super) ignored: Counter,
+}
+
+/// Where a log is in its life.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Phase {
+    #[default]
+    Starting,
+    /// It has caught up once.
+    Running,
+    Failed(LogError),
+    Stopped,
+}
+
+/// The part of the state that changes seldom.
+#[derive(Debug, Clone, Default)]
+pub(super) struct View {
+    pub(super) phase: Phase,
+    pub(super) server: Option<String>,
+    pub(super) last_error: Option<String>,
+    pub(super) replicas: usize,
+    pub(super) digest: Option<Digest>,
+    pub(super) snapshot: Option<u64>,
+    pub(super) nodes: BTreeMap<String, NodeView>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Digest {
+    pub sequence: u64,
+    pub digest: String,
+    /// Whether another node has the same digest, or another one; `None` if no node has told one.
+    pub agrees: Option<bool>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct NodeView {
+    /// The sequence of its last message, and when the stream stored it.
+    pub(super) sequence: u64,
+    pub(super) stored: i64,
+    pub(super) digest: Option<(u64, String)>,
+}
+
+/// A node of the log.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Node {
+    pub name: String,
+    /// The sequence of its last message.
+    pub sequence: u64,
+    /// When the stream stored that, in nanoseconds of Unix time.
+    pub stored: i64,
+    /// The sequence of its last digest, and the digest.
+    pub digest: Option<(u64, String)>,
+}
+
+/// What a log shows of itself.
+#[derive(Debug, Clone)]
+pub struct Status {
+    pub phase: Phase,
+    /// The server of the present connection.
+    pub server: Option<String>,
+    pub last_error: Option<String>,
+    /// How long ago the contents were current for sure.
+    pub contact_age: Option<Duration>,
+    /// The sequence that was applied last.
+    pub sequence: u64,
+    /// The last sequence of the stream, as far as it is known.
+    pub last_sequence: u64,
+    /// Steps of this node that were carried out.
+    pub steps: u64,
+    pub unavailable: u64,
+    pub not_confirmed: u64,
+    pub not_stored: u64,
+    /// Steps of this node that a memory refused when it was their turn.
+    pub refused: u64,
+    /// Messages that were applied before, or came too late.
+    pub stale: u64,
+    /// Messages that are not of a node.
+    pub ignored: u64,
+    pub replicas: usize,
+    pub digest: Option<Digest>,
+    /// The sequence of the newest snapshot.
+    pub snapshot: Option<u64>,
+    pub nodes: Vec<Node>,
+}
+
+/// Something that happened, for the log of the program.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Event {
+    pub name: &'static str,
+    pub fields: Vec<(&'static str, String)>,
+}
+
+impl Event {
+    pub(super) fn new(name: &'static str, fields: &[(&'static str, &str)]) -> Event {
+        let fields = fields.iter().map(|(key, value)| (*key, (*value).to_owned())).collect();
+        Event { name, fields }
+    }
+}

@@ -1,0 +1,343 @@
+//! What a log keeps in JetStream: its stream, snapshots in an object store, and a bucket of keys that
+//! names the newest snapshot and has the digests of all nodes.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
+use async_nats::jetstream::context::{CreateStreamErrorKind, GetStreamErrorKind};
+use async_nats::jetstream::object_store::{self, ObjectMetadata, ObjectStore};
+use async_nats::jetstream::stream::{
+    Config, DiscardPolicy, Info, RetentionPolicy, StorageType, Stream,
+};
+use async_nats::jetstream::{Context, ErrorCode, kv};
+use bytes::Bytes;
+use futures_util::StreamExt;
+use serde::{Deserialize, Serialize};
+use tokio::io::AsyncReadExt;
+
+use super::error::{End, LogError};
+use super::layout::difference;
+use super::message::VERSION;
+use super::settings::Settings;
+use super::state::{Place, State, digest_of};
+
+/// Within this time, the servers themselves notice a message that was sent twice.
+const DUPLICATES: Duration = Duration::from_secs(120);
+
+/// After this time without a pull, the server forgets a consumer.
+const FORGOTTEN: Duration = Duration::from_secs(30);
+
+/// How long the lease of whoever takes a snapshot lasts.
+const LEASE: Duration = Duration::from_secs(30);
+
+/// No snapshot is longer than this.
+const MAX_SNAPSHOT: u64 = 1 << 30;
+
+pub(super) const POINTER: &str = "snapshot";
+pub(super) const DIGEST: &str = "digest.";
+
+const META_VERSION: &str = "holdfast-version";
+const META_LAYOUT: &str = "holdfast-layout";
+const META_ID: &str = "holdfast-id";
+
+#[derive(Clone)]
+pub(super) struct Store {
+    pub(super) stream: Stream,
+    pub(super) keys: kv::Store,
+    leases: kv::Store,
+    objects: ObjectStore,
+}
+
+/// Names the snapshots of a log.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Pointer {
+    pub(super) newest: Snapshot,
+    pub(super) previous: Option<Snapshot>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Snapshot {
+    pub(super) sequence: u64,
+    pub(super) stored: i64,
+    pub(super) steps: u64,
+    pub(super) object: String,
+    pub(super) digest: String,
+    pub(super) node: String,
+}
+
+pub(super) fn subject(log: &str) -> String {
+    format!("holdfast.log.{log}.steps")
+}
+
+fn stream_name(log: &str) -> String {
+    format!("holdfast-log-{log}")
+}
+
+impl Store {
+    /// Opens what the log keeps, and makes what does not exist.
+    ///
+    /// The stream and its fingerprint are made in one request, and only the first one succeeds: all
+    /// nodes see the same fingerprint.
+    pub(super) async fn open(
+        context: &Context,
+        settings: &Settings,
+        fingerprint: &str,
+        create: bool,
+    ) -> Result<Store, End> {
+        let name = stream_name(&settings.name);
+        let missing = |error: &dyn std::fmt::Display| End::lost("the stream of the log", error);
+        let stream = match context.get_stream(&name).await {
+            Ok(stream) => stream,
+            Err(error) if is_missing(&error.kind()) => {
+                if !create {
+                    let text = format!("the servers have no log {:?}", settings.name);
+                    return Err(LogError::Settings(text).into());
+                }
+                match context.create_stream(config(settings, fingerprint)).await {
+                    Ok(stream) => stream,
+                    Err(error) if is_taken(&error.kind()) => {
+                        context.get_stream(&name).await.map_err(|error| missing(&error))?
+                    }
+                    Err(error) => return Err(End::lost("making the stream of the log", error)),
+                }
+            }
+            Err(error) => return Err(missing(&error)),
+        };
+        check(stream.cached_info(), fingerprint)?;
+        let bucket = |suffix: &str| format!("{name}{suffix}");
+        let pointers = keys(context, settings, bucket(""), Duration::ZERO, create).await?;
+        let leases = keys(context, settings, bucket("-leases"), LEASE, create).await?;
+        let objects = match context.get_object_store(bucket("")).await {
+            Ok(objects) => objects,
+            Err(error) if !create => return Err(End::lost("the snapshots of the log", error)),
+            Err(_) => {
+                let config = object_store::Config {
+                    bucket: bucket(""),
+                    num_replicas: settings.replicas,
+                    ..object_store::Config::default()
+                };
+                // Another node may make it at the same time.
+                let _ = context.create_object_store(config).await;
+                context
+                    .get_object_store(bucket(""))
+                    .await
+                    .map_err(|error| End::lost("the snapshots of the log", error))?
+            }
+        };
+        Ok(Store { stream, keys: pointers, leases, objects })
+    }
+
+    /// Tells the stream from another one with the same name.
+    pub(super) fn id(&self) -> Option<&str> {
+        self.stream.cached_info().config.metadata.get(META_ID).map(String::as_str)
+    }
+
+    pub(super) async fn messages(
+        &self,
+        from: u64,
+        heartbeat: Duration,
+    ) -> Result<pull::Stream, End> {
+        let config = pull::Config {
+            deliver_policy: match from {
+                0 => DeliverPolicy::All,
+                start_sequence => DeliverPolicy::ByStartSequence { start_sequence },
+            },
+            ack_policy: AckPolicy::None,
+            inactive_threshold: FORGOTTEN,
+            num_replicas: 1,
+            memory_storage: true,
+            ..pull::Config::default()
+        };
+        let lost = |error: &dyn std::fmt::Display| End::lost("reading the stream", error);
+        let consumer = self.stream.create_consumer(config).await.map_err(|error| lost(&error))?;
+        let pulls = consumer.stream().max_messages_per_batch(500).heartbeat(heartbeat);
+        pulls.messages().await.map_err(|error| lost(&error))
+    }
+
+    /// Which snapshots there are, and the revision of that knowledge.
+    pub(super) async fn pointer(&self) -> Result<Option<(u64, Pointer)>, End> {
+        let entry = self.keys.entry(POINTER).await;
+        let entry = entry.map_err(|error| End::lost("reading the key of the snapshot", error))?;
+        match entry {
+            Some(entry) if entry.operation == kv::Operation::Put => {
+                Ok(Some((entry.revision, parsed(&entry.value)?)))
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Loads one of the snapshots.
+    pub(super) async fn load(&self, snapshot: &Snapshot, state: &mut State) -> Result<(), End> {
+        let place = Place { sequence: snapshot.sequence, stored: snapshot.stored };
+        let damaged = |what: String| {
+            let text = format!("the snapshot at sequence {}: {what}", place.sequence);
+            End::Fatal(LogError::Snapshot(text))
+        };
+        let missing = |error: object_store::GetError| match error.kind() {
+            object_store::GetErrorKind::NotFound => damaged("it is missing".to_owned()),
+            _ => End::lost("reading a snapshot", error),
+        };
+        let object = self.objects.get(&snapshot.object).await.map_err(missing)?;
+        let mut bytes = Vec::new();
+        object
+            .take(MAX_SNAPSHOT)
+            .read_to_end(&mut bytes)
+            .await
+            .map_err(|error| End::lost("reading a snapshot", error))?;
+        let digest = digest_of(&bytes);
+        if digest != snapshot.digest {
+            let expected = &snapshot.digest;
+            return Err(damaged(format!("its digest is {digest}, expected is {expected}")));
+        }
+        state.load(&bytes)?;
+        if state.place == place { Ok(()) } else { Err(damaged("it has another sequence".into())) }
+    }
+
+    /// Whether this node may take a snapshot now.
+    pub(super) async fn lease(&self, node: &str) -> bool {
+        self.leases.create(POINTER, Bytes::copy_from_slice(node.as_bytes())).await.is_ok()
+    }
+
+    pub(super) async fn release(&self) {
+        // Otherwise it expires.
+        let _ = self.leases.delete(POINTER).await;
+    }
+
+    /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.
+    pub(super) async fn put(
+        &self,
+        seen: Option<(u64, Pointer)>,
+        encoded: &[u8],
+        mut snapshot: Snapshot,
+    ) -> Result<(u64, Pointer), String> {
+        snapshot.object = format!("{}-{}-{}", snapshot.sequence, snapshot.node, snapshot.object);
+        let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
+        let mut bytes = encoded;
+        self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
+        let (revision, previous) =
+            seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
+        let name = snapshot.object.clone();
+        let pointer = Pointer { newest: snapshot, previous };
+        let value = Bytes::from(serde_json::to_vec(&pointer).map_err(|error| error.to_string())?);
+        let named = match revision {
+            None => self.keys.create(POINTER, value).await.map_err(|error| error.to_string()),
+            Some(at) => {
+                self.keys.update(POINTER, value, at).await.map_err(|error| error.to_string())
+            }
+        };
+        match named {
+            Ok(revision) => Ok((revision, pointer)),
+            Err(error) => {
+                // If this fails as well, the next snapshot removes it.
+                let _ = self.objects.delete(&name).await;
+                Err(error)
+            }
+        }
+    }
+
+    /// Removes messages and snapshots from before the snapshot before the last.
+    pub(super) async fn tidy(&self, pointer: &Pointer) -> Result<(), String> {
+        let Some(previous) = &pointer.previous else { return Ok(()) };
+        if previous.sequence > 1 {
+            let purge = self.stream.purge().sequence(previous.sequence);
+            purge.await.map_err(|error| error.to_string())?;
+        }
+        let mut objects = self.objects.list().await.map_err(|error| error.to_string())?;
+        while let Some(object) = objects.next().await {
+            let name = object.map_err(|error| error.to_string())?.name;
+            if name != pointer.newest.object && name != previous.object {
+                self.objects.delete(&name).await.map_err(|error| error.to_string())?;
+            }
+        }
+        Ok(())
+    }
+}
+
+pub(super) fn parsed(pointer: &[u8]) -> Result<Pointer, LogError> {
+    serde_json::from_slice(pointer)
+        .map_err(|error| LogError::Snapshot(format!("the key of the snapshot: {error}")))
+}
+
+fn config(settings: &Settings, fingerprint: &str) -> Config {
+    let id = format!("{:032x}", unique());
+    let metadata =
+        [(META_VERSION, VERSION.to_string()), (META_LAYOUT, fingerprint.to_owned()), (META_ID, id)];
+    Config {
+        name: stream_name(&settings.name),
+        description: Some("Writes to memories of Holdfast, in their order".to_owned()),
+        subjects: vec![subject(&settings.name)],
+        storage: StorageType::File,
+        retention: RetentionPolicy::Limits,
+        // Without limits, and if there were any: a full stream refuses, it never forgets.
+        max_messages: -1,
+        max_bytes: -1,
+        max_messages_per_subject: -1,
+        discard: DiscardPolicy::New,
+        num_replicas: settings.replicas,
+        duplicate_window: DUPLICATES,
+        deny_delete: true,
+        metadata: metadata.map(|(key, value)| (key.to_owned(), value)).into(),
+        ..Config::default()
+    }
+}
+
+/// A number that no other process has drawn.
+pub(super) fn unique() -> u128 {
+    let mut bytes = [0; 16];
+    aws_lc_rs::rand::fill(&mut bytes).expect("the system has random numbers");
+    u128::from_le_bytes(bytes)
+}
+
+fn is_missing(kind: &GetStreamErrorKind) -> bool {
+    matches!(kind, GetStreamErrorKind::JetStream(error)
+        if error.error_code() == ErrorCode::STREAM_NOT_FOUND)
+}
+
+fn is_taken(kind: &CreateStreamErrorKind) -> bool {
+    matches!(kind, CreateStreamErrorKind::JetStream(error)
+        if error.error_code() == ErrorCode::STREAM_NAME_EXIST)
+}
+
+/// Checks that a stream is of this version and layout.
+fn check(info: &Info, fingerprint: &str) -> Result<(), LogError> {
+    let metadata: &HashMap<String, String> = &info.config.metadata;
+    let (Some(version), Some(layout), Some(_)) =
+        (metadata.get(META_VERSION), metadata.get(META_LAYOUT), metadata.get(META_ID))
+    else {
+        let text = format!("stream {} is not that of a log: delete it", info.config.name);
+        return Err(LogError::Settings(text));
+    };
+    let found = version.parse().unwrap_or(u8::MAX);
+    if found != VERSION {
+        return Err(LogError::Version { what: "the log", found, supported: VERSION });
+    }
+    difference(layout, fingerprint).map_or(Ok(()), |difference| Err(LogError::Layout(difference)))
+}
+
+async fn keys(
+    context: &Context,
+    settings: &Settings,
+    bucket: String,
+    max_age: Duration,
+    create: bool,
+) -> Result<kv::Store, End> {
+    let lost = |error: &dyn std::fmt::Display| End::lost("the keys of the log", error);
+    match context.get_key_value(&bucket).await {
+        Ok(keys) => Ok(keys),
+        Err(error) if !create => Err(lost(&error)),
+        Err(_) => {
+            let config = kv::Config {
+                bucket: bucket.clone(),
+                history: 1,
+                max_age,
+                storage: StorageType::File,
+                num_replicas: settings.replicas,
+                ..kv::Config::default()
+            };
+            // Another node may make it at the same time.
+            let _ = context.create_key_value(config).await;
+            context.get_key_value(&bucket).await.map_err(|error| lost(&error))
+        }
+    }
+}

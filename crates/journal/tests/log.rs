@@ -1,0 +1,456 @@
+//! Nodes that share a log over a real nats-server.
+
+mod nodes;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use holdfast_journal::log::LogError;
+use holdfast_memory::{
+    Access, Action, Memory, Operation, Read, Refusal, Step, StepWrite, Write, write_across,
+};
+use nodes::{Node, REGISTERS, Server, memory_of, until};
+
+fn step(address: u16, value: u16) -> Step {
+    let write = StepWrite {
+        member: 0,
+        area: REGISTERS,
+        address,
+        count: 1,
+        bytes: value.to_be_bytes().to_vec(),
+    };
+    Step { access: Access::Ingest, action: Action::Write(vec![write]) }
+}
+
+#[test]
+fn two_nodes_agree_on_a_register() {
+    let server = Server::new();
+    let (a, b) = (Node::started(&[&server], "a"), Node::started(&[&server], "b"));
+    a.write(3, 7).unwrap();
+    assert_eq!(a.read(3), Ok(7), "a node reads its own writes");
+    until("the other node has it", || b.read(3) == Ok(7));
+    b.write(3, 8).unwrap();
+    assert_eq!(b.read(3), Ok(8));
+    until("the first node has it", || a.read(3) == Ok(8));
+}
+
+#[test]
+fn writes_that_meet_lead_to_the_same_everywhere() {
+    let server = Server::new();
+    let nodes = ["a", "b", "c"].map(|name| Node::started(&[&server], name));
+    std::thread::scope(|scope| {
+        for (index, node) in nodes.iter().enumerate() {
+            scope.spawn(move || {
+                for round in 0..100_u16 {
+                    let bit = 1 << (3 * (round % 5) + index as u16);
+                    // Sets a bit, or clears it.
+                    let or = if round % 2 == 0 { bit } else { 0 };
+                    node.memory.mask_write(Access::Client, REGISTERS, 0, !bit, or).unwrap();
+                    node.write(1, round * 3 + index as u16).unwrap();
+                    let (bytes, mut out) = ([1, round as u8], [0; 2]);
+                    let write = Write { area: REGISTERS, address: 2, count: 1, bytes: &bytes };
+                    let read = Read { area: REGISTERS, address: 1, count: 1, out: &mut out };
+                    node.memory.write_then_read(Access::Client, write, read).unwrap();
+                }
+            });
+        }
+    });
+    let last = nodes.iter().map(|node| node.status().last_sequence).max().unwrap();
+    for node in &nodes {
+        node.until_applied(last);
+        assert_eq!(node.all(), nodes[0].all());
+        assert_eq!(node.status().steps, 300);
+        assert_eq!(node.status().refused, 0);
+    }
+}
+
+#[test]
+fn a_write_then_read_returns_what_was_there_at_its_place_in_the_order() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    node.write(1, 500).unwrap();
+    let mut out = [0; 4];
+    let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &[0, 9] };
+    let read = Read { area: REGISTERS, address: 0, count: 2, out: &mut out };
+    node.memory.write_then_read(Access::Client, write, read).unwrap();
+    assert_eq!(out, [0, 9, 1, 244]);
+}
+
+#[test]
+fn writes_given_away_together_are_carried_out_in_their_order() {
+    let server = Server::new();
+    let (a, b) = (Node::started(&[&server], "a"), Node::started(&[&server], "b"));
+    let (sender, receiver) = std::sync::mpsc::channel();
+    for value in 0..2000_u16 {
+        let bytes = value.to_be_bytes();
+        let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &bytes };
+        let sender = sender.clone();
+        let done = Box::new(move |outcome| sender.send((value, outcome)).unwrap());
+        a.memory.submit(Access::Client, Operation::Write(write), done).unwrap();
+    }
+    for value in 0..2000 {
+        assert_eq!(receiver.recv().unwrap(), (value, Ok(Vec::new())));
+    }
+    assert_eq!(a.read(0), Ok(1999));
+    until("the other node has the last", || b.read(0) == Ok(1999));
+    let messages = a.status().last_sequence;
+    assert!(messages < 1500, "small steps travel together: {messages} messages");
+}
+
+#[test]
+fn a_step_across_memories_is_one_step() {
+    let server = Server::new();
+    let node = |name: &str| {
+        let memories = [memory_of(10), memory_of(20)];
+        let named = memories.iter().zip(["x", "y"]);
+        let named = named.map(|(memory, name)| (name.to_owned(), Arc::clone(memory))).collect();
+        let settings = holdfast_journal::log::Settings::new("site", name, vec![server.url()]);
+        let log = holdfast_journal::log::Log::new(settings, named).unwrap();
+        log.start().unwrap();
+        assert!(log.wait_until_caught_up(nodes::DEADLINE).unwrap());
+        (log, memories)
+    };
+    let ((_a, of_a), (_b, of_b)) = (node("a"), node("b"));
+    let stop = AtomicBool::new(false);
+    let both = |memories: &[Arc<Memory>; 2]| {
+        let contents = Memory::contents(memories);
+        [contents[0].areas[2][0], contents[1].areas[2][0]]
+    };
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            for value in 0..100 {
+                let bytes = [value, 0];
+                let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &bytes };
+                let writes = [(&*of_a[0], write), (&*of_a[1], write)];
+                write_across(Access::Ingest, &writes).unwrap();
+            }
+            stop.store(true, Ordering::Release);
+        });
+        while !stop.load(Ordering::Acquire) {
+            let [x, y] = both(&of_b);
+            assert_eq!(x, y, "half a step is seen");
+        }
+    });
+    let other = memory_of(5);
+    let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &[1, 1] };
+    let refused = write_across(Access::Ingest, &[(&*of_a[0], write), (&*other, write)]);
+    assert_eq!(refused.unwrap_err().refusal, Refusal::NotOneStep);
+}
+
+#[test]
+fn the_first_node_decides_what_a_log_begins_with() {
+    let server = Server::new();
+    let with = |value: u8, name: &str| {
+        let memory = nodes::memory();
+        let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &[0, value] };
+        memory.write(Access::Ingest, write).unwrap();
+        Node::with(memory, &[&server], name, |_| {})
+    };
+    let (a, b) = (with(5, "a"), with(6, "b"));
+    a.start();
+    b.start();
+    assert_eq!((a.read(0), b.read(0)), (Ok(5), Ok(5)));
+}
+
+#[test]
+fn nodes_that_start_at_once_begin_with_the_same() {
+    let server = Server::new();
+    let nodes: Vec<Node> = (1..=5_u8)
+        .map(|value| {
+            let memory = nodes::memory();
+            let write = Write { area: REGISTERS, address: 0, count: 1, bytes: &[0, value] };
+            memory.write(Access::Ingest, write).unwrap();
+            Node::with(memory, &[&server], &format!("n{value}"), |_| {})
+        })
+        .collect();
+    std::thread::scope(|scope| {
+        for node in &nodes {
+            scope.spawn(|| node.start());
+        }
+    });
+    let first = nodes[0].read(0).unwrap();
+    assert!((1..=5).contains(&first));
+    for node in &nodes {
+        assert_eq!(node.read(0), Ok(first));
+    }
+}
+
+#[test]
+fn another_layout_is_refused_and_named() {
+    let server = Server::new();
+    let _a = Node::started(&[&server], "a");
+    let b = Node::with(memory_of(101), &[&server], "b", |_| {});
+    let error = b.try_start().unwrap_err();
+    assert_eq!(error.kind(), "layout");
+    let expected = "the layout differs from that of the log: memory \"plant\" is coils 0+64, \
+                    holding_registers 0+100 in the log, here it is coils 0+64, holding_registers \
+                    0+101";
+    assert_eq!(error.to_string(), expected);
+}
+
+#[test]
+fn nodes_with_different_layouts_that_start_at_once_do_not_share_a_log() {
+    let server = Server::new();
+    let nodes: Vec<Node> = (0..6)
+        .map(|index| {
+            let memory = memory_of(100 + index % 2);
+            Node::with(memory, &[&server], &format!("n{index}"), |_| {})
+        })
+        .collect();
+    let started: Vec<bool> = std::thread::scope(|scope| {
+        let starts: Vec<_> =
+            nodes.iter().map(|node| scope.spawn(|| node.try_start().is_ok())).collect();
+        starts.into_iter().map(|start| start.join().unwrap()).collect()
+    });
+    let expected = started[0];
+    for (index, started) in started.into_iter().enumerate() {
+        assert_eq!(started == expected, index % 2 == 0, "node {index}");
+    }
+}
+
+#[test]
+fn without_a_server_nothing_starts_and_the_error_says_why() {
+    let mut server = Server::new();
+    server.kill();
+    let node = Node::new(&[&server], "a", |_| {});
+    node.log.start().unwrap();
+    assert!(!node.log.wait_until_caught_up(Duration::from_millis(300)).unwrap());
+    let error = node.log.no_connection(Duration::from_millis(300));
+    assert_eq!(error.kind(), "no_connection");
+    assert!(error.to_string().contains("connect"), "{error}");
+    assert_eq!(node.write(0, 1), Err(Refusal::Unavailable));
+}
+
+#[test]
+fn a_killed_server_refuses_writes_at_once_and_comes_back() {
+    let mut server = Server::new();
+    let (a, b) = (Node::started(&[&server], "a"), Node::started(&[&server], "b"));
+    a.write(0, 1).unwrap();
+    server.kill();
+    until("the node sees it", || a.write(0, 2) == Err(Refusal::Unavailable));
+    assert_eq!(a.read(0), Ok(1), "reads go on");
+    assert!(a.status().unavailable > 0);
+    assert_eq!(a.status().server, None);
+    server.start();
+    a.write_at_last(1, 3);
+    until("the other node has it", || b.read(1) == Ok(3));
+    b.write_at_last(2, 4);
+    until("the first node has it", || a.read(2) == Ok(4));
+    assert_eq!(a.read(0), b.read(0));
+}
+
+#[test]
+fn a_server_that_does_not_answer_leaves_writes_unconfirmed() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", |settings| {
+        settings.write_timeout = Duration::from_millis(200);
+    });
+    node.start();
+    server.signal("STOP");
+    assert_eq!(node.write(0, 1), Err(Refusal::NotConfirmed));
+    assert_eq!(node.status().not_confirmed, 1);
+    // After a while it counts as lost.
+    until("writes are refused at once", || node.write(0, 2) == Err(Refusal::Unavailable));
+    server.signal("CONT");
+    node.write_at_last(1, 5);
+    assert_eq!(node.read(1), Ok(5));
+}
+
+#[test]
+fn a_message_that_is_sent_twice_is_applied_once() {
+    let server = Server::new();
+    let (a, b) = (Node::started(&[&server], "a"), Node::started(&[&server], "b"));
+    a.write(0, 1).unwrap();
+    // Each message of the stream again, without the header by which the server finds duplicates.
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let mask = |node: &Node| node.memory.mask_write(Access::Client, REGISTERS, 5, 0, 0xFFFF);
+    mask(&a).unwrap();
+    a.write(5, 3).unwrap();
+    let before = a.all();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let stream = jetstream.get_stream("holdfast-log-site").await.unwrap();
+        let last = stream.cached_info().state.last_sequence;
+        for sequence in 1..=last {
+            let message = stream.get_raw_message(sequence).await.unwrap();
+            let publish = jetstream.publish("holdfast.log.site.steps", message.payload);
+            publish.await.unwrap().await.unwrap();
+        }
+        let publish = jetstream.publish("holdfast.log.site.steps", "not of a node".into());
+        let last = publish.await.unwrap().await.unwrap().sequence;
+        a.until_applied(last);
+        b.until_applied(last);
+    });
+    assert_eq!((a.all(), b.all()), (before.clone(), before));
+    assert!(a.status().stale > 2, "{:?}", a.status());
+    assert_eq!(a.status().ignored, 1);
+    a.write(6, 1).unwrap();
+}
+
+#[test]
+fn a_node_joins_late_with_a_snapshot_and_the_stream_is_purged() {
+    let server = Server::new();
+    let soon = |settings: &mut holdfast_journal::log::Settings| settings.snapshot_steps = 20;
+    let a = Node::new(&[&server], "a", soon);
+    let b = Node::new(&[&server], "b", soon);
+    a.start();
+    b.start();
+    let mut round = 0;
+    until("two snapshots are taken", || {
+        round += 1;
+        a.write(round % 50, round).unwrap();
+        b.write(50 + round % 50, round).unwrap();
+        let events = a.log.take_events(Duration::ZERO);
+        assert!(events.iter().all(|event| event.name != "log_snapshot_failed"), "{events:?}");
+        first_sequence(&server) > 1 && a.status().snapshot.is_some_and(|sequence| sequence > 60)
+    });
+    let c = Node::started(&[&server], "c");
+    let last = a.status().last_sequence.max(b.status().last_sequence);
+    c.until_applied(last);
+    a.until_applied(last);
+    assert_eq!(c.all(), a.all());
+    c.write(7, 7777).unwrap();
+    until("all have it", || a.read(7) == Ok(7777) && b.read(7) == Ok(7777));
+}
+
+fn first_sequence(server: &Server) -> u64 {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let stream = jetstream.get_stream("holdfast-log-site").await.unwrap();
+        stream.cached_info().state.first_sequence
+    })
+}
+
+#[test]
+fn a_restarted_node_goes_on_where_it_was() {
+    let server = Server::new();
+    let a = Node::started(&[&server], "a");
+    a.write(0, 1).unwrap();
+    drop(a);
+    let a = Node::started(&[&server], "a");
+    assert_eq!(a.read(0), Ok(1));
+    a.write(0, 2).unwrap();
+    drop(a);
+    let b = Node::started(&[&server], "b");
+    assert_eq!(b.read(0), Ok(2));
+}
+
+#[test]
+fn a_node_that_applied_something_wrongly_stops_serving() {
+    let server = Server::new();
+    let often = |settings: &mut holdfast_journal::log::Settings| settings.digest_every = 5;
+    let nodes = ["a", "b", "c"].map(|name| Node::new(&[&server], name, often));
+    nodes.iter().for_each(Node::start);
+    nodes[0].write(0, 1).unwrap();
+    step(90, 666).carry_out(std::slice::from_ref(&nodes[1].memory)).unwrap();
+    until("the node notices it", || {
+        // Digests are compared while the log goes on.
+        nodes[0].write(1, 2).unwrap();
+        nodes[1].failure().is_some()
+    });
+    let error = nodes[1].failure().unwrap();
+    assert!(matches!(error, LogError::Differs { .. }), "{error}");
+    assert_eq!(nodes[1].read(0), Err(Refusal::Differs));
+    assert_eq!(nodes[1].write(0, 3), Err(Refusal::Differs));
+    for good in [&nodes[0], &nodes[2]] {
+        good.write(5, 9).unwrap();
+        assert_eq!(good.failure(), None);
+    }
+}
+
+/// Without a majority, the log decides.
+#[test]
+fn of_two_nodes_the_one_that_the_log_does_not_lead_to_stops_serving() {
+    for wrong in [0, 1] {
+        let server = Server::new();
+        let often = |settings: &mut holdfast_journal::log::Settings| settings.digest_every = 5;
+        let nodes = ["a", "b"].map(|name| Node::new(&[&server], name, often));
+        nodes.iter().for_each(Node::start);
+        step(90, 666).carry_out(std::slice::from_ref(&nodes[wrong].memory)).unwrap();
+        let good = &nodes[1 - wrong];
+        until("the node notices it", || {
+            good.write(1, 2).unwrap();
+            nodes[wrong].failure().is_some()
+        });
+        assert_eq!(nodes[wrong].failure().unwrap().kind(), "differs");
+        assert_eq!(good.failure(), None);
+        good.write(1, 3).unwrap();
+    }
+}
+
+#[test]
+fn equal_nodes_have_equal_digests() {
+    let server = Server::new();
+    let often = |settings: &mut holdfast_journal::log::Settings| settings.digest_every = 5;
+    let nodes = ["a", "b"].map(|name| Node::new(&[&server], name, often));
+    nodes.iter().for_each(Node::start);
+    until("digests agree", || {
+        nodes[0].write(1, 2).unwrap();
+        nodes.iter().all(|node| node.status().digest.is_some_and(|own| own.agrees == Some(true)))
+    });
+}
+
+#[test]
+fn without_contact_reads_are_refused_if_that_is_wanted() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", |settings| {
+        settings.when_behind = holdfast_journal::log::WhenBehind::Refuse;
+        settings.max_lag = Duration::from_secs(2);
+    });
+    let other = Node::started(&[&server], "b");
+    assert_eq!(node.read(0), Err(Refusal::Behind), "before the first contact");
+    node.start();
+    node.write(0, 1).unwrap();
+    assert_eq!(node.read(0), Ok(1));
+    server.signal("STOP");
+    until("reads are refused", || node.read(0) == Err(Refusal::Behind));
+    assert_eq!(other.read(0), Ok(1), "the other node serves");
+    server.signal("CONT");
+    until("reads are served", || node.read(0) == Ok(1));
+}
+
+#[test]
+fn two_processes_with_the_name_of_a_node_are_noticed() {
+    let server = Server::new();
+    let first = Node::started(&[&server], "a");
+    let second = Node::started(&[&server], "a");
+    until("the first one stops", || first.failure().is_some());
+    assert_eq!(first.failure().unwrap().kind(), "name_taken");
+    assert_eq!(first.read(0), Err(Refusal::Differs));
+    second.write(0, 1).unwrap();
+}
+
+#[test]
+fn a_server_that_has_lost_messages_is_not_followed() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    node.write(0, 1).unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        jetstream.delete_stream("holdfast-log-site").await.unwrap();
+    });
+    until("the node stops", || node.failure().is_some());
+    assert_eq!(node.failure().unwrap().kind(), "replaced");
+    assert_eq!(node.read(0), Err(Refusal::Differs));
+}
+
+#[test]
+fn a_step_that_no_message_holds_is_refused() {
+    let server = Server::with(nodes::free_port(), &[]);
+    let memory = memory_of(65_536);
+    let nodes = [Node::with(memory, &[&server], "a", |_| {})];
+    nodes[0].start();
+    let bytes = vec![1; 131_072];
+    let write = Write { area: REGISTERS, address: 0, count: 65_536, bytes: &bytes };
+    nodes[0].memory.write(Access::Ingest, write).unwrap();
+    let writes = vec![write; 9];
+    let refused = nodes[0].memory.write_many(Access::Ingest, &writes).unwrap_err();
+    assert_eq!(refused.refusal, Refusal::NotStored);
+    assert_eq!(nodes[0].status().not_stored, 1);
+}
