@@ -13,12 +13,15 @@ from holdfast.types import (
     Extent,
     Forward,
     ListenerCounters,
+    LogRecord,
+    LogStatus,
     MemoryFileStatus,
     NarrowedRights,
     PolledBlock,
     Seal,
     StatusBlock,
     ThreadHeartbeat,
+    TlsFiles,
     WhenFull,
 )
 from holdfast.write_callback import WriteCallback
@@ -43,6 +46,9 @@ __all__ = [
     "Follower",
     "Link",
     "Listener",
+    "Log",
+    "LogError",
+    "LogFollower",
     "Memory",
     "MemoryFile",
     "OutOfRange",
@@ -794,6 +800,105 @@ class Attempt:
     @property
     def has_own_timeout(self) -> bool:
         """Whether its timeout begins anew."""
+
+class LogError(Exception):
+    """A log can't be used."""
+
+    kind: Literal[
+        "no_connection", "layout", "version", "snapshot", "replaced", "name_taken", "differs", "thread"
+    ]
+
+@final
+class Log:
+    """Shares the writes to memories with other nodes, through a stream of NATS JetStream.
+
+    From construction on, every write to these memories is a step of the log: it is carried out when
+    the log has it, on all nodes in the same order, and refused while the log can't be reached. What
+    the memories contain at that time is what a new log begins with; an existing log replaces it.
+
+    `tls` are files: trusted authorities, certificate, key. Files are read again for each connection.
+    With `when_behind="refuse"`, all reads are refused after `max_lag` seconds without contact.
+
+    Raises `ValueError` for an unusable argument, also for a memory that has a log already.
+    """
+
+    def __new__(
+        cls,
+        name: str,
+        node: str,
+        servers: Sequence[str],
+        memories: Sequence[tuple[str, Memory]],
+        *,
+        replicas: int = 1,
+        write_timeout: float = 1.0,
+        when_behind: Literal["serve", "refuse"] = "serve",
+        max_lag: float = 5.0,
+        snapshot_steps: int = 100_000,
+        snapshot_seconds: float = 600.0,
+        digest_steps: int = 10_000,
+        queue: int = 4096,
+        connect_timeout: float = 2.0,
+        user: str | None = None,
+        password_file: str | PathLike[str] | None = None,
+        token_file: str | PathLike[str] | None = None,
+        credentials_file: str | PathLike[str] | None = None,
+        tls: TlsFiles | None = None,
+    ) -> Log: ...
+    def start(self, timeout: float) -> None:
+        """Starts the thread of the log, and returns when the memories have caught up.
+
+        Raises `LogError`, and `ValueError` for a setting or a file that the servers show to be
+        unusable. After a timeout or a signal the log is stopped.
+        """
+
+    def stop(self) -> None:
+        """Refuses writes from now on, waits for those that were sent, and ends the thread."""
+
+    def status(self) -> LogStatus:
+        """Returns the state of the log."""
+
+    def events(self, timeout: float) -> list[tuple[str, dict[str, str]]]:
+        """Takes what has happened, as names and fields. Waits if there is nothing."""
+
+@final
+class LogFollower:
+    """Rebuilds what a log leads to, in these memories, without writing to the log.
+
+    It begins with a snapshot, and ends at a sequence, at a time (seconds since 1970), at the last
+    message there is now, or with `follow` never. Raises `LogError`, and `ValueError` for an unusable
+    argument.
+    """
+
+    def __new__(
+        cls,
+        name: str,
+        servers: Sequence[str],
+        memories: Sequence[tuple[str, Memory]],
+        *,
+        sequence: int | None = None,
+        time: float | None = None,
+        follow: bool = False,
+        timeout: float = 10.0,
+        connect_timeout: float = 2.0,
+        user: str | None = None,
+        password_file: str | PathLike[str] | None = None,
+        token_file: str | PathLike[str] | None = None,
+        credentials_file: str | PathLike[str] | None = None,
+        tls: TlsFiles | None = None,
+    ) -> LogFollower: ...
+    def next(self, timeout: float) -> LogRecord | None:
+        """Applies the next message. Returns `None` if none comes in time, and at the end."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether all is applied."""
+
+    @property
+    def sequence(self) -> int:
+        """The sequence that was applied last."""
+
+    def digest(self) -> str:
+        """Returns the digest of the contents, as nodes compare it."""
 
 @final
 class PolledDevice:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias, TypedDict, get_args
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, get_args
+
+if TYPE_CHECKING:
+    from os import PathLike
 
 Access: TypeAlias = Literal["read-only", "read-write"]
 Area: TypeAlias = Literal["coils", "discrete_inputs", "holding_registers", "input_registers"]
@@ -91,6 +94,11 @@ PolledBlock: TypeAlias = tuple[Area, int, int, bytes | None, int, float]
 """One block of a poll: area, address, count, the bytes or `None`, the fault, and the time of the
 result in seconds since 1970."""
 
+
+TlsFiles: TypeAlias = (
+    "tuple[str | PathLike[str] | None, str | PathLike[str] | None, str | PathLike[str] | None]"
+)
+"""Files of trusted authorities, of a certificate, and of its key."""
 
 ThreadHeartbeat: TypeAlias = tuple[str, float, int | None]
 """A thread's name, seconds since its last heartbeat, and its number in the system, if known."""
@@ -199,3 +207,73 @@ class RawCounters(TypedDict):
 
 
 ListenerCounters: TypeAlias = ModbusCounters | RawCounters
+
+
+class LogNode(TypedDict):
+    """A node of a log: its last message, when the stream stored that, and its last digest."""
+
+    name: str
+    sequence: int
+    time: float
+    digest: tuple[int, str] | None
+
+
+class LogStatus(TypedDict):
+    """The state of a log.
+
+    `failure`: kind and text of the error that ended it. `contact_age`: seconds since the contents
+    were current for sure. `steps`, `unavailable`, `not_confirmed`, `not_stored` and `refused` count
+    the outcomes of steps of this node. `stale` and `ignored` count messages of the stream that were
+    applied before, and that no node has sent. `digest`: sequence, digest, and whether other nodes
+    have the same. `snapshot`: the sequence of the newest one.
+    """
+
+    phase: Literal["starting", "running", "failed", "stopped"]
+    failure: tuple[str, str] | None
+    connected: bool
+    server: str | None
+    last_error: str | None
+    contact_age: float | None
+    sequence: int
+    last_sequence: int
+    lag: int
+    steps: int
+    unavailable: int
+    not_confirmed: int
+    not_stored: int
+    refused: int
+    stale: int
+    ignored: int
+    replicas: int
+    digest: tuple[int, str, bool | None] | None
+    snapshot: int | None
+    nodes: list[LogNode]
+
+
+class LogStep(TypedDict, total=False):
+    """A step of a log. Memories are named.
+
+    `writes`: memory, area, address and values. `place` and `masks` are of a mask write: memory,
+    area and address; the AND mask and the OR mask. `read` follows the write of `write_then_read`.
+    """
+
+    access: Literal["client", "ingest", "mirror"]
+    action: Literal["write", "mask", "write_then_read"]
+    writes: list[tuple[str, Area, int, list[int]]]
+    place: tuple[str, Area, int]
+    masks: tuple[int, int]
+    read: tuple[str, Area, int, int]
+
+
+class LogRecord(TypedDict):
+    """A message of a log.
+
+    `time`: when the stream stored it, in seconds since 1970. `node`: `None` if no node has sent it.
+    `fresh`: `False` if it was applied before.
+    """
+
+    sequence: int
+    time: float
+    node: str | None
+    fresh: bool
+    steps: list[LogStep]

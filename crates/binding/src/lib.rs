@@ -16,6 +16,7 @@ mod limits;
 mod link;
 mod listed;
 mod listener;
+mod log;
 mod memory;
 mod memory_file;
 mod peer;
@@ -45,6 +46,8 @@ mod _core {
     use super::link::{Caller, Link, Passage, Route};
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule, ServerTls};
+    #[pymodule_export]
+    use super::log::{Log, LogError, LogFollower};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange};
     #[pymodule_export]

@@ -145,6 +145,11 @@ impl Follower {
         }
     }
 
+    /// Whether all is applied up to the end, or an error came.
+    pub fn has_ended(&self) -> bool {
+        self.ended
+    }
+
     /// The sequence that was applied last.
     pub fn sequence(&self) -> u64 {
         self.reading.state.place.sequence

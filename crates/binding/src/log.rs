@@ -1,0 +1,332 @@
+//! `Log` and `LogFollower`: memories that several nodes share.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use holdfast_journal::log::{
+    Follower, Log as Core, LogError as CoreError, Login, Next, Phase, Record, Settings, Tls, Until,
+    WhenBehind,
+};
+use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
+use pyo3::exceptions::{PyException, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+
+use crate::arguments::{seconds, within, word};
+use crate::listed::listed;
+use crate::memory::Memory;
+
+pyo3::create_exception!(
+    holdfast._core,
+    LogError,
+    PyException,
+    "A log can't be used. `kind` tells why, as one word."
+);
+
+/// The longest time between two looks for signals.
+const SLICE: Duration = Duration::from_millis(100);
+
+/// Names and memories.
+type Memories<'py> = Vec<(String, PyRef<'py, Memory>)>;
+
+/// The files of TLS: trusted authorities, certificate, key.
+type TlsFiles = (Option<PathBuf>, Option<PathBuf>, Option<PathBuf>);
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Log {
+    core: Core,
+}
+
+#[pymethods]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+impl Log {
+    #[new]
+    #[pyo3(signature = (name, node, servers, memories, *, replicas=1, write_timeout=1.0, when_behind="serve", max_lag=5.0, snapshot_steps=100_000, snapshot_seconds=600.0, digest_steps=10_000, queue=4096, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
+    fn new(
+        name: &str,
+        node: &str,
+        servers: Vec<String>,
+        memories: Memories<'_>,
+        replicas: i128,
+        write_timeout: f64,
+        when_behind: &str,
+        max_lag: f64,
+        snapshot_steps: i128,
+        snapshot_seconds: f64,
+        digest_steps: i128,
+        queue: i128,
+        connect_timeout: f64,
+        user: Option<String>,
+        password_file: Option<PathBuf>,
+        token_file: Option<PathBuf>,
+        credentials_file: Option<PathBuf>,
+        tls: Option<TlsFiles>,
+    ) -> PyResult<Log> {
+        let most = u32::MAX as usize;
+        let mut settings = Settings::new(name, node, servers);
+        settings.replicas = within("replicas", replicas, 1..=5)?;
+        settings.write_timeout = seconds("write_timeout", write_timeout)?;
+        settings.when_behind = word(
+            "when_behind",
+            when_behind,
+            &[("serve", WhenBehind::Serve), ("refuse", WhenBehind::Refuse)],
+        )?;
+        settings.max_lag = seconds("max_lag", max_lag)?;
+        settings.snapshot_steps = within("snapshot_steps", snapshot_steps, 1..=most)? as u64;
+        settings.snapshot_after = seconds("snapshot_seconds", snapshot_seconds)?;
+        settings.digest_every = within("digest_steps", digest_steps, 1..=most)? as u64;
+        settings.queue = within("queue", queue, 1..=1_000_000)?;
+        settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
+        settings.servers.login = login(user, password_file, token_file, credentials_file)?;
+        settings.servers.tls = tls.map(tls_of).transpose()?;
+        let core = Core::new(settings, named(&memories)).map_err(raised)?;
+        Ok(Log { core })
+    }
+
+    fn start(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
+        let timeout = seconds("timeout", timeout)?;
+        let end = Instant::now() + timeout;
+        self.core.start().map_err(raised)?;
+        loop {
+            let left = end.saturating_duration_since(Instant::now()).min(SLICE);
+            let caught_up = py.detach(|| self.core.wait_until_caught_up(left)).map_err(raised)?;
+            if caught_up {
+                return Ok(());
+            }
+            let signalled = py.check_signals();
+            if signalled.is_err() || Instant::now() >= end {
+                let error = self.core.no_connection(timeout);
+                py.detach(|| self.core.stop());
+                return signalled.and(Err(raised(error)));
+            }
+        }
+    }
+
+    fn stop(&self, py: Python<'_>) {
+        py.detach(|| self.core.stop());
+    }
+
+    fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let status = py.detach(|| self.core.status());
+        let shown = PyDict::new(py);
+        let (phase, error) = match &status.phase {
+            Phase::Starting => ("starting", None),
+            Phase::Running => ("running", None),
+            Phase::Stopped => ("stopped", None),
+            Phase::Failed(error) => ("failed", Some((error.kind(), error.to_string()))),
+        };
+        shown.set_item("phase", phase)?;
+        shown.set_item("failure", error)?;
+        shown.set_item("connected", status.server.is_some())?;
+        shown.set_item("server", status.server)?;
+        shown.set_item("last_error", status.last_error)?;
+        shown.set_item("contact_age", status.contact_age.map(|age| age.as_secs_f64()))?;
+        shown.set_item("sequence", status.sequence)?;
+        shown.set_item("last_sequence", status.last_sequence)?;
+        shown.set_item("lag", status.last_sequence - status.sequence)?;
+        shown.set_item("steps", status.steps)?;
+        shown.set_item("unavailable", status.unavailable)?;
+        shown.set_item("not_confirmed", status.not_confirmed)?;
+        shown.set_item("not_stored", status.not_stored)?;
+        shown.set_item("refused", status.refused)?;
+        shown.set_item("stale", status.stale)?;
+        shown.set_item("ignored", status.ignored)?;
+        shown.set_item("replicas", status.replicas)?;
+        let digest = status.digest.map(|own| (own.sequence, own.digest, own.agrees));
+        shown.set_item("digest", digest)?;
+        shown.set_item("snapshot", status.snapshot)?;
+        let nodes = PyList::empty(py);
+        for node in status.nodes {
+            let one = PyDict::new(py);
+            one.set_item("name", node.name)?;
+            one.set_item("sequence", node.sequence)?;
+            one.set_item("time", node.stored as f64 / 1e9)?;
+            one.set_item("digest", node.digest)?;
+            nodes.append(one)?;
+        }
+        shown.set_item("nodes", nodes)?;
+        Ok(shown)
+    }
+
+    fn events<'py>(
+        &self,
+        py: Python<'py>,
+        timeout: f64,
+    ) -> PyResult<Vec<(&'static str, Bound<'py, PyDict>)>> {
+        let timeout = seconds("timeout", timeout)?;
+        let events = py.detach(|| self.core.take_events(timeout));
+        let shown = events.into_iter().map(|event| {
+            let fields = PyDict::new(py);
+            for (key, value) in event.fields {
+                fields.set_item(key, value)?;
+            }
+            Ok((event.name, fields))
+        });
+        shown.collect()
+    }
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct LogFollower {
+    core: Mutex<Follower>,
+    names: Vec<String>,
+}
+
+#[pymethods]
+#[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+impl LogFollower {
+    #[new]
+    #[pyo3(signature = (name, servers, memories, *, sequence=None, time=None, follow=false, timeout=10.0, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
+    fn new(
+        py: Python<'_>,
+        name: &str,
+        servers: Vec<String>,
+        memories: Memories<'_>,
+        sequence: Option<u64>,
+        time: Option<f64>,
+        follow: bool,
+        timeout: f64,
+        connect_timeout: f64,
+        user: Option<String>,
+        password_file: Option<PathBuf>,
+        token_file: Option<PathBuf>,
+        credentials_file: Option<PathBuf>,
+        tls: Option<TlsFiles>,
+    ) -> PyResult<LogFollower> {
+        let until = match (sequence, time, follow) {
+            (Some(sequence), None, false) => Until::Sequence(sequence),
+            (None, Some(time), false) => Until::Time((time * 1e9) as i64),
+            (None, None, true) => Until::Forever,
+            (None, None, false) => Until::Now,
+            _ => {
+                let message = "give one of sequence, time and follow";
+                return Err(PyValueError::new_err(message));
+            }
+        };
+        let mut settings = Settings::new(name, "replay", servers);
+        settings.servers.connect_timeout = seconds("connect_timeout", connect_timeout)?;
+        settings.servers.login = login(user, password_file, token_file, credentials_file)?;
+        settings.servers.tls = tls.map(tls_of).transpose()?;
+        let timeout = seconds("timeout", timeout)?;
+        let members = named(&memories);
+        let mut names: Vec<String> = members.iter().map(|(name, _)| name.clone()).collect();
+        names.sort();
+        let core = py.detach(|| Follower::open(&settings, members, until, timeout));
+        Ok(LogFollower { core: Mutex::new(core.map_err(raised)?), names })
+    }
+
+    fn next<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let timeout = seconds("timeout", timeout)?;
+        match py.detach(|| self.locked(|core| core.next(timeout))).map_err(raised)? {
+            Next::Record(record) => self.shown(py, &record).map(Some),
+            Next::Nothing | Next::End => Ok(None),
+        }
+    }
+
+    #[getter]
+    fn ended(&self, py: Python<'_>) -> bool {
+        py.detach(|| self.locked(|core| core.has_ended()))
+    }
+
+    #[getter]
+    fn sequence(&self, py: Python<'_>) -> u64 {
+        py.detach(|| self.locked(|core| core.sequence()))
+    }
+
+    fn digest(&self, py: Python<'_>) -> String {
+        py.detach(|| self.locked(|core| core.digest()))
+    }
+}
+
+impl LogFollower {
+    fn locked<T>(&self, of: impl FnOnce(&mut Follower) -> T) -> T {
+        of(&mut self.core.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn shown<'py>(&self, py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
+        let shown = PyDict::new(py);
+        shown.set_item("sequence", record.sequence)?;
+        shown.set_item("time", record.stored as f64 / 1e9)?;
+        shown.set_item("node", record.origin.as_ref().map(|origin| &origin.node))?;
+        shown.set_item("fresh", record.fresh)?;
+        let steps = PyList::empty(py);
+        for step in &record.steps {
+            steps.append(self.step(py, step)?)?;
+        }
+        shown.set_item("steps", steps)?;
+        Ok(shown)
+    }
+
+    fn step<'py>(&self, py: Python<'py>, step: &Step) -> PyResult<Bound<'py, PyDict>> {
+        let shown = PyDict::new(py);
+        let access = match step.access {
+            Access::Client => "client",
+            Access::Ingest => "ingest",
+            Access::Mirror => "mirror",
+        };
+        shown.set_item("access", access)?;
+        let name = |member: u16| &self.names[usize::from(member)];
+        let written = |write: &StepWrite| {
+            let values = listed(py, write.area, write.count, &write.bytes)?;
+            Ok::<_, PyErr>((name(write.member), write.area.name(), write.address, values))
+        };
+        match &step.action {
+            Action::Write(writes) => {
+                shown.set_item("action", "write")?;
+                let writes = writes.iter().map(written).collect::<PyResult<Vec<_>>>()?;
+                shown.set_item("writes", writes)?;
+            }
+            Action::Mask { member, area, address, and_mask, or_mask } => {
+                shown.set_item("action", "mask")?;
+                shown.set_item("place", (name(*member), area.name(), address))?;
+                shown.set_item("masks", (and_mask, or_mask))?;
+            }
+            Action::WriteThenRead { write, area, address, count } => {
+                shown.set_item("action", "write_then_read")?;
+                shown.set_item("writes", vec![written(write)?])?;
+                shown.set_item("read", (name(write.member), area.name(), address, count))?;
+            }
+        }
+        Ok(shown)
+    }
+}
+
+fn named(memories: &Memories<'_>) -> Vec<(String, Arc<CoreMemory>)> {
+    memories.iter().map(|(name, memory)| (name.clone(), Arc::clone(&memory.core))).collect()
+}
+
+fn login(
+    user: Option<String>,
+    password_file: Option<PathBuf>,
+    token_file: Option<PathBuf>,
+    credentials_file: Option<PathBuf>,
+) -> PyResult<Login> {
+    match (user, password_file, token_file, credentials_file) {
+        (None, None, None, None) => Ok(Login::None),
+        (Some(name), password_file, None, None) => Ok(Login::User { name, password_file }),
+        (None, None, Some(file), None) => Ok(Login::Token { file }),
+        (None, None, None, Some(file)) => Ok(Login::Credentials { file }),
+        _ => Err(PyValueError::new_err(
+            "give user (with or without password_file), token_file or credentials_file, not several",
+        )),
+    }
+}
+
+fn tls_of((ca, cert, key): TlsFiles) -> PyResult<Tls> {
+    let own = match (cert, key) {
+        (Some(cert), Some(key)) => Some((cert, key)),
+        (None, None) => None,
+        _ => return Err(PyValueError::new_err("tls: give certificate and key, or neither")),
+    };
+    Ok(Tls { ca, own })
+}
+
+fn raised(error: CoreError) -> PyErr {
+    if let CoreError::Settings(text) = error {
+        return PyValueError::new_err(text);
+    }
+    let raised = LogError::new_err(error.to_string());
+    let noted = Python::attach(|py| raised.value(py).setattr("kind", error.kind()));
+    noted.err().unwrap_or(raised)
+}

@@ -1,0 +1,433 @@
+//! Nodes and servers that are killed, stopped and started again at random, while clients write and
+//! read. What the clients saw is judged by Porcupine, a checker of linearizability.
+//!
+//! The short form runs for some seconds. With `HOLDFAST_TORTURE=1` each form runs for ten minutes;
+//! `HOLDFAST_TORTURE_SECONDS` sets another time, `HOLDFAST_TORTURE_SEED` the seed.
+
+mod nodes;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::fmt::Write as _;
+use std::io::{BufRead, BufReader, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use holdfast_journal::log::{Follower, Next, Settings, Until};
+use holdfast_memory::{Action, Area, Layout, Memory, Span};
+use nodes::{Server, cluster, signal_to, until};
+
+/// Registers of a node that are in use at one time. After an epoch, others are.
+const REGISTERS: u64 = 4;
+const CLIENTS: u64 = 4;
+const EPOCH: Duration = Duration::from_secs(3);
+
+/// How long a client waits for an answer. A stopped node answers later, or never.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        // SplitMix64.
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut mixed = self.0;
+        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        mixed ^ (mixed >> 31)
+    }
+
+    fn below(&mut self, end: u64) -> u64 {
+        self.next() % end
+    }
+}
+
+fn program() -> PathBuf {
+    let tests = std::env::current_exe().unwrap();
+    let folder = tests.parent().and_then(Path::parent).unwrap();
+    let program = folder.join("examples/log_node");
+    assert!(program.exists(), "{} is missing: run `cargo build --examples`", program.display());
+    program
+}
+
+/// A node in a process of its own.
+struct Process {
+    name: String,
+    arguments: Vec<String>,
+    running: Mutex<Option<Running>>,
+    next: AtomicU64,
+}
+
+struct Running {
+    child: Child,
+    input: ChildStdin,
+    waiting: Arc<Mutex<HashMap<u64, Sender<String>>>>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Answer {
+    Ok(String),
+    /// Nothing was done.
+    Refused,
+    Unknown,
+}
+
+impl Process {
+    fn new(name: &str, arguments: Vec<String>) -> Process {
+        let (running, next) = (Mutex::default(), AtomicU64::new(1));
+        Process { name: name.to_owned(), arguments, running, next }
+    }
+
+    /// Starts it. When it has caught up, it takes commands.
+    fn start(&self) {
+        let mut child = Command::new(program())
+            .arg(&self.name)
+            .args(&self.arguments)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let output = BufReader::new(child.stdout.take().unwrap());
+        let waiting: Arc<Mutex<HashMap<u64, Sender<String>>>> = Arc::default();
+        let (ready, is_ready) = channel();
+        waiting.lock().unwrap().insert(0, ready);
+        let answers = Arc::clone(&waiting);
+        std::thread::spawn(move || {
+            for line in output.lines().map_while(Result::ok) {
+                let (id, answer) = line.split_once(' ').unwrap();
+                let sender = answers.lock().unwrap().remove(&id.parse().unwrap());
+                // Whoever has asked may have lost patience.
+                sender.map(|sender| sender.send(answer.to_owned()));
+            }
+            answers.lock().unwrap().clear();
+        });
+        let input = child.stdin.take().unwrap();
+        *self.running.lock().unwrap() = Some(Running { child, input, waiting });
+        is_ready.recv_timeout(nodes::DEADLINE).expect("the node catches up");
+    }
+
+    fn kill(&self) {
+        if let Some(mut running) = self.running.lock().unwrap().take() {
+            running.child.kill().unwrap();
+            running.child.wait().unwrap();
+        }
+    }
+
+    fn signal(&self, signal: &str) {
+        let running = self.running.lock().unwrap();
+        signal_to(running.as_ref().unwrap().child.id(), signal);
+    }
+
+    fn send(&self, command: &str) -> Option<Receiver<String>> {
+        let (sender, receiver) = channel();
+        let id = self.next.fetch_add(1, Ordering::Relaxed);
+        let mut running = self.running.lock().unwrap();
+        let running = running.as_mut()?;
+        running.waiting.lock().unwrap().insert(id, sender);
+        // If the node has died, the answer never comes.
+        let _ = writeln!(running.input, "{id} {command}");
+        Some(receiver)
+    }
+
+    fn ask(&self, command: &str, patience: Duration) -> Answer {
+        let Some(receiver) = self.send(command) else { return Answer::Refused };
+        let Ok(answer) = receiver.recv_timeout(patience) else { return Answer::Unknown };
+        match answer.split_once(' ') {
+            Some(("ok", value)) => Answer::Ok(value.to_owned()),
+            _ if answer == "refused" => Answer::Refused,
+            _ => Answer::Unknown,
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.kill();
+    }
+}
+
+#[derive(Debug)]
+struct Operation {
+    register: u64,
+    client: u64,
+    is_write: bool,
+    value: u16,
+    called: Duration,
+    returned: Option<Duration>,
+    /// Of a write: whether it was refused, so that it has done nothing.
+    refused: bool,
+}
+
+/// What nodes, clients and the disturber share.
+struct Run {
+    nodes: Vec<Process>,
+    urls: Vec<String>,
+    began: Instant,
+    history: Mutex<Vec<Operation>>,
+    stopping: AtomicBool,
+}
+
+impl Run {
+    fn new(servers: &[Server], nodes: usize, options: &[&str]) -> Run {
+        let urls: Vec<String> = servers.iter().map(Server::url).collect();
+        let replicas = if servers.len() == 1 { 1 } else { 3 };
+        let mut arguments = vec![urls.join(","), replicas.to_string()];
+        arguments.extend(options.iter().map(|option| (*option).to_owned()));
+        let nodes: Vec<Process> =
+            (0..nodes).map(|index| Process::new(&format!("n{index}"), arguments.clone())).collect();
+        std::thread::scope(|scope| {
+            for node in &nodes {
+                scope.spawn(|| node.start());
+            }
+        });
+        let (history, stopping) = (Mutex::default(), AtomicBool::new(false));
+        Run { nodes, urls, began: Instant::now(), history, stopping }
+    }
+
+    /// Lets clients work while servers and nodes are disturbed. Then reads everything on all nodes.
+    fn work(&self, servers: Option<&mut [Server]>, time: Duration, seed: u64) {
+        println!("seed {seed}");
+        let values = AtomicU64::new(0);
+        let mut random = Random(seed);
+        std::thread::scope(|scope| {
+            for client in 0..self.nodes.len() as u64 * CLIENTS {
+                let (values, seed) = (&values, random.next());
+                scope.spawn(move || self.client(client, values, seed));
+            }
+            match servers {
+                Some(servers) => self.disturb(servers, time, random.next()),
+                None => std::thread::sleep(time),
+            }
+            self.stopping.store(true, Ordering::Release);
+        });
+        let registers: BTreeSet<u64> =
+            self.history.lock().unwrap().iter().map(|operation| operation.register).collect();
+        for (node, process) in self.nodes.iter().enumerate() {
+            // A register that no client uses. Behind this write, the node has all writes before it.
+            let write = format!("write {} 1", 65_000 + node);
+            until("the node writes again", || {
+                matches!(process.ask(&write, nodes::DEADLINE), Answer::Ok(_))
+            });
+        }
+        for node in 0..self.nodes.len() {
+            for register in &registers {
+                let client = 1000 + node as u64;
+                assert!(matches!(self.operate(node, client, *register, None), Answer::Ok(_)));
+            }
+        }
+    }
+
+    /// Writes and reads registers of one node until the end. No other node writes these.
+    fn client(&self, client: u64, values: &AtomicU64, seed: u64) {
+        let mut random = Random(seed);
+        let node = client / CLIENTS;
+        while !self.stopping.load(Ordering::Acquire) {
+            let epoch = self.began.elapsed().as_secs() / EPOCH.as_secs();
+            let register =
+                (epoch * self.nodes.len() as u64 + node) * REGISTERS + random.below(REGISTERS);
+            // Unique among the writes to a register.
+            let value = (1 + values.fetch_add(1, Ordering::Relaxed) % 65_535) as u16;
+            let value = (random.below(2) == 0).then_some(value);
+            self.operate(node as usize, client, register, value);
+            std::thread::sleep(Duration::from_millis(1 + random.below(4)));
+        }
+    }
+
+    fn operate(&self, node: usize, client: u64, register: u64, value: Option<u16>) -> Answer {
+        let command = match value {
+            Some(value) => format!("write {register} {value}"),
+            None => format!("read {register}"),
+        };
+        let called = self.began.elapsed();
+        let answer = self.nodes[node].ask(&command, PATIENCE);
+        let returned = self.began.elapsed();
+        let (is_write, refused) = (value.is_some(), answer == Answer::Refused);
+        let (value, returned) = match &answer {
+            Answer::Ok(read) => (value.unwrap_or_else(|| read.parse().unwrap()), Some(returned)),
+            // A read without an answer tells nothing.
+            _ if !is_write => return answer,
+            _ => (value.unwrap_or_default(), None),
+        };
+        let operation = Operation { register, client, is_write, value, called, returned, refused };
+        self.history.lock().unwrap().push(operation);
+        answer
+    }
+
+    /// Disturbs one thing after the other: at most one node and one server at a time.
+    fn disturb(&self, servers: &mut [Server], time: Duration, seed: u64) {
+        let mut random = Random(seed);
+        let end = self.began + time;
+        while Instant::now() < end {
+            std::thread::sleep(Duration::from_millis(200 + random.below(1500)));
+            let what = random.below(5);
+            let node = &self.nodes[random.below(self.nodes.len() as u64) as usize];
+            let server = random.below(servers.len() as u64) as usize;
+            let server = &mut servers[server];
+            let long = Duration::from_millis(300 + random.below(2500));
+            let at = self.began.elapsed().as_secs_f64();
+            let named = ["kill node", "stop node", "kill server", "stop server", "both"];
+            println!("{at:.1} {}: {} {} {long:?}", named[what as usize], node.name, server.port);
+            match what {
+                0 => {
+                    node.kill();
+                    std::thread::sleep(long / 4);
+                    node.start();
+                }
+                1 => {
+                    node.signal("STOP");
+                    std::thread::sleep(long);
+                    node.signal("CONT");
+                }
+                2 => {
+                    server.kill();
+                    std::thread::sleep(long / 2);
+                    server.start();
+                }
+                3 => {
+                    server.signal("STOP");
+                    std::thread::sleep(long);
+                    server.signal("CONT");
+                }
+                _ => {
+                    server.kill();
+                    node.signal("STOP");
+                    std::thread::sleep(long);
+                    server.start();
+                    node.signal("CONT");
+                }
+            }
+        }
+    }
+
+    fn assert_equal_contents(&self) {
+        let dumps = self.nodes.iter().map(|node| node.ask("dump", nodes::DEADLINE));
+        let dumps: Vec<Answer> = dumps.collect();
+        assert!(matches!(dumps[0], Answer::Ok(_)), "{dumps:?}");
+        assert!(dumps.iter().all(|dump| *dump == dumps[0]), "nodes differ: {dumps:?}");
+    }
+
+    /// Compares the history with the stream: a confirmed write is there once, a refused one is not.
+    fn assert_writes_are_in_the_log_once(&self) {
+        let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 65_536).unwrap());
+        let memory = Arc::new(Memory::new(layout, None).unwrap());
+        let settings = Settings::new("torture", "reader", self.urls.clone());
+        let memories = vec![("plant".to_owned(), memory)];
+        let mut follower =
+            Follower::open(&settings, memories, Until::Now, nodes::DEADLINE).unwrap();
+        let mut found: BTreeMap<(u64, u16), u32> = BTreeMap::new();
+        loop {
+            let record = match follower.next(nodes::DEADLINE).unwrap() {
+                Next::Record(record) => record,
+                Next::End => break,
+                Next::Nothing => panic!("the stream does not go on"),
+            };
+            for step in record.steps.iter().filter(|_| record.fresh) {
+                let Action::Write(writes) = &step.action else { panic!("{step:?}") };
+                for write in writes {
+                    let value = u16::from_be_bytes([write.bytes[0], write.bytes[1]]);
+                    *found.entry((write.address.into(), value)).or_default() += 1;
+                }
+            }
+        }
+        let history = self.history.lock().unwrap();
+        for write in history.iter().filter(|operation| operation.is_write) {
+            let count = found.get(&(write.register, write.value)).copied().unwrap_or_default();
+            match (write.returned, write.refused) {
+                (Some(_), _) => assert_eq!(count, 1, "a confirmed write: {write:?}"),
+                (None, true) => assert_eq!(count, 0, "a refused write: {write:?}"),
+                (None, false) => assert!(count <= 1, "an unconfirmed write: {write:?}"),
+            }
+        }
+    }
+
+    /// Asks Porcupine whether each register behaved as one. Returns what it says.
+    fn judge(&self) -> Result<String, String> {
+        let mut text = String::new();
+        let history = self.history.lock().unwrap();
+        for operation in history.iter().filter(|operation| !operation.refused) {
+            let Operation { register, client, is_write, value, called, returned, .. } = operation;
+            let kind = if *is_write { 'w' } else { 'r' };
+            let returned = returned.map_or(-1, |returned| returned.as_nanos() as i64);
+            let called = called.as_nanos();
+            writeln!(text, "{register} {client} {kind} {value} {called} {returned}").unwrap();
+        }
+        let confirmed = history.iter().filter(|one| one.is_write && one.returned.is_some()).count();
+        let refused = history.iter().filter(|one| one.refused).count();
+        let all = history.len();
+        println!("{all} operations, {confirmed} confirmed writes, {refused} refused writes");
+        assert!(confirmed > 100, "only {confirmed} writes were confirmed");
+        let mut checker =
+            Command::new(checker()).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        checker.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+        let output = checker.wait_with_output().unwrap();
+        let said = String::from_utf8(output.stdout).unwrap();
+        println!("{said}");
+        if output.status.success() { Ok(said) } else { Err(said) }
+    }
+}
+
+/// Builds the checker.
+fn checker() -> PathBuf {
+    let program = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("checker");
+    let built = Command::new("go")
+        .args(["build", "-o"])
+        .arg(&program)
+        .arg(".")
+        .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/checker"))
+        .status();
+    assert!(built.expect("Go is installed").success(), "the checker is built");
+    program
+}
+
+fn time(short: u64) -> Duration {
+    let set = std::env::var("HOLDFAST_TORTURE_SECONDS").ok().and_then(|text| text.parse().ok());
+    let long = std::env::var_os("HOLDFAST_TORTURE").map(|_| 600);
+    Duration::from_secs(set.or(long).unwrap_or(short))
+}
+
+fn seed(default: u64) -> u64 {
+    let set = std::env::var("HOLDFAST_TORTURE_SEED").ok().and_then(|text| text.parse().ok());
+    set.unwrap_or(default)
+}
+
+#[test]
+fn no_write_is_lost_or_applied_twice_while_nodes_and_servers_die() {
+    let mut servers = cluster(3);
+    let run = Run::new(&servers, 3, &[]);
+    run.work(Some(&mut servers), time(15), seed(1));
+    run.assert_equal_contents();
+    run.assert_writes_are_in_the_log_once();
+    run.judge().unwrap();
+}
+
+#[test]
+fn the_same_with_snapshots_and_purges() {
+    let mut servers = cluster(3);
+    let run = Run::new(&servers, 3, &["snapshots"]);
+    run.work(Some(&mut servers), time(15), seed(2));
+    run.assert_equal_contents();
+    run.judge().unwrap();
+}
+
+#[test]
+fn the_same_with_one_server() {
+    let mut servers = vec![Server::new()];
+    let run = Run::new(&servers, 2, &["refuse"]);
+    run.work(Some(&mut servers), time(10), seed(3));
+    run.assert_equal_contents();
+    run.assert_writes_are_in_the_log_once();
+    run.judge().unwrap();
+}
+
+/// A node that answers before its step is confirmed breaks the promise, and the checker sees it.
+#[test]
+fn the_checker_finds_writes_that_are_answered_too_early() {
+    let servers = [Server::new()];
+    let run = Run::new(&servers, 2, &["answers-early"]);
+    run.work(None, Duration::from_secs(5), seed(4));
+    let said = run.judge().unwrap_err();
+    assert!(said.contains("not linearizable"), "{said}");
+}
