@@ -4,13 +4,14 @@ mod nodes;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use holdfast_journal::log::LogError;
 use holdfast_memory::{
     Access, Action, Memory, Operation, Read, Refusal, Step, StepWrite, Write, write_across,
 };
-use nodes::{Node, REGISTERS, Server, memory_of, until};
+use nodes::process::{Answer, Process};
+use nodes::{Node, REGISTERS, Server, cluster, memory_of, until};
 
 fn step(address: u16, value: u16) -> Step {
     let write = StepWrite {
@@ -453,4 +454,62 @@ fn a_step_that_no_message_holds_is_refused() {
     let refused = nodes[0].memory.write_many(Access::Ingest, &writes).unwrap_err();
     assert_eq!(refused.refusal, Refusal::NotStored);
     assert_eq!(nodes[0].status().not_stored, 1);
+}
+
+/// A process that was stopped has old contents when it goes on, and its connection looks sound.
+#[test]
+fn a_node_that_was_stopped_serves_no_old_value() {
+    let server = Server::new();
+    let arguments = |options: &[&str]| {
+        let arguments = [server.url(), "1".to_owned()].into_iter();
+        arguments.chain(options.iter().map(|option| (*option).to_owned())).collect()
+    };
+    let writer = Process::new("writer", arguments(&[]));
+    let reader = Process::new("reader", arguments(&["refuse"]));
+    writer.start();
+    reader.start();
+    for round in 1..=3 {
+        until("the reader has the value", || {
+            let last = (round - 1).to_string();
+            reader.ask("read 0", nodes::DEADLINE) == Answer::Ok(last)
+        });
+        reader.signal("STOP");
+        let written = writer.ask(&format!("write 0 {round}"), nodes::DEADLINE);
+        assert_eq!(written, Answer::Ok("0".to_owned()));
+        // Longer than the `max_lag` of the process.
+        let stopped = Instant::now();
+        until("the contents are too old", || stopped.elapsed() > Duration::from_millis(1500));
+        let reads: Vec<_> = (0..100).filter_map(|_| reader.send("read 0")).collect();
+        reader.signal("CONT");
+        let answers: Vec<Answer> =
+            reads.iter().map(|read| Answer::of(read, nodes::DEADLINE)).collect();
+        let is_right = |answer: &Answer| {
+            *answer == Answer::Refused || *answer == Answer::Ok(round.to_string())
+        };
+        assert!(answers.iter().all(is_right), "{answers:?}");
+    }
+}
+
+#[test]
+fn a_cluster_goes_on_without_one_of_its_servers() {
+    let mut servers = cluster(3);
+    let of_three = |settings: &mut holdfast_journal::log::Settings| settings.replicas = 3;
+    let (a, b) = {
+        let all: Vec<&Server> = servers.iter().collect();
+        (Node::new(&all, "a", of_three), Node::new(&all, "b", of_three))
+    };
+    a.start();
+    b.start();
+    assert_eq!(a.status().replicas, 3);
+    for (round, server) in servers.iter_mut().take(2).enumerate() {
+        let round = round as u16;
+        server.kill();
+        a.write_at_last(round, 10 + round);
+        b.write_at_last(10 + round, 20 + round);
+        until("both have both", || {
+            b.read(round) == Ok(10 + round) && a.read(10 + round) == Ok(20 + round)
+        });
+        server.start();
+    }
+    assert_eq!(a.all(), b.all());
 }
