@@ -383,6 +383,23 @@ fn of_two_nodes_the_one_that_the_log_does_not_lead_to_stops_serving() {
     }
 }
 
+/// Otherwise those who load it would be wrong as well.
+#[test]
+fn wrong_contents_do_not_become_a_snapshot() {
+    let server = Server::new();
+    let soon = |settings: &mut holdfast_journal::log::Settings| settings.snapshot_steps = 5;
+    let (good, wrong) = (Node::started(&[&server], "a"), Node::new(&[&server], "b", soon));
+    wrong.start();
+    step(90, 666).carry_out(std::slice::from_ref(&wrong.memory)).unwrap();
+    until("the node notices it", || {
+        good.write(1, 2).unwrap();
+        wrong.failure().is_some()
+    });
+    assert_eq!(wrong.failure().unwrap().kind(), "differs");
+    assert_eq!(good.failure(), None);
+    assert_eq!(Node::started(&[&server], "c").read(90), Ok(0));
+}
+
 #[test]
 fn equal_nodes_have_equal_digests() {
     let server = Server::new();

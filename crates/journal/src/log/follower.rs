@@ -186,7 +186,7 @@ impl Reading {
             }
             let decoded = message::decode(&message.payload, &self.state.members).ok();
             let applied = self.state.apply(place, &message.payload)?;
-            let fresh = matches!(applied, super::state::Applied::Fresh(..));
+            let fresh = matches!(applied, super::state::Applied::Fresh { .. });
             let (origin, steps) =
                 decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();
             let sequence = place.sequence;
@@ -201,15 +201,26 @@ async fn read(
     members: Vec<Arc<Memory>>,
     until: Until,
 ) -> Result<Reading, End> {
+    let known = [Some(&pointer.newest), pointer.previous.as_ref()];
+    read_from(store, known, members, until).await
+}
+
+/// Reads from the first of these snapshots that is not behind the end.
+async fn read_from(
+    store: &Store,
+    known: [Option<&Snapshot>; 2],
+    members: Vec<Arc<Memory>>,
+    until: Until,
+) -> Result<Reading, End> {
     let reaches = |snapshot: &&Snapshot| match until {
         Until::Sequence(end) => snapshot.sequence <= end,
         Until::Time(end) => snapshot.stored <= end,
         Until::Now | Until::Forever => true,
     };
-    let known = [Some(&pointer.newest), pointer.previous.as_ref()];
-    let Some(snapshot) = known.into_iter().flatten().find(reaches) else {
-        let oldest = pointer.previous.as_ref().unwrap_or(&pointer.newest);
-        let text = format!("the log reaches back to sequence {}", oldest.sequence);
+    let snapshots = known.into_iter().flatten();
+    let Some(snapshot) = snapshots.clone().find(reaches) else {
+        let oldest = snapshots.map(|snapshot| snapshot.sequence).min().unwrap_or_default();
+        let text = format!("the log reaches back to sequence {oldest}");
         return Err(LogError::Snapshot(text).into());
     };
     let mut state = State::new(members);
@@ -218,7 +229,8 @@ async fn read(
     Ok(Reading { state, messages })
 }
 
-/// The digest that the log leads to at a sequence.
+/// The digest that the log leads to at a sequence, from the oldest snapshot: the fewer nodes have made
+/// what this begins with, the better.
 pub(super) async fn digest_at(
     store: &Store,
     pointer: &Pointer,
@@ -231,7 +243,8 @@ pub(super) async fn digest_at(
         End::Lost(reason) => reason,
         End::Fatal(error) => error.to_string(),
     };
-    let mut reading = read(store, pointer, members, until).await.map_err(text)?;
+    let known = [pointer.previous.as_ref(), Some(&pointer.newest)];
+    let mut reading = read_from(store, known, members, until).await.map_err(text)?;
     while reading.state.place.sequence < sequence {
         reading.next(until).await.map_err(text)?;
     }

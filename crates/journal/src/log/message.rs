@@ -36,6 +36,8 @@ impl Origin {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Message {
     pub(super) origin: Origin,
+    /// Whether all nodes compare their contents here.
+    pub(super) compares: bool,
     pub(super) steps: Vec<Step>,
 }
 
@@ -58,12 +60,14 @@ pub(super) const OVERHEAD: usize = 128;
 /// Encodes a message of steps that are encoded already.
 pub(super) fn encode<'a>(
     origin: &Origin,
+    compares: bool,
     steps: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
 ) -> Bytes {
     let len: usize = steps.clone().map(|step| step.len() + 4).sum();
     let mut out = Vec::with_capacity(len + OVERHEAD);
     out.extend_from_slice(&MARK);
     out.push(VERSION);
+    out.push(u8::from(compares));
     out.push(u8::try_from(origin.node.len()).expect("names of nodes are short"));
     out.extend_from_slice(origin.node.as_bytes());
     out.extend_from_slice(&origin.start.to_le_bytes());
@@ -81,6 +85,10 @@ pub(super) fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Message, M
     if version != VERSION {
         return Err(MessageError::Version(version));
     }
+    let (compares, bytes) = match bytes.split_first() {
+        Some((&flag @ (0 | 1), bytes)) => (flag == 1, bytes),
+        _ => return Err(MessageError::Malformed),
+    };
     let (origin, mut bytes) = origin(bytes).ok_or(MessageError::Malformed)?;
     let mut steps = Vec::new();
     while !bytes.is_empty() {
@@ -91,7 +99,7 @@ pub(super) fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Message, M
         steps.push(step);
         bytes = rest;
     }
-    Ok(Message { origin, steps })
+    Ok(Message { origin, compares, steps })
 }
 
 fn origin(bytes: &[u8]) -> Option<(Origin, &[u8])> {
@@ -128,7 +136,7 @@ mod tests {
         Step { access: Access::Client, action }
     }
 
-    fn encoded(origin: &Origin, steps: &[Step]) -> Bytes {
+    fn encoded(origin: &Origin, compares: bool, steps: &[Step]) -> Bytes {
         let steps: Vec<Vec<u8>> = steps
             .iter()
             .map(|step| {
@@ -137,7 +145,7 @@ mod tests {
                 bytes
             })
             .collect();
-        encode(origin, steps.iter().map(Vec::as_slice))
+        encode(origin, compares, steps.iter().map(Vec::as_slice))
     }
 
     proptest! {
@@ -146,12 +154,14 @@ mod tests {
             node in "[a-zA-Z0-9_-]{1,64}",
             start: u64,
             counter: u64,
+            compares: bool,
             addresses in prop::collection::vec(0..10u16, 0..5),
         ) {
             let origin = Origin { node, start, counter };
             let steps: Vec<Step> = addresses.into_iter().map(mask).collect();
-            let bytes = encoded(&origin, &steps);
-            prop_assert_eq!(decode(&bytes, &members()), Ok(Message { origin, steps }));
+            let bytes = encoded(&origin, compares, &steps);
+            let message = Message { origin, compares, steps };
+            prop_assert_eq!(decode(&bytes, &members()), Ok(message));
         }
 
         #[test]
@@ -160,7 +170,7 @@ mod tests {
             mut bytes in prop::collection::vec(any::<u8>(), 0..100),
         ) {
             if marked {
-                bytes.splice(0..0, *b"HFL\x01\x01a");
+                bytes.splice(0..0, *b"HFL\x01\x00\x01a");
             }
             let _ = decode(&bytes, &members());
         }
@@ -168,7 +178,7 @@ mod tests {
         #[test]
         fn changed_bytes_are_a_message_or_an_error(at in any::<prop::sample::Index>(), byte: u8) {
             let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
-            let mut bytes = encoded(&origin, &[mask(1), mask(2)]).to_vec();
+            let mut bytes = encoded(&origin, false, &[mask(1), mask(2)]).to_vec();
             let at = at.index(bytes.len());
             bytes[at] = byte;
             let _ = decode(&bytes, &members());
@@ -182,7 +192,7 @@ mod tests {
         assert_eq!(of(b"HFL\x02whatever"), Err(MessageError::Version(2)));
         assert_eq!(of(b"HFL\x01"), Err(MessageError::Malformed));
         let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
-        let error = of(&encoded(&origin, &[mask(1), mask(10)])).unwrap_err();
+        let error = of(&encoded(&origin, false, &[mask(1), mask(10)])).unwrap_err();
         assert!(matches!(error, MessageError::Step { index: 1, .. }), "{error}");
     }
 }

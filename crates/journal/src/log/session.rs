@@ -41,6 +41,12 @@ const MAX_PAUSE: Duration = Duration::from_secs(1);
 /// For so long, a server may know less than this node: it may be cut off from the others.
 const CUT_OFF: Duration = Duration::from_secs(30);
 
+/// How long a snapshot waits for the digests of other nodes.
+const ALONE: Duration = Duration::from_secs(5);
+
+/// When a snapshot is tried again.
+const RETRY: Duration = Duration::from_secs(5);
+
 /// How long requests to JetStream may take.
 const REQUEST: Duration = Duration::from_secs(3);
 
@@ -81,6 +87,15 @@ enum Report {
     },
 }
 
+/// A snapshot that is stored when no other node has another digest.
+struct Prepared {
+    encoded: Vec<u8>,
+    snapshot: Snapshot,
+    since: Instant,
+    /// Another node has another digest, so the log is asked.
+    is_disputed: bool,
+}
+
 struct Session {
     client: Client,
     store: Store,
@@ -93,7 +108,11 @@ struct Session {
     /// When a message of this node with this counter is applied, this node has caught up.
     caught_up_at: Option<u64>,
     reports: mpsc::UnboundedSender<Report>,
+    /// From the request for the lease to the end of its use.
     takes_snapshot: bool,
+    /// At the message of this node with this counter, a snapshot is made.
+    asked: Option<u64>,
+    prepared: Option<Prepared>,
     /// After a refused lease, another node is about to store a snapshot.
     no_snapshot_before: Instant,
     replays: bool,
@@ -141,6 +160,8 @@ impl Node {
             self.shared.close();
             match end {
                 End::Stopped => break,
+                // A file that can't be read now can be read later.
+                End::Fatal(LogError::Settings(reason)) if self.id.is_some() => self.lost(reason),
                 End::Fatal(error) => {
                     self.sent.expire(
                         Instant::now() + self.settings.write_timeout,
@@ -231,6 +252,8 @@ impl Node {
             caught_up_at: None,
             reports,
             takes_snapshot: false,
+            asked: None,
+            prepared: None,
             no_snapshot_before: now,
             replays: false,
         };
@@ -246,7 +269,7 @@ impl Node {
             self.publish(&mut session, counter, payload).await?;
         }
         session.caught_up_at = Some(self.origin.counter + 1);
-        self.send(&mut session, Vec::new(), Vec::new(), now).await?;
+        self.send(&mut session, false, Vec::new(), Vec::new(), now).await?;
 
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -260,7 +283,7 @@ impl Node {
                     Some(Err(error)) => return Err(End::lost("watching the keys of the log", error)),
                     None => return Err(End::Lost("the watch of the keys has ended".to_owned())),
                 },
-                Some(report) = reported.recv() => self.reported(&mut session, report)?,
+                Some(report) = reported.recv() => self.reported(&mut session, report).await?,
                 end = connected.end() => return Err(end),
                 _ = look.tick() => self.look(&mut session).await?,
             }
@@ -320,7 +343,7 @@ impl Node {
             }
             // The first node that gets here decides what the log begins with.
             let encoded = self.state.encode();
-            let snapshot = self.snapshot_of(&encoded);
+            let snapshot = self.snapshot_of(digest_of(&encoded));
             let first = self.tend(store.put(None, &encoded, snapshot)).await?;
             self.pointer = Some(first.map_err(|error| End::lost("the first snapshot", error))?);
             self.pointer_since = Instant::now();
@@ -363,13 +386,13 @@ impl Node {
         }
     }
 
-    fn snapshot_of(&self, encoded: &[u8]) -> Snapshot {
+    fn snapshot_of(&self, digest: String) -> Snapshot {
         Snapshot {
             sequence: self.state.place.sequence,
             stored: self.state.place.stored,
             steps: self.state.steps,
             object: format!("{:016x}", unique() as u64),
-            digest: digest_of(encoded),
+            digest,
             node: self.settings.node.clone(),
         }
     }
@@ -384,7 +407,7 @@ impl Node {
             let Some(until) = waiting.first().map(|first| first.until) else { break };
             let (steps, dones) =
                 waiting.into_iter().map(|waiting| (waiting.bytes, waiting.done)).unzip();
-            self.send(session, steps, dones, until).await?;
+            self.send(session, false, steps, dones, until).await?;
         }
         Ok(())
     }
@@ -392,12 +415,13 @@ impl Node {
     async fn send(
         &mut self,
         session: &mut Session,
+        compares: bool,
         steps: Vec<Vec<u8>>,
         mut dones: Vec<holdfast_memory::Done>,
         until: Instant,
     ) -> Result<(), End> {
         self.origin.counter += 1;
-        let payload = message::encode(&self.origin, steps.iter().map(Vec::as_slice));
+        let payload = message::encode(&self.origin, compares, steps.iter().map(Vec::as_slice));
         if self.settings.answers_early {
             dones.drain(..).for_each(|done| done(Ok(Vec::new())));
         }
@@ -488,15 +512,18 @@ impl Node {
 
     fn apply(&mut self, session: &mut Session, place: Place, payload: &[u8]) -> Result<(), End> {
         let counters = &self.shared.counters;
+        let (mut compared, mut for_snapshot) = (false, false);
         session.last_applied = Instant::now();
         match self.state.apply(place, payload)? {
-            Applied::Fresh(origin, outcomes) => {
+            Applied::Fresh { origin, compares, outcomes } => {
                 self.shared.counters.sequence.set(place.sequence);
+                compared = compares;
                 if origin.node == self.origin.node {
                     if origin.start > self.origin.start {
                         return Err(LogError::NameTaken(origin.node).into());
                     }
                     if origin.start == self.origin.start {
+                        for_snapshot = session.asked == Some(origin.counter);
                         self.applied_own(session, origin.counter, outcomes);
                     }
                 }
@@ -516,8 +543,8 @@ impl Node {
             }
         }
         self.shared.counters.sequence.set(place.sequence);
-        if place.sequence.is_multiple_of(self.settings.digest_every) {
-            self.tell_digest(session)?;
+        if compared || place.sequence.is_multiple_of(self.settings.digest_every) {
+            self.tell_digest(session, for_snapshot)?;
         }
         Ok(())
     }
@@ -531,6 +558,11 @@ impl Node {
         let sent = self.sent.applied(counter, outcomes, &self.shared.counters);
         if let Some(at) = sent {
             self.shared.contact(at);
+        }
+        if session.asked.is_some_and(|asked| asked <= counter) {
+            let was_lost = session.asked != Some(counter);
+            session.asked = None;
+            session.takes_snapshot &= !was_lost;
         }
         if session.caught_up_at.is_some_and(|at| at <= counter) {
             session.caught_up_at = None;
@@ -553,9 +585,14 @@ impl Node {
         });
     }
 
-    fn tell_digest(&mut self, session: &mut Session) -> Result<(), End> {
+    fn tell_digest(&mut self, session: &mut Session, for_snapshot: bool) -> Result<(), End> {
         let sequence = self.state.place.sequence;
-        let digest = digest_of(&self.state.encode());
+        let encoded = self.state.encode();
+        let digest = digest_of(&encoded);
+        if for_snapshot {
+            let (snapshot, since) = (self.snapshot_of(digest.clone()), Instant::now());
+            session.prepared = Some(Prepared { encoded, snapshot, since, is_disputed: false });
+        }
         let told = Told { sequence, digest: digest.clone() };
         if let Ok(value) = serde_json::to_vec(&told) {
             let (keys, key) =
@@ -601,11 +638,18 @@ impl Node {
     ) -> Result<(), End> {
         let agrees = match verdict {
             Verdict::Alone => return Ok(()),
-            Verdict::Agrees => true,
+            Verdict::Agrees => {
+                self.store_snapshot(session, sequence);
+                true
+            }
             Verdict::Differs(other) => {
                 return Err(self.differs(sequence, format!("most nodes have {other}")));
             }
             Verdict::Unclear(_) => {
+                let mut prepared = session.prepared.iter_mut();
+                if let Some(own) = prepared.find(|own| own.snapshot.sequence == sequence) {
+                    own.is_disputed = true;
+                }
                 self.replay(session, sequence);
                 false
             }
@@ -644,29 +688,16 @@ impl Node {
         });
     }
 
-    fn reported(&mut self, session: &mut Session, report: Report) -> Result<(), End> {
+    async fn reported(&mut self, session: &mut Session, report: Report) -> Result<(), End> {
         match report {
             Report::Leased(false) => {
                 session.takes_snapshot = false;
-                session.no_snapshot_before = Instant::now() + Duration::from_secs(5);
+                session.no_snapshot_before = Instant::now() + RETRY;
             }
             Report::Leased(true) => {
-                let encoded = self.state.encode();
-                let snapshot = self.snapshot_of(&encoded);
-                let (store, reports) = (session.store.clone(), session.reports.clone());
-                let pointer = self.pointer.clone();
-                tokio::spawn(async move {
-                    let stored = store.put(pointer, &encoded, snapshot).await;
-                    let stored = match stored {
-                        Ok((revision, pointer)) => {
-                            store.tidy(&pointer).await.map(|()| (revision, pointer))
-                        }
-                        Err(error) => Err(error),
-                    };
-                    store.release().await;
-                    // If the session has ended, the next one sees the key.
-                    let _ = reports.send(Report::Stored(stored));
-                });
+                let until = Instant::now() + self.settings.write_timeout;
+                self.send(session, true, Vec::new(), Vec::new(), until).await?;
+                session.asked = Some(self.origin.counter);
             }
             Report::Stored(Ok((revision, pointer))) => {
                 session.takes_snapshot = false;
@@ -676,7 +707,7 @@ impl Node {
             }
             Report::Stored(Err(reason)) => {
                 session.takes_snapshot = false;
-                session.no_snapshot_before = Instant::now() + Duration::from_secs(5);
+                session.no_snapshot_before = Instant::now() + RETRY;
                 self.shared.event(Event::new("log_snapshot_failed", &[("reason", &reason)]));
             }
             Report::Replayed { sequence, digest: Ok(digest) } => {
@@ -684,14 +715,42 @@ impl Node {
                 if self.digests.own(sequence).is_some_and(|own| own != digest) {
                     return Err(self.differs(sequence, format!("the log leads to {digest}")));
                 }
+                self.store_snapshot(session, sequence);
+                self.drop_disputed(session);
             }
             Report::Replayed { sequence, digest: Err(reason) } => {
                 session.replays = false;
+                self.drop_disputed(session);
                 let fields = [("sequence", &*sequence.to_string()), ("reason", &reason)];
                 self.shared.event(Event::new("log_replay_failed", &fields));
             }
         }
         Ok(())
+    }
+
+    /// Stores the snapshot that was made at this sequence: its digest is right.
+    fn store_snapshot(&mut self, session: &mut Session, sequence: u64) {
+        let own = session.prepared.take_if(|own| own.snapshot.sequence == sequence);
+        let Some(Prepared { encoded, snapshot, .. }) = own else { return };
+        let (store, reports) = (session.store.clone(), session.reports.clone());
+        let pointer = self.pointer.clone();
+        tokio::spawn(async move {
+            let stored = match store.put(pointer, &encoded, snapshot).await {
+                Ok((revision, pointer)) => store.tidy(&pointer).await.map(|()| (revision, pointer)),
+                Err(error) => Err(error),
+            };
+            store.release().await;
+            // If the session has ended, the next one sees the key.
+            let _ = reports.send(Report::Stored(stored));
+        });
+    }
+
+    /// Gives up a snapshot that nodes don't agree on. There will be another one.
+    fn drop_disputed(&self, session: &mut Session) {
+        if session.prepared.take_if(|own| own.is_disputed).is_some() {
+            session.takes_snapshot = false;
+            session.no_snapshot_before = Instant::now() + RETRY;
+        }
     }
 
     async fn look(&mut self, session: &mut Session) -> Result<(), End> {
@@ -708,9 +767,15 @@ impl Node {
         }
         if now.saturating_duration_since(session.last_sent) >= self.settings.tick() {
             let until = now + self.settings.write_timeout;
-            self.send(session, Vec::new(), Vec::new(), until).await?;
+            self.send(session, false, Vec::new(), Vec::new(), until).await?;
         }
         self.send_waiting(session).await?;
+        let is_alone =
+            |own: &&Prepared| !own.is_disputed && now.saturating_duration_since(own.since) >= ALONE;
+        if let Some(own) = session.prepared.as_ref().filter(is_alone) {
+            let sequence = own.snapshot.sequence;
+            self.store_snapshot(session, sequence);
+        }
         self.consider_snapshot(session, now);
         Ok(())
     }

@@ -35,7 +35,11 @@ pub(super) struct Place {
 /// What became of a message.
 #[derive(Debug)]
 pub(super) enum Applied {
-    Fresh(Origin, Vec<Outcome>),
+    Fresh {
+        origin: Origin,
+        compares: bool,
+        outcomes: Vec<Outcome>,
+    },
     /// It was applied before, or a later one of the same node was.
     Stale(Origin),
     /// It is not of a node.
@@ -59,7 +63,7 @@ impl State {
     /// [`LogError::Version`]: nobody knows what the message does.
     pub(super) fn apply(&mut self, place: Place, payload: &[u8]) -> Result<Applied, LogError> {
         debug_assert_eq!(place.sequence, self.place.sequence + 1, "messages are applied in order");
-        let Message { origin, steps } = match message::decode(payload, &self.members) {
+        let Message { origin, compares, steps } = match message::decode(payload, &self.members) {
             Ok(message) => message,
             Err(MessageError::Version(found)) => {
                 let what = "a message of the log";
@@ -78,7 +82,7 @@ impl State {
         self.origins.insert(origin.node.clone(), now);
         self.steps += steps.len() as u64;
         let outcomes = steps.iter().map(|step| step.carry_out(&self.members)).collect();
-        Ok(Applied::Fresh(origin, outcomes))
+        Ok(Applied::Fresh { origin, compares, outcomes })
     }
 
     pub(super) fn encode(&self) -> Vec<u8> {
