@@ -805,7 +805,14 @@ class LogError(Exception):
     """A log can't be used."""
 
     kind: Literal[
-        "no_connection", "layout", "version", "snapshot", "replaced", "name_taken", "differs", "thread"
+        "no_connection",
+        "layout",
+        "version",
+        "snapshot",
+        "replaced",
+        "name_taken",
+        "differs",
+        "thread",
     ]
 
 @final
@@ -816,7 +823,7 @@ class Log:
     the log has it, on all nodes in the same order, and refused while the log can't be reached. What
     the memories contain at that time is what a new log begins with; an existing log replaces it.
 
-    `tls` are files: trusted authorities, certificate, key. Files are read again for each connection.
+    `tls` are files: trusted authorities, certificate, key. All files are read for each connection.
     With `when_behind="refuse"`, all reads are refused after `max_lag` seconds without contact.
 
     Raises `ValueError` for an unusable argument, also for a memory that has a log already.
@@ -864,9 +871,9 @@ class Log:
 class LogFollower:
     """Rebuilds what a log leads to, in these memories, without writing to the log.
 
-    It begins with a snapshot, and ends at a sequence, at a time (seconds since 1970), at the last
-    message there is now, or with `follow` never. Raises `LogError`, and `ValueError` for an unusable
-    argument.
+    It begins with a snapshot, and ends at a sequence, at a time (nanoseconds since 1970), at the
+    last message there is now, or with `follow` never. Raises `LogError`, and `ValueError` for an
+    unusable argument.
     """
 
     def __new__(
@@ -876,7 +883,7 @@ class LogFollower:
         memories: Sequence[tuple[str, Memory]],
         *,
         sequence: int | None = None,
-        time: float | None = None,
+        time_ns: int | None = None,
         follow: bool = False,
         timeout: float = 10.0,
         connect_timeout: float = 2.0,

@@ -214,7 +214,7 @@ class LogNode(TypedDict):
 
     name: str
     sequence: int
-    time: float
+    time_ns: int
     digest: tuple[int, str] | None
 
 
@@ -268,12 +268,12 @@ class LogStep(TypedDict, total=False):
 class LogRecord(TypedDict):
     """A message of a log.
 
-    `time`: when the stream stored it, in seconds since 1970. `node`: `None` if no node has sent it.
+    `time_ns`: when the stream stored it, in nanoseconds since 1970. `node`: `None` if no node has sent it.
     `fresh`: `False` if it was applied before.
     """
 
     sequence: int
-    time: float
+    time_ns: int
     node: str | None
     fresh: bool
     steps: list[LogStep]

@@ -141,7 +141,7 @@ impl Log {
             let one = PyDict::new(py);
             one.set_item("name", node.name)?;
             one.set_item("sequence", node.sequence)?;
-            one.set_item("time", node.stored as f64 / 1e9)?;
+            one.set_item("time_ns", node.stored)?;
             one.set_item("digest", node.digest)?;
             nodes.append(one)?;
         }
@@ -177,14 +177,14 @@ pub struct LogFollower {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl LogFollower {
     #[new]
-    #[pyo3(signature = (name, servers, memories, *, sequence=None, time=None, follow=false, timeout=10.0, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
+    #[pyo3(signature = (name, servers, memories, *, sequence=None, time_ns=None, follow=false, timeout=10.0, connect_timeout=2.0, user=None, password_file=None, token_file=None, credentials_file=None, tls=None))]
     fn new(
         py: Python<'_>,
         name: &str,
         servers: Vec<String>,
         memories: Memories<'_>,
         sequence: Option<u64>,
-        time: Option<f64>,
+        time_ns: Option<i64>,
         follow: bool,
         timeout: f64,
         connect_timeout: f64,
@@ -194,13 +194,13 @@ impl LogFollower {
         credentials_file: Option<PathBuf>,
         tls: Option<TlsFiles>,
     ) -> PyResult<LogFollower> {
-        let until = match (sequence, time, follow) {
+        let until = match (sequence, time_ns, follow) {
             (Some(sequence), None, false) => Until::Sequence(sequence),
-            (None, Some(time), false) => Until::Time((time * 1e9) as i64),
+            (None, Some(time), false) => Until::Time(time),
             (None, None, true) => Until::Forever,
             (None, None, false) => Until::Now,
             _ => {
-                let message = "give one of sequence, time and follow";
+                let message = "give one of sequence, time_ns and follow";
                 return Err(PyValueError::new_err(message));
             }
         };
@@ -247,7 +247,7 @@ impl LogFollower {
     fn shown<'py>(&self, py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
         let shown = PyDict::new(py);
         shown.set_item("sequence", record.sequence)?;
-        shown.set_item("time", record.stored as f64 / 1e9)?;
+        shown.set_item("time_ns", record.stored)?;
         shown.set_item("node", record.origin.as_ref().map(|origin| &origin.node))?;
         shown.set_item("fresh", record.fresh)?;
         let steps = PyList::empty(py);
