@@ -60,7 +60,7 @@ NAME ?= server
 # Long runs of tests that `make test` does in short.
 torture: .venv/core.stamp .venv/dev.stamp
 	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-engine --test route
-	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-journal
+	HOLDFAST_TORTURE=1 cargo test --locked --release --quiet -p holdfast-journal -- --test-threads 1
 	HOLDFAST_TORTURE=1 $(BIN)/pytest tests/server/test_slow_connections.py tests/outputs/test_mqtt_outage.py
 
 bench: .venv/core.stamp .venv/dev.stamp
@@ -82,6 +82,7 @@ lock: .venv/dev.stamp
 	cargo update --manifest-path $(PEERS)/rust/Cargo.toml
 	cd $(PEERS)/node && npm install --package-lock-only --ignore-scripts
 	cd $(PEERS)/go && go mod tidy
+	cd crates/journal/tests/checker && go get -u ./... && go mod tidy
 
 clean:
 	rm -rf .venv .cache target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

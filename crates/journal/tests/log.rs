@@ -224,6 +224,23 @@ fn without_a_server_nothing_starts_and_the_error_says_why() {
 }
 
 #[test]
+fn without_a_server_it_stops_soon() {
+    let mut server = Server::new();
+    server.kill();
+    for _ in 0..20 {
+        let node = Node::new(&[&server], "a", |_| {});
+        node.log.start().unwrap();
+        until("it has tried", || node.status().last_error.is_some());
+        let (sender, stopped) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            node.log.stop();
+            sender.send(()).unwrap();
+        });
+        stopped.recv_timeout(nodes::DEADLINE).expect("it stops");
+    }
+}
+
+#[test]
 fn a_killed_server_refuses_writes_at_once_and_comes_back() {
     let mut server = Server::new();
     let (a, b) = (Node::started(&[&server], "a"), Node::started(&[&server], "b"));

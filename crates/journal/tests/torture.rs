@@ -256,8 +256,9 @@ impl Run {
         let all = history.len();
         println!("{all} operations, {confirmed} confirmed writes, {refused} refused writes");
         assert!(confirmed > 100, "only {confirmed} writes were confirmed");
+        let Some(checker) = checker() else { return Ok("not judged".to_owned()) };
         let mut checker =
-            Command::new(checker()).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+            Command::new(checker).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         checker.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
         let output = checker.wait_with_output().unwrap();
         let said = String::from_utf8(output.stdout).unwrap();
@@ -266,8 +267,14 @@ impl Run {
     }
 }
 
-/// Builds the checker.
-fn checker() -> PathBuf {
+/// Builds the checker. Without Go, nothing is judged on a developer's machine; CI has it.
+fn checker() -> Option<PathBuf> {
+    if Command::new("go").arg("version").output().is_err() {
+        let is_ci = std::env::var("CI").is_ok_and(|ci| ci == "true");
+        assert!(!is_ci, "Go is missing, and this is CI");
+        println!("Go is missing: Porcupine does not judge");
+        return None;
+    }
     let program = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("checker");
     let built = Command::new("go")
         .args(["build", "-o"])
@@ -275,8 +282,8 @@ fn checker() -> PathBuf {
         .arg(".")
         .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/checker"))
         .status();
-    assert!(built.expect("Go is installed").success(), "the checker is built");
-    program
+    assert!(built.unwrap().success(), "the checker is built");
+    Some(program)
 }
 
 fn time(short: u64) -> Duration {
@@ -322,9 +329,12 @@ fn the_same_with_one_server() {
 /// A node that answers before its step is confirmed breaks the promise, and the checker sees it.
 #[test]
 fn the_checker_finds_writes_that_are_answered_too_early() {
+    if checker().is_none() {
+        return;
+    }
     let servers = [Server::new()];
     let run = Run::new(&servers, 2, &["answers-early"]);
     run.work(None, Duration::from_secs(5), seed(4));
-    let said = run.judge().unwrap_err();
+    let Err(said) = run.judge() else { panic!("nothing is found") };
     assert!(said.contains("not linearizable"), "{said}");
 }

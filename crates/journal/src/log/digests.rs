@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-/// Of how many sequences digests are kept.
+/// Of how many sequences digests are kept: of those that this node has reached, and of others.
 const KEPT: usize = 16;
 
 #[derive(Debug)]
@@ -31,8 +31,13 @@ impl Digests {
         let digests = self.by_sequence.entry(sequence).or_default();
         digests.insert(node.to_owned(), digest.to_owned());
         let verdict = judge(digests, &self.node);
-        while self.by_sequence.len() > KEPT {
-            self.by_sequence.pop_first();
+        for is_own in [true, false] {
+            let is_of = |digests: &BTreeMap<_, _>| digests.contains_key(&self.node) == is_own;
+            let of = self.by_sequence.iter().filter(|(_, digests)| is_of(digests));
+            let of: Vec<u64> = of.map(|(sequence, _)| *sequence).collect();
+            for sequence in &of[..of.len().saturating_sub(KEPT)] {
+                self.by_sequence.remove(sequence);
+            }
         }
         verdict
     }
@@ -88,9 +93,11 @@ mod tests {
     fn old_sequences_are_forgotten() {
         let mut digests = Digests::new("a");
         for sequence in 0..1000 {
+            digests.add("b", 1_000_000 + sequence, "1");
             digests.add("a", sequence, "1");
         }
-        assert_eq!(digests.by_sequence.len(), KEPT);
+        assert_eq!(digests.by_sequence.len(), 2 * KEPT);
         assert_eq!(digests.own(999), Some("1"));
+        assert_eq!(digests.own(983), None);
     }
 }

@@ -50,9 +50,14 @@ pub(super) enum MessageError {
     Foreign,
     #[error("it is malformed")]
     Malformed,
+    #[error("it is of a node beyond the {MAX_NODES} that a log may have had")]
+    TooManyNodes,
     #[error("step {index}: {error}")]
     Step { index: usize, error: DecodeError },
 }
+
+/// How many nodes a log may have had.
+pub(super) const MAX_NODES: usize = 1024;
 
 /// The bytes before the steps, and those before each step, at most.
 pub(super) const OVERHEAD: usize = 128;

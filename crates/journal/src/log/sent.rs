@@ -92,10 +92,21 @@ impl Sent {
         let message = self.messages.iter_mut().find(|message| message.counter == counter);
         // A message that was sent twice may have been stored the other time.
         let Some(message) = message.filter(|message| message.times == 1) else { return };
-        let steps = std::mem::take(&mut message.steps);
+        let steps = message.tell();
         self.open -= usize::from(!steps.is_empty());
         counted.add(steps.len() as u64);
         steps.into_iter().for_each(|done| refuse(done, refusal));
+    }
+
+    /// Messages up to this counter may have been applied where this node did not see it.
+    pub(super) fn unclear(&mut self, counter: u64, counters: &Counters) {
+        while self.messages.front().is_some_and(|first| first.counter <= counter) {
+            if let Some(message) = self.messages.pop_front() {
+                self.told(&message);
+                counters.not_confirmed.add(message.steps.len() as u64);
+                message.steps.into_iter().for_each(|done| refuse(done, Refusal::NotConfirmed));
+            }
+        }
     }
 
     /// Answers steps that were not confirmed in time.
@@ -104,7 +115,7 @@ impl Sent {
             if message.until > now {
                 break;
             }
-            let steps = std::mem::take(&mut message.steps);
+            let steps = message.tell();
             self.open -= usize::from(!steps.is_empty());
             counters.not_confirmed.add(steps.len() as u64);
             steps.into_iter().for_each(|done| refuse(done, Refusal::NotConfirmed));
@@ -130,6 +141,12 @@ impl Sent {
 }
 
 impl Message {
+    /// The steps, to be answered now. The message is not sent again.
+    fn tell(&mut self) -> Vec<Done> {
+        self.payload = Bytes::new();
+        std::mem::take(&mut self.steps)
+    }
+
     fn is_told(&self) -> bool {
         self.steps.is_empty()
     }
@@ -137,3 +154,77 @@ impl Message {
 
 /// How often deadlines are looked at.
 pub(super) const LOOK: Duration = Duration::from_millis(20);
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::{Receiver, channel};
+
+    use holdfast_memory::Refused;
+
+    use super::*;
+
+    fn push(sent: &mut Sent, counter: u64, until: Instant) -> Receiver<Outcome> {
+        let (sender, receiver) = channel();
+        let done: Done = Box::new(move |outcome| sender.send(outcome).unwrap());
+        sent.push(counter, Bytes::from_static(b"steps"), vec![done], until);
+        receiver
+    }
+
+    fn refused(refusal: Refusal) -> Outcome {
+        Err(Refused { index: 0, refusal })
+    }
+
+    fn later() -> Instant {
+        Instant::now() + Duration::from_secs(60)
+    }
+
+    #[test]
+    fn a_message_before_one_that_was_applied_never_will_be() {
+        let (mut sent, counters) = (Sent::default(), Counters::default());
+        let [one, two, three] = [1, 2, 3].map(|counter| push(&mut sent, counter, later()));
+        assert!(sent.applied(2, vec![Ok(vec![7])], &counters).is_some());
+        assert_eq!(one.try_recv(), Ok(refused(Refusal::Unavailable)));
+        assert_eq!(two.try_recv(), Ok(Ok(vec![7])));
+        assert!(three.try_recv().is_err());
+        assert_eq!((counters.steps.get(), counters.unavailable.get()), (1, 1));
+        assert!(!sent.is_empty());
+    }
+
+    #[test]
+    fn a_message_that_a_snapshot_may_have_is_unclear() {
+        let (mut sent, counters) = (Sent::default(), Counters::default());
+        let [one, two] = [1, 2].map(|counter| push(&mut sent, counter, later()));
+        sent.unclear(1, &counters);
+        assert_eq!(one.try_recv(), Ok(refused(Refusal::NotConfirmed)));
+        assert!(two.try_recv().is_err());
+        assert_eq!(sent.again().len(), 1);
+    }
+
+    #[test]
+    fn what_was_told_is_not_sent_again() {
+        let (mut sent, counters) = (Sent::default(), Counters::default());
+        let [late, open] = [Instant::now(), later()];
+        let (one, two) = (push(&mut sent, 1, late), push(&mut sent, 2, open));
+        sent.expire(Instant::now(), &counters);
+        assert_eq!(one.try_recv(), Ok(refused(Refusal::NotConfirmed)));
+        assert_eq!(sent.again(), [(2, Bytes::from_static(b"steps"))]);
+        assert!(two.try_recv().is_err());
+        assert_eq!(sent.applied(1, vec![Ok(Vec::new())], &counters), None);
+        assert_eq!(counters.not_confirmed.get(), 1);
+    }
+
+    #[test]
+    fn only_a_message_that_was_sent_once_is_known_not_to_be_stored() {
+        let (mut sent, counters) = (Sent::default(), Counters::default());
+        let one = push(&mut sent, 1, later());
+        sent.again();
+        sent.not_taken(1, &counters);
+        assert!(one.try_recv().is_err(), "the first time, it may have been stored");
+        let two = push(&mut sent, 2, later());
+        sent.not_taken(2, &counters);
+        assert_eq!(two.try_recv(), Ok(refused(Refusal::Unavailable)));
+        let three = push(&mut sent, 3, later());
+        sent.not_stored(3, &counters);
+        assert_eq!(three.try_recv(), Ok(refused(Refusal::NotConfirmed)));
+    }
+}

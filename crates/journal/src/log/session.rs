@@ -25,11 +25,14 @@ use super::follower::digest_at;
 use super::layout::copies;
 use super::message::{self, OVERHEAD, Origin};
 use super::sent::{LOOK, Sent};
-use super::settings::Settings;
+use super::settings::{Settings, is_word};
 use super::shared::Shared;
 use super::state::{Applied, Place, State, digest_of};
 use super::status::{Digest, Event, NodeView, Phase};
 use super::store::{DIGEST, POINTER, Pointer, Snapshot, Store, parsed, subject, unique};
+
+/// The length of a digest as text.
+const DIGEST_LEN: usize = 64;
 
 /// The most bytes of steps that travel in one message with others.
 const TOGETHER: usize = 64 << 10;
@@ -146,7 +149,7 @@ impl Node {
     /// Runs sessions until the log is stopped, or can't go on.
     pub(super) fn run(mut self) {
         let mut pause = FIRST_PAUSE;
-        loop {
+        while !self.shared.is_stopping() {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
             let end = match runtime {
                 Ok(runtime) => {
@@ -364,9 +367,20 @@ impl Node {
                 .event(Event::new("log_snapshot_damaged", &[("reason", &error.to_string())]));
             loaded = self.tend(store.load(previous, &mut state)).await;
         }
-        let end = loaded.and_then(|loaded| loaded);
+        let mut end = loaded.and_then(|loaded| loaded);
+        if matches!(end, Err(End::Fatal(_))) {
+            // Other nodes may have stored snapshots meanwhile, and removed these.
+            if let Ok(Ok(Some((now, _)))) = self.tend(store.pointer()).await
+                && now != revision
+            {
+                end = Err(End::Lost("the snapshot was replaced".to_owned()));
+            }
+        }
         if end.is_ok() {
             self.state = state;
+            // What the snapshot has of this node was applied, but not here: the outcomes are lost.
+            let counter = self.state.last_counter(&self.origin);
+            self.sent.unclear(counter, &self.shared.counters);
         } else {
             self.state.members = state.members;
         }
@@ -619,7 +633,8 @@ impl Node {
         }
         let node = key.strip_prefix(DIGEST).unwrap_or_default();
         let Ok(told) = serde_json::from_slice::<Told>(value) else { return Ok(()) };
-        if node == self.settings.node {
+        let is_digest = is_word(node) && told.digest.len() == DIGEST_LEN;
+        if !is_digest || node == self.settings.node || !self.state.knows(node) {
             return Ok(());
         }
         let verdict = self.digests.add(node, told.sequence, &told.digest);

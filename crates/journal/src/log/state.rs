@@ -8,7 +8,7 @@ use aws_lc_rs::digest::{SHA256, digest};
 use holdfast_memory::{Area, Contents, Memory, Outcome};
 
 use super::error::LogError;
-use super::message::{self, Message, MessageError, Origin, VERSION};
+use super::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
 use super::settings::is_word;
 
 const MARK: [u8; 3] = *b"HFS";
@@ -52,9 +52,20 @@ impl State {
         State { members, place: Place::default(), steps: 0, origins: BTreeMap::new() }
     }
 
+    /// Whether a message of this node was applied.
+    pub(super) fn knows(&self, node: &str) -> bool {
+        self.origins.contains_key(node)
+    }
+
     /// The last start of a node that was applied.
     pub(super) fn last_start(&self, node: &str) -> u64 {
         self.origins.get(node).map_or(0, |(start, _)| *start)
+    }
+
+    /// The last counter that was applied of this start of a node.
+    pub(super) fn last_counter(&self, origin: &Origin) -> u64 {
+        let last = self.origins.get(&origin.node);
+        last.filter(|(start, _)| *start == origin.start).map_or(0, |(_, counter)| *counter)
     }
 
     /// Applies the next message.
@@ -78,6 +89,9 @@ impl State {
         let now = (origin.start, origin.counter);
         if self.origins.get(&origin.node).is_some_and(|last| *last >= now) {
             return Ok(Applied::Stale(origin));
+        }
+        if self.origins.len() == MAX_NODES && !self.origins.contains_key(&origin.node) {
+            return Ok(Applied::Ignored(MessageError::TooManyNodes));
         }
         self.origins.insert(origin.node.clone(), now);
         self.steps += steps.len() as u64;

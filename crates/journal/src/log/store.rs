@@ -31,6 +31,9 @@ const FORGOTTEN: Duration = Duration::from_secs(30);
 /// How long the lease of whoever takes a snapshot lasts.
 const LEASE: Duration = Duration::from_secs(30);
 
+/// How long a part of a snapshot may take.
+const SILENCE: Duration = Duration::from_secs(10);
+
 /// No snapshot is longer than this.
 const MAX_SNAPSHOT: u64 = 1 << 30;
 
@@ -179,12 +182,15 @@ impl Store {
             _ => End::lost("reading a snapshot", error),
         };
         let object = self.objects.get(&snapshot.object).await.map_err(missing)?;
+        let mut object = object.take(MAX_SNAPSHOT);
         let mut bytes = Vec::new();
-        object
-            .take(MAX_SNAPSHOT)
-            .read_to_end(&mut bytes)
-            .await
-            .map_err(|error| End::lost("reading a snapshot", error))?;
+        loop {
+            let read = tokio::time::timeout(SILENCE, object.read_buf(&mut bytes)).await;
+            let read = read.map_err(|_| End::Lost("the snapshot does not arrive".to_owned()))?;
+            if read.map_err(|error| End::lost("reading a snapshot", error))? == 0 {
+                break;
+            }
+        }
         let digest = digest_of(&bytes);
         if digest != snapshot.digest {
             let expected = &snapshot.digest;
