@@ -268,8 +268,8 @@ class LogStep(TypedDict, total=False):
 class LogRecord(TypedDict):
     """A message of a log.
 
-    `time_ns`: when the stream stored it, in nanoseconds since 1970. `node`: `None` if no node has sent it.
-    `fresh`: `False` if it was applied before.
+    `time_ns`: when the stream stored it, in nanoseconds since 1970. `node`: `None` if no node has
+    sent it. `fresh`: `False` if it was applied before.
     """
 
     sequence: int

@@ -26,7 +26,9 @@ class Node:
         self.log = Log("site", name, servers, [("plant", self.memory)], **options)
         stack.callback(self.log.stop)
         self.log.start(wire.DEADLINE)
-        server = stack.enter_context(holdfast.Server({1: self.memory}, bind="127.0.0.1:0", access="read-write"))
+        server = stack.enter_context(
+            holdfast.Server({1: self.memory}, bind="127.0.0.1:0", access="read-write")
+        )
         url = f"tcp://127.0.0.1:{server.address[1]}"
         self.address = server.address
         client = holdfast.SyncClient(url, timeout=wire.DEADLINE)

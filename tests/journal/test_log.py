@@ -195,7 +195,7 @@ def test_a_file_that_is_missing_is_named(tmp_path: Path, nats: NatsServer) -> No
         {"tls": (tmp_path / "missing", None, None)},
     ):
         log = Log("site", "a", [nats.url], [("plant", plant())], **options)
-        with pytest.raises(ValueError, match="missing: .*No such file"):
+        with pytest.raises(ValueError, match=r"missing: .*No such file"):
             log.start(wire.DEADLINE)
 
 

@@ -9,8 +9,8 @@ use holdfast_memory::{Done, Outcome, Refusal};
 use super::shared::refuse;
 use super::status::Counters;
 
-/// The most messages of a session that are on their way.
-pub(super) const MOST: usize = 256;
+/// The most messages with steps that are on their way. Further steps wait, and travel together.
+const MOST: usize = 16;
 
 /// The most messages whose time is over, or that have no steps, that are remembered.
 const REMEMBERED: usize = 4096;

@@ -12,7 +12,7 @@ use async_nats::jetstream::consumer::pull;
 use async_nats::jetstream::{self, Context};
 use async_nats::{Client, HeaderMap, StatusCode, header};
 use bytes::Bytes;
-use futures_util::StreamExt;
+use futures_util::{FutureExt, StreamExt};
 use holdfast_memory::Memory;
 use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
@@ -36,6 +36,9 @@ const DIGEST_LEN: usize = 64;
 
 /// The most bytes of steps that travel in one message with others.
 const TOGETHER: usize = 64 << 10;
+
+/// The most further messages that are applied before steps are sent.
+const TOGETHER_RECEIVED: usize = 255;
 
 /// Pauses between sessions. Each failure doubles the pause.
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
@@ -278,7 +281,16 @@ impl Node {
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
-                message = messages.next() => self.received(&mut session, message).await?,
+                message = messages.next() => {
+                    self.received(&mut session, message)?;
+                    // What has arrived together is answered before steps are sent: those who were
+                    // answered write again, and their steps travel together.
+                    for _ in 0..TOGETHER_RECEIVED {
+                        let Some(message) = messages.next().now_or_never() else { break };
+                        self.received(&mut session, message)?;
+                    }
+                    self.send_waiting(&mut session).await?;
+                }
                 ack = acks.next() => self.acknowledged(ack)?,
                 () = self.shared.arrived.notified() => self.send_waiting(&mut session).await?,
                 entry = watch.next() => match entry {
@@ -490,7 +502,7 @@ impl Node {
         }
     }
 
-    async fn received(
+    fn received(
         &mut self,
         session: &mut Session,
         message: Option<Result<jetstream::Message, pull::MessagesError>>,
@@ -520,8 +532,7 @@ impl Node {
             let next = applied.sequence + 1;
             return Err(End::Lost(format!("sequence {} came in place of {next}", place.sequence)));
         }
-        self.apply(session, place, &message.payload)?;
-        self.send_waiting(session).await
+        self.apply(session, place, &message.payload)
     }
 
     fn apply(&mut self, session: &mut Session, place: Place, payload: &[u8]) -> Result<(), End> {
