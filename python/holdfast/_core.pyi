@@ -147,7 +147,8 @@ class Memory:
     def read(self, area: Area, address: int, count: int) -> list[int]:
         """Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
 
-        Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1.
+        Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1,
+        `OSError` while the log of the memory does not let it be read.
         """
 
     def mirror(self, ranges: Sequence[tuple[Area, int, int]]) -> None:

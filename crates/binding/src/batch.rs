@@ -142,11 +142,10 @@ const fn reason(refusal: Refusal) -> &'static str {
         Refusal::WrongLength => "wrong_length",
         Refusal::Mirrored => "mirrored",
         Refusal::NotRegisters => "not_registers",
-        Refusal::Unavailable => "log_unavailable",
+        // What is wrong with the log is in its status.
+        Refusal::Unavailable | Refusal::Behind | Refusal::Differs => "log_unavailable",
         Refusal::NotStored => "not_stored",
         Refusal::NotConfirmed => "not_confirmed",
-        Refusal::Behind => "log_behind",
-        Refusal::Differs => "contents_differ",
         Refusal::NotOneStep => "not_one_step",
     }
 }

@@ -122,7 +122,8 @@ impl Memory {
 
     /// Reads `count` bits (0 or 1) or registers (0 to 65535) from `address`, as one snapshot.
     ///
-    /// Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1.
+    /// Raises `OutOfRange` outside the area, `ValueError` for an unknown area or a count below 1,
+    /// `OSError` while the log of the memory does not let it be read.
     fn read<'py>(
         &self,
         py: Python<'py>,
@@ -288,9 +289,11 @@ impl Range {
             Refusal::OutOfRange => {
                 out_of_range(memory, self.area, i128::from(self.address), self.count as i128)
             }
-            kept @ (Refusal::Unavailable | Refusal::NotStored | Refusal::NotConfirmed) => {
-                PyOSError::new_err(kept.to_string())
-            }
+            kept @ (Refusal::Unavailable
+            | Refusal::NotStored
+            | Refusal::NotConfirmed
+            | Refusal::Behind
+            | Refusal::Differs) => PyOSError::new_err(kept.to_string()),
             other => PyValueError::new_err(other.to_string()),
         }
     }
