@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use futures_util::StreamExt;
 use holdfast_journal::log::LogError;
 use holdfast_memory::{
     Access, Action, Memory, Operation, Read, Refusal, Step, StepWrite, Write, write_across,
@@ -472,6 +473,71 @@ fn a_server_that_has_lost_messages_is_not_followed() {
     });
     until("the node stops", || node.failure().is_some());
     assert_eq!(node.failure().unwrap().kind(), "replaced");
+    assert_eq!(node.read(0), Err(Refusal::Differs));
+}
+
+/// Puts other bytes in place of the snapshots whose names are chosen.
+fn damage(server: &Server, chosen: impl Fn(&[String]) -> Vec<String>) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let objects = jetstream.get_object_store("holdfast-log-site").await.unwrap();
+        let mut names = Vec::new();
+        let mut list = objects.list().await.unwrap();
+        while let Some(object) = list.next().await {
+            names.push(object.unwrap().name);
+        }
+        names.sort_by_key(|name| name.split('-').next().unwrap().parse::<u64>().unwrap());
+        for name in chosen(&names) {
+            objects.put(name.as_str(), &mut &b"damaged"[..]).await.unwrap();
+        }
+    });
+}
+
+#[test]
+fn a_damaged_snapshot_is_never_loaded() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", |settings| settings.snapshot_steps = 5);
+    node.start();
+    let mut value = 0;
+    until("two snapshots are taken", || {
+        value += 1;
+        node.write(0, value).unwrap();
+        first_sequence(&server) > 1
+    });
+    drop(node);
+    damage(&server, |names| names.last().cloned().into_iter().collect());
+    let node = Node::started(&[&server], "b");
+    assert_eq!(node.read(0), Ok(value), "the one before it is loaded");
+    let events = node.log.take_events(Duration::ZERO);
+    assert!(events.iter().any(|event| event.name == "log_snapshot_damaged"), "{events:?}");
+    drop(node);
+    damage(&server, <[String]>::to_vec);
+    let node = Node::new(&[&server], "c", |_| {});
+    let error = node.try_start().unwrap_err();
+    assert_eq!(error.kind(), "snapshot");
+    assert!(error.to_string().contains("its digest is"), "{error}");
+    assert_eq!(node.read(0), Err(Refusal::Differs), "nor is it empty");
+}
+
+/// A node does not know what such a message does to the contents.
+#[test]
+fn a_message_of_a_newer_version_stops_a_node() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let publish = jetstream.publish("holdfast.log.site.steps", "HFL\u{9}new".into());
+        publish.await.unwrap().await.unwrap();
+    });
+    until("the node stops", || node.failure().is_some());
+    let error = node.failure().unwrap();
+    assert_eq!(error.kind(), "version");
+    let expected = "a message of the log has version 9, supported is 1: update this node";
+    assert_eq!(error.to_string(), expected);
     assert_eq!(node.read(0), Err(Refusal::Differs));
 }
 
