@@ -77,7 +77,7 @@ def test_without_a_server_writes_are_refused_and_reads_are_not(
     wire.until(lambda: refusal(lambda: a.client.write_register(0, 2)) == 6, "writes are refused")
     assert a.read(0) == 1
     assert a.log.status()["unavailable"] > 0
-    assert not a.log.status()["connected"]
+    wire.until(lambda: not a.log.status()["connected"], "the status says so")
     nats.start()
     wire.until(lambda: refusal(lambda: a.client.write_register(0, 3)) is None, "writes are taken")
     assert a.read(0) == 3

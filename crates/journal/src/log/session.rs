@@ -70,7 +70,9 @@ pub(super) struct Node {
     digests: Digests,
     pointer: Option<(u64, Pointer)>,
     pointer_since: Instant,
+    /// Since when the servers have known less than this node, in this session and in the last one.
     short_since: Option<Instant>,
+    was_short_since: Option<Instant>,
     worked: bool,
 }
 
@@ -145,6 +147,7 @@ impl Node {
             pointer: None,
             pointer_since: Instant::now(),
             short_since: None,
+            was_short_since: None,
             worked: false,
         }
     }
@@ -225,6 +228,7 @@ impl Node {
     }
 
     async fn session(&mut self) -> Result<Infallible, End> {
+        self.was_short_since = self.short_since.take();
         let settings = Arc::clone(&self.settings);
         let name = format!("holdfast log {} {}", settings.name, settings.node);
         let mut connected = self.tend(connect(&settings.servers, name)).await??;
@@ -327,7 +331,6 @@ impl Node {
             self.load(store, last).await?;
         }
         self.id = id;
-        self.short_since = None;
         if self.origin.start == 0 {
             let clock = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
             let now = u64::try_from(clock.as_micros()).unwrap_or(u64::MAX);
@@ -340,7 +343,8 @@ impl Node {
 
     /// A server knows less than this node. Whether that stays so is seen later.
     fn short(&mut self, text: String) -> End {
-        let since = *self.short_since.get_or_insert_with(Instant::now);
+        let since = self.was_short_since.unwrap_or_else(Instant::now);
+        self.short_since = Some(since);
         if since.elapsed() < CUT_OFF { End::Lost(text) } else { LogError::Replaced(text).into() }
     }
 

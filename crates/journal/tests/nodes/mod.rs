@@ -109,6 +109,15 @@ impl Server {
         }
     }
 
+    /// Copies what the stopped server has stored, or puts the copy back.
+    pub fn copy(&self, from: &str, to: &str) {
+        assert!(self.process.is_none(), "the server is stopped");
+        let [from, to] = [from, to].map(|name| self.folder.0.join(name));
+        let _ = std::fs::remove_dir_all(&to);
+        let done = Command::new("cp").arg("-r").args([from, to]).status();
+        assert!(done.unwrap().success());
+    }
+
     pub fn signal(&self, signal: &str) {
         let id = self.process.as_ref().unwrap().id();
         signal_to(id, signal);
