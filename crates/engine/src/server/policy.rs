@@ -159,10 +159,9 @@ pub struct PeerRights {
 struct UnitRights {
     /// `None` if all requests go elsewhere.
     memory: Option<Arc<Memory>>,
-    /// `None` if the memory answers everything, or only its journal carries out writes.
-    elsewhere: Option<Elsewhere>,
-    /// [`Elsewhere::Journal`], if the memory has one.
-    journal: Option<Elsewhere>,
+    /// Where requests may go; the first place that takes one gets it. `None` if the memory answers
+    /// everything.
+    places: Option<Box<[Elsewhere]>>,
     functions: Codes,
     access: AccessMode,
     /// `None` if there is no limit.
@@ -210,7 +209,9 @@ impl PeerRights {
                 let has_journal = |memory: &&Arc<Memory>| memory.has_journal();
                 let journal = memory.as_ref().filter(has_journal).cloned().map(Elsewhere::Journal);
                 let functions = codes;
-                *place = Some(UnitRights { memory, elsewhere, journal, functions, access, ranges });
+                let places: Box<[_]> = elsewhere.into_iter().chain(journal).collect();
+                let places = (!places.is_empty()).then_some(places);
+                *place = Some(UnitRights { memory, places, functions, access, ranges });
             }
             if rule.units.is_empty() && rule.elsewhere.is_empty() {
                 functions = functions.with(Codes::of(&rule.functions, rule.access, false));
@@ -232,14 +233,8 @@ impl PeerRights {
 
     /// Where requests to a unit id go, or some of them.
     #[inline]
-    pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&Elsewhere> {
-        self.unit(unit_id)?.elsewhere.as_ref()
-    }
-
-    /// Where writes to a unit id go that are not passed on to a device.
-    #[inline]
-    pub(crate) fn journal(&self, unit_id: u8) -> Option<&Elsewhere> {
-        self.unit(unit_id)?.journal.as_ref()
+    pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&[Elsewhere]> {
+        self.unit(unit_id)?.places.as_deref()
     }
 
     /// The ranges that requests to a unit id must be inside, if they are limited.

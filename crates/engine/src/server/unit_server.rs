@@ -106,12 +106,12 @@ impl UnitServer {
         unit_id: u8,
         request: &[u8],
     ) -> Option<&'r Elsewhere> {
-        let takes = |place: &&Elsewhere| match place {
+        let places = rights.elsewhere(unit_id)?;
+        places.iter().find(|place| match place {
             Elsewhere::Device(_) => !self.refuses_silence(request),
             Elsewhere::Mirror(passage) => !self.is_silent(unit_id) && passage.takes(request),
             Elsewhere::Journal(_) => !self.is_silent(unit_id) && is_write(request),
-        };
-        rights.elsewhere(unit_id).filter(takes).or_else(|| rights.journal(unit_id).filter(takes))
+        })
     }
 
     /// Sends a request on its way to a device or a journal. Returns also the name of the device.
