@@ -22,7 +22,8 @@ class Node:
 
     def __init__(self, stack: ExitStack, name: str, servers: list[str], **options: Any) -> None:
         self.memory = holdfast.Memory(coils=64, holding_registers=100)
-        options = {"write_timeout": wire.DEADLINE, **options}
+        # Shorter than the timeout of the client, which is told what became of its write.
+        options = {"write_timeout": wire.DEADLINE / 2, **options}
         self.log = Log("site", name, servers, [("plant", self.memory)], **options)
         stack.callback(self.log.stop)
         self.log.start(wire.DEADLINE)

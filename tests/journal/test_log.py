@@ -71,8 +71,8 @@ def test_pipelined_writes_keep_their_order(node: Start) -> None:
 def test_without_a_server_writes_are_refused_and_reads_are_not(
     node: Start, nats: NatsServer
 ) -> None:
-    a = node("a")
-    a.client.write_register(0, 1)
+    a = node("a", write_timeout=1.0)
+    wire.until(lambda: refusal(lambda: a.client.write_register(0, 1)) is None, "it is written")
     nats.kill()
     wire.until(lambda: refusal(lambda: a.client.write_register(0, 2)) == 6, "writes are refused")
     assert a.read(0) == 1
@@ -146,9 +146,13 @@ def test_a_signal_ends_the_start() -> None:
     log = Log("site", "a", [f"nats://127.0.0.1:{free_port()}"], [("plant", plant())])
     main = threading.main_thread().ident
     assert main is not None
-    threading.Timer(0.2, signal.pthread_kill, (main, signal.SIGINT)).start()
-    with pytest.raises(KeyboardInterrupt):
-        log.start(wire.DEADLINE)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        threading.Timer(0.2, signal.pthread_kill, (main, signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            log.start(wire.DEADLINE)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert log.status()["phase"] == "stopped"
 
 
