@@ -49,7 +49,7 @@ def test_bash_completes_commands_areas_and_options(tmp_path: Path) -> None:
         )
         return result.stdout.split()
 
-    assert completed("holdfast", "re") == ["read", "reload"]
+    assert completed("holdfast", "re") == ["read", "reload", "replicas", "replay"]
     assert set(completed("holdfast", '""')) == set(COMMANDS)
     assert completed("holdfast", "read", "tcp://plc", "hol") == ["holding_registers"]
     assert completed("holdfast", "map", "--ex") == ["--exact"]

@@ -51,6 +51,14 @@ GROUPS = {
             "holdfast.cli.sessions:sessions",
             "List the connections of a running appliance.",
         ),
+        "replicas": (
+            "holdfast.cli.replicas:replicas",
+            "Show the logs of a running appliance, and their nodes.",
+        ),
+        "replay": (
+            "holdfast.cli.replay:replay",
+            "Rebuild the memories of a log as they were.",
+        ),
         "memory": (
             "holdfast.cli.memory:memory",
             "Verify, export and import files that keep memories.",

@@ -19,6 +19,7 @@ from holdfast.appliance import Appliance, assembly
 from holdfast.appliance.control import Control
 from holdfast.appliance.kept import UnusableFile
 from holdfast.appliance.service_manager import ServiceManager
+from holdfast.appliance.shared_logs import LogNotJoined
 from holdfast.appliance.supervision import give_way
 from holdfast.cli.configuration import WRONG, load_or_exit, load_whole
 from holdfast.cli.open_files import allow_open_files
@@ -107,6 +108,9 @@ def serve(
     except UnusableFile as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(WRONG)
+    except LogNotJoined as error:
+        click.echo(f"holdfast: {error}", err=True)
+        sys.exit(WRONG if error.is_settings else 1)
     except OSError as error:
         click.echo(f"holdfast: {explained(error)}", err=True)
         sys.exit(1)
@@ -138,6 +142,7 @@ def _control(appliance: Appliance, reloading: Reloading, file: Path) -> Callable
     handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
         "reload": reloading.ask,
         "sessions": lambda: {"sessions": appliance.sessions()},
+        "replicas": lambda: {"logs": appliance.replicas()},
         "end": lambda listener, id: {"ended": appliance.end_session(listener, id, SOURCE)},
     }
     try:

@@ -1,0 +1,187 @@
+"""`holdfast replay`: the memories of a log as they were at any moment that the log still covers."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from holdfast import _core, logs
+from holdfast.appliance import assembly
+from holdfast.appliance.shared_logs import credentials, servers
+from holdfast.cli.configuration import WRONG, load_or_exit
+from holdfast.cli.signals import Signals
+from holdfast.config.words import guess, listing
+from holdfast.server import Server
+
+if TYPE_CHECKING:
+    from holdfast.config import Config
+    from holdfast.types import LogRecord
+
+NOTICE = 0.1
+"""Seconds within which a signal is noticed."""
+
+
+@click.command(epilog="Example: holdfast replay plant.yaml --to 2026-11-20T14:05:00Z --values")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--log", "name", metavar="NAME", help="Required if there are several logs.")
+@click.option(
+    "--to",
+    metavar="SEQUENCE|TIME",
+    help="The last step: its sequence in the stream, or a time as in 2026-11-20T14:05:00Z. "
+    "Default: the last one there is.",
+)
+@click.option("--follow", is_flag=True, help="Print each step, also those to come.")
+@click.option("--values", is_flag=True, help="Print all values that are not 0.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    metavar="N",
+    help="Serve the memories on this port of 127.0.0.1, read-only, as units 1, 2, ….",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines for programs.")
+def replay(
+    file: Path,
+    name: str | None,
+    to: str | None,
+    follow: bool,
+    values: bool,
+    port: int | None,
+    as_json: bool,
+) -> None:
+    """Rebuild the memories of a log in FILE as they were, without changing the log.
+
+    Prints the digest of the contents, which all nodes have at the same sequence. Exit codes: 0
+    done, 1 the log can't be read, 2 wrong usage.
+    """
+    if follow and to is not None:
+        raise click.UsageError("--follow and --to can't be used together.")
+    config = load_or_exit(file)
+    log = _chosen(config, name)
+    settings = config.logs[log]
+    memories = [
+        (each, assembly.memory(config.memories[each]))
+        for each, memory in config.memories.items()
+        if memory.replicate is not None and memory.replicate.log == log
+    ]
+    if not memories:
+        raise click.UsageError(f"no memory is replicated through the log {log}.")
+    signals = Signals()
+    try:
+        sequence, time_ns = _end(to)
+        replaying = _core.LogFollower(
+            log,
+            servers(settings),
+            memories,
+            sequence=sequence,
+            time_ns=time_ns,
+            follow=follow,
+            **credentials(settings),
+        )
+        while not signals.received and not replaying.ended:
+            record = replaying.next(NOTICE)
+            if record is not None and follow:
+                click.echo(_line(record, as_json=as_json))
+        if not follow:
+            _tell(replaying, memories, values=values, as_json=as_json)
+    except (_core.LogError, ValueError) as error:
+        _fail(f"logs.{log}: {error}")
+    if port is not None and not signals.received:
+        _serve(memories, port, signals)
+
+
+def _chosen(config: Config, name: str | None) -> str:
+    if name is None and len(config.logs) == 1:
+        return next(iter(config.logs))
+    known = listing(config.logs) or "none, there are no logs"
+    if name is None:
+        raise click.UsageError(f"--log is missing, allowed: {known}.")
+    if name not in config.logs:
+        near = guess(name, config.logs) or "."
+        raise click.UsageError(f"there is no log {name!r}, allowed: {known}{near}")
+    return name
+
+
+def _end(to: str | None) -> tuple[int | None, int | None]:
+    """The sequence or the time, in nanoseconds since 1970."""
+    if to is None:
+        return None, None
+    if to.isascii() and to.isdigit():
+        return int(to), None
+    try:
+        at = datetime.fromisoformat(to)
+    except ValueError:
+        message = f"found {to!r}, allowed: a sequence, or a time as in 2026-11-20T14:05:00Z"
+        raise click.BadParameter(message, param_hint="'--to'") from None
+    return None, int(at.timestamp() * 1e9)
+
+
+def _tell(
+    replaying: _core.LogFollower,
+    memories: list[tuple[str, _core.Memory]],
+    *,
+    values: bool,
+    as_json: bool,
+) -> None:
+    found = {"sequence": replaying.sequence, "digest": replaying.digest()}
+    kept = [
+        (name, area, address, value)
+        for name, memory in (memories if values else ())
+        for area, addresses in memory.areas.items()
+        for address, value in zip(
+            addresses, memory.read(area, addresses.start, len(addresses)), strict=True
+        )
+        if value
+    ]
+    if as_json:
+        click.echo(json.dumps(found | ({"values": kept} if values else {})))
+        return
+    click.echo(f"sequence {found['sequence']}, digest {found['digest']}")
+    for name, area, address, value in kept:
+        click.echo(f"{name} {area} {address}: {value}")
+
+
+def _line(record: LogRecord, *, as_json: bool) -> str:
+    if as_json:
+        return json.dumps(record)
+    when = logs.timestamp(record["time_ns"] / 1e9)
+    head = f"{record['sequence']} {when} {record['node'] or '-'}"
+    steps = [_step(step) for step in record["steps"]] if record["fresh"] else ["a repeated message"]
+    return "\n".join(f"{head} {step}" for step in steps)
+
+
+def _step(step: Any) -> str:
+    writes = [
+        f"{memory} {area} {address}: {listing(values)}"
+        for memory, area, address, values in step.get("writes", ())
+    ]
+    if "place" in step:
+        memory, area, address = step["place"]
+        and_mask, or_mask = step["masks"]
+        writes.append(f"{memory} {area} {address}: AND {and_mask:#06x} OR {or_mask:#06x}")
+    return "; ".join(writes)
+
+
+def _serve(memories: list[tuple[str, _core.Memory]], port: int, signals: Signals) -> None:
+    units = {unit: memory for unit, (_, memory) in enumerate(memories, start=1)}
+    try:
+        server = Server(units, bind=f"127.0.0.1:{port}", access="read-only")
+    except OSError as error:
+        _fail(f"port {port}: {error.strerror or error}")
+    with server:
+        host, bound = server.address
+        for unit, (name, _) in enumerate(memories, start=1):
+            click.echo(f"{name}: tcp://{host}:{bound}, unit {unit}, read-only")
+        click.echo("Ctrl-C stops it.")
+        while not signals.received:
+            time.sleep(NOTICE)
+
+
+def _fail(message: str) -> NoReturn:
+    click.echo(f"holdfast: {message}", err=True)
+    sys.exit(WRONG if "allowed" in message else 1)

@@ -1,0 +1,71 @@
+"""`holdfast replicas`: the logs of a running appliance, and the nodes that share them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from holdfast import logs
+from holdfast.appliance.control import NotRunning, ask
+from holdfast.cli.showing import table
+
+_HEAD = ("node", "last write at", "last write", "digest at", "digest")
+_DIGEST = 12
+"""Characters of a digest that are shown."""
+
+
+@click.command(epilog="Example: holdfast replicas plant.yaml")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object for programs.")
+def replicas(file: Path, as_json: bool) -> None:
+    """Show the logs of the appliance that runs FILE on this machine, and the nodes in them.
+
+    Exit codes: 0 all logs are well, 1 no appliance of this user runs FILE, 3 a log is not
+    connected, has failed, or nodes have different contents.
+    """
+    try:
+        found = ask(file, "replicas")["logs"]
+    except NotRunning as error:
+        click.echo(f"holdfast: {error}", err=True)
+        sys.exit(1)
+    if as_json:
+        click.echo(json.dumps({"logs": found}, indent=2))
+    elif not found:
+        click.echo("no memory is replicated")
+    else:
+        for name, status in found.items():
+            click.echo("\n".join(_shown(name, status)))
+    if not all(_is_well(status) for status in found.values()):
+        sys.exit(3)
+
+
+def _is_well(status: dict[str, Any]) -> bool:
+    differs = status["digest"] is not None and status["digest"][2] is False
+    return status["phase"] == "running" and status["connected"] and not differs
+
+
+def _shown(name: str, status: dict[str, Any]) -> list[str]:
+    where = f"connected to {status['server']}" if status["connected"] else "not connected"
+    contact = status["contact_age"]
+    lines = [
+        f"log {name}: {status['phase']}, {where}",
+        f"  sequence {status['sequence']}, {status['lag']} behind the last known, "
+        + ("no contact yet" if contact is None else f"contact {contact:.1f} s ago"),
+        f"  writes of this node: {status['steps']} done, {status['unavailable']} not sent, "
+        f"{status['not_confirmed']} not confirmed",
+    ]
+    if status["failure"] is not None:
+        lines.append(f"  failed: {status['failure'][1]}")
+    elif status["last_error"] is not None and not status["connected"]:
+        lines.append(f"  last error: {status['last_error']}")
+    return [*lines, *(f"  {line}" for line in table(_HEAD, map(_row, status["nodes"])))]
+
+
+def _row(node: dict[str, Any]) -> tuple[str, ...]:
+    at, digest = node["digest"] or ("", "")
+    when = logs.timestamp(node["time_ns"] / 1e9)
+    return node["name"], str(node["sequence"]), when, str(at), digest[:_DIGEST]
