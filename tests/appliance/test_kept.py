@@ -133,7 +133,7 @@ def test_keep_takes_effect_at_a_start(tmp_path: Path) -> None:
             with pytest.raises(ReloadRefused, match=r"memories\.plant: keep changed"):
                 appliance.reload(config(tmp_path, plant=other))
         both = {"plant": keeping(), "new": keeping()}
-        with pytest.raises(ReloadRefused, match=r"memories\.new: added with keep"):
+        with pytest.raises(ReloadRefused, match=r"memories\.new: added with keep or replicate"):
             appliance.reload(config(tmp_path, **both))
         assert appliance.reload(config(tmp_path)) == []
 

@@ -555,6 +555,7 @@ def test_the_dump_of_the_example_shows_every_default(loaded: Callable[..., Confi
         "  plant:\n"
         "    coils: {start: 0, size: 8}\n"
         "    input_registers: {start: 1000, size: 200}\n"
+        "logs: {}\n"
         "identity:\n"
         "  vendor_name: Holdfast\n"
         "  product_code: HF\n"
@@ -730,6 +731,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RawRuleConfig": ["sources", "areas"],
         "SecureRawRuleConfig": ["sources", "areas"],
         "ReadConfig": ["area", "address", "count"],
+        "ReplicateConfig": ["log"],
         "RestConfig": ["bind", "sources", "tokens"],
         "RetryConfig": None,
         "RouteConfig": ["route"],
@@ -737,6 +739,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RuleConfig": ["sources", "units", "access"],
         "Seal": ["area", "address"],
         "SerialRuleConfig": ["units", "access"],
+        "SharedLogConfig": ["servers", "node"],
         "ServerTlsConfig": ["cert_file", "key_file", "ca_file"],
         "Span": ["size"],
         "StatusConfig": ["area", "slot", "memory"],

@@ -50,7 +50,7 @@ SOURCE = "a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64"
 BIND = "address:port with an IP address, as in 127.0.0.1:502 or [::1]:502"
 CODES = "1, 2, 3, 4, 5, 6, 8, 11, 15, 16, 17, 22, 23 or 43"
 TOP = (
-    "memories, identity, listeners, profiles, devices, links, rest, mqtt, nats, gateway, "
+    "memories, logs, identity, listeners, profiles, devices, links, rest, mqtt, nats, gateway, "
     "outputs, adapters, metrics, audit, log, reload, workers"
 )
 TYPES = (

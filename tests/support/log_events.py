@@ -6,6 +6,7 @@ import ast
 import re
 from typing import TYPE_CHECKING
 
+from holdfast.appliance.shared_logs import EVENTS
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ SERVER = ROOT / "crates" / "engine" / "src" / "server"
 BY_VARIABLE = {
     "appliance/expiring.py": {"certificate_expires", "certificate_expired"},
     "appliance/running.py": set(),  # The events of listeners.
+    "appliance/shared_logs.py": set(EVENTS),
     "logs.py": set(),
     "scanner/kept.py": {"restored", "not_restored"},
     "scanner/service.py": {

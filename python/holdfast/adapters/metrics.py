@@ -173,6 +173,7 @@ class Figures(Collector):
             stats["log_dropped"],
         )
         yield from _of_memory_files(stats["memory_files"])
+        yield from _of_logs(stats["logs"])
         if stats["audit"] is not None:
             yield CounterMetricFamily(
                 "holdfast_audit_lines", "Lines written to the audit log.", stats["audit"]["lines"]
@@ -245,6 +246,32 @@ def _of_memory_files(files: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]
         refused.add_metric([name], told["refused"])
         size.add_metric([name], told["bytes"])
     yield from (failing, stored, commits, refused, size)
+
+
+def _of_logs(logs: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
+    if not logs:
+        return
+    up = _gauge("log_up", "1 if the node is connected to the log and follows it.", "log")
+    lag = _gauge("log_lag", "Messages of the log that are not applied yet.", "log")
+    contact = _gauge("log_contact_age_seconds", "Time since the last contact to the log.", "log")
+    sequence = _gauge("log_sequence", "The sequence that was applied last.", "log")
+    differs = _gauge("log_differs", "1 if other nodes have other contents.", "log")
+    steps = _counter("log_steps", "Writes of this node, by outcome.", "log", "outcome")
+    for name, told in logs.items():
+        up.add_metric([name], told["phase"] == "running" and told["connected"])
+        lag.add_metric([name], told["lag"])
+        if told["contact_age"] is not None:
+            contact.add_metric([name], told["contact_age"])
+        sequence.add_metric([name], told["sequence"])
+        differs.add_metric([name], told["digest"] is not None and told["digest"][2] is False)
+        for outcome, key in (
+            ("done", "steps"),
+            ("unavailable", "unavailable"),
+            ("not_confirmed", "not_confirmed"),
+            ("refused", "refused"),
+        ):
+            steps.add_metric([name, outcome], told[key])
+    yield from (up, lag, contact, sequence, differs, steps)
 
 
 def _of_audit(audit: Mapping[str, Any]) -> Iterator[Metric]:

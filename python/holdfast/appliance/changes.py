@@ -56,11 +56,17 @@ def restarts(before: Config, now: Config) -> list[str]:
             reasons.append(f"memories.{name}: removed; its values would be lost")
         elif _layout(memory) != _layout(now.memories[name]):
             reasons.append(f"memories.{name}: areas or seal changed")
-        elif memory.keep != now.memories[name].keep:
-            reasons.append(f"memories.{name}: keep changed")
+        else:
+            reasons += (
+                f"memories.{name}: {key} changed"
+                for key in ("keep", "replicate")
+                if getattr(memory, key) != getattr(now.memories[name], key)
+            )
     for name, memory in now.memories.items():
-        if name not in before.memories and memory.keep is not None:
-            reasons.append(f"memories.{name}: added with keep")
+        if name not in before.memories and (memory.keep or memory.replicate):
+            reasons.append(f"memories.{name}: added with keep or replicate")
+    if before.logs != now.logs:
+        reasons.append("logs: changed")
     known = {link.url: link for link in before.links.values()}
     for name, link in now.links.items():
         if link.url in known and _waiting(known[link.url]) != _waiting(link):

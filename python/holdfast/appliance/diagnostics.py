@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from holdfast._core import Engine, Link, Memory, Poller
     from holdfast.appliance.kept import KeptMemories
     from holdfast.appliance.liveness import Liveness
+    from holdfast.appliance.shared_logs import SharedLogs
     from holdfast.appliance.supervision import Supervisor
     from holdfast.appliance.tag_values import TagValues
     from holdfast.audit import Audit
@@ -37,6 +38,9 @@ class Diagnostics:
         self.adapters: dict[str, tuple[Supervisor, MemoryAccess | None]] = {}
         self.kept: KeptMemories | None = None
         """The files that keep memories."""
+
+        self.logs: SharedLogs | None = None
+        """The logs that memories are replicated through."""
 
         self.audit: Audit | None = None
         self.poller: Poller | None = None
@@ -75,11 +79,16 @@ class Diagnostics:
             "events_lost": self._engine.lost_events,
             "log_dropped": logs.dropped(),
             "memory_files": {} if self.kept is None else self.kept.status(),
+            "logs": self.shared_logs(),
             "audit": None if self.audit is None else self.audit.counts(),
             "threads": self._liveness.threads(),
             "certificates": self.expiries.certificates,
             "revocation_lists": self.expiries.revocation_lists,
         }
+
+    def shared_logs(self) -> dict[str, dict[str, Any]]:
+        """Returns the state of each log that memories are replicated through."""
+        return {} if self.logs is None else self.logs.status()
 
     def devices(self) -> dict[str, dict[str, Any]]:
         """Returns the health and the counters of each device."""

@@ -80,6 +80,7 @@ def made(config: Config, name: str) -> _core.Memory:
     settings = config.memories[name]
     memory = assembly.memory(settings)
     if settings.keep is None:
+        # Of a log, the first node has them; the others get those of the log.
         assembly.fill(memory, settings)
     return memory
 

@@ -19,6 +19,7 @@ from holdfast.appliance.expiring import Expiring
 from holdfast.appliance.kept import KeptMemories
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.output_site import OutputSite
+from holdfast.appliance.shared_logs import SharedLogs
 from holdfast.appliance.supervision import STOP_TIMEOUT, Supervisor
 from holdfast.appliance.tag_values import TagValues
 from holdfast.appliance.tag_writes import TagWrites
@@ -113,9 +114,9 @@ class Appliance:
         if self._running is not None:
             raise RuntimeError("the appliance is already running")
         if self._was_started:
-            # The contents of memories that are kept come from their files again.
+            # The contents of memories that are kept come from their files and logs again.
             for name, settings in self.config.memories.items():
-                if settings.keep is not None:
+                if settings.keep is not None or settings.replicate is not None:
                     self.memories[name] = kept.made(self.config, name)
         self._was_started = True
         self._running = _Running(self.config, self.memories, retries_ports=self._retries_ports)
@@ -169,6 +170,10 @@ class Appliance:
     def sessions(self) -> list[dict[str, Any]]:
         """The open connections of all listeners. Thread-safe."""
         return self._parts().sessions()
+
+    def replicas(self) -> dict[str, dict[str, Any]]:
+        """The state of each log that memories are replicated through. Thread-safe."""
+        return self._parts().diagnostics.shared_logs()
 
     def end_session(self, listener: str, number: int, by: Mapping[str, str]) -> bool:
         """Ends a connection. Returns whether there was one. Thread-safe.
@@ -233,6 +238,8 @@ class _Running:
         with ExitStack() as undo:
             self._kept = KeptMemories(config, memories)
             undo.callback(self._kept.stop)
+            self._logs = SharedLogs(config, memories)
+            undo.callback(self._logs.stop)
             assembly.mirror(config, memories)
             disabled = self._tell_disabled()
             self._audit = auditing.opened(config)
@@ -263,6 +270,7 @@ class _Running:
             self.liveness = Liveness(self._heartbeats)
             self.diagnostics = Diagnostics(memories, self._engine, self.liveness)
             self.diagnostics.kept = self._kept
+            self.diagnostics.logs = self._logs
             self.diagnostics.audit = self._audit
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
@@ -301,6 +309,7 @@ class _Running:
             self._writes.join(STOP_TIMEOUT)
         for port in self._ports.values():
             port.close()
+        self._logs.stop()
         self._kept.stop()
         if self._recorder is not None:
             self._recorder.finish()
@@ -336,6 +345,7 @@ class _Running:
         logs.tell_held_back()
         self.liveness.check()
         self._kept.check()
+        self._logs.check()
         self._expiring.check(self.diagnostics.expiries)
         interval = _review_interval(self._config)
         if interval is not None and now - self._reviewed >= interval:

@@ -17,6 +17,7 @@ from holdfast.config.device_checks import DeviceChecks
 from holdfast.config.grant_checks import GrantChecks, doubt_grants
 from holdfast.config.lenient import mapping
 from holdfast.config.listener_checks import ListenerChecks
+from holdfast.config.log_checks import check_logs
 from holdfast.config.memory_checks import MemoryChecks
 from holdfast.config.model import Config
 from holdfast.config.output_checks import OutputChecks
@@ -92,6 +93,7 @@ def _check_others(data: dict[Any, Any], folder: Path, report: Report) -> None:
     routes.check_names()
     ListenerChecks(folder, report, grants, routes, memories).check(data.get("listeners"))
     ServiceChecks(folder, report, grants).check(data)
+    check_logs(data, folder, report)
     AddressChecks(folder, report).check(data)
     DeviceChecks(report, grants, memories).check(data.get("devices"))
     OutputChecks(folder, report).check(data)

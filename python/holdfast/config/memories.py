@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, PrivateAttr
 
 from holdfast.config.base import Model
 from holdfast.config.initial import InitialRun
-from holdfast.config.scalars import FilePath, NotNull, whole_number
+from holdfast.config.scalars import FilePath, Name, NotNull, whole_number
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.types import AREAS, Area, BitArea
 
@@ -63,6 +63,13 @@ class KeepConfig(Model):
     or a power cut may cost; a clean stop loses nothing."""
 
 
+class ReplicateConfig(Model):
+    """The log that all writes to a memory go through."""
+
+    log: Name
+    """The log, a key of logs."""
+
+
 class MemoryConfig(Model):
     """Four areas of bits and registers. An omitted area does not exist."""
 
@@ -83,6 +90,9 @@ class MemoryConfig(Model):
 
     keep: Annotated[KeepConfig | None, NotNull()] = None
     """Keeps the contents over restarts; `initial` then applies only to the first start."""
+
+    replicate: Annotated[ReplicateConfig | None, NotNull()] = None
+    """Shares the contents with other appliances: all writes go through a log."""
 
     _initial_values: tuple[InitialRun, ...] = PrivateAttr(default=())
 

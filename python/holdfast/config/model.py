@@ -17,6 +17,7 @@ from holdfast.config.base import Model
 from holdfast.config.devices import DeviceConfig
 from holdfast.config.links import LinkConfig
 from holdfast.config.listeners import Listener
+from holdfast.config.logs import SharedLogConfig
 from holdfast.config.memories import MemoryConfig
 from holdfast.config.outputs import Output
 from holdfast.config.scalars import (
@@ -116,6 +117,8 @@ class Config(Model):
     memories: dict[Name, MemoryConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
     """The memories, by name; optional when only nats, gateway, routes and
     devices that are forwarded or have tags are configured."""
+    logs: dict[Name, SharedLogConfig] = Field(default={}, json_schema_extra=NAME_KEYS)
+    """Logs of writes that several appliances share, by name."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
     """The identification of the appliance."""
     listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(

@@ -173,6 +173,9 @@ class MemoryAccess:
                 values = target.read(area, address, count)  # type: ignore[arg-type]
             except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
                 raise self._out_of_range(memory, area, address, count) from None
+            except OSError as error:
+                where = _where(None, memory, area, address)
+                raise Refused("log_unavailable", str(error), **where) from None
         except Refused as refused:
             self.note(refused, grant.name, peer)
             raise
@@ -367,8 +370,12 @@ class MemoryAccess:
             case "not_one_step":
                 detail = f"{_of(index)}{memory} and the memories before it are not kept together"
                 return Refused("not_one_step", f"{detail}, so no step writes all of them", **where)
-            case "not_stored" | "log_unavailable" | "not_confirmed":
-                return Refused(refused.reason, KEEPING[refused.reason], **where)
+            case "not_stored":
+                return Refused("not_stored", KEEPING["not_stored"], **where)
+            case "log_unavailable":
+                return Refused("log_unavailable", KEEPING["log_unavailable"], **where)
+            case "not_confirmed":
+                return Refused("not_confirmed", KEEPING["not_confirmed"], **where)
             case "invalid_value" | "invalid_type" if refused.index is not None:
                 shown = _shown(values[refused.index])
                 wrong = "outside" if refused.reason == "invalid_value" else "not"

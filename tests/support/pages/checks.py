@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import functools
 import io
@@ -115,8 +116,14 @@ def sql(block: Block, stage: Stage) -> None:
     found = re.fullmatch(r'sqlite3 (\S+) "(.*)"\n', block.text)
     assert found
     database = sqlite3.connect(stage.folder / found[1])
+
+    def has_rows() -> bool:
+        with contextlib.suppress(sqlite3.OperationalError):  # The table may not be there yet.
+            return database.execute(found[2]).fetchone() is not None
+        return False
+
     try:
-        wire.until(lambda: database.execute(found[2]).fetchone() is not None, "there are rows")
+        wire.until(has_rows, "there are rows")
     finally:
         database.close()
 

@@ -72,6 +72,7 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/architecture.md", "socket ─►"): drawing,
     ("docs/architecture.md", "connection.rs ─►"): drawing,
     ("docs/architecture.md", "body ─► msgspec"): drawing,
+    ("docs/architecture.md", "Memory::submit"): drawing,
     ("docs/audit.md", '{"time":'): checks.audit_lines,
     ("docs/cli.md", "REST at http://127.0.0.1:5080   every"): drawing,
     ("docs/client.md", ">>> import holdfast"): CLIENT,

@@ -489,6 +489,18 @@ def durability(stage: Stage) -> None:
     file = MemoryFile(stage.folder / "setpoints.redb", [("setpoints", memory)], 0)
     file.start()
     file.stop()
+    folder = stage.folder / "nats-server"
+    folder.mkdir()
+    server = NatsServer(folder)
+    stage.callback(server.kill)
+    stage.file(
+        "plant.yaml",
+        f"""memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
+logs: {{site: {{servers: ["{server.url}"], node: scada-a}}}}
+rest: {{bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}}
+""",
+    )
+    stage.serve("run", "plant.yaml")
 
 
 def operations(stage: Stage) -> None:

@@ -144,7 +144,7 @@ READ = Route(
     "read",
     "Read a range atomically",
     json_answer("The values; bits are 0 or 1", ref("Values"), {"values": [100, 200, 300]}),
-    (*QUERY, *MEMORY),
+    (*QUERY, *MEMORY, "log_unavailable"),
     parameters=(
         Parameter("memory", "The name of the memory", TEXT, "plant_a"),
         Parameter("area", "The area", ref("Area"), "holding_registers"),
@@ -286,6 +286,27 @@ ROUTES = (
                         "refused": 0,
                         "last_commit_seconds": 0.004,
                         "bytes": 73728,
+                    }
+                },
+                "logs": {
+                    "site": {
+                        "phase": "running",
+                        "connected": True,
+                        "contact_age": 0.2,
+                        "sequence": 5000,
+                        "lag": 0,
+                        "steps": 1200,
+                        "unavailable": 0,
+                        "not_confirmed": 0,
+                        "refused": 0,
+                        "nodes": [
+                            {
+                                "name": "scada-a",
+                                "sequence": 5000,
+                                "time_ns": 1893456000000000000,
+                                "digest": None,
+                            }
+                        ],
                     }
                 },
                 "audit": None,

@@ -190,6 +190,28 @@ DIAGNOSTICS: dict[str, Schema] = {
                     "additionalProperties": False,
                 },
             },
+            "logs": {
+                "type": "object",
+                "description": "By name: the logs that memories are replicated through",
+                "additionalProperties": {
+                    "type": "object",
+                    "required": ["phase", "connected", "sequence", "lag", "steps", "nodes"],
+                    "properties": {
+                        "phase": {"enum": ["starting", "running", "failed", "stopped"]},
+                        "connected": {"type": "boolean"},
+                        "contact_age": {
+                            "type": ["number", "null"],
+                            "description": "Seconds since the contents were current for sure",
+                        },
+                        "sequence": COUNTER | {"description": "Of the last message applied"},
+                        "lag": COUNTER | {"description": "Messages that are not applied yet"},
+                        "steps": COUNTER | {"description": "Writes of this node"},
+                        "unavailable": COUNTER | {"description": "Writes that were not sent"},
+                        "not_confirmed": COUNTER,
+                        "refused": COUNTER,
+                    },
+                },
+            },
             "audit": {
                 "type": ["object", "null"],
                 "required": ["lines", "failed", "waiting", "failing", "copies"],

@@ -1,0 +1,125 @@
+"""The logs that appliances share: joined before anything listens, left last."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from holdfast import _core, logs
+from holdfast.net.tls import NO_FILES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from holdfast.config import Config
+    from holdfast.config.logs import SharedLogConfig
+
+JOIN_TIMEOUT = 30.0
+"""Seconds within which a node must have caught up with its log."""
+
+EVENTS = {
+    "log_connected": logging.INFO,
+    "log_caught_up": logging.INFO,
+    "log_disconnected": logging.WARNING,
+    "log_connect_failed": logging.WARNING,
+    "log_error": logging.WARNING,
+    "log_failed": logging.ERROR,
+    "log_digests_differ": logging.ERROR,
+    "log_message_ignored": logging.WARNING,
+    "log_replay_failed": logging.ERROR,
+    "log_snapshot_stored": logging.DEBUG,
+    "log_snapshot_failed": logging.WARNING,
+    "log_snapshot_damaged": logging.WARNING,
+}
+"""The levels of what the native log tells."""
+
+
+class LogNotJoined(OSError):
+    """A log can't be used. `is_settings` tells whether another start can't change that."""
+
+    def __init__(self, message: str, *, is_settings: bool) -> None:
+        super().__init__(message)
+        self.is_settings = is_settings
+
+
+class SharedLogs:
+    """The logs of one configuration. The constructor joins all of them or none."""
+
+    def __init__(self, config: Config, memories: Mapping[str, _core.Memory]) -> None:
+        """Returns when the memories have caught up. Raises `LogNotJoined`."""
+        self._logs: dict[str, _core.Log] = {}
+        try:
+            for name, settings in config.logs.items():
+                members = [
+                    (each, memories[each])
+                    for each, memory in config.memories.items()
+                    if memory.replicate is not None and memory.replicate.log == name
+                ]
+                if members:
+                    self._join(name, settings, members)
+        except BaseException:
+            self.stop()
+            raise
+
+    def _join(
+        self, name: str, settings: SharedLogConfig, members: list[tuple[str, _core.Memory]]
+    ) -> None:
+        try:
+            log = _core.Log(
+                name,
+                settings.node,
+                servers(settings),
+                members,
+                replicas=settings.replicas,
+                write_timeout=settings.write_timeout,
+                when_behind=settings.when_behind,
+                max_lag=settings.max_lag,
+                **credentials(settings),
+            )
+            self._logs[name] = log
+            log.start(JOIN_TIMEOUT)
+        except _core.LogError as error:
+            is_settings = error.kind in ("layout", "version", "snapshot", "name_taken")
+            raise LogNotJoined(f"logs.{name}: {error}", is_settings=is_settings) from None
+        except ValueError as error:
+            raise LogNotJoined(f"logs.{name}: {error}", is_settings=True) from None
+        logs.write(
+            logging.INFO,
+            "log_joined",
+            log=name,
+            node=settings.node,
+            sequence=log.status()["sequence"],
+            memories=",".join(each for each, _ in members),
+        )
+
+    def status(self) -> dict[str, dict[str, Any]]:
+        """The state and the counters of each log."""
+        return {name: dict(log.status()) for name, log in self._logs.items()}
+
+    def check(self) -> None:
+        """Logs what has happened since the last call."""
+        for name, log in self._logs.items():
+            for event, fields in log.events(0):
+                logs.write(EVENTS[event], event, log=name, **fields)
+
+    def stop(self) -> None:
+        """Waits for the writes that were sent, and leaves the logs."""
+        for log in self._logs.values():
+            log.stop()
+
+
+def servers(settings: SharedLogConfig) -> list[str]:
+    """The URLs of the NATS servers."""
+    return [str(url) for url in settings.servers]
+
+
+def credentials(settings: SharedLogConfig) -> dict[str, Any]:
+    """What the NATS servers want to see, as arguments of `Log` and `LogFollower`."""
+    files = NO_FILES if settings.tls is None else settings.tls.files
+    return {
+        "user": settings.username,
+        "password_file": settings.password_file,
+        "token_file": settings.token_file,
+        "credentials_file": settings.credentials_file,
+        "tls": None if settings.tls is None else (files.ca, files.cert, files.key),
+    }

@@ -1,0 +1,35 @@
+"""Checks rules between memories and the logs that they share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from holdfast.config.lenient import mapping
+from holdfast.config.nats_checks import check_nats
+from holdfast.config.words import guess, listing, show
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.config.report import Report
+
+
+def check_logs(data: dict[Any, Any], folder: Path, report: Report) -> None:
+    """Reports what is wrong; files are relative to `folder`."""
+    logs, used = mapping(data.get("logs")), set[str]()
+    for name, settings in logs.items():
+        check_nats(("logs", name), mapping(settings), folder, report)
+    for name, memory in mapping(data.get("memories")).items():
+        log = mapping(mapping(memory).get("replicate")).get("log")
+        if not isinstance(log, str):
+            continue  # Reported by the model.
+        used.add(log)
+        if log not in logs:
+            words = f"allowed: {listing(logs) or 'none, there are no logs'}{guess(log, logs)}"
+            report.add(("memories", name, "replicate", "log"), f"found {show(log)}, {words}")
+        if "keep" in mapping(memory):
+            message = "found together with replicate, allowed: only one of them"
+            report.add(("memories", name, "keep"), message, of_key=True)
+    for name in logs:
+        if name not in used:
+            report.doubt(("logs", name), "has no effect: no memory is replicated through it")

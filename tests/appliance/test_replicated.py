@@ -1,0 +1,216 @@
+"""Appliances that share memories through a log in NATS JetStream."""
+
+from __future__ import annotations
+
+import json
+import threading
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.appliance import Appliance
+from holdfast.appliance.changes import ReloadRefused
+from holdfast.appliance.shared_logs import LogNotJoined
+from holdfast.config import load
+from support import wire
+from support.brokers import NatsServer, free_port
+from support.cli import done, invoke
+from support.config_folder import Folder, written
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from holdfast.config import Config
+
+Settings = dict[str, Any]
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    yield server
+    server.kill()
+
+
+def config(folder: Path, servers: list[str], name: str = "a", **memory: Any) -> Config:
+    plant = {"holding_registers": 100, "coils": 16, "replicate": {"log": "site"}} | memory
+    rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
+    parts = {
+        "memories": {"plant": plant, "alone": {"holding_registers": 10}},
+        "logs": {"site": {"servers": servers, "node": name}},
+        "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
+        "rest": {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"},
+    }
+    file = folder / f"{name}.yaml"
+    file.write_text(written(parts))
+    return load(file)
+
+
+@pytest.fixture
+def node(tmp_path: Path, server: NatsServer) -> Iterator[Callable[..., Appliance]]:
+    with ExitStack() as running:
+
+        def start(name: str, **memory: Any) -> Appliance:
+            settings = config(tmp_path, [server.url], name, **memory)
+            return running.enter_context(Appliance(settings))
+
+        yield start
+
+
+def ask(appliance: Appliance, pdu: str) -> str:
+    with wire.Connection(endpoint(appliance, "scada")) as connection:
+        return connection.ask(bytes.fromhex(pdu)).hex()
+
+
+def register(appliance: Appliance, address: int = 3) -> int:
+    return appliance.memories["plant"].read("holding_registers", address, 1)[0]
+
+
+def test_a_write_to_one_node_is_read_from_all(node: Callable[..., Appliance]) -> None:
+    one, two = node("a"), node("b")
+    assert ask(one, "060003002a") == "060003002a"
+    assert ask(one, "0300030001") == "0302002a"
+    wire.until(lambda: register(two) == 42, "the other node has it")
+    assert ask(two, "16000300f0000f") == "16000300f0000f"
+    assert ask(two, "0300030001") == "0302002f"
+    wire.until(lambda: register(one) == 0x2F, "the first node has it")
+
+
+def test_masks_of_all_nodes_at_once_have_one_order(node: Callable[..., Appliance]) -> None:
+    nodes = [node(name) for name in "abc"]
+
+    def toggle(of: Appliance, bit: int) -> None:
+        others = f"160003{0xFFFF ^ 1 << bit:04x}"
+        set_, clear = f"{others}{1 << bit:04x}", f"{others}0000"
+        with wire.Connection(endpoint(of, "scada")) as connection:
+            for pdu in map(bytes.fromhex, [set_, clear] * 40 + [set_]):
+                assert connection.ask(pdu) == pdu
+
+    threads = [threading.Thread(target=toggle, args=(of, bit)) for bit, of in enumerate(nodes)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(wire.DEADLINE)
+    wire.until(lambda: [register(of) for of in nodes] == [7, 7, 7], "all bits are set everywhere")
+
+
+def test_contents_survive_all_nodes(
+    node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
+) -> None:
+    (tmp_path / "values.csv").write_text("holding_registers,1,7\n")
+    first = node("a", initial="values.csv")
+    assert register(first, 1) == 7
+    first.memories["plant"].write("holding_registers", 1, [8])
+    first.stop()
+    with Appliance(config(tmp_path, [server.url], "b", initial="values.csv")) as second:
+        assert register(second, 1) == 8
+
+
+def test_without_its_log_a_node_reads_and_does_not_write(
+    node: Callable[..., Appliance], server: NatsServer
+) -> None:
+    one = node("a")
+    assert ask(one, "0600030001") == "0600030001"
+    server.kill()
+    wire.until(lambda: not one.replicas()["site"]["connected"], "it notices")
+    assert ask(one, "0600030002") == "8606"
+    assert ask(one, "0300030001") == "03020001"
+    with pytest.raises(OSError, match="can't be reached"):
+        one.memories["plant"].write("holding_registers", 3, [2])
+    one.memories["alone"].write("holding_registers", 3, [2])
+    server.start()
+    wire.until(lambda: ask(one, "0600030003") == "0600030003", "it comes back")
+
+
+def test_a_server_that_does_not_answer_confirms_nothing(
+    node: Callable[..., Appliance], server: NatsServer
+) -> None:
+    one = node("a")
+    server.freeze()
+    try:
+        assert ask(one, "0600030002") == "8604"
+        assert register(one) == 0
+    finally:
+        server.thaw()
+    # It may still be carried out.
+    wire.until(lambda: register(one) in (0, 2) and ask(one, "0600030005")[:2] == "06", "it is back")
+
+
+def test_other_areas_are_refused_and_named(
+    node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
+) -> None:
+    node("a")
+    with pytest.raises(LogNotJoined, match=r"logs\.site: .*holding_registers") as caught:
+        Appliance(config(tmp_path, [server.url], "b", holding_registers=99)).start()
+    assert caught.value.is_settings
+    result = invoke("run", str(tmp_path / "b.yaml"))
+    assert result.exit_code == 2
+    assert result.stderr.startswith("holdfast: logs.site: ")
+
+
+def test_a_change_of_logs_requires_a_restart(
+    node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
+) -> None:
+    one = node("a")
+    with pytest.raises(ReloadRefused, match=r"logs: changed"):
+        one.reload(config(tmp_path, [server.url, server.url.replace("127.0.0.1", "localhost")]))
+    assert one.reload(config(tmp_path, [server.url])) == []
+
+
+@pytest.mark.parametrize(
+    ("more", "problem"),
+    [
+        ("memories: {plant: {coils: 8, replicate: {log: sit}}}", "found 'sit', allowed: site; did"),
+        (
+            "memories: {plant: {coils: 8, keep: {file: x}, replicate: {log: site}}}",
+            "memories.plant.keep: found together with replicate, allowed: only one of them",
+        ),
+    ],
+)
+def test_settings_are_checked(tmp_path: Path, more: str, problem: str) -> None:
+    text = f"""
+{more}
+logs: {{site: {{servers: ["nats://127.0.0.1"], node: a}}}}
+rest: {{bind: "127.0.0.1:0", tokens: none}}
+"""
+    assert any(problem in found for found in Folder(tmp_path).problems(text))
+
+
+def test_a_log_that_no_memory_uses_is_doubtful(tmp_path: Path) -> None:
+    text = """
+memories: {plant: {coils: 8}}
+logs: {site: {servers: ["nats://127.0.0.1"], node: a}}
+rest: {bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}
+"""
+    [warning] = Folder(tmp_path).warnings(text)
+    assert "logs.site: has no effect: no memory is replicated through it" in warning
+
+
+def test_the_past_can_be_rebuilt(
+    node: Callable[..., Appliance], tmp_path: Path, server: NatsServer
+) -> None:
+    one = node("a")
+    for value in (1, 2, 3):
+        ask(one, f"06000300{value:02x}")
+    file = str(tmp_path / "a.yaml")
+    last = one.replicas()["site"]["sequence"]
+    head, *values = done("replay", file, "--values")
+    assert head.startswith(f"sequence {last}, digest ")
+    assert values == ["plant holding_registers 3: 3"]
+    before = done("replay", file, "--to", str(last - 1), "--values")
+    assert before[1:] == ["plant holding_registers 3: 2"]
+    assert before[0] != head
+    told = json.loads(invoke("replay", file, "--json", "--values").stdout)
+    assert (told["sequence"], told["values"]) == (last, [["plant", "holding_registers", 3, 3]])
+    assert server.url
+
+
+def test_a_log_that_is_not_there_can_not_be_replayed(tmp_path: Path) -> None:
+    config(tmp_path, [f"nats://127.0.0.1:{free_port()}"])
+    result = invoke("replay", str(tmp_path / "a.yaml"))
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.startswith("holdfast: logs.site: ")
