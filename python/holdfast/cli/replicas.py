@@ -13,7 +13,7 @@ from holdfast import logs
 from holdfast.appliance.control import NotRunning, ask
 from holdfast.cli.showing import table
 
-_HEAD = ("node", "last write at", "last write", "digest at", "digest")
+_HEAD = ("node", "last message", "at", "digest of", "digest")
 _DIGEST = 12
 """Characters of a digest that are shown."""
 
