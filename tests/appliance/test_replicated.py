@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+import holdfast
 from holdfast.appliance import Appliance
 from holdfast.appliance.changes import ReloadRefused
 from holdfast.appliance.shared_logs import LogNotJoined
@@ -36,10 +37,17 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
     server.kill()
 
 
-def config(folder: Path, servers: list[str], name: str = "a", **memory: Any) -> Config:
+def config(
+    folder: Path,
+    servers: list[str],
+    name: str = "a",
+    devices: Settings | None = None,
+    **memory: Any,
+) -> Config:
     plant = {"holding_registers": 100, "coils": 16, "replicate": {"log": "site"}} | memory
     rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
     parts = {
+        "devices": devices or {},
         "memories": {"plant": plant, "alone": {"holding_registers": 10}},
         "logs": {"site": {"servers": servers, "node": name}},
         "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
@@ -140,6 +148,37 @@ def test_a_server_that_does_not_answer_confirms_nothing(
     wire.until(lambda: register(one) in (0, 2) and ask(one, "0600030005")[:2] == "06", "it is back")
 
 
+def test_a_log_that_does_not_answer_does_not_hold_up_devices(
+    server: NatsServer, tmp_path: Path
+) -> None:
+    source = holdfast.Memory(holding_registers=10)
+    with holdfast.Server({1: source}, bind="127.0.0.1:0", access="read-write") as device:
+        host, port = device.address
+        read = {"area": "holding_registers", "address": 0, "count": 10}
+        read |= {"into": {"memory": "plant", "area": "holding_registers", "address": 0}}
+        meter = {"url": f"tcp://{host}:{port}", "unit": 1, "interval": 0.02, "reads": [read]}
+        settings = config(tmp_path, [server.url], devices={"meter": meter})
+        with Appliance(settings) as one:
+
+            def told() -> dict[str, Any]:
+                return one.diagnostics.devices()["meter"]
+
+            source.write("holding_registers", 3, [42])
+            wire.until(lambda: register(one) == 42, "it is mirrored")
+            server.freeze()
+            try:
+                before = told()["polls"]
+                # A write that waited for the log would take a second each.
+                wire.until(lambda: told()["polls"] > before + 50, "polls go on")
+                wire.until(lambda: told()["unstored"] > 0, "they are counted")
+                wire.until(lambda: told()["health"] == "error", "the device says so")
+            finally:
+                server.thaw()
+            source.write("holding_registers", 3, [43])
+            wire.until(lambda: register(one) == 43, "it is mirrored again")
+            wire.until(lambda: told()["health"] == "ok", "the device says so")
+
+
 def test_other_areas_are_refused_and_named(
     node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
 ) -> None:
@@ -149,7 +188,7 @@ def test_other_areas_are_refused_and_named(
     assert caught.value.is_settings
     result = invoke("run", str(tmp_path / "b.yaml"))
     assert result.exit_code == 2
-    assert result.stderr.startswith("holdfast: logs.site: ")
+    assert "\nholdfast: logs.site: " in result.stderr
 
 
 def test_a_change_of_logs_requires_a_restart(

@@ -18,7 +18,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use holdfast_memory::Area;
+use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
@@ -109,8 +109,6 @@ pub(super) struct Device {
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
-    /// Whether memory has refused a write since the last poll.
-    unstored: Cell<bool>,
     silent: Cell<u32>,
     /// The due time of the next poll.
     due: Cell<Instant>,
@@ -216,7 +214,6 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
-            unstored: Cell::new(false),
             silent: Cell::new(0),
             due: Cell::new(Instant::now()),
             backing_off: Cell::new(false),
@@ -457,7 +454,7 @@ impl Device {
         }
         let silent = fault.is_some() && !answered;
         self.silent.set(if silent { self.silent.get().saturating_add(1) } else { 0 });
-        let unstored = self.unstored.take().then_some(Fault::Unstored);
+        let unstored = self.state.take_unstored().then_some(Fault::Unstored);
         match fault.or(unstored) {
             None => self.state.good(),
             Some(fault) => self.state.bad(fault),
@@ -595,14 +592,14 @@ impl Device {
         let (mut area, mut address, mut stored) = (read.area, read.address, Ok(()));
         if let Some(into) = &read.into {
             (area, address) = (into.area, into.address);
-            stored = into.write(read.count, bytes);
+            stored = self.store(&into.memory, Access::Mirror, into.writing(read.count, bytes));
         }
         match stored {
             Ok(()) => {
                 self.state.counters.reads.add();
                 self.state.counters.values.add_many(u64::from(read.count));
             }
-            Err(_) => self.count_unstored(),
+            Err(_) => self.state.count_unstored(),
         }
         if !read.forward {
             return;
@@ -614,22 +611,31 @@ impl Device {
         }
     }
 
+    /// Writes what the device has told. This doesn't wait for the journal of a memory, because the other
+    /// devices of the thread would wait too: what the journal refuses is counted later.
+    fn store(&self, memory: &Memory, access: Access, write: Write<'_>) -> Result<(), Refusal> {
+        if !memory.has_journal() {
+            return memory.write(access, write);
+        }
+        let state = Arc::clone(&self.state);
+        let done = Box::new(move |outcome: Outcome| {
+            if outcome.is_err() {
+                state.count_unstored();
+            }
+        });
+        memory.submit(access, Operation::Write(write), done)
+    }
+
     fn tell(&self) {
         let status = self.state.status();
         if let Some(to) = &self.settings.status
-            && status.write(to).is_err()
+            && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
         {
-            self.count_unstored();
+            self.state.count_unstored();
         }
         for forward in &self.forwards {
             forward.tell(&status);
         }
-    }
-
-    /// Counts a refusal of memory. The poll counts as failed.
-    fn count_unstored(&self) {
-        self.state.counters.unstored.add();
-        self.unstored.set(true);
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use holdfast_memory::{Access, Area, Memory, Refusal, Write};
+use holdfast_memory::{Area, Memory, Write};
 
 /// A range of a memory.
 #[derive(Debug, Clone)]
@@ -13,14 +13,10 @@ pub struct Destination {
 }
 
 impl Destination {
-    /// Writes the whole read, atomically.
-    ///
-    /// # Errors
-    /// [`Refusal::OutOfRange`] when the read does not fit. Nothing has changed then.
-    pub(super) fn write(&self, count: u32, bytes: &[u8]) -> Result<(), Refusal> {
+    /// The write of a whole read.
+    pub(super) fn writing<'b>(&self, count: u32, bytes: &'b [u8]) -> Write<'b> {
         let Destination { area, address, .. } = *self;
-        let write = Write { area, address, count: count as usize, bytes };
-        self.memory.write(Access::Mirror, write)
+        Write { area, address, count: count as usize, bytes }
     }
 
     /// Whether `count` items fit.

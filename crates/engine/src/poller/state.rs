@@ -25,6 +25,8 @@ pub struct DeviceState {
     requests_per_poll: AtomicU32,
     since: Mutex<Times>,
     plan_error: Mutex<Option<String>>,
+    /// Whether a memory has refused something since the last poll.
+    unstored: AtomicBool,
     /// Whether a task of the device has panicked since the device was created or replaced.
     broken: AtomicBool,
     /// What the connection to its address has received without a request, or late.
@@ -100,6 +102,17 @@ impl DeviceState {
         if broken {
             self.bad(Fault::Internal);
         }
+    }
+
+    /// Counts a refusal of memory. The poll counts as failed, or the next one.
+    pub(super) fn count_unstored(&self) {
+        self.counters.unstored.add();
+        self.unstored.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether a memory has refused something since the last call.
+    pub(super) fn take_unstored(&self) -> bool {
+        self.unstored.swap(false, Ordering::Relaxed)
     }
 
     /// What the connection to its address has received without a request, or late. Devices at one address

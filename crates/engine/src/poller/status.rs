@@ -109,6 +109,15 @@ impl Status {
     /// # Errors
     /// [`Refusal::OutOfRange`] when the block does not fit. Nothing has changed then.
     pub fn write(&self, to: &StatusSettings) -> Result<(), Refusal> {
+        self.write_by(to, |write| to.memory.write(Access::Ingest, write))
+    }
+
+    /// As [`Status::write`], by something else than the memory.
+    pub(super) fn write_by(
+        &self,
+        to: &StatusSettings,
+        write_to: impl FnOnce(Write<'_>) -> Result<(), Refusal>,
+    ) -> Result<(), Refusal> {
         let bytes = self.bytes(&to.block);
         let write = Write {
             area: to.block.area,
@@ -116,7 +125,7 @@ impl Status {
             count: usize::from(STATUS_BLOCK_LEN),
             bytes: &bytes,
         };
-        to.memory.write(Access::Ingest, write)
+        write_to(write)
     }
 }
 
