@@ -8,6 +8,7 @@ import socket
 import sys
 import tempfile
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -169,6 +170,10 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
     class Signals:
         def __init__(self, **_: object) -> None:
             pass
+
+        @staticmethod
+        def interrupting() -> nullcontext[None]:
+            return nullcontext()
 
         @property
         def received(self) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from support import wire
-from support.brokers import NatsServer
+from support.brokers import NatsServer, free_port
 from support.cli import RunCommand, answer, invoke
 
 if TYPE_CHECKING:
@@ -42,6 +42,20 @@ def node(tmp_path: Path, server: NatsServer) -> Iterator[RunCommand]:
     yield command
     command.process.kill()
     command.process.communicate()
+
+
+def test_a_signal_ends_a_start_that_waits_for_the_log(tmp_path: Path) -> None:
+    file = tmp_path / "a plant.yaml"
+    file.write_text(CONFIGURATION.format(url=f"nats://127.0.0.1:{free_port()}"))
+    command = RunCommand(file)
+    try:
+        log = command.process.stderr
+        assert log is not None
+        assert any("log_joining log=site" in line for line in iter(log.readline, ""))
+        code, more = command.end(signal.SIGTERM)
+    finally:
+        command.process.kill()
+    assert (code, more) == (0, "")
 
 
 def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_path: Path) -> None:

@@ -77,6 +77,7 @@ class SharedLogs:
                 **credentials(settings),
             )
             self._logs[name] = log
+            logs.write(logging.INFO, "log_joining", log=name, node=settings.node)
             log.start(JOIN_TIMEOUT)
         except _core.LogError as error:
             is_settings = error.kind in ("layout", "version", "snapshot", "name_taken")

@@ -26,7 +26,7 @@ from holdfast.cli.open_files import allow_open_files
 from holdfast.cli.places import MODICON
 from holdfast.cli.reloading import Reloading
 from holdfast.cli.showing import ranges_shown
-from holdfast.cli.signals import Signals
+from holdfast.cli.signals import Interrupted, Signals
 from holdfast.config import GatewayConfig, ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from holdfast.config.rights import unit_rights
 from holdfast.config.scanning import written_pollable
@@ -104,7 +104,11 @@ def serve(
     manager = ServiceManager()
     appliance = Appliance(config, retries_ports=retries_ports)
     try:
-        appliance.start()
+        with signals.interrupting():
+            appliance.start()
+    except Interrupted:
+        appliance.stop()
+        return
     except UnusableFile as error:
         click.echo(f"holdfast: {error}", err=True)
         sys.exit(WRONG)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -40,6 +41,10 @@ def ending_signals() -> Iterator[signal.Signals]:
             yield number
 
 
+class Interrupted(BaseException):
+    """A signal came before the service was ready."""
+
+
 class Signals:
     """Records the signals that end a service. The second signal ends the process at once.
 
@@ -49,6 +54,7 @@ class Signals:
 
     def __init__(self, *, reload: Literal["always", "with a terminal", "never"] = "never") -> None:
         self.received = False
+        self._interrupts = False
         self._reload = False
         self._needs_terminal = reload == "with a terminal" and _has_terminal()
         for number in ending_signals():
@@ -56,6 +62,17 @@ class Signals:
         hangup = getattr(signal, "SIGHUP", None)
         if reload != "never" and hangup is not None:
             signal.signal(hangup, self._request_reload)
+
+    @contextmanager
+    def interrupting(self) -> Iterator[None]:
+        """Lets a signal end what is inside: a start may wait long. Raises `Interrupted`."""
+        self._interrupts = True
+        try:
+            if self.received:
+                raise Interrupted
+            yield
+        finally:
+            self._interrupts = False
 
     def take_reload(self) -> bool:
         """Whether a reload was requested since the last call."""
@@ -71,6 +88,9 @@ class Signals:
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self.received = True
         signal.signal(number, signal.SIG_DFL)
+        if self._interrupts:
+            self._interrupts = False
+            raise Interrupted
 
 
 def _has_terminal() -> bool:
