@@ -47,6 +47,9 @@ WRITES: dict[str, dict[str, Any]] = {
     "/diagnostics": {"subFunction": 1},
 }
 
+WHILE_OTHERS_ASK = 3000
+"""The timeout in milliseconds of a request that is pending until others have asked."""
+
 
 def read(device: FakeDevice, **more: Any) -> dict[str, Any]:
     """The body of a read of a device."""
@@ -471,7 +474,7 @@ def test_too_many_requests_are_told_to_come_again(server: holdfast.Server) -> No
         gateways.running(limits={"requests": 1}) as running,
         ThreadPoolExecutor(1) as threads,
     ):
-        waiting = threads.submit(running.ask, "/read", read(device, timeout=300))
+        waiting = threads.submit(running.ask, "/read", read(device, timeout=WHILE_OTHERS_ASK))
         assert asked.acquire(timeout=wire.DEADLINE)
         answer = running.ask("/connect", {"host": "127.0.0.1", "port": server.address[1]})
         assert (answer.status, answer.headers["retry-after"]) == (503, "1")
@@ -494,7 +497,7 @@ def test_a_dead_device_leaves_places_for_others(server: holdfast.Server) -> None
         ) as running,
         ThreadPoolExecutor(2) as threads,
     ):
-        body = read(device, timeout=1000)
+        body = read(device, timeout=WHILE_OTHERS_ASK)
         waiting = [threads.submit(running.ask, "/read", body) for _ in range(2)]
         for _ in waiting:
             assert asked.acquire(timeout=wire.DEADLINE)
@@ -518,7 +521,7 @@ def test_a_request_that_had_no_turn_says_that_it_was_not_sent() -> None:
         gateways.running() as running,
         ThreadPoolExecutor(1) as threads,
     ):
-        waiting = threads.submit(running.ask, "/read", read(device, timeout=1000))
+        waiting = threads.submit(running.ask, "/read", read(device, timeout=WHILE_OTHERS_ASK))
         assert asked.acquire(timeout=wire.DEADLINE)
         answer = running.ask("/read", read(device, timeout=50))
         assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
@@ -530,8 +533,10 @@ def test_a_request_that_had_no_turn_says_that_it_was_not_sent() -> None:
         assert len(device.asked) == 1
 
 
-@pytest.mark.parametrize("path", ["/read", "/write/register"])
-def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str) -> None:
+@pytest.mark.parametrize(
+    ("path", "ending"), [("/read", 0.05), ("/write/register", 0.05), ("/read", 1.5)]
+)
+def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str, ending: float) -> None:
     asked = threading.Semaphore(0)
 
     def mute(_: bytes) -> None:
@@ -539,7 +544,7 @@ def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str) -> Non
 
     with (
         FakeDevice(mute) as device,
-        gateways.running(limits={"ending": 0.05}) as running,
+        gateways.running(limits={"ending": ending}) as running,
         ThreadPoolExecutor(1) as threads,
     ):
         body = {"/read": read(device), "/write/register": write(device)}[path]
@@ -645,7 +650,7 @@ def test_connections_that_nobody_uses_give_way(server: holdfast.Server) -> None:
             assert running.ask("/read", body).status == 200
             assert asked.acquire(timeout=0) or body is other
         mute.set()
-        waiting = threads.submit(running.ask, "/read", read(device, timeout=300))
+        waiting = threads.submit(running.ask, "/read", read(device, timeout=WHILE_OTHERS_ASK))
         assert asked.acquire(timeout=wire.DEADLINE)
         assert running.ask("/read", other).status == 503
         assert waiting.result(wire.DEADLINE).status == 500

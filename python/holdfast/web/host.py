@@ -58,8 +58,9 @@ KEEP_ALIVE = 60.0
 LATE_ANSWER_TIMEOUT = 1.0
 """Seconds for the application to answer a request that did not arrive in time."""
 
-STOP_TIMEOUT = 1.0
-"""Seconds for pending requests to finish when the host stops."""
+STOP_TIMEOUT = 3.0
+"""Seconds for pending requests to finish when the host stops. Longer than applications need to end
+them, so that a loaded machine can still send the answers."""
 
 SAFE: Headers = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
 """Headers of every response: no caching, no guessing of content types."""
