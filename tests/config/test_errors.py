@@ -623,15 +623,18 @@ def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(value, (*path, key))
 
 
+FULL = YAML(typ="safe").load(EXAMPLES / "full.yaml")
+
+
+@pytest.mark.parametrize("section", FULL)
 @pytest.mark.parametrize("wrong", [None, -5, [], [1], {"a": {"b": [None]}}])
 def test_any_shape_anywhere_is_answered_with_problems_or_served(
-    folder: Folder, wrong: object
+    folder: Folder, section: str, wrong: object
 ) -> None:
     for name in ("boiler.csv", "mqtt-password.txt", "nats-password.txt"):
         shutil.copy(EXAMPLES / name, folder.path)
-    whole = YAML(typ="safe").load(EXAMPLES / "full.yaml")
-    for path in places(whole):
-        data = copy.deepcopy(whole)
+    for path in places(FULL[section], (section,)):
+        data = copy.deepcopy(FULL)
         inside = data
         for part in path[:-1]:
             inside = inside[part]

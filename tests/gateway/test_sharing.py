@@ -101,16 +101,21 @@ def test_all_writes_take_the_shared_connection(run: Run) -> None:
     assert counters(appliance)["requests"] == 6
 
 
-FAULTS: dict[str, tuple[Callable[[Asked], object], int, str, str]] = {
-    "silence": (silent, 500, "timeout", "Connection timeout"),
+LONGEST = 60_000
+"""The longest timeout of a request in milliseconds, for what does not wait for it."""
+
+FAULTS: dict[str, tuple[Callable[[Asked], object], int, int, str, str]] = {
+    "silence": (silent, 300, 500, "timeout", "Connection timeout"),
     "the end of the connection": (
         lambda asked: asked.end_with(HANG_UP),
+        LONGEST,
         500,
         "connection_lost",
         "connection lost: closed by the peer",
     ),
     "another function": (
         lambda asked: asked.answer(b"\x04\x02\0\7"),
+        LONGEST,
         500,
         "invalid_reply",
         "invalid response: function code 0x04, expected 0x03",
@@ -120,13 +125,13 @@ FAULTS: dict[str, tuple[Callable[[Asked], object], int, str, str]] = {
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
 def test_failures_are_those_of_a_connection_of_its_own(
-    run: Run, fault: tuple[Callable[[Asked], object], int, str, str]
+    run: Run, fault: tuple[Callable[[Asked], object], int, int, str, str]
 ) -> None:
-    behaviour, *expected = fault
+    behaviour, timeout, *expected = fault
     with Stream("tcp", then=behaviour) as device, Stream("tcp", then=behaviour) as other:
         appliance = run(with_gateway(device.url))
         found = [
-            failure(read(appliance, port, 5, timeout=300)) for port in (device.port, other.port)
+            failure(read(appliance, port, 5, timeout=timeout)) for port in (device.port, other.port)
         ]
     assert found == [tuple(expected)] * 2
     assert counters(appliance)["requests"] == 1

@@ -242,6 +242,7 @@ def test_the_session_ends_with_the_primary_host(plant: Plant) -> None:
     watching.host("scada", 1000, online=True)
     plant.run(**SETTINGS, primary_host="scada")
     watching.until("DBIRTH", "pump")
+    wire.until(lambda: plant.status()["born"], "the broker has confirmed the births")
     watching.host("scada", 999, online=False)
     watching.raw_command(None, b"")
     watching.command(None, name="marker")
