@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 LIMIT = 8 * 2**20
-SOON = 0.25
-"""The request timeout of tests that wait for it."""
+SOON = 1.0
+"""The request timeout of tests that wait for it. A request must begin before it ends."""
 
 HEALTH = web.head("GET", "/api/v1/health")
 GOOD = b'{"memory":"plant_a","area":"coils","address":0,"values":[1]}'

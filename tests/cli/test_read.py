@@ -311,7 +311,7 @@ def test_a_signal_ends_repeated_readings(server: holdfast.Server) -> None:
         assert process.stdout.readline().split() == ["time", "0"]
         assert process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, log = process.communicate(timeout=10)
+        _, log = process.communicate(timeout=wire.DEADLINE)
     finally:
         process.kill()
         process.communicate()
@@ -334,7 +334,7 @@ def test_ctrl_c_ends_a_command_that_waits_for_a_silent_device(command: tuple[str
         try:
             wire.until(lambda: len(device.requests) == 1, "the device has been asked")
             process.send_signal(signal.SIGINT)
-            _, log = process.communicate(timeout=20)
+            _, log = process.communicate(timeout=wire.DEADLINE)
         finally:
             process.kill()
             process.communicate()

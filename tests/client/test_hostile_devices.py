@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from support.fake_device import Behaviour
 
-SHORT = 0.1
+SHORT = 0.4
 """A timeout that is waited for."""
 
 
@@ -592,7 +592,7 @@ def test_a_connection_that_cannot_be_made_in_time_is_given_up(kind: str, dial: D
             waiting.connect_ex(full.getsockname())
         client = dial(f"{kind}://127.0.0.1:{full.getsockname()[1]}", timeout=SHORT)
         began = time.monotonic()
-        with pytest.raises(holdfast.RequestTimeout, match=r"within 0\.1 s"):
+        with pytest.raises(holdfast.RequestTimeout, match=f"within {SHORT} s"):
             client.read_coils(0, 1)
         assert SHORT <= time.monotonic() - began < wire.DEADLINE
 
@@ -617,7 +617,7 @@ def test_a_reply_that_does_not_come_times_out(
     client = dial(device.url, timeout=SHORT)
     began = time.monotonic()
 
-    with pytest.raises(holdfast.RequestTimeout, match=r"^no reply within 0\.1 s$"):
+    with pytest.raises(holdfast.RequestTimeout, match=f"^no reply within {SHORT} s$"):
         client.write_register(7, 70)
 
     assert SHORT <= time.monotonic() - began < wire.DEADLINE
@@ -1228,7 +1228,7 @@ def test_whatever_comes_is_a_reply_only_if_it_is_one(
 # Signals
 
 
-LONG = 60.0
+LONG = 4 * wire.DEADLINE
 """A timeout that is not waited for."""
 
 

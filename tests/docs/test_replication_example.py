@@ -44,7 +44,7 @@ def test_one_command_shows_what_the_page_says(tmp_path: Path, ports: dict[str, s
         env={**os.environ, "HOLDFAST": str(script)},
         capture_output=True,
         text=True,
-        timeout=8 * wire.DEADLINE,
+        timeout=4 * wire.DEADLINE,
     )
     assert (done.returncode, done.stderr) == (0, "")
     shown = re.sub(r"(?<=:)\d+\b", lambda match: back.get(match[0], match[0]), done.stdout)

@@ -149,7 +149,7 @@ CURL = {
 def test_a_command_line_with_another_host_works(gateway: Running, command: str) -> None:
     tool("curl")
     words = shlex.split(command.replace("URL", gateway.url))
-    result = subprocess.run(words, capture_output=True, check=True, timeout=10)
+    result = subprocess.run(words, capture_output=True, check=True, timeout=wire.DEADLINE)
     answer = json.loads(result.stdout)
     if "write" in command:
         assert type(answer.pop("rtt")) is int

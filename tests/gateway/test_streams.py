@@ -273,7 +273,7 @@ def test_only_the_areas_that_are_asked_for_are_read(gateway: Running) -> None:
         [area] = mapped(gateway, device.port, **asked).next("result")["areas"]
         assert area["ranges"] == [[0, 7]]
         assert {pdu[0] for pdu in device.asked} == {4}
-        asked = {"areas": ["holding_registers", "input_registers"], "last": 20, "timeout": 50}
+        asked = {"areas": ["holding_registers", "input_registers"], "last": 20, "timeout": 500}
         result = mapped(gateway, device.port, **asked).next("result")
         assert result["success"] is True
         assert [each["area"] for each in result["areas"]] == asked["areas"]

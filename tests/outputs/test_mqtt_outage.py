@@ -67,7 +67,7 @@ def recorded(plant: Plant, file: Path) -> Iterator[None]:
             process.wait()
 
 
-@pytest.mark.timeout(900 if IS_LONG else 120)
+@pytest.mark.timeout(900 if IS_LONG else 300)
 def test_nothing_is_lost_or_out_of_order(plant: Plant, tmp_path: Path) -> None:
     """Each change of each tag is published, in order, with the time of its poll."""
     device, proxy = plant.device(registers=TAGS), plant.proxy()

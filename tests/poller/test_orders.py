@@ -208,7 +208,7 @@ def test_a_unit_that_is_given_a_rest_keeps_it_when_its_device_is_replaced(
         taken(poller, lambda polls, _: len(polls) == 3)
         reads = len(fake.requests)
         fake.answer = writable
-        poller.replace("a", device(fake, interval=0.05, timeout=0.05))
+        poller.replace("a", device(fake, interval=0.05))
         assert written(poller, poller.write("a", Request.write_register(0, 1))) == 0
         # Then it is read at once.
         assert fake.requests[reads].pdu[0] == 6

@@ -458,7 +458,7 @@ def test_it_ends_while_everything_hangs(
     try:
         began = time.monotonic()
         scanner.stop()
-        assert time.monotonic() - began < 15
+        assert time.monotonic() - began < wire.DEADLINE
     finally:
         own_nats.thaw()
         os.kill(plc.pid, signal.SIGCONT)

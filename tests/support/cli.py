@@ -83,10 +83,10 @@ class ServingCommand:
             self.greeting += line
         return self.greeting
 
-    def end(self, number: signal.Signals) -> tuple[int, str]:
-        """Sends a signal. Returns the exit code and the log."""
+    def end(self, number: signal.Signals, within: float = wire.DEADLINE) -> tuple[int, str]:
+        """Sends a signal. Returns the exit code and the log. The command must end in time."""
         self.process.send_signal(number)
-        _, log = self.process.communicate(timeout=wire.DEADLINE)
+        _, log = self.process.communicate(timeout=within)
         return self.process.returncode, log
 
 

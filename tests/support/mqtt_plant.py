@@ -117,7 +117,7 @@ class Plant:
             name: {
                 "url": device.url,
                 "interval": self.interval,
-                "timeout": 0.3,
+                "timeout": wire.DEADLINE,
                 "retry": {"first": 0.05, "most": 0.1},
                 "tags": TAGS if tags is None else tags,
             }

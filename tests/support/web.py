@@ -165,7 +165,13 @@ class Service:
         **settings: Any,
     ) -> None:
         self.https = https
-        given = {"bind": bind, "sources": LOOPBACK, "tokens": "none", **settings}
+        given = {
+            "bind": bind,
+            "sources": LOOPBACK,
+            "tokens": "none",
+            "request_timeout": wire.DEADLINE,
+            **settings,
+        }
         self.settings = RestConfig.model_validate(given)
         self.memories = memories
         self.memory_access = MemoryAccess("rest", memories, audit)
