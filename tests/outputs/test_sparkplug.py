@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.outputs import sending
+from holdfast.outputs.mqtt import session
 from support import wire
 from support.mqtt_plant import TAGS, Plant
 from support.mqtt_rig import Proxy
@@ -100,6 +101,20 @@ def test_a_session_has_births_then_data_then_a_death(plant: Plant, version: str)
     death = watching.until("NDEATH")
     assert [metric.name for metric in death.payload.metrics] == ["bdSeq"]
     assert (session_of(death), death.payload.HasField("seq")) == (0, False)
+
+
+@pytest.mark.parametrize("version", ["3.1.1", "5"])
+def test_an_end_that_was_not_confirmed_has_the_will(
+    plant: Plant, version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "LAST", 0.0)
+    plant.device()
+    watching = watch(plant)
+    plant.run(**SETTINGS, version=version)
+    wire.until(lambda: plant.status().get("born"), "the broker has confirmed the births")
+    plant.stop()
+    while watching.next().kind != "NDEATH":
+        pass
 
 
 def test_a_rebirth_is_a_new_birth_in_the_same_session(plant: Plant) -> None:

@@ -64,7 +64,7 @@ class Session:
         """
         self._settings, self._qos, self._proves = settings, qos, proves
         self._will_qos = qos if will_qos is None else will_qos
-        self._ends_with_will = False
+        self._ends_with_will = self._is_cut = False
         self._stop, self._end = stop, Stop()
         self._lock = threading.Lock()
         self._news = threading.Condition(self._lock)
@@ -123,13 +123,15 @@ class Session:
     def close(self, last: Sequence[Message] = (), *, with_will: bool = False) -> None:
         """Publishes the last messages, and ends the connection.
 
-        `with_will`: the broker publishes the will too. MQTT 3.1.1 has no way to ask for it.
+        `with_will`: the broker publishes the will too. MQTT 3.1.1 has no way to ask for it, so the
+        connection is cut if the last messages were not confirmed.
         """
         self._ends_with_will = with_will
         if last and not self._is_over:
             delivery = self.publish(last)
             with self._news:
                 self._news.wait_for(lambda: delivery.is_done or self._is_over, LAST)
+            self._is_cut = with_will and not delivery.is_done
         self._end.set()
         self._thread.join()
 
@@ -204,7 +206,7 @@ class Session:
             if self._ends_with_will and self._settings.version == "5":
                 packet, reason = PacketTypes.DISCONNECT, "Disconnect with will message"
                 connection.disconnect(ReasonCode(packet, reason))
-            else:
+            elif not self._is_cut:
                 connection.disconnect()
         except (OSError, ValueError) as error:
             self._reason = str(error)
