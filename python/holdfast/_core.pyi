@@ -919,8 +919,9 @@ class PolledDevice:
     (default: the interval). `report` takes the polls; `fields` are areas, addresses and counts that
     are read only for it, and not forwarded. `release` closes the
     connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
-    are the first and the longest pause after failures (default: 1 and 60). Times are in seconds;
-    interval 0 polls without a pause.
+    are the first and the longest pause after failures (default: 1 and 60). With a `fence`, the
+    device is polled and written to while that is open; devices of one link have the same. Times are
+    in seconds; interval 0 polls without a pause.
     """
 
     def __new__(
@@ -947,7 +948,39 @@ class PolledDevice:
         release: bool = False,
         measured: bool = False,
         retry: tuple[float, float] | None = None,
+        fence: Fence | None = None,
     ) -> PolledDevice: ...
+
+@final
+class Fence:
+    """Until when devices may be used; it begins closed. Times are those of `time.monotonic`.
+
+    It is compared with the clock at the last moment before something is sent, so a process that was
+    stopped sends nothing when it goes on too late.
+    """
+
+    def __new__(cls) -> Fence: ...
+    def open(self, until: float, *, settle: float = 0.0) -> None:
+        """Opens it. Writes wait for `settle` seconds and the timeout of the device."""
+
+    def renew(self, until: float) -> None:
+        """Moves the end, never to an earlier time. Without effect if it was closed."""
+
+    def end(self) -> None:
+        """Lets polls that have begun end, and none begin. Go on to renew it meanwhile."""
+
+    def close(self) -> None: ...
+    @property
+    def is_open(self) -> bool:
+        """Whether polls and writes may begin."""
+
+    @property
+    def allows(self) -> bool:
+        """Whether something may be sent."""
+
+    @property
+    def in_use(self) -> int:
+        """The number of polls, writes and connections."""
 
 @final
 class Link:

@@ -22,6 +22,7 @@ _TEXTS = {
     FAULTS["not stored"]: "memory refused the values",
     FAULTS["internal error"]: "an internal error",
     FAULTS["flooded"]: "a flood of data that was not requested",
+    FAULTS["standby"]: "another node uses the device",
 }
 
 

@@ -481,7 +481,7 @@ fn mapped(error: &ClientError) -> PyErr {
             let of = (failure.reason(), to.clone(), failure.to_string(), *maybe_sent);
             TlsFailed::new_err(of)
         }
-        ClientError::Lost(_) => ConnectionLost::new_err(text),
+        ClientError::Lost(_) | ClientError::Fenced => ConnectionLost::new_err(text),
         ClientError::Invalid(invalid) => InvalidResponse::new_err((text, invalid.reason())),
     }
 }

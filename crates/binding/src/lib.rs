@@ -10,6 +10,7 @@ mod channel;
 mod client;
 mod connection;
 mod engine;
+mod fence;
 mod following;
 mod heartbeat;
 mod limits;
@@ -40,6 +41,8 @@ mod _core {
     use super::connection::{Attempt, Connection};
     #[pymodule_export]
     use super::engine::Engine;
+    #[pymodule_export]
+    use super::fence::Fence;
     #[pymodule_export]
     use super::following::Follower;
     #[pymodule_export]

@@ -40,6 +40,7 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
         Fault::Unstored,
         Fault::Internal,
         Fault::Flooded,
+        Fault::Standby,
     ];
     for fault in all {
         if let Some(word) = word(fault) {
@@ -61,6 +62,7 @@ fn word(fault: Fault) -> Option<&'static str> {
         Fault::Unstored => Some("not stored"),
         Fault::Internal => Some("internal error"),
         Fault::Flooded => Some("flooded"),
+        Fault::Standby => Some("standby"),
     }
 }
 

@@ -17,6 +17,7 @@ use pyo3::types::{PyBytes, PyDict};
 
 use crate::arguments::{byte, seconds, within, word};
 use crate::client::{Endpoint, Request};
+use crate::fence::Fence;
 use crate::heartbeat;
 use crate::link::{self, Link, Passage};
 use crate::memory::{Memory, named};
@@ -49,7 +50,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=125, max_bits=2000, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None, fence=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -72,6 +73,7 @@ impl PolledDevice {
         release: bool,
         measured: bool,
         retry: Option<(f64, f64)>,
+        fence: Option<PyRef<'_, Fence>>,
     ) -> PyResult<PolledDevice> {
         let place = |area: String, address, count| -> PyResult<_> {
             let address = within("address", address, 0..=65_535)? as u16;
@@ -105,6 +107,7 @@ impl PolledDevice {
             report: report.map(|receiver| Arc::clone(&receiver.core)),
             release,
             measured,
+            fence: fence.map(|fence| Arc::clone(&fence.core)),
         };
         Ok(PolledDevice { core })
     }

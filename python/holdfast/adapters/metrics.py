@@ -34,7 +34,7 @@ LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
 PATH = "/metrics"
 STATES = ("running", "failed", "stopped")
-HEALTH = ("unknown", "ok", "error", "stale", "disabled")
+HEALTH = ("unknown", "ok", "error", "stale", "disabled", "standby")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
 """The outcomes of requests to a device."""
 EXPIRIES = (

@@ -60,6 +60,8 @@ struct Call<'r> {
     unit_id: u8,
     request: &'r EncodedRequest,
     attempt: Attempt,
+    /// Asked at the last moment before something is sent.
+    may_send: &'r dyn Fn() -> bool,
 }
 
 impl BlockingClient {
@@ -86,7 +88,8 @@ impl BlockingClient {
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Result<T, ClientError> {
-        let called = self.call_unless(Interrupt::new(None), (unit_id, request), timeout, take);
+        let interrupt = Interrupt::new(None);
+        let called = self.call_unless(interrupt, (unit_id, request, &|| true), timeout, take);
         called.unwrap_or_else(|| unreachable!("nobody interrupts this call"))
     }
 
@@ -100,13 +103,33 @@ impl BlockingClient {
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
-        self.call_unless(Interrupt::new(Some(interrupted)), (unit_id, request), timeout, take)
+        let interrupt = Interrupt::new(Some(interrupted));
+        self.call_unless(interrupt, (unit_id, request, &|| true), timeout, take)
+    }
+
+    /// The same as [`BlockingClient::call`], while it is allowed: this is asked at the last moment before
+    /// the request is sent, and then at most every 0.1 s. If it no longer is, the connection is closed.
+    ///
+    /// # Errors
+    /// [`ClientError::Fenced`] if nothing was sent.
+    pub fn call_while<T>(
+        &self,
+        allowed: &dyn Fn() -> bool,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        take: impl FnOnce(Response<'_>, &[u8]) -> T,
+    ) -> Result<T, ClientError> {
+        let mut interrupted = || !allowed();
+        let interrupt = Interrupt::new(Some(&mut interrupted));
+        let called = self.call_unless(interrupt, (unit_id, request, allowed), timeout, take);
+        called.unwrap_or(Err(ClientError::Lost(Lost::Closed(Closed::BySelf))))
     }
 
     fn call_unless<T>(
         &self,
         mut interrupt: Interrupt<'_>,
-        (unit_id, request): (u8, &EncodedRequest),
+        (unit_id, request, may_send): (u8, &EncodedRequest, &dyn Fn() -> bool),
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
@@ -114,9 +137,13 @@ impl BlockingClient {
         let _turn = self.turns.take(interrupt)?;
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let mut take = Some(take);
-        let mut call = Call { unit_id, request, attempt: Attempt::default() };
+        let mut call = Call { unit_id, request, attempt: Attempt::default(), may_send };
         let mut deadline = Instant::now() + timeout;
         loop {
+            if !may_send() {
+                state.end();
+                return Some(Err(ClientError::Fenced));
+            }
             let open = match self.connected(&mut state, deadline, timeout, interrupt)? {
                 Ok(open) => open,
                 Err(error) => return Some(Err(error)),
@@ -354,6 +381,10 @@ impl Open {
         loop {
             let outgoing = self.connection.outgoing();
             if !outgoing.is_empty() {
+                if !(call.may_send)() {
+                    self.connection.close(Closed::BySelf, sink);
+                    return Ok(());
+                }
                 let until = self.epoch + self.connection.deadline().unwrap_or(now - self.epoch);
                 match self.stream.send(outgoing, until) {
                     // Part of the request may have been sent.

@@ -49,6 +49,9 @@ pub enum ClientError {
     /// The received bytes are not the reply.
     #[error("invalid response: {0}")]
     Invalid(InvalidResponse),
+    /// The device may not be used now: another process may use it. Nothing was sent.
+    #[error("another node uses the device")]
+    Fenced,
 }
 
 /// Why a connection was lost.

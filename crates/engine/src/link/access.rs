@@ -11,6 +11,7 @@ use tokio::time::Instant;
 use super::backoff::Retry;
 use super::blocking::BlockingLink;
 use super::fault::{Answer, Exchanged, fault};
+use super::fence::Fence;
 use super::pace::{InFlight, Pace, Place as Turn};
 use super::queue::Priority;
 use super::tcp::TcpLink;
@@ -50,17 +51,18 @@ impl Link {
     }
 
     /// Sends a request of the poller when it is its turn, and waits for the answer. `timeout` does not
-    /// include the wait for the turn.
+    /// include the wait for the turn. Devices of one link have the same fence, or none.
     pub(crate) async fn call(
         &self,
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
         priority: Priority,
+        fence: Option<&Arc<Fence>>,
     ) -> Answer {
         let _turn = self.turn(POLLER, priority).await;
         let eager = priority == Priority::Urgent;
-        let answer = self.exchange(unit_id, request, timeout, eager).await;
+        let answer = self.exchange(unit_id, request, timeout, eager, fence).await;
         answer.map_err(|error| fault(&error))
     }
 
@@ -77,11 +79,14 @@ impl Link {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
+        fence: Option<&Arc<Fence>>,
     ) -> Exchanged {
         self.note_change(request);
         let answer = match &self.wire {
-            Wire::Tcp(link) => link.exchange(&self.pace, unit_id, request, timeout, eager).await,
-            Wire::Blocking(link) => link.exchange(unit_id, request, timeout, eager).await,
+            Wire::Tcp(link) => {
+                link.exchange(&self.pace, unit_id, request, timeout, eager, fence).await
+            }
+            Wire::Blocking(link) => link.exchange(unit_id, request, timeout, eager, fence).await,
         };
         self.note_change(request);
         answer

@@ -11,6 +11,7 @@ use tokio::time::Instant;
 
 use super::backoff::Retry;
 use super::fault::{Exchanged, FLOODED, Fault, fault};
+use super::fence::{Fence, Pass};
 use super::flood::Flood;
 use crate::client::{BlockingClient, ClientError, Endpoint, Lost, Place, StrayCounters};
 
@@ -37,6 +38,7 @@ struct Call {
     request: Box<EncodedRequest>,
     timeout: Duration,
     eager: bool,
+    fence: Option<Arc<Fence>>,
     /// The result, and when an endpoint that could not be opened is tried again.
     answer: oneshot::Sender<(Exchanged, Option<Instant>)>,
 }
@@ -51,12 +53,17 @@ impl BlockingLink {
         let counted = Arc::clone(&strays);
         let work = move || {
             let mut failed = None;
+            // While there may be a connection.
+            let mut pass: Option<Pass> = None;
             let flood = (!is_line).then(|| Flood::new(counted, retry));
             for job in queue {
                 match job {
                     // A stopped device no longer waits for its read.
                     Job::Call(call) if call.answer.is_closed() => {}
                     Job::Call(call) => {
+                        if let Some(fence) = &call.fence {
+                            pass.get_or_insert_with(|| fence.pass());
+                        }
                         let answer = carried_out(&client, retry, &call, &mut failed);
                         let flooded = flood.as_ref().and_then(|flood| flood.until(Instant::now()));
                         if let Some(until) = flooded {
@@ -67,7 +74,10 @@ impl BlockingLink {
                         let retry_at = failed.as_ref().map(|failed| failed.until);
                         let _ = call.answer.send((answer, retry_at));
                     }
-                    Job::Release => client.close(),
+                    Job::Release => {
+                        client.close();
+                        pass = None;
+                    }
                 }
             }
         };
@@ -82,11 +92,13 @@ impl BlockingLink {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
+        fence: Option<&Arc<Fence>>,
     ) -> Exchanged {
         let ended = || Arc::new(ClientError::Lost(Lost::Closed(Closed::BySelf)));
         let (answer, answered) = oneshot::channel();
         let request = Box::new(request.clone());
-        let call = Call { unit_id, request, timeout, eager, answer };
+        let fence = fence.cloned();
+        let call = Call { unit_id, request, timeout, eager, fence, answer };
         self.jobs.send(Job::Call(call)).map_err(|_| ended())?;
         let (answer, retry_at) = answered.await.unwrap_or_else(|_| (Err(ended()), None));
         self.retry_at.set(retry_at);
@@ -120,7 +132,14 @@ fn carried_out(
     {
         return Err(Arc::clone(error));
     }
-    let answer = client.call(call.unit_id, &call.request, call.timeout, |_, pdu| pdu.to_vec());
+    let Call { unit_id, ref request, timeout, ref fence, .. } = *call;
+    let answer = match fence {
+        None => client.call(unit_id, request, timeout, |_, pdu| pdu.to_vec()),
+        Some(fence) => {
+            let allowed = || fence.allows();
+            client.call_while(&allowed, unit_id, request, timeout, |_, pdu| pdu.to_vec())
+        }
+    };
     let answer = answer.map_err(Arc::new);
     *failed = match &answer {
         Err(error) if fault(error) == Fault::Refused => {

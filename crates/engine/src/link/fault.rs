@@ -26,6 +26,8 @@ pub enum Fault {
     Internal,
     /// The device sends so much without a request that it is left alone for a while.
     Flooded,
+    /// Another node uses the device. Nothing was sent.
+    Standby,
 }
 
 /// Exceptions of a gateway that could not reach the unit.
@@ -42,6 +44,7 @@ impl Fault {
     pub(crate) fn exception(self, is_unreachable: bool) -> u8 {
         match self {
             Fault::Exception(code) => code,
+            Fault::Standby => ExceptionCode::GatewayPathUnavailable.code(),
             _ if is_unreachable => ExceptionCode::GatewayPathUnavailable.code(),
             _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
         }
@@ -58,6 +61,7 @@ impl Fault {
             Fault::Unstored => NO_EXCEPTION + 6,
             Fault::Internal => NO_EXCEPTION + 7,
             Fault::Flooded => NO_EXCEPTION + 8,
+            Fault::Standby => NO_EXCEPTION + 9,
         }
     }
 }
@@ -84,6 +88,7 @@ pub(super) fn fault(error: &ClientError) -> Fault {
         ClientError::Connect { .. } | ClientError::Tls { maybe_sent: false, .. } => Fault::Refused,
         ClientError::Invalid(InvalidResponse::Flood) => Fault::Flooded,
         ClientError::Invalid(_) => Fault::Invalid,
+        ClientError::Fenced => Fault::Standby,
         ClientError::Lost(_) | ClientError::Tls { .. } => Fault::Reset,
     }
 }

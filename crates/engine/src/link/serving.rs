@@ -69,7 +69,7 @@ impl Serving {
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
         replies.iter().for_each(Reply::note_sent);
         let changes = self.link.changes.get();
-        let answered = self.link.exchange(unit_id, &request, timeout, true).await;
+        let answered = self.link.exchange(unit_id, &request, timeout, true, None).await;
         drop(turn);
         self.learn(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
         let error = match answered {

@@ -20,6 +20,7 @@ use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
 use super::backoff::Retry;
 use super::fault::{Exchanged, FLOODED};
+use super::fence::{Fence, Pass};
 use super::flood::Flood;
 use super::handshake;
 use super::pace::Pace;
@@ -70,6 +71,8 @@ struct Open {
     /// Bytes that the socket has not accepted yet.
     unsent: Vec<u8>,
     reader: Option<AbortHandle>,
+    /// Nothing is sent against it. Set by the first request that has one.
+    pass: Option<Pass>,
 }
 
 impl TcpLink {
@@ -104,14 +107,23 @@ impl TcpLink {
         request: &EncodedRequest,
         timeout: Duration,
         eager: bool,
+        fence: Option<&Arc<Fence>>,
     ) -> Exchanged {
+        let check = || match fence {
+            Some(fence) if !fence.allows() => Err(Arc::new(ClientError::Fenced)),
+            _ => Ok(()),
+        };
         let mut deadline = Instant::now() + timeout;
         let failed = |failure| Arc::new(ClientError::new(failure, timeout));
         let mut attempt = Attempt::default();
         loop {
             if self.open.borrow().is_none() {
-                self.connect(deadline, timeout, eager).await?;
+                self.connect(deadline, timeout, eager, &check).await?;
             }
+            if let (Some(open), Some(fence)) = (self.open.borrow_mut().as_mut(), fence) {
+                open.pass.get_or_insert_with(|| fence.pass());
+            }
+            check()?;
             let began = pace.began();
             let (answer, again) =
                 self.carry_out(unit_id, request, deadline, attempt).await.map_err(failed)?;
@@ -153,6 +165,7 @@ impl TcpLink {
         deadline: Instant,
         timeout: Duration,
         eager: bool,
+        check: &impl Fn() -> Result<(), Arc<ClientError>>,
     ) -> Result<(), Arc<ClientError>> {
         let too_late = || ClientError::ConnectTimeout { to: self.url.clone(), after: timeout };
         let alone = timeout_at(deadline, self.connecting.lock()).await;
@@ -172,6 +185,7 @@ impl TcpLink {
         if let Some(ended) = self.ended.get() {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
+        check()?;
         let address = (self.host.as_str(), self.port);
         let connected = timeout_at(deadline, async {
             let mut stream = TcpStream::connect(address).await?;
@@ -221,6 +235,7 @@ impl TcpLink {
             tls,
             unsent: Vec::new(),
             reader: None,
+            pass: None,
         };
         *self.open.borrow_mut() = Some(open);
         let task = tokio::task::spawn_local(receive(Rc::clone(&self.open), reader));
@@ -333,9 +348,16 @@ impl Drop for TcpLink {
 }
 
 impl Open {
+    fn is_fenced(&self) -> bool {
+        self.pass.as_ref().is_some_and(|pass| !pass.fence().allows())
+    }
+
     /// Sends without waiting. Bytes that the socket does not accept are sent later. Returns whether
     /// the connection still works.
     fn write(&mut self) -> bool {
+        if self.is_fenced() {
+            return false;
+        }
         let frames = self.connection.outgoing();
         match &mut self.tls {
             None => self.unsent.extend_from_slice(frames),
@@ -357,6 +379,9 @@ impl Open {
 impl Drop for Open {
     fn drop(&mut self) {
         self.ended.set(Some(Instant::now()));
+        if self.is_fenced() {
+            self.unsent.clear();
+        }
         if let Some(tls) = &mut self.tls {
             tls.end(&mut self.unsent);
             let _ = self.writer.try_write(&self.unsent);
@@ -438,7 +463,7 @@ mod tests {
 
             let (for_stopped, request) = (Rc::clone(&link), read.clone());
             let stopped = spawn_local(async move {
-                for_stopped.call(1, &request, TIMEOUT, Priority::Usual).await
+                for_stopped.call(1, &request, TIMEOUT, Priority::Usual, None).await
             });
             let (mut device, _) = listener.accept().await.unwrap();
             let mut request = [0; 12];
@@ -447,7 +472,9 @@ mod tests {
             assert!(stopped.await.unwrap_err().is_cancelled());
 
             let next =
-                spawn_local(async move { link.call(1, &read, TIMEOUT, Priority::Usual).await });
+                spawn_local(
+                    async move { link.call(1, &read, TIMEOUT, Priority::Usual, None).await },
+                );
             let mut request = [0; 12];
             device.read_exact(&mut request).await.unwrap();
             let reply = [request[0], request[1], 0, 0, 0, 5, 1, 3, 2, 0, 7];

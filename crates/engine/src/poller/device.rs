@@ -35,9 +35,7 @@ use super::state::DeviceState;
 use super::status::StatusSettings;
 use super::turn::Turn;
 use crate::client::Endpoint;
-use crate::link::Fault;
-use crate::link::Link;
-use crate::link::{InFlight, Priority, Retry};
+use crate::link::{Fault, Fence, InFlight, Link, Priority, Retry, Stage};
 
 /// The longest interval between writes of the status block.
 const TELLING: Duration = Duration::from_secs(1);
@@ -76,6 +74,8 @@ pub struct DeviceSettings {
     pub report: Option<Arc<Results>>,
     /// Whether the connection is closed after each poll, for devices that accept only one.
     pub release: bool,
+    /// Until when the device may be used. Devices of one link have the same, or none.
+    pub fence: Option<Arc<Fence>>,
 }
 
 #[derive(Debug, Clone)]
@@ -109,6 +109,8 @@ pub(super) struct Device {
     first: Cell<usize>,
     strategy: Cell<Strategy>,
     samples: Cell<Samples>,
+    /// Whether another node polls the device.
+    stands_by: Cell<bool>,
     silent: Cell<u32>,
     /// The due time of the next poll.
     due: Cell<Instant>,
@@ -214,6 +216,7 @@ impl Device {
             first: Cell::new(0),
             strategy: Cell::new(settings.strategy),
             samples: Cell::default(),
+            stands_by: Cell::new(false),
             silent: Cell::new(0),
             due: Cell::new(Instant::now()),
             backing_off: Cell::new(false),
@@ -268,6 +271,9 @@ impl Device {
     async fn poll_until_replaced(&self, inbox: &Inbox) -> Box<Device> {
         let interval = self.settings.interval;
         loop {
+            if let Some(successor) = self.stand_by(inbox).await {
+                return successor;
+            }
             let (mut due, off_schedule) = (self.due.get(), self.off_schedule.get());
             let at = off_schedule.map_or(due, |off_schedule| off_schedule.min(due));
             tokio::select! {
@@ -279,6 +285,7 @@ impl Device {
                         continue;
                     }
                 },
+                () = self.fenced() => continue,
                 () = sleep_until(at) => {}
             }
             self.off_schedule.set(None);
@@ -290,7 +297,17 @@ impl Device {
                 due += interval;
             }
             self.turn.polls(true);
-            self.poll(began).await;
+            match &self.settings.fence {
+                None => self.poll(began).await,
+                Some(fence) => {
+                    let _pass = fence.pass();
+                    tokio::select! {
+                        biased;
+                        () = fence.closed() => {}
+                        () = self.poll(began) => {}
+                    }
+                }
+            }
             self.turn.polls(false);
             self.tell();
             let (mut due, missed) = first_from(Instant::now(), due, interval);
@@ -305,6 +322,59 @@ impl Device {
             if interval.is_zero() {
                 tokio::task::yield_now().await;
             }
+        }
+    }
+
+    /// Waits while another node polls the device. Returns the device that replaces it meanwhile.
+    async fn stand_by(&self, inbox: &Inbox) -> Option<Box<Device>> {
+        let fence = self.settings.fence.as_ref()?;
+        if fence.stage() == Stage::Open && self.settled(fence).is_none() {
+            return None;
+        }
+        self.link.release();
+        self.stands_by.set(true);
+        self.state.set_standby(true);
+        self.tell();
+        loop {
+            tokio::select! {
+                biased;
+                told = inbox.next() => if let Told::Successor(successor) = told {
+                    return Some(successor);
+                },
+                () = self.admitted(fence) => break,
+            }
+        }
+        self.stands_by.set(false);
+        self.state.set_standby(false);
+        self.silent.set(0);
+        self.backing_off.set(false);
+        self.off_schedule.set(None);
+        self.due.set(Instant::now());
+        None
+    }
+
+    /// Waits until the device may be polled.
+    async fn admitted(&self, fence: &Fence) {
+        loop {
+            fence.opened().await;
+            let Some(at) = self.settled(fence) else { return };
+            tokio::select! {
+                () = fence.ended() => {}
+                () = sleep_until(at.into()) => {}
+            }
+        }
+    }
+
+    /// When a device that accepts one connection may be connected to: that of a former holder may last.
+    fn settled(&self, fence: &Fence) -> Option<std::time::Instant> {
+        self.settings.release.then(|| fence.settled(self.settings.timeout)).flatten()
+    }
+
+    /// Waits until no poll may begin.
+    async fn fenced(&self) {
+        match &self.settings.fence {
+            None => pending().await,
+            Some(fence) => fence.ended().await,
         }
     }
 
@@ -437,6 +507,7 @@ impl Device {
                     answered = true;
                     fault = Some(refused);
                 }
+                Err(Fault::Standby) => return,
                 Err(other) => {
                     fault = Some(other);
                     // If one request is not answered, the next would not be either.
@@ -447,6 +518,9 @@ impl Device {
         }
         if answered || plan.is_empty() {
             fault = fault.or(self.look_at_unreadable(&known, &mut gathered).await);
+            if fault == Some(Fault::Standby) {
+                return;
+            }
             answered |= fault.is_some_and(Fault::is_answer);
         }
         if self.settings.release {
@@ -551,7 +625,12 @@ impl Device {
         let began = Instant::now();
         let priority = if self.silent.get() > 0 { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
-        let answer = self.link.call(*unit_id, &request, *timeout, priority).await.map(data);
+        let fence = self.settings.fence.as_ref();
+        let answer = self.link.call(*unit_id, &request, *timeout, priority, fence).await.map(data);
+        // After a stop of the process, a reply may be old, and another node may have read a newer one.
+        if fence.is_some_and(|fence| !fence.allows()) {
+            return Err(Fault::Standby);
+        }
         match &answer {
             Ok(bytes) => {
                 debug_assert_eq!(bytes.len(), block.area.byte_len(block.count.into()));
@@ -629,9 +708,13 @@ impl Device {
     fn tell(&self) {
         let status = self.state.status();
         if let Some(to) = &self.settings.status
+            && !(self.stands_by.get() && to.memory.has_journal())
             && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
         {
             self.state.count_unstored();
+        }
+        if self.stands_by.get() {
+            return;
         }
         for forward in &self.forwards {
             forward.tell(&status);

@@ -13,6 +13,8 @@ pub enum Health {
     Stale,
     /// The device is switched off in the configuration.
     Disabled,
+    /// Another node polls the device.
+    Standby,
 }
 
 impl Health {
@@ -40,6 +42,7 @@ impl Health {
             2 => Health::Error,
             3 => Health::Stale,
             4 => Health::Disabled,
+            5 => Health::Standby,
             _ => unreachable!("no health has the code {code}"),
         }
     }
@@ -51,6 +54,7 @@ impl Health {
             Health::Error => 2,
             Health::Stale => 3,
             Health::Disabled => 4,
+            Health::Standby => 5,
         }
     }
 
@@ -61,6 +65,7 @@ impl Health {
             Health::Error => "error",
             Health::Stale => "stale",
             Health::Disabled => "disabled",
+            Health::Standby => "standby",
         }
     }
 }

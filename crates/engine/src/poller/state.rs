@@ -29,6 +29,8 @@ pub struct DeviceState {
     unstored: AtomicBool,
     /// Whether a task of the device has panicked since the device was created or replaced.
     broken: AtomicBool,
+    /// Whether another node polls the device.
+    standby: AtomicBool,
     /// What the connection to its address has received without a request, or late.
     strays: Mutex<Arc<StrayCounters>>,
 }
@@ -69,6 +71,9 @@ impl DeviceState {
     pub fn health(&self) -> Health {
         if self.broken.load(Ordering::Relaxed) {
             return Health::Error;
+        }
+        if self.standby.load(Ordering::Relaxed) {
+            return Health::Standby;
         }
         let health = Health::from_code(self.health.load(Ordering::Relaxed));
         health.at(self.age(), self.stale_after())
@@ -119,6 +124,15 @@ impl DeviceState {
     /// share it.
     pub fn strays(&self) -> Arc<StrayCounters> {
         Arc::clone(&self.strays.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Records whether another node polls the device. What was known before is old when it comes back.
+    pub(super) fn set_standby(&self, standby: bool) {
+        if !standby {
+            self.health.store(Health::Unknown.code(), Ordering::Relaxed);
+            self.times().error_since = None;
+        }
+        self.standby.store(standby, Ordering::Relaxed);
     }
 
     pub(super) fn set_strays(&self, strays: &Arc<StrayCounters>) {

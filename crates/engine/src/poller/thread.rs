@@ -26,7 +26,9 @@ use super::turn::Turn;
 use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::heartbeat::Heartbeat;
-use crate::link::{Call, Fault, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, serve};
+use crate::link::{
+    Call, Fault, Fence, InFlight, Link, LinkSettings, Priority, Retry, SharedLink, Stage, serve,
+};
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
 
@@ -356,6 +358,7 @@ struct Running {
     unit_id: u8,
     timeout: Duration,
     release: bool,
+    fence: Option<Arc<Fence>>,
     inbox: Rc<Inbox>,
     device: AbortHandle,
     forwards: Vec<AbortHandle>,
@@ -379,6 +382,7 @@ async fn obey(
 ) {
     let mut links: HashMap<Address, rc::Weak<Link>> = HashMap::new();
     let mut running: HashMap<String, Running> = HashMap::new();
+    let mut fences = Fences::default();
     let mut started = 0;
     loop {
         let order = tokio::select! {
@@ -409,6 +413,7 @@ async fn obey(
             Order::Add(planned, polled) => {
                 let phase = spread(planned.settings.start_within, started);
                 started += 1;
+                fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
                 let DeviceSettings { endpoint, in_flight, retry, .. } = &planned.settings;
                 let link = link_to(endpoint, (*in_flight, *retry), &mut links);
@@ -421,6 +426,7 @@ async fn obey(
                 let link = link_to(endpoint, (*in_flight, *retry), &mut links);
                 let before = running.remove(&name);
                 debug_assert!(before.is_some(), "{IN_ORDER}");
+                fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
                 let device = match before {
                     Some(mut device) if !device.has_ended() => {
@@ -441,17 +447,33 @@ async fn obey(
     }
 }
 
+/// The fences of devices, each with a task that tells when its end has passed.
+#[derive(Default)]
+struct Fences(HashMap<*const Fence, Weak<Fence>>);
+
+impl Fences {
+    fn watch(&mut self, fence: Option<&Arc<Fence>>) {
+        let Some(fence) = fence else { return };
+        if !self.0.contains_key(&Arc::as_ptr(fence)) {
+            self.0.retain(|_, other| other.strong_count() > 0);
+            self.0.insert(Arc::as_ptr(fence), Arc::downgrade(fence));
+            spawn_local(Fence::watch(Arc::downgrade(fence)));
+        }
+    }
+}
+
 impl Running {
     /// Starts the tasks of a device.
     fn start(planned: Planned, polled: Polled, link: Rc<Link>, phase: Duration) -> Running {
         let inbox = Rc::new(Inbox::default());
         let DeviceSettings { unit_id, timeout, release, .. } = planned.settings;
+        let fence = planned.settings.fence.clone();
         let turn = Rc::new(Turn::default());
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
         let (device, forwards) = made(planned, polled, to);
         let device = spawn_watched(device.run(phase, Rc::clone(&inbox)), state);
-        Running { link, turn, unit_id, timeout, release, inbox, device, forwards }
+        Running { link, turn, unit_id, timeout, release, fence, inbox, device, forwards }
     }
 
     /// Whether the task of the device has panicked. It does not end otherwise.
@@ -464,6 +486,7 @@ impl Running {
         let settings = &planned.settings;
         (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
         (self.release, self.link) = (settings.release, Rc::clone(&link));
+        self.fence.clone_from(&settings.fence);
         let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)));
         self.forwards = forwards;
         if at_once {
@@ -478,11 +501,15 @@ impl Running {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
         let Running { unit_id, timeout, release, .. } = *self;
+        let fence = self.fence.clone();
         spawn_local(async move {
-            let turn = turn.take().await;
-            let answer = link.call(unit_id, &request, timeout, Priority::Urgent).await;
-            drop(turn);
-            if release {
+            let Some(taken) = turn.take_to_write(fence.as_ref(), timeout).await else {
+                return to.push_write(Written { ticket, outcome: Err(Fault::Standby) });
+            };
+            let urgent = Priority::Urgent;
+            let answer = link.call(unit_id, &request, timeout, urgent, fence.as_ref()).await;
+            drop(taken);
+            if release || has_ended(fence.as_ref()) {
                 link.release();
             }
             if answer.is_ok() {
@@ -497,14 +524,17 @@ impl Running {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
         let Running { unit_id, timeout, release, .. } = *self;
+        let fence = self.fence.clone();
         spawn_local(async move {
-            let taken = turn.take().await;
-            if let Some(change) = write.carry_out(&link, unit_id, timeout).await {
+            let Some(taken) = turn.take_to_write(fence.as_ref(), timeout).await else {
+                return write.refuse(ExceptionCode::GatewayPathUnavailable);
+            };
+            if let Some(change) = write.carry_out(&link, unit_id, timeout, fence.as_ref()).await {
                 turn.note(change);
                 inbox.wake();
             }
             drop(taken);
-            if release {
+            if release || has_ended(fence.as_ref()) {
                 link.release();
             }
         });
@@ -515,6 +545,11 @@ impl Running {
             task.abort();
         }
     }
+}
+
+/// Whether a device stands by, so that a write leaves no connection behind.
+fn has_ended(fence: Option<&Arc<Fence>>) -> bool {
+    fence.is_some_and(|fence| fence.stage() != Stage::Open)
 }
 
 /// Creates a device, and starts the tasks that forward its reads.
@@ -679,6 +714,7 @@ mod tests {
             start_within: Duration::ZERO,
             report: None,
             release: false,
+            fence: None,
         }
     }
 

@@ -1,15 +1,20 @@
 //! The turn of a device: it gets one request at a time, from polls and writes alike.
 
 use std::cell::{Cell, RefCell};
+use std::sync::Arc;
+use std::time::Duration;
 
 use holdfast_memory::Area;
 use tokio::sync::{Mutex, MutexGuard};
 
 use super::write_through::Change;
+use crate::link::{Fence, Pass};
 
 #[derive(Default)]
 pub(super) struct Turn {
     lock: Mutex<()>,
+    /// Held by a write that waits for a fence: later ones do not overtake it.
+    writes: Mutex<()>,
     is_polling: Cell<bool>,
     /// What was written to the device since its current poll began.
     changes: RefCell<Vec<Change>>,
@@ -19,6 +24,19 @@ impl Turn {
     /// Waits for the turn, which lasts as long as the result.
     pub(super) async fn take(&self) -> MutexGuard<'_, ()> {
         self.lock.lock().await
+    }
+
+    /// Waits for the turn of a write, in the order of the calls. With a fence, it is not before what a former
+    /// holder has sent has ended; `None` if the device may not be used.
+    pub(super) async fn take_to_write(
+        &self,
+        fence: Option<&Arc<Fence>>,
+        timeout: Duration,
+    ) -> Option<(MutexGuard<'_, ()>, Option<Pass>)> {
+        let Some(fence) = fence else { return Some((self.take().await, None)) };
+        let _next = self.writes.lock().await;
+        let pass = fence.admit_write(timeout).await?;
+        Some((self.take().await, Some(pass)))
     }
 
     /// A poll begins or ends.

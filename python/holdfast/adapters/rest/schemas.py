@@ -116,7 +116,9 @@ DIAGNOSTICS: dict[str, Schema] = {
                     "type": "object",
                     "required": ["health"],
                     "properties": {
-                        "health": {"enum": ["unknown", "ok", "error", "stale", "disabled"]},
+                        "health": {
+                            "enum": ["unknown", "ok", "error", "stale", "disabled", "standby"]
+                        },
                     },
                 },
             },

@@ -118,6 +118,7 @@ fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSet
         start_within: Duration::ZERO,
         report: None,
         release: false,
+        fence: None,
     }
 }
 

@@ -1,0 +1,75 @@
+//! `Fence`: until when devices may be used.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use holdfast_engine::link::{Fence as Core, Stage};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+
+use crate::arguments::seconds;
+
+#[pyclass(frozen, module = "holdfast")]
+#[derive(Default)]
+pub struct Fence {
+    pub(crate) core: Arc<Core>,
+}
+
+#[pymethods]
+impl Fence {
+    #[new]
+    fn new() -> Fence {
+        Fence::default()
+    }
+
+    #[pyo3(signature = (until, *, settle=0.0))]
+    fn open(&self, py: Python<'_>, until: f64, settle: f64) -> PyResult<()> {
+        let settle = seconds("settle", settle)?;
+        self.core.open(instant(py, until)?, settle);
+        Ok(())
+    }
+
+    fn renew(&self, py: Python<'_>, until: f64) -> PyResult<()> {
+        self.core.renew(instant(py, until)?);
+        Ok(())
+    }
+
+    fn end(&self) {
+        self.core.end();
+    }
+
+    fn close(&self) {
+        self.core.close();
+    }
+
+    #[getter]
+    fn is_open(&self) -> bool {
+        self.core.stage() == Stage::Open
+    }
+
+    #[getter]
+    fn allows(&self) -> bool {
+        self.core.allows()
+    }
+
+    #[getter]
+    fn in_use(&self) -> usize {
+        self.core.in_use()
+    }
+}
+
+/// A time of Python's `time.monotonic`, or now if it has passed.
+///
+/// The clock of this side is read first: if the process is stopped in between, the result is too early,
+/// never too late.
+fn instant(py: Python<'_>, time: f64) -> PyResult<Instant> {
+    static CLOCK: PyOnceLock<Py<PyAny>> = PyOnceLock::new();
+    let here = Instant::now();
+    let clock = CLOCK.import(py, "time", "monotonic")?;
+    let left = time - clock.call0()?.extract::<f64>()?;
+    if left.is_nan() {
+        return Err(PyValueError::new_err("the time is not a number"));
+    }
+    Ok(here + Duration::from_secs_f64(left.clamp(0.0, 3600.0)))
+}

@@ -1,0 +1,203 @@
+//! Fences: until when devices may be used. Whoever holds the lease of a device moves the end of its fence;
+//! when that passes without a renewal, nothing is sent to the device any more, not even by a process that
+//! was stopped in between.
+//!
+//! The end is compared with the clock at the last moment before bytes are sent. It is not enough that a
+//! task closes the connection when the time is over: after a stop of the process, others may run first.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+use tokio::time::sleep_until;
+
+/// What a fence allows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// Nothing is sent, and connections are closed.
+    Closed,
+    /// Polls that have begun end, and none begins.
+    Ending,
+    Open,
+}
+
+/// Until when devices may be used. It begins closed.
+#[derive(Debug)]
+pub struct Fence {
+    /// The zero of all times.
+    zero: Instant,
+    /// In nanoseconds after `zero`; 0 if it was never opened, or is closed.
+    until: AtomicU64,
+    /// When everything that a former holder has sent has ended, but for the timeout of the device.
+    settled: AtomicU64,
+    is_ending: AtomicBool,
+    /// Polls, writes and connections.
+    in_use: AtomicUsize,
+    stage: watch::Sender<Stage>,
+}
+
+/// A use of the devices behind a fence, while it lasts.
+#[derive(Debug)]
+pub struct Pass(Arc<Fence>);
+
+impl Default for Fence {
+    fn default() -> Fence {
+        Fence {
+            zero: Instant::now(),
+            until: AtomicU64::new(0),
+            settled: AtomicU64::new(0),
+            is_ending: AtomicBool::new(false),
+            in_use: AtomicUsize::new(0),
+            stage: watch::Sender::new(Stage::Closed),
+        }
+    }
+}
+
+impl Fence {
+    /// Opens it. What a former holder has sent may still arrive for `settle`, and the timeout of a device.
+    pub fn open(&self, until: Instant, settle: Duration) {
+        let settled = if settle.is_zero() { 0 } else { self.time(Instant::now() + settle) };
+        self.settled.store(settled, Ordering::Release);
+        self.is_ending.store(false, Ordering::Release);
+        self.until.store(self.time(until), Ordering::Release);
+        self.announce();
+    }
+
+    /// Moves the end, never to an earlier time. Without effect if it was closed.
+    pub fn renew(&self, until: Instant) {
+        let until = self.time(until);
+        let moved = self.until.fetch_update(Ordering::AcqRel, Ordering::Acquire, |before| {
+            (before > 0).then_some(before.max(until))
+        });
+        if moved.is_ok() {
+            self.announce();
+        }
+    }
+
+    /// Lets polls that have begun end, and none begin. The end must still be moved meanwhile.
+    pub fn end(&self) {
+        self.is_ending.store(true, Ordering::Release);
+        self.announce();
+    }
+
+    pub fn close(&self) {
+        self.until.store(0, Ordering::Release);
+        self.announce();
+    }
+
+    pub fn stage(&self) -> Stage {
+        if self.time(Instant::now()) >= self.until.load(Ordering::Acquire) {
+            Stage::Closed
+        } else if self.is_ending.load(Ordering::Acquire) {
+            Stage::Ending
+        } else {
+            Stage::Open
+        }
+    }
+
+    /// Whether bytes may be sent now.
+    pub fn allows(&self) -> bool {
+        self.stage() != Stage::Closed
+    }
+
+    /// The number of polls, writes and connections.
+    pub fn in_use(&self) -> usize {
+        self.in_use.load(Ordering::Acquire)
+    }
+
+    /// When nothing of a former holder can arrive at a device with this timeout any more.
+    pub(crate) fn settled(&self, timeout: Duration) -> Option<Instant> {
+        let settled = self.settled.load(Ordering::Acquire);
+        let at = (settled > 0).then(|| self.zero + Duration::from_nanos(settled) + timeout);
+        at.filter(|at| Instant::now() < *at)
+    }
+
+    /// Waits until nothing of a former holder can arrive any more; `None` if the device may not be used.
+    pub(crate) async fn admit_write(self: &Arc<Fence>, timeout: Duration) -> Option<Pass> {
+        while self.stage() == Stage::Open {
+            let Some(at) = self.settled(timeout) else { return Some(self.pass()) };
+            tokio::select! {
+                () = self.ended() => {}
+                () = sleep_until(at.into()) => {}
+            }
+        }
+        None
+    }
+
+    pub(crate) fn pass(self: &Arc<Fence>) -> Pass {
+        self.in_use.fetch_add(1, Ordering::AcqRel);
+        Pass(Arc::clone(self))
+    }
+
+    /// Waits until it is open.
+    pub(crate) async fn opened(&self) {
+        self.wait(|stage| stage == Stage::Open).await;
+    }
+
+    /// Waits until no poll may begin.
+    pub(crate) async fn ended(&self) {
+        self.wait(|stage| stage != Stage::Open).await;
+    }
+
+    /// Waits until nothing may be sent.
+    pub(crate) async fn closed(&self) {
+        self.wait(|stage| stage == Stage::Closed).await;
+    }
+
+    async fn wait(&self, is_reached: impl Fn(Stage) -> bool) {
+        let mut stage = self.stage.subscribe();
+        // What was announced may be over: the clock decides.
+        while !is_reached(self.stage()) {
+            if is_reached(*stage.borrow_and_update()) {
+                self.announce();
+            }
+            // The sender is a part of the fence.
+            let _ = stage.changed().await;
+        }
+    }
+
+    fn announce(&self) {
+        self.stage.send_if_modified(|announced| {
+            let now = self.stage();
+            std::mem::replace(announced, now) != now
+        });
+    }
+
+    /// Announces that the end has passed. Runs while there is a fence.
+    pub(crate) async fn watch(fence: Weak<Fence>) {
+        let Some(mut stage) = fence.upgrade().map(|fence| fence.stage.subscribe()) else { return };
+        loop {
+            let Some(found) = fence.upgrade() else { return };
+            stage.mark_unchanged();
+            found.announce();
+            let until = found.zero + Duration::from_nanos(found.until.load(Ordering::Acquire));
+            let is_closed = found.stage() == Stage::Closed;
+            drop(found);
+            if is_closed {
+                if stage.changed().await.is_err() {
+                    return;
+                }
+            } else {
+                sleep_until(until.into()).await;
+            }
+        }
+    }
+
+    fn time(&self, instant: Instant) -> u64 {
+        let nanos = instant.saturating_duration_since(self.zero).as_nanos();
+        u64::try_from(nanos).unwrap_or(u64::MAX)
+    }
+}
+
+impl Pass {
+    pub(crate) fn fence(&self) -> &Arc<Fence> {
+        &self.0
+    }
+}
+
+impl Drop for Pass {
+    fn drop(&mut self) {
+        self.0.in_use.fetch_sub(1, Ordering::AcqRel);
+    }
+}
