@@ -1,0 +1,168 @@
+"""A bucket of leases: makes it, changes keys by compare-and-set, and follows all keys.
+
+`KeyValue` of nats-py can't renew a key with a TTL, and its `create` is late to find a key that the
+server has deleted. Here every change names the revision that it replaces.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from nats.js.api import (
+    AckPolicy,
+    ConsumerConfig,
+    DeliverPolicy,
+    DiscardPolicy,
+    StorageType,
+    StreamConfig,
+)
+from nats.js.errors import APIError, BadRequestError, NotFoundError, ServerError
+
+from holdfast.leases.entries import TTL, entry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+    from nats.aio.subscription import Subscription
+
+    from holdfast.leases.entries import Entry
+
+TIMEOUT = 0.9
+"""Seconds to wait for an answer of JetStream: less than between two renewals."""
+
+OPENING = 5.0
+"""The same while the bucket is opened."""
+
+MARKER = 60.0
+"""Seconds that the server keeps the mark of a key that has ended."""
+
+WRONG_SEQUENCE = (10071, 10164)
+"""Error codes of JetStream: the key has another revision than expected."""
+
+IN_USE = 10058
+"""The stream exists with other settings."""
+
+MESSAGE = 64 * 1024
+"""The size limit of an entry in bytes."""
+
+
+class NotALeaseBucket(Exception):
+    """The bucket has other settings. Another attempt can't change that."""
+
+
+class Outdated(Exception):
+    """A key has another revision than expected."""
+
+
+class LeaseBucket:
+    """One bucket, over one connection."""
+
+    def __init__(self, client: Client, name: str) -> None:
+        self.name = name
+        self.client = client
+        self._jetstream = client.jetstream(timeout=TIMEOUT)
+        self._stream = f"KV_{name}"
+        self._pre = f"$KV.{name}."
+        self._following: Subscription | None = None
+
+    async def open(self, replicas: int = 1) -> None:
+        """Makes the bucket, if there is none.
+
+        Raises `NotALeaseBucket` and the errors of nats-py.
+        """
+        jetstream = self.client.jetstream(timeout=OPENING)
+        try:
+            info = await jetstream.stream_info(self._stream)
+        except NotFoundError:
+            config = StreamConfig(
+                name=self._stream,
+                subjects=[f"{self._pre}>"],
+                max_msgs_per_subject=1,
+                max_msg_size=MESSAGE,
+                num_replicas=replicas,
+                storage=StorageType.FILE,
+                discard=DiscardPolicy.NEW,
+                deny_delete=True,
+                allow_rollup_hdrs=True,
+                allow_direct=True,
+                allow_msg_ttl=True,
+                subject_delete_marker_ttl=MARKER,
+            )
+            try:
+                info = await jetstream.add_stream(config)
+            except BadRequestError as error:
+                if error.err_code != IN_USE:
+                    raise
+                info = await jetstream.stream_info(self._stream)
+        found = info.config
+        if not found.allow_msg_ttl or found.max_msgs_per_subject != 1:
+            raise NotALeaseBucket(
+                f"the bucket {self.name} exists without TTLs of keys or with a history: delete it, "
+                "so that it is made again"
+            )
+
+    async def put(self, key: str, value: bytes, revision: int) -> int:
+        """Replaces the revision of a key, 0 if there is none, for `TTL`. Returns the new revision.
+
+        Raises `Outdated` and the errors of nats-py.
+        """
+        return await self._publish(key, value, revision, {"Nats-TTL": f"{TTL:.0f}s"})
+
+    async def delete(self, key: str, revision: int) -> None:
+        """Deletes a key, which is given back. Raises as `put` does."""
+        headers = {"KV-Operation": "DEL", "Nats-TTL": f"{MARKER:.0f}s"}
+        await self._publish(key, b"", revision, headers)
+
+    async def _publish(self, key: str, value: bytes, revision: int, headers: dict[str, str]) -> int:
+        expected = {"Nats-Expected-Last-Subject-Sequence": str(revision)}
+        try:
+            ack = await self._jetstream.publish(
+                f"{self._pre}{key}", value, headers=headers | expected
+            )
+        except (APIError, ServerError) as error:
+            if getattr(error, "err_code", None) in WRONG_SEQUENCE:
+                raise Outdated(key) from None
+            raise
+        return ack.seq
+
+    async def get(self, key: str) -> Entry | None:
+        """Reads a key. Raises the errors of nats-py."""
+        try:
+            found = await self._jetstream.get_last_msg(self._stream, f"{self._pre}{key}")
+        except NotFoundError:
+            return None
+        return entry(found.seq or 0, found.headers, found.data or b"", time.monotonic())
+
+    async def follow(self, take: Callable[[str, Entry], None]) -> None:
+        """Passes on all keys, and then their changes, until `unfollow`.
+
+        Raises the errors of nats-py.
+        """
+
+        async def taken(message: Msg) -> None:
+            key = message.subject.removeprefix(self._pre)
+            metadata = message.metadata
+            take(
+                key,
+                entry(metadata.sequence.stream, message.headers, message.data, time.monotonic()),
+            )
+
+        config = ConsumerConfig(
+            deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
+            ack_policy=AckPolicy.NONE,
+            mem_storage=True,
+            num_replicas=1,
+            inactive_threshold=30.0,
+        )
+        self._following = await self._jetstream.subscribe(
+            f"{self._pre}>", stream=self._stream, config=config, cb=taken
+        )
+
+    async def unfollow(self) -> None:
+        """Ends `follow`."""
+        following, self._following = self._following, None
+        if following is not None:
+            await following.unsubscribe()

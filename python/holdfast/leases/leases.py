@@ -1,0 +1,344 @@
+"""Holds leases: takes those that are free, renews them, and gives them back.
+
+Two clocks are never compared. A holder stops `HELD` seconds after it *sent* its last renewal; all
+others wait until they have not seen a renewal for `TTL` seconds, which is longer, and then replace
+exactly the revision that they have seen. If it was renewed meanwhile, that fails. So it does not
+matter when the server deletes a key, whether a message about it is late, or how long a process was
+stopped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import msgspec
+from nats.errors import Error
+from nats.js.errors import NoStreamResponseError
+
+from holdfast import _core
+from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated
+from holdfast.leases.entries import HELD, RENEWED, TTL, Entry, Holding
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable, Mapping
+
+    from nats.aio.client import Client
+
+TICK = 0.1
+"""The longest time in seconds between two looks at what others hold."""
+
+SILENCE = 2.5
+"""Seconds without news, while renewals are confirmed, after which keys are followed anew."""
+
+RETRIED = 0.5
+"""Seconds before the bucket is opened again after a failure."""
+
+USED = 0.01
+"""Seconds between looks at a lease that is being given back."""
+
+
+class Watcher(Protocol):
+    """Who is told of changes, in the event loop."""
+
+    def taken(self, key: str) -> None:
+        """A lease was taken."""
+
+    def lost(self, key: str, reason: str) -> None:
+        """A lease is not held any more, though it was wanted."""
+
+    def changed(self) -> None:
+        """Somebody else has taken or left a lease."""
+
+    def works(self, reason: str | None) -> None:
+        """The bucket works; or it does not, for this reason."""
+
+
+@dataclass
+class _Held:
+    """A lease that this process holds."""
+
+    revision: int
+    holding: Holding
+    since: int
+    """The revision with which it was taken. It grows with each holder."""
+    until: float
+    """When it must not be used any more."""
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Held while the key is being written."""
+
+
+class Leases:
+    """The leases of one bucket, as one process holds them, from `run` to its end."""
+
+    def __init__(
+        self,
+        bucket: str,
+        node: str,
+        watcher: Watcher,
+        *,
+        replicas: int = 1,
+        about: Callable[[str], dict[str, Any]] = lambda _: {},
+    ) -> None:
+        """`about` returns what the value of a lease says besides its holder."""
+        self.node = node
+        self.process = secrets.token_hex(8)
+        self.seen: dict[str, Entry] = {}
+        """All keys of the bucket, as last seen."""
+        self._bucket_name = bucket
+        self._watcher = watcher
+        self._replicas = replicas
+        self._about = about
+        self._fences: dict[str, _core.Fence] = {}
+        self._held: dict[str, _Held] = {}
+        self._wanted: frozenset[str] = frozenset()
+        self._taking: set[str] = set()
+        self._ending: set[str] = set()
+        self._client: Client | None = None
+        self._bucket: LeaseBucket | None = None
+        self._reason: str | None = "not connected"
+        self._news = asyncio.Event()
+        self._heard = self._acknowledged = 0.0
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def connected(self, client: Client | None) -> None:
+        """Sets the client; `None` while there is no connection."""
+        self._client = client
+        if client is not None and self._bucket is not None and self._bucket.client is not client:
+            self._bucket = None
+        self._heard = 0.0  # The server may have forgotten who follows.
+        self._news.set()
+
+    def fence(self, key: str) -> _core.Fence:
+        """The fence of what a lease protects. It stays the same while the lease comes and goes."""
+        return self._fences.setdefault(key, _core.Fence())
+
+    def want(self, keys: Iterable[str]) -> None:
+        """Takes these leases as soon as they are free. Others are kept until `give_back`."""
+        self._wanted = frozenset(keys)
+        self._news.set()
+
+    @property
+    def held(self) -> Mapping[str, int]:
+        """The leases that are held, with the revision with which each was taken."""
+        return {key: held.since for key, held in self._held.items()}
+
+    def is_held(self, key: str) -> bool:
+        """Whether what the lease protects may be used now. Ask at the last moment."""
+        return key in self._held and self._fences[key].allows
+
+    def holder(self, key: str) -> Holding | None:
+        """Who holds a lease, as far as is known."""
+        if (own := self._held.get(key)) is not None:
+            return own.holding
+        entry = self.seen.get(key)
+        return entry.holding if entry is not None and entry.is_live(time.monotonic()) else None
+
+    @property
+    def reason(self) -> str | None:
+        """Why the bucket does not work; `None` if it does."""
+        return self._reason
+
+    async def run(self) -> None:
+        """Holds what is wanted, until it is cancelled."""
+        due = 0.0
+        try:
+            while True:
+                if self._client is not None and self._bucket is None:
+                    await self._open(self._client)
+                now = time.monotonic()
+                if now >= due:
+                    due = now + RENEWED
+                    for key, held in list(self._held.items()):
+                        self._begin(self._renew(key, held))
+                    await self._follow_again(now)
+                self._take_free(now)
+                self._note_lapsed(now)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(min(TICK, max(due - now, 0.0))):
+                        await self._news.wait()
+                self._news.clear()
+        finally:
+            for task in self._tasks:
+                task.cancel()
+            for fence in self._fences.values():
+                fence.close()
+
+    async def give_back(self, key: str, limit: float) -> bool:
+        """Gives a lease back when all polls and writes have ended, or after `limit` seconds.
+
+        Returns whether all had ended. Nothing new begins meanwhile, and the lease is renewed.
+        """
+        held = self._held.get(key)
+        if held is None:
+            return True
+        fence = self._fences[key]
+        self._ending.add(key)
+        try:
+            fence.end()
+            until = time.monotonic() + limit
+            while fence.in_use and time.monotonic() < until and key in self._held:
+                await asyncio.sleep(USED)
+            is_clean = fence.in_use == 0
+            fence.close()
+            async with held.lock:
+                if self._held.pop(key, None) is None:
+                    return False
+                if is_clean and self._bucket is not None:
+                    # Without the mark, others wait until the lease has ended.
+                    with contextlib.suppress(Outdated, Error, OSError):
+                        await self._bucket.delete(key, held.revision)
+            return is_clean
+        finally:
+            self._ending.discard(key)
+            self._watcher.changed()
+
+    async def _open(self, client: Client) -> None:
+        bucket = LeaseBucket(client, self._bucket_name)
+        try:
+            await bucket.open(self._replicas)
+            await bucket.follow(self._saw)
+        except (Error, OSError, NotALeaseBucket) as error:
+            self._works(str(error) or type(error).__name__)
+            await asyncio.sleep(RETRIED)
+            return
+        if self._client is client:
+            self._bucket = bucket
+            self._heard = self._acknowledged = time.monotonic()
+            self._works(None)
+
+    def _works(self, reason: str | None) -> None:
+        if reason != self._reason:
+            self._reason = reason
+            self._watcher.works(reason)
+
+    async def _follow_again(self, now: float) -> None:
+        """Follows the keys anew if nothing is seen of renewals that are confirmed."""
+        if self._bucket is None or self._client is None or now - self._heard < SILENCE:
+            return
+        if self._heard == 0.0 or now - self._acknowledged < SILENCE:
+            self._heard = now
+            with contextlib.suppress(Error, OSError):
+                await self._bucket.unfollow()
+                await self._bucket.follow(self._saw)
+
+    def _saw(self, key: str, entry: Entry) -> None:
+        self._heard = time.monotonic()
+        before = self.seen.get(key)
+        if before is not None and entry.revision <= before.revision:
+            return
+        self.seen[key] = entry
+        was, now = (None if each is None else each.holding for each in (before, entry))
+        same = was is not None and now is not None and was.process == now.process
+        if not same:
+            self._news.set()
+            self._watcher.changed()
+
+    def _take_free(self, now: float) -> None:
+        if self._bucket is None or self._client is None:
+            return
+        for key in self._wanted:
+            if key in self._held or key in self._taking or key in self._ending:
+                continue
+            entry = self.seen.get(key)
+            if entry is None or not entry.is_live(now):
+                self._taking.add(key)
+                self._begin(self._take(self._bucket, key, entry))
+
+    async def _take(self, bucket: LeaseBucket, key: str, entry: Entry | None) -> None:
+        holding = Holding(
+            node=self.node,
+            process=self.process,
+            taken=int(time.time() * 1000),
+            about=self._about(key),
+        )
+        sent = time.monotonic()
+        try:
+            revision = await bucket.put(
+                key, msgspec.json.encode(holding), 0 if entry is None else entry.revision
+            )
+        except Outdated:
+            await self._read(bucket, key)
+            return
+        except NoStreamResponseError:
+            if not self._held:
+                self._bucket = None  # It is made again.
+            return
+        except (Error, OSError):
+            # If it was taken all the same, it ends by its TTL.
+            await self._read(bucket, key)
+            return
+        finally:
+            self._taking.discard(key)
+        self._acknowledged = time.monotonic()
+        self.seen[key] = Entry(revision, holding, sent)
+        self._held[key] = _Held(revision, holding, revision, sent + HELD)
+        clean = entry is not None and entry.is_given_back
+        self.fence(key).open(sent + HELD, settle=0.0 if clean else TTL)
+        self._watcher.taken(key)
+
+    async def _read(self, bucket: LeaseBucket, key: str) -> None:
+        """Reads a key that is not as it was last seen."""
+        with contextlib.suppress(Error, OSError):
+            entry = await bucket.get(key)
+            if entry is None:
+                self.seen.pop(key, None)
+            else:
+                self._saw(key, entry)
+
+    async def _renew(self, key: str, held: _Held) -> None:
+        bucket = self._bucket
+        if bucket is None or self._client is None or held.lock.locked():
+            return
+        async with held.lock:
+            if self._held.get(key) is not held:
+                return
+            sent = time.monotonic()
+            value = msgspec.json.encode(held.holding)
+            try:
+                held.revision = await bucket.put(key, value, held.revision)
+            except Outdated:
+                await self._look(bucket, key, held)
+                return
+            except (Error, OSError):
+                return  # The next renewal tries again, until the lease has lapsed.
+            self._acknowledged = time.monotonic()
+            held.until = sent + HELD
+            self._fences[key].renew(held.until)
+
+    async def _look(self, bucket: LeaseBucket, key: str, held: _Held) -> None:
+        """Finds out who has written a key: another holder, or an own renewal without an answer."""
+        try:
+            entry = await bucket.get(key)
+        except (Error, OSError):
+            return
+        if (
+            entry is not None
+            and entry.holding is not None
+            and entry.holding.process == self.process
+        ):
+            held.revision = entry.revision
+            return
+        self._fences[key].close()
+        self._held.pop(key, None)
+        if entry is not None:
+            self._saw(key, entry)
+        ended = entry is None or entry.holding is None
+        self._watcher.lost(key, "it has ended" if ended else "another node holds it")
+
+    def _note_lapsed(self, now: float) -> None:
+        """Gives up leases that could not be renewed for so long that others may have taken them."""
+        for key, held in list(self._held.items()):
+            if now >= held.until - HELD + TTL and not held.lock.locked():
+                self._fences[key].close()
+                del self._held[key]
+                self._watcher.lost(key, "it could not be renewed")
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

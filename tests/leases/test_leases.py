@@ -1,0 +1,230 @@
+"""Leases in a bucket of a real NATS server: one holder at a time, whatever happens to it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from nats.errors import TimeoutError as NatsTimeout
+
+from holdfast.leases import LeaseBucket, Leases, entries
+from holdfast.leases.bucket import Outdated
+from holdfast.scanner.broker import Broker, Ping, Servers
+from support import wire
+from support.brokers import NatsServer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+    from pathlib import Path
+
+    from nats.aio.client import Client
+
+BUCKET = "leases"
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    server = NatsServer(tmp_path)
+    yield server
+    server.kill()
+
+
+class Node:
+    """One holder of leases, with a connection of its own."""
+
+    def __init__(self, name: str) -> None:
+        self.leases = Leases(BUCKET, name, self)
+        self.events: list[str] = []
+        self.client: Client | None = None
+
+    def taken(self, key: str) -> None:
+        self.events.append(f"taken {key}")
+
+    def lost(self, key: str, reason: str) -> None:
+        self.events.append(f"lost {key}: {reason}")
+
+    def changed(self) -> None:
+        pass
+
+    def works(self, reason: str | None) -> None:
+        self.events.append("works" if reason is None else f"fails: {reason}")
+
+    def connected(self, client: Client | None) -> None:
+        self.client = client
+        self.leases.connected(client)
+
+
+@contextlib.asynccontextmanager
+async def running(server: NatsServer, name: str) -> AsyncIterator[Node]:
+    """A node that disappears at the end of the block, without giving anything back."""
+    node = Node(name)
+    broker = Broker(Servers((server.url,)), {}, node.connected, Ping())
+    tasks = [asyncio.create_task(broker.run()), asyncio.create_task(node.leases.run())]
+    try:
+        yield node
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def until(condition: Callable[[], Any], what: str) -> None:
+    end = time.monotonic() + wire.DEADLINE
+    while not condition():
+        assert time.monotonic() < end, f"not within {wire.DEADLINE} s: {what}"
+        await asyncio.sleep(0.01)
+
+
+def test_the_holder_keeps_its_lease_and_another_takes_it_when_it_is_gone(
+    server: NatsServer,
+) -> None:
+    async def work() -> None:
+        async with running(server, "b") as second:
+            async with running(server, "a") as first:
+                first.leases.want(["x"])
+                await until(lambda: first.leases.is_held("x"), "the first node has it")
+                second.leases.want(["x"])
+                since = first.leases.held["x"]
+                await until(lambda: second.leases.holder("x") is not None, "the second one knows")
+                holder = second.leases.holder("x")
+                assert holder is not None
+                assert holder.node == "a"
+                # Several renewals later, nothing has changed.
+                revision = second.leases.seen["x"].revision
+                await until(lambda: second.leases.seen["x"].revision >= revision + 4, "renewals")
+                assert dict(first.leases.held) == {"x": since}
+                assert not second.leases.held
+                fence = first.leases.fence("x")
+                assert fence.is_open
+            assert not fence.allows
+            await until(lambda: second.leases.is_held("x"), "the second node has taken over")
+            assert second.leases.held["x"] > since
+
+    asyncio.run(work())
+
+
+def test_a_lease_that_is_given_back_is_taken_at_once(
+    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Only the mark of its former holder can free it.
+    monkeypatch.setattr(entries, "TTL", 1000.0)
+
+    async def work() -> None:
+        async with running(server, "a") as first, running(server, "b") as second:
+            first.leases.want(["x"])
+            await until(lambda: first.leases.is_held("x"), "the first node has it")
+            second.leases.want(["x"])
+            await until(lambda: second.leases.holder("x") is not None, "the second one knows")
+            first.leases.want([])
+            assert await first.leases.give_back("x", 1.0)
+            assert not first.leases.fence("x").allows
+            await until(lambda: second.leases.is_held("x"), "the second node has it")
+
+    asyncio.run(work())
+
+
+def test_a_renewal_that_was_not_confirmed_is_found(
+    server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = LeaseBucket.put
+    lost = 0
+
+    async def put(bucket: LeaseBucket, key: str, value: bytes, revision: int) -> int:
+        nonlocal lost
+        done = await original(bucket, key, value, revision)
+        if revision and not lost:
+            lost += 1
+            raise NatsTimeout
+        return done
+
+    async def work() -> None:
+        async with running(server, "a") as node:
+            node.leases.want(["x"])
+            await until(lambda: lost, "a confirmation is lost")
+            revision = node.leases.seen["x"].revision
+            await until(lambda: node.leases.seen["x"].revision > revision + 2, "renewals go on")
+            assert node.leases.is_held("x")
+            assert [event for event in node.events if event != "works"] == ["taken x"]
+
+    monkeypatch.setattr(LeaseBucket, "put", put)
+    asyncio.run(work())
+
+
+def test_without_the_server_a_holder_stops_before_others_may_begin(server: NatsServer) -> None:
+    async def work() -> None:
+        async with running(server, "a") as node:
+            node.leases.want(["x"])
+            await until(lambda: node.leases.is_held("x"), "it is held")
+            fence = node.leases.fence("x")
+            server.kill()
+            await until(lambda: not fence.allows, "the fence has closed")
+            await until(lambda: "x" not in node.leases.held, "the lease is given up")
+            assert node.events[-1] == "lost x: it could not be renewed"
+            server.start()
+            await until(lambda: node.leases.is_held("x"), "it is held again")
+            assert fence.is_open
+
+    asyncio.run(work())
+
+
+def test_a_former_holder_changes_nothing(server: NatsServer) -> None:
+    async def work() -> None:
+        async with running(server, "a") as first, running(server, "b") as second:
+            first.leases.want(["x"])
+            await until(lambda: first.leases.is_held("x"), "the first node has it")
+            revision = first.leases.seen["x"].revision
+            second.leases.want(["x"])
+            await until(lambda: second.leases.holder("x") is not None, "the second one knows")
+            # The first one is stopped for longer than the lease lasts.
+            held = first.leases.connected
+            held(None)
+            await until(lambda: second.leases.is_held("x"), "the second node has taken over")
+            assert not first.leases.fence("x").allows
+            assert first.client is not None
+            bucket = LeaseBucket(first.client, BUCKET)
+            with pytest.raises(Outdated):
+                await bucket.put("x", b"{}", revision)
+            with pytest.raises(Outdated):
+                await bucket.delete("x", revision)
+            held(first.client)
+            await until(
+                lambda: (holder := first.leases.holder("x")) and holder.node == "b",
+                "it knows the new holder",
+            )
+            assert not first.leases.held
+            assert second.leases.is_held("x")
+
+    asyncio.run(work())
+
+
+def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
+    async def work() -> None:
+        async with running(server, "b") as node:
+            await until(lambda: node.client is not None, "it is connected")
+            assert node.client is not None
+            await node.client.jetstream().delete_stream(f"KV_{BUCKET}")
+            await node.client.jetstream().add_stream(
+                name=f"KV_{BUCKET}", subjects=[f"$KV.{BUCKET}.>"]
+            )
+        async with running(server, "a") as node:
+            node.leases.want(["x"])
+            await until(lambda: "exists without TTLs" in str(node.leases.reason), "it says so")
+            assert not node.leases.held
+
+    asyncio.run(work())
+
+
+def test_a_bucket_that_was_deleted_is_made_again(server: NatsServer) -> None:
+    async def work() -> None:
+        async with running(server, "a") as node:
+            node.leases.want(["x"])
+            await until(lambda: node.leases.is_held("x"), "it is held")
+            assert node.client is not None
+            await node.client.jetstream().delete_stream(f"KV_{BUCKET}")
+            await until(lambda: "x" not in node.leases.held, "it is given up")
+            await until(lambda: node.leases.is_held("x"), "it is held again")
+
+    asyncio.run(work())
