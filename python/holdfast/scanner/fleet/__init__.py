@@ -1,0 +1,1 @@
+"""Several scanners that share their devices."""
