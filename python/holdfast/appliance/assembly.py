@@ -282,11 +282,15 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
 
 
 def device(
-    name: str, config: Config, memories: Mapping[str, Memory], report: _core.Results | None
+    name: str,
+    config: Config,
+    memories: Mapping[str, Memory],
+    report: _core.Results | None,
+    fence: _core.Fence | None = None,
 ) -> _core.PolledDevice:
     """Creates the native poller's device of that name. Raises `OSError` for unusable files.
 
-    `report` takes the polls of devices with tags.
+    `report` takes the polls of devices with tags. With a `fence`, it is polled while that is open.
     """
     settings = config.devices[name]
     fields = Reader(name, config.tags(name)).fields
@@ -313,6 +317,7 @@ def device(
         measured=settings.cost is not None and settings.cost.measured,
         report=report if fields else None,
         fields=fields,
+        fence=fence,
         **planning.rules(settings),
     )
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from holdfast._core import Engine, Link, Memory, Poller
+    from holdfast.appliance.device_leases import DeviceLeases
     from holdfast.appliance.kept import KeptMemories
     from holdfast.appliance.liveness import Liveness
     from holdfast.appliance.shared_logs import SharedLogs
@@ -41,6 +42,9 @@ class Diagnostics:
 
         self.logs: SharedLogs | None = None
         """The logs that memories are replicated through."""
+
+        self.leases: DeviceLeases | None = None
+        """Who polls the devices that are read into replicated memories."""
 
         self.audit: Audit | None = None
         self.poller: Poller | None = None
@@ -88,7 +92,12 @@ class Diagnostics:
 
     def shared_logs(self) -> dict[str, dict[str, Any]]:
         """Returns the state of each log that memories are replicated through."""
-        return {} if self.logs is None else self.logs.status()
+        if self.logs is None:
+            return {}
+        found = self.logs.status()
+        for name, status in found.items():
+            status["devices"] = {} if self.leases is None else self.leases.status(name)
+        return found
 
     def devices(self) -> dict[str, dict[str, Any]]:
         """Returns the health and the counters of each device."""

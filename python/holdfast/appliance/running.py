@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from holdfast import _core, logs
 from holdfast.adapters import foreign
 from holdfast.appliance import assembly, auditing, changes, configured_certificates, kept, receivers
+from holdfast.appliance.device_leases import DeviceLeases
 from holdfast.appliance.diagnostics import Diagnostics, configured
 from holdfast.appliance.expiring import Expiring
 from holdfast.appliance.kept import KeptMemories
@@ -240,6 +241,7 @@ class _Running:
             undo.callback(self._kept.stop)
             self._logs = SharedLogs(config, memories)
             undo.callback(self._logs.stop)
+            self._leases = DeviceLeases(config)
             assembly.mirror(config, memories)
             disabled = self._tell_disabled()
             self._audit = auditing.opened(config)
@@ -257,7 +259,7 @@ class _Running:
                 self._values = _tag_values(None, self._poller, config)
                 links = assembly.links(config, memories, self._poller)
                 devices = [
-                    assembly.device(name, config, memories, _results(self._values))
+                    self._device(name, config, memories, self._values)
                     for name, device in config.devices.items()
                     if device.is_polled
                 ]
@@ -271,6 +273,7 @@ class _Running:
             self.diagnostics = Diagnostics(memories, self._engine, self.liveness)
             self.diagnostics.kept = self._kept
             self.diagnostics.logs = self._logs
+            self.diagnostics.leases = self._leases
             self.diagnostics.audit = self._audit
             self.diagnostics.poller = self._poller
             self.diagnostics.links = links.links
@@ -288,6 +291,7 @@ class _Running:
             self._recorder.start()
         for supervisor in self._supervisors.values():
             supervisor.start()
+        self._leases.start()
 
     def stop(self) -> None:
         """Requests the stop of all parts, then waits for each.
@@ -301,6 +305,7 @@ class _Running:
         self._log_last_events()
         for supervisor in self._supervisors.values():
             supervisor.join()
+        self._leases.stop()
         if self._poller is not None:
             self._poller.stop()
         if self._values is not None:
@@ -361,7 +366,7 @@ class _Running:
 
     def _heartbeats(self) -> list[ThreadHeartbeat]:
         """The heartbeats of all threads that the appliance depends on. Thread-safe."""
-        heartbeats = self._engine.heartbeats()
+        heartbeats = [*self._engine.heartbeats(), *self._leases.heartbeats()]
         if self._poller is not None:
             heartbeats.append(self._poller.heartbeat)
         if self._values is not None and (tags := self._values.heartbeat()) is not None:
@@ -388,7 +393,8 @@ class _Running:
         fields: dict[str, object] = {"device": name, "health": health}
         if health == "error":
             fields |= {"error": fault_word(told["last_error"]), "failures": told["failures"]}
-        logs.write(logging.INFO if health == "ok" else logging.WARNING, "device_health", **fields)
+        usual = health in ("ok", "standby")
+        logs.write(logging.INFO if usual else logging.WARNING, "device_health", **fields)
 
     def _log_strays(self, kind: str, name: str, told: Mapping[str, int]) -> None:
         """Logs that a device has begun to send what nobody asked for."""
@@ -494,7 +500,7 @@ class _Running:
             if poller is not None:
                 links = assembly.links(config, memories, poller)
             devices = {
-                name: assembly.device(name, config, memories, _results(tag_values))
+                name: self._device(name, config, memories, tag_values)
                 for name, device in config.devices.items()
                 if device.is_polled and f"devices.{name}" in changed
             }
@@ -539,6 +545,7 @@ class _Running:
             del self._passages[name]
         self.diagnostics.links = links.links
         self._replace_devices(before, devices)
+        self._leases.adopt(config)
         self.diagnostics.disabled = self._tell_disabled()
         self.diagnostics.expiries = configured_certificates.expiries(config)
         for name, fresh in https.items():
@@ -565,6 +572,16 @@ class _Running:
             undo.callback(ports[name].close)
             ports[name].open()
         return ports
+
+    def _device(
+        self,
+        name: str,
+        config: Config,
+        memories: Mapping[str, _core.Memory],
+        values: TagValues | None,
+    ) -> _core.PolledDevice:
+        fence = self._leases.fence(name, config)
+        return assembly.device(name, config, memories, _results(values), fence)
 
     def _replace_devices(self, before: Config, devices: Mapping[str, _core.PolledDevice]) -> None:
         """Removes, replaces and adds polled devices. `devices` are those with other settings."""

@@ -14,6 +14,7 @@ from holdfast.appliance.control import NotRunning, ask
 from holdfast.cli.showing import table
 
 _HEAD = ("node", "last message", "at", "digest of", "digest")
+_DEVICES = ("device", "polled by")
 _DIGEST = 12
 """Characters of a digest that are shown."""
 
@@ -62,7 +63,16 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
         lines.append(f"  failed: {status['failure'][1]}")
     elif status["last_error"] is not None and not status["connected"]:
         lines.append(f"  last error: {status['last_error']}")
-    return [*lines, *(f"  {line}" for line in table(_HEAD, map(_row, status["nodes"])))]
+    lines += (f"  {line}" for line in table(_HEAD, map(_row, status["nodes"])))
+    devices = status.get("devices")
+    if devices:
+        lines += (f"  {line}" for line in table(_DEVICES, map(_polled, devices.items())))
+    return lines
+
+
+def _polled(device: tuple[str, dict[str, Any]]) -> tuple[str, ...]:
+    name, found = device
+    return name, "nobody" if found["node"] is None else found["node"]
 
 
 def _row(node: dict[str, Any]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from holdfast.client.tolerance import (
     STRICT,
     Tolerance,
 )
-from holdfast.net.addresses import LAST_PORT, joined
+from holdfast.net.addresses import LAST_PORT, address_in, joined
 from holdfast.net.tls import NO_FILES
 from holdfast.net.tls import Tls as Tls
 from holdfast.protocol import MAX_UNIT, usual_port
@@ -88,6 +88,16 @@ class SerialTarget:
 
 
 Target: TypeAlias = NetworkTarget | SerialTarget
+
+
+def connection_of(target: Target) -> str:
+    """The same text for all devices behind one connection or line, however it is written."""
+    if isinstance(target, SerialTarget):
+        return f"serial:{target.device}"
+    found = address_in(target.host)
+    host = target.host.lower() if found is None else str(found)
+    transport = "tcp" if target.transport == "tls" else target.transport
+    return f"{transport}://{joined(host, target.port)}"
 
 
 def parse(url: str) -> Target:

@@ -101,7 +101,11 @@ class Broker:
         handlers: Mapping[str, Handler],
         connected: Callable[[Client | None], None],
         ping: Ping,
+        *,
+        name: str = "holdfast scan",
     ) -> None:
+        """`name` is what the server shows of the connection."""
+        self._name = name
         self._ping = ping
         self._servers = servers
         self._handlers = handlers
@@ -158,7 +162,7 @@ class Broker:
         try:
             await client.connect(
                 **self._servers.options(),
-                name="holdfast scan",
+                name=self._name,
                 error_cb=failed,
                 disconnected_cb=lost,
                 reconnected_cb=again,

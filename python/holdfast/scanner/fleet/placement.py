@@ -25,8 +25,8 @@ def partition_of(link: str, partitions: int) -> int:
 def placed(partitions: int, nodes: Collection[str], held: Mapping[int, str]) -> dict[int, str]:
     """Who should hold each partition; `held` is who does now.
 
-    All nodes have the same number of partitions, or one more. No other assignment of that kind moves
-    fewer of those that are held by live nodes.
+    All nodes have the same number of partitions, or one more. No other assignment of that kind
+    moves fewer of those that are held by live nodes.
     """
     if not nodes:
         return {}

@@ -1,0 +1,231 @@
+"""Which of the appliances of a log polls each device that is read into a replicated memory.
+
+One lease for each address, because devices behind it share a connection. Whoever has it polls, all
+others stand by. The thread of a log holds the leases; the native poller obeys their fences.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from holdfast import logs
+from holdfast.appliance import assembly
+from holdfast.client.url import connection_of
+from holdfast.heartbeat import Heartbeat
+from holdfast.leases import Leases
+from holdfast.scanner.broker import Broker, Ping
+
+if TYPE_CHECKING:
+    from holdfast import _core
+    from holdfast.config import Config
+    from holdfast.types import ThreadHeartbeat
+
+ENDING = 2.0
+"""Seconds to wait for polls and writes in progress before a lease is given back."""
+
+RETRIED = 5.0
+"""Seconds before an unusable file for NATS is read again."""
+
+
+def leased(config: Config) -> dict[str, str]:
+    """The logs of devices that only one node polls, by device."""
+    found: dict[str, str] = {}
+    for name, device in config.devices.items():
+        if not device.is_polled:
+            continue
+        memories = [read.into.memory for read in device.reads if read.into is not None]
+        if device.status is not None:
+            memories.append(device.status.memory)
+        for memory in memories:
+            replicate = config.memories[memory].replicate
+            if replicate is not None:
+                found.setdefault(name, replicate.log)
+    return found
+
+
+def key_of(config: Config, device: str) -> str:
+    """The key of the lease of a device: its address, in characters that a key may have."""
+    return connection_of(config.devices[device].target).encode().hex()
+
+
+class DeviceLeases:
+    """The leases of all logs of a configuration."""
+
+    def __init__(self, config: Config) -> None:
+        logs_used = set(leased(config).values()) | {
+            memory.replicate.log for memory in config.memories.values() if memory.replicate
+        }
+        self._of_log = {name: _LogLeases(name, config) for name in sorted(logs_used)}
+        self._logs: dict[str, str] = {}
+        self.adopt(config)
+
+    def fence(self, device: str, config: Config) -> _core.Fence | None:
+        """The fence of a device; `None` if every node polls it."""
+        log = leased(config).get(device)
+        return None if log is None else self._of_log[log].leases.fence(key_of(config, device))
+
+    def adopt(self, config: Config) -> None:
+        """Holds leases for the devices of a configuration. Gives those of removed devices back."""
+        self._logs = leased(config)
+        for name, of_log in self._of_log.items():
+            devices: dict[str, list[str]] = {}
+            for device, log in self._logs.items():
+                if log == name:
+                    devices.setdefault(key_of(config, device), []).append(device)
+            of_log.adopt(devices)
+
+    def start(self) -> None:
+        """Begins to take leases."""
+        for of_log in self._of_log.values():
+            of_log.start()
+
+    def status(self, log: str) -> dict[str, dict[str, Any]]:
+        """Who polls each device of a log. Thread-safe."""
+        of_log = self._of_log.get(log)
+        return {} if of_log is None else of_log.status()
+
+    def heartbeats(self) -> list[ThreadHeartbeat]:
+        """The heartbeats of the threads. Thread-safe."""
+        found = (of_log.heartbeat() for of_log in self._of_log.values())
+        return [each for each in found if each is not None]
+
+    def stop(self) -> None:
+        """Gives all leases back. Call it while devices are still polled."""
+        for of_log in self._of_log.values():
+            of_log.stop()
+
+
+@dataclass
+class _LogLeases:
+    """The leases of one log, in a thread of its own while there are devices."""
+
+    log: str
+    config: Config
+
+    def __post_init__(self) -> None:
+        settings = self.config.logs[self.log]
+        self.leases = Leases(
+            f"holdfast-log-{self.log}-devices",
+            settings.node,
+            self,
+            replicas=settings.replicas,
+            about=lambda key: {"devices": self._devices.get(key, [])},
+        )
+        self._heartbeat = Heartbeat()
+        self._servers = assembly.nats_servers(settings)
+        self._devices: dict[str, list[str]] = {}
+        self._ending: set[asyncio.Future[bool]] = set()
+        self._missing: set[tuple[str, str]] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stopping: asyncio.Event | None = None
+        self._thread: threading.Thread | None = None
+        self._is_started = self._is_stopped = False
+
+    def adopt(self, devices: dict[str, list[str]]) -> None:
+        before, self._devices = self._devices, devices
+        if self._is_started and self._thread is None:
+            self.start()
+        elif self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # The thread has ended.
+                self._loop.call_soon_threadsafe(self._want, set(before) - set(devices))
+
+    def _want(self, gone: set[str]) -> None:
+        self.leases.want(self._devices)
+        for key in gone:
+            task = asyncio.ensure_future(self.leases.give_back(key, ENDING))
+            self._ending.add(task)
+            task.add_done_callback(self._ending.discard)
+
+    def start(self) -> None:
+        self._is_started = True
+        if self._devices:
+            name = f"holdfast-leases-{self.log}"
+            self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        self._is_stopped = True
+        if self._loop is not None and self._stopping is not None:
+            with contextlib.suppress(RuntimeError):  # The thread has ended.
+                self._loop.call_soon_threadsafe(self._stopping.set)
+        if self._thread is not None:
+            self._thread.join()
+
+    def heartbeat(self) -> ThreadHeartbeat | None:
+        if self._thread is None:
+            return None
+        return self._thread.name, self._heartbeat.age, self._thread.native_id
+
+    def status(self) -> dict[str, dict[str, Any]]:
+        found = {}
+        for key, devices in dict(self._devices).items():
+            holder = self.leases.holder(key)
+            for device in devices:
+                known = holder is None or device in holder.about.get("devices", [device])
+                found[device] = {
+                    "node": holder.node if holder is not None and known else None,
+                    "polled_here": self.leases.is_held(key),
+                }
+        return dict(sorted(found.items()))
+
+    def taken(self, key: str) -> None:
+        for device in self._devices.get(key, ()):
+            logs.write(logging.INFO, "device_taken_over", device=device, log=self.log)
+
+    def lost(self, key: str, reason: str) -> None:
+        for device in self._devices.get(key, ()):
+            logs.write(
+                logging.WARNING, "device_given_up", device=device, log=self.log, reason=reason
+            )
+
+    def works(self, reason: str | None) -> None:
+        if reason is None:
+            logs.write(logging.INFO, "leases_available", log=self.log)
+        else:
+            logs.write(logging.WARNING, "leases_unavailable", log=self.log, reason=reason)
+
+    def changed(self) -> None:
+        """Notes devices that nobody polls: the holder of their address does not have them."""
+        for key, devices in self._devices.items():
+            holder = self.leases.holder(key)
+            if holder is None:
+                continue
+            for device in devices:
+                unknown = device not in holder.about.get("devices", [device])
+                if unknown and (device, holder.node) not in self._missing:
+                    self._missing.add((device, holder.node))
+                    fields = {"device": device, "log": self.log, "node": holder.node}
+                    logs.write(logging.WARNING, "device_not_polled", **fields)
+
+    def _run(self) -> None:
+        asyncio.run(self._hold())
+
+    async def _hold(self) -> None:
+        stopping = self._stopping = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        if self._is_stopped:
+            return
+        self.leases.want(self._devices)
+        async with self._heartbeat.kept(), asyncio.TaskGroup() as tasks:
+            running = [tasks.create_task(self._connect()), tasks.create_task(self.leases.run())]
+            await stopping.wait()
+            self.leases.want(())
+            await asyncio.gather(
+                *(self.leases.give_back(key, ENDING) for key in list(self.leases.held))
+            )
+            for task in running:
+                task.cancel()
+
+    async def _connect(self) -> None:
+        broker = Broker(self._servers, {}, self.leases.connected, Ping(), name="holdfast leases")
+        while True:
+            try:
+                await broker.run()
+            except OSError as error:
+                self.works(str(error))
+                await asyncio.sleep(RETRIED)
