@@ -1,0 +1,282 @@
+"""Devices that are read into replicated memories: one of the appliances polls each of them.
+
+The device is the judge: it knows which connection every request came over.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.appliance import Appliance
+from holdfast.config import load
+from holdfast.leases import TTL, leases
+from support import wire
+from support.brokers import NatsServer
+from support.cli import invoke
+from support.config_folder import written
+from support.fake_device import Stream
+from support.running import endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from support.fake_device import Asked, Peer
+
+
+START = 60.0
+"""Seconds in which a process must start."""
+
+
+class Device(Stream):
+    """A device that notes over which connection each request came."""
+
+    def __init__(self) -> None:
+        super().__init__("tcp", then=self._note)
+        self.peers: list[Peer] = []
+        self.writes: list[tuple[float, bytes]] = []
+
+    def _note(self, asked: Asked) -> None:
+        self.peers.append(asked.peer)
+        if asked.pdu[0] > 4:
+            self.writes.append((time.monotonic(), asked.pdu))
+        asked.answer()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    yield server
+    server.kill()
+
+
+@pytest.fixture
+def device() -> Iterator[Device]:
+    with Device() as made:
+        yield made
+
+
+@pytest.fixture
+def settings(tmp_path: Path, server: NatsServer, device: Device) -> Callable[..., Path]:
+    """Writes the configuration of a node."""
+
+    def write(name: str, **more: Any) -> Path:
+        meter = {
+            "url": device.url,
+            "interval": 0.05,
+            "timeout": 0.5,
+            "writes": "pass",
+            "reads": [
+                {
+                    "area": "holding_registers",
+                    "address": 7,
+                    "count": 2,
+                    "into": {"memory": "plant", "area": "holding_registers", "address": 10},
+                }
+            ],
+        }
+        rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
+        parts = {
+            "memories": {"plant": {"holding_registers": 100, "replicate": {"log": "site"}}},
+            "logs": {"site": {"servers": [server.url], "node": name}},
+            "devices": {"meter": meter | more},
+            "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
+        }
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(written(parts))
+        return file
+
+    return write
+
+
+@pytest.fixture
+def node(settings: Callable[..., Path]) -> Iterator[Callable[..., Appliance]]:
+    with ExitStack() as running:
+
+        def start(name: str, **more: Any) -> Appliance:
+            return running.enter_context(Appliance(load(settings(name, **more))))
+
+        yield start
+
+
+@pytest.fixture
+def process(settings: Callable[..., Path]) -> Iterator[Callable[[str], subprocess.Popen[bytes]]]:
+    """Starts appliances as processes, which can be stopped and killed."""
+    with ExitStack() as running:
+
+        def start(name: str) -> subprocess.Popen[bytes]:
+            command = [sys.executable, "-m", "holdfast", "run", str(settings(name))]
+            started = running.enter_context(
+                subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+            )
+            running.callback(started.kill)
+            return started
+
+        yield start
+
+
+def ask(appliance: Appliance, pdu: str) -> str:
+    with wire.Connection(endpoint(appliance, "scada")) as connection:
+        return connection.ask(bytes.fromhex(pdu)).hex()
+
+
+def health(appliance: Appliance) -> str:
+    found: str = appliance.diagnostics.devices()["meter"]["health"]
+    return found
+
+
+def polled_by(appliance: Appliance) -> str | None:
+    found: str | None = appliance.replicas()["site"]["devices"]["meter"]["node"]
+    return found
+
+
+def test_one_node_polls_a_device_and_all_have_its_values(
+    node: Callable[..., Appliance], device: Device
+) -> None:
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls it")
+    two = node("b")
+    wire.until(lambda: ask(two, "03000a0002") == "030400070008", "the other node has its values")
+    wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+    assert health(two) == "standby"
+    polls = len(device.peers)
+    wire.until(lambda: len(device.peers) > polls + 20, "it is polled")
+    assert device.connections == 1
+    one.stop()
+    wire.until(lambda: health(two) == "ok", "the other node has taken over")
+    assert device.connections == 2
+    assert polled_by(two) == "b"
+
+
+def test_a_node_that_was_stopped_sends_not_one_poll_when_it_goes_on(
+    process: Callable[[str], subprocess.Popen[bytes]],
+    node: Callable[..., Appliance],
+    device: Device,
+) -> None:
+    one = process("a")
+    wire.until(lambda: device.connections == 1, "the first node polls it", START)
+    two = node("b")
+    wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+    wire.until(lambda: len(device.peers) > 20, "it is polled")
+    one.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
+    wire.until(lambda: polled_by(two) == "b", "the other node has taken over")
+    wire.until(lambda: health(two) == "ok", "it polls")
+    polls = len(device.peers)
+    wire.until(lambda: len(device.peers) > polls + 5, "it goes on")
+    stopped_at = len(device.peers)
+    [first, second] = dict.fromkeys(device.peers)
+    # The device has seen all that the first node sent before it was stopped.
+    one.send_signal(signal.SIGCONT)
+    # It closes its connection, and asks nothing more.
+    wire.until(lambda: device.sources() and first not in device._peers, "it closes its connection")
+    wire.until(lambda: len(device.peers) > stopped_at + 20, "the other node goes on")
+    assert set(device.peers[stopped_at:]) == {second}
+    assert device.connections == 2
+
+
+def test_a_node_that_dies_is_replaced_and_the_first_write_waits(
+    process: Callable[[str], subprocess.Popen[bytes]],
+    node: Callable[..., Appliance],
+    device: Device,
+) -> None:
+    one = process("a")
+    wire.until(lambda: device.connections == 1, "the first node polls it", START)
+    two = node("b")
+    wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+    # A node that stands by does not write to the device.
+    assert ask(two, "06000a0063") == "860a"
+    assert not device.writes
+    one.kill()
+    wire.until(lambda: device.connections == 2, "the other node has taken over")
+    taken_over = time.monotonic()
+    assert ask(two, "06000a0063") == "06000a0063"
+    [(at, pdu)] = device.writes
+    assert pdu.hex() == "0600070063"
+    # The timeout of the device, and the TTL, of which a part has passed when it is first polled.
+    assert at - taken_over > TTL - 1.0
+    assert ask(two, "03000a0001") == "03020063"
+    # Polls went on meanwhile, and later writes do not wait.
+    assert ask(two, "06000a0064") == "06000a0064"
+
+
+def test_after_a_lease_that_was_given_back_the_first_write_does_not_wait(
+    node: Callable[..., Appliance], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leases, "TTL", 3600.0)  # What the first write waits for otherwise.
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls it")
+    two = node("b")
+    wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
+    one.stop()
+    wire.until(lambda: health(two) == "ok", "the other node has taken over")
+    assert ask(two, "06000a0063") == "06000a0063"
+
+
+def test_a_device_that_is_removed_gives_its_lease_back(
+    node: Callable[..., Appliance], settings: Callable[..., Path]
+) -> None:
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls it")
+    two = node("b")
+    wire.until(lambda: health(two) == "standby", "the other node stands by")
+    one.reload(load(settings("a", enabled=False)))
+    wire.until(lambda: health(two) == "ok", "the other node has taken over")
+    one.reload(load(settings("a")))
+    wire.until(lambda: health(one) == "standby", "the first node stands by")
+
+
+def test_a_device_whose_address_another_node_polls_without_it_is_named(
+    node: Callable[..., Appliance],
+    settings: Callable[..., Path],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls it")
+    file = settings("b")
+    file.write_text(file.read_text().replace("meter", "pump"))
+    with Appliance(load(file)) as two:
+        wire.until(
+            lambda: two.replicas()["site"]["devices"].get("pump", {}).get("node", "") is None,
+            "nobody polls it",
+        )
+        wire.until(lambda: "device_not_polled" in caplog.messages, "it is logged")
+
+
+def test_without_its_log_a_node_stops_polling_and_comes_back(
+    node: Callable[..., Appliance], server: NatsServer, device: Device
+) -> None:
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "it polls")
+    server.kill()
+    wire.until(lambda: health(one) == "standby", "it stands by")
+    polls = len(device.peers)
+    wire.until(lambda: not one.replicas()["site"]["connected"], "the log is gone")
+    assert len(device.peers) == polls
+    server.start()
+    wire.until(lambda: health(one) == "ok", "it polls again")
+
+
+def test_replicas_shows_who_polls_what(
+    process: Callable[[str], subprocess.Popen[bytes]], device: Device, tmp_path: Path
+) -> None:
+    process("a")
+    wire.until(lambda: device.connections == 1, "it polls", START)
+    result = invoke("replicas", str(tmp_path / "a.yaml"))
+    assert result.exit_code == 0, result.output
+    assert "polled by" in result.stdout
+    [line] = [line for line in result.stdout.splitlines() if line.strip().startswith("meter")]
+    assert line.split() == ["meter", "a"]
+    result = invoke("replicas", str(tmp_path / "a.yaml"), "--json")
+    [status] = json.loads(result.stdout)["logs"].values()
+    assert status["devices"] == {"meter": {"node": "a", "polled_here": True}}
