@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
-from holdfast.config import load
+from holdfast.client.url import connection_of, parse
+from holdfast.config import ConfigError, load
 from holdfast.leases import TTL, leases
 from support import wire
 from support.brokers import NatsServer
@@ -31,10 +32,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from support.fake_device import Asked, Peer
-
-
-START = 60.0
-"""Seconds in which a process must start."""
 
 
 class Device(Stream):
@@ -164,7 +161,7 @@ def test_a_node_that_was_stopped_sends_not_one_poll_when_it_goes_on(
     device: Device,
 ) -> None:
     one = process("a")
-    wire.until(lambda: device.connections == 1, "the first node polls it", START)
+    wire.until(lambda: device.connections == 1, "the first node polls it")
     two = node("b")
     wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
     wire.until(lambda: len(device.peers) > 20, "it is polled")
@@ -191,7 +188,7 @@ def test_a_node_that_dies_is_replaced_and_the_first_write_waits(
     device: Device,
 ) -> None:
     one = process("a")
-    wire.until(lambda: device.connections == 1, "the first node polls it", START)
+    wire.until(lambda: device.connections == 1, "the first node polls it")
     two = node("b")
     wire.until(lambda: polled_by(two) == "a", "the other node knows who polls it")
     # A node that stands by does not write to the device.
@@ -271,7 +268,7 @@ def test_replicas_shows_who_polls_what(
     process: Callable[[str], subprocess.Popen[bytes]], device: Device, tmp_path: Path
 ) -> None:
     process("a")
-    wire.until(lambda: device.connections == 1, "it polls", START)
+    wire.until(lambda: device.connections == 1, "it polls")
     result = invoke("replicas", str(tmp_path / "a.yaml"))
     assert result.exit_code == 0, result.output
     assert "polled by" in result.stdout
@@ -280,3 +277,30 @@ def test_replicas_shows_who_polls_what(
     result = invoke("replicas", str(tmp_path / "a.yaml"), "--json")
     [status] = json.loads(result.stdout)["logs"].values()
     assert status["devices"] == {"meter": {"node": "a", "polled_here": True}}
+
+
+def test_a_device_of_two_logs_is_refused(settings: Callable[..., Path]) -> None:
+    read = {"area": "holding_registers", "address": 7, "count": 2}
+    into = {"area": "holding_registers", "address": 10}
+    reads = [{**read, "into": {"memory": name, **into}} for name in ("plant", "other")]
+    file = settings("a", reads=reads)
+    text = file.read_text()
+    log = "nats://127.0.0.1:1"
+    text = text.replace(
+        '"memories": {',
+        '"memories": {"other": {"holding_registers": 20, "replicate": {"log": "second"}}, ',
+    )
+    text = text.replace('"logs": {', f'"logs": {{"second": {{"servers": ["{log}"], "node": "a"}}, ')
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"devices\.meter: found memories of the logs "):
+        load(file)
+
+
+def test_one_connection_has_one_name_however_it_is_written() -> None:
+    def of(url: str) -> str:
+        return connection_of(parse(url))
+
+    assert of("tcp://PLC.local") == of("tcp://plc.local:502")
+    assert of("tcp://[::ffff:10.0.0.5]") == of("tcp://10.0.0.5:502")
+    assert of("rtu:///dev/ttyS0?baud=9600") == of("rtu:///dev/ttyS0")
+    assert of("rtu+tcp://10.0.0.5") != of("tcp://10.0.0.5")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.lenient import mapping
+from holdfast.config.lenient import entries, mapping
 from holdfast.config.nats_checks import check_nats
 from holdfast.config.words import guess, listing, show
 
@@ -33,3 +33,21 @@ def check_logs(data: dict[Any, Any], folder: Path, report: Report) -> None:
     for name in logs:
         if name not in used:
             report.doubt(("logs", name), "has no effect: no memory is replicated through it")
+    _check_devices(data, report)
+
+
+def _check_devices(data: dict[Any, Any], report: Report) -> None:
+    """Reports devices of more than one log: one lease says which node polls a device."""
+    memories = mapping(data.get("memories"))
+    for name, device in mapping(data.get("devices")).items():
+        settings = mapping(device)
+        into = [mapping(mapping(read).get("into")) for read in entries(settings.get("reads"))]
+        logs = dict.fromkeys(
+            str(log)
+            for place in [*into, mapping(settings.get("status"))]
+            if isinstance(memory := place.get("memory"), str)
+            and (log := mapping(mapping(memories.get(memory)).get("replicate")).get("log"))
+        )
+        if len(logs) > 1:
+            message = f"found memories of the logs {' and '.join(logs)}, allowed: those of one log"
+            report.add(("devices", name), message, of_key=True)
