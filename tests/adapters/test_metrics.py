@@ -18,6 +18,7 @@ from holdfast.adapters import Grant, MemoryAccess, Refused
 from holdfast.adapters.metrics import Metrics
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import MetricsConfig
+from holdfast.web.health import Check
 from holdfast.web.port import listen
 from support import web, wire
 
@@ -155,11 +156,29 @@ def diagnostics(memories: dict[str, holdfast.Memory], memory_access: MemoryAcces
     return made
 
 
+class Healthy:
+    """The health of an appliance, as a test sets it."""
+
+    def __init__(self) -> None:
+        self.is_live = self.is_ready = True
+
+    def live(self) -> dict[str, Check]:
+        return {"threads": Check(self.is_live, "stalled: io")}
+
+    def ready(self) -> dict[str, Check]:
+        return {**self.live(), "logs": Check(self.is_ready, "site: not connected")}
+
+
 @pytest.fixture
-def address(diagnostics: Diagnostics) -> Iterator[tuple[str, int]]:
+def health() -> Healthy:
+    return Healthy()
+
+
+@pytest.fixture
+def address(diagnostics: Diagnostics, health: Healthy) -> Iterator[tuple[str, int]]:
     settings = MetricsConfig.model_validate({"bind": "127.0.0.1:0"})
     listener = listen("127.0.0.1", 0)
-    supervisor = Supervisor("metrics", lambda: Metrics(settings, diagnostics, listener))
+    supervisor = Supervisor("metrics", lambda: Metrics(settings, diagnostics, health, listener))
     diagnostics.adapters["metrics"] = (supervisor, None)
     with web.supervised(supervisor, listener):
         yield listener.getsockname()
@@ -424,7 +443,40 @@ def test_head_and_other_methods(client: web.Client) -> None:
     assert (post.status, post.headers["allow"]) == (405, "GET, HEAD, OPTIONS")
 
 
-@pytest.mark.parametrize("path", ["/", "/metrics/", "/api/v1/health", "/openapi.json"])
+def test_probes_are_answered_by_status_and_each_check(client: web.Client, health: Healthy) -> None:
+    assert client.get("/health/ready").status == 200
+    health.is_ready = False
+    assert client.get("/health/live").status == 200
+    answer = client.get("/health/ready")
+    assert (answer.status, answer.headers["cache-control"]) == (503, "no-store")
+    assert answer.json == {
+        "ok": False,
+        "checks": {
+            "threads": {"ok": True, "detail": "stalled: io"},
+            "logs": {"ok": False, "detail": "site: not connected"},
+        },
+    }
+    seen = samples(client.get("/metrics").body.decode())
+    assert (seen["holdfast_ready", "threads"], seen["holdfast_ready", "logs"]) == (1, 0)
+    health.is_live = False
+    assert client.get("/health/live").status == 503
+
+
+@pytest.mark.parametrize("path", ["/health/live", "/health/ready"])
+def test_probes_take_head_and_nothing_that_changes(
+    client: web.Client, health: Healthy, path: str
+) -> None:
+    for health.is_live, status in ((True, 200), (False, 503)):
+        answer = client.ask("HEAD", path)
+        assert (answer.status, answer.body) == (status, b"")
+        assert int(answer.headers["content-length"]) > 0
+    assert client.ask("OPTIONS", path).headers["allow"] == "GET, HEAD, OPTIONS"
+    assert client.ask("POST", path, b"{}").status == 405
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/metrics/", "/health", "/health/ready/", "/api/v1/health", "/openapi.json"]
+)
 def test_nothing_else_is_there(client: web.Client, path: str) -> None:
     answer = client.get(path)
     assert answer.status == 404

@@ -83,7 +83,7 @@ def test_a_stalled_thread_is_logged_once_and_when_it_is_back(
     def check() -> bool:
         clock.now += 1
         watched.check()
-        return watched.all_live
+        return not watched.stalled()
 
     ages["io"] = STALLED
     assert check()
@@ -106,10 +106,10 @@ def test_a_process_that_was_suspended_has_no_stalled_threads(
     clock.now += 300
     ages[0] = 300.5
     watched.check()
-    assert watched.all_live
+    assert not watched.stalled()
     clock.now += 1
     watched.check()
-    assert not watched.all_live
+    assert watched.stalled()
     assert len(log.of("thread_stalled")) == 1
 
 
@@ -118,10 +118,10 @@ def test_a_thread_that_has_ended_as_it_should_is_not_stalled(clock: Clock) -> No
     watched = Liveness(lambda: beats)
     clock.now += 1
     watched.check()
-    assert not watched.all_live
+    assert watched.stalled()
     beats.clear()
     watched.check()
-    assert watched.all_live
+    assert not watched.stalled()
 
 
 def test_every_thread_of_an_appliance_has_a_heartbeat(run: Run) -> None:

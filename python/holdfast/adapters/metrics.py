@@ -1,4 +1,4 @@
-"""Exports the diagnostics as Prometheus metrics, see docs/metrics.md."""
+"""Exports the diagnostics as Prometheus metrics, and answers probes, see docs/metrics.md."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from prometheus_client.registry import Collector
 
 from holdfast import __version__
 from holdfast.tags.text import plain
+from holdfast.web import health as probes
 from holdfast.web.admission import ConnectionLimits
-from holdfast.web.host import SAFE, Host, rejection, respond
+from holdfast.web.host import SAFE, Host, headers_of, rejection, respond
 
 if TYPE_CHECKING:
     import socket
@@ -27,12 +28,14 @@ if TYPE_CHECKING:
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.config import MetricsConfig
     from holdfast.stop import Stop
+    from holdfast.web.health import HealthSource
     from holdfast.web.host import Receive, Scope, Send
     from holdfast.web.https import Https
 
 LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
 PATH = "/metrics"
+ALLOWED = (b"allow", b"GET, HEAD, OPTIONS")
 STATES = ("running", "failed", "stopped")
 HEALTH = ("unknown", "ok", "error", "stale", "disabled", "standby")
 OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
@@ -85,12 +88,15 @@ class Metrics:
         self,
         settings: MetricsConfig,
         diagnostics: DiagnosticsSource,
+        health: HealthSource,
         listener: socket.socket,
         *,
         https: Https | None = None,
     ) -> None:
+        self._health = health
         registry = CollectorRegistry()
         registry.register(Figures(diagnostics))
+        registry.register(Readiness(health))
         if settings.values:
             registry.register(TagFigures(diagnostics))
         ProcessCollector(registry=registry)
@@ -120,15 +126,20 @@ class Metrics:
         }
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["path"] != PATH:
-            await respond(send, 404, *rejection("not_found", f"the metrics are at {PATH}"))
+        path = scope["path"]
+        if path != PATH and path not in probes.PATHS:
+            detail = f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
+            await respond(send, 404, *rejection("not_found", detail))
         elif scope["method"] == "OPTIONS":
-            await respond(send, 204, [(b"allow", b"GET, HEAD, OPTIONS"), *SAFE])
+            await respond(send, 204, [ALLOWED, *SAFE])
         elif scope["method"] not in ("GET", "HEAD"):
             headers, body = rejection("method_not_allowed", "allowed are GET, HEAD, OPTIONS")
-            await respond(send, 405, [*headers, (b"allow", b"GET, HEAD, OPTIONS")], body)
-        else:
+            await respond(send, 405, [*headers, ALLOWED], body)
+        elif path == PATH:
             await self._export(scope, receive, send)
+        else:
+            status, body = probes.answer(self._health, path)
+            await respond(send, status, headers_of(b"application/json", body), body)
 
     async def _export(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Sends the exporter's response with a length and the security headers."""
@@ -195,6 +206,24 @@ class Figures(Collector):
         yield from _of_adapters(stats["adapters"])
         yield from _of_threads(stats["threads"])
         yield from _of_memories(self._diagnostics.memories())
+
+
+class Readiness(Collector):
+    """Turns the checks of readiness into metrics."""
+
+    def __init__(self, health: HealthSource) -> None:
+        self._health = health
+
+    def describe(self) -> Iterable[Metric]:
+        """Returns no metrics: the checks are those of the time of a scrape."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yields whether each check has passed."""
+        ready = _gauge("ready", "1 if this check of readiness has passed.", "check")
+        for name, check in self._health.ready().items():
+            ready.add_metric([name], check.ok)
+        yield ready
 
 
 class TagFigures(Collector):

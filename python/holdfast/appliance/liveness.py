@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 STALLED = 10.0
 """Seconds without a heartbeat after which a thread is stalled."""
 
+MAIN = "main"
+"""The name of the thread that calls `check`, among those that are stalled."""
+
+MAIN_STALLED = 30.0
+"""Seconds without a check after which that thread is stalled. A reload, which waits for adapters to
+stop, must be possible in this time."""
+
 
 class Liveness:
     """Watches heartbeats. `check` is for one thread; all else is thread-safe."""
@@ -27,10 +34,15 @@ class Liveness:
         self._checked = time.monotonic()
         self._stalled: set[str] = set()
 
-    @property
-    def all_live(self) -> bool:
-        """Whether no thread was stalled at the last check."""
-        return not self._stalled
+    def stalled(self) -> list[str]:
+        """Returns the threads that were stalled at the last check; `MAIN` if that is long ago."""
+        unchecked = time.monotonic() - self._checked
+        if unchecked > MAIN_STALLED:
+            # A suspended process holds up all threads. Those without a loop have the age 0.
+            ages = [age for _, age, _ in self._heartbeats() if age]
+            if unchecked - min(ages, default=0.0) > MAIN_STALLED:
+                return sorted({*self._stalled, MAIN})
+        return sorted(self._stalled)
 
     def check(self) -> None:
         """Logs threads that have stalled or are back. Call it about once a second."""

@@ -17,6 +17,7 @@ from holdfast.appliance import assembly, auditing, changes, configured_certifica
 from holdfast.appliance.device_leases import DeviceLeases
 from holdfast.appliance.diagnostics import Diagnostics, configured
 from holdfast.appliance.expiring import Expiring
+from holdfast.appliance.health import Health
 from holdfast.appliance.kept import KeptMemories
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.output_site import OutputSite
@@ -150,7 +151,12 @@ class Appliance:
     @property
     def is_live(self) -> bool:
         """Whether no thread was stalled when `log_events` looked last. False if not running."""
-        return self._running is not None and self._running.liveness.all_live
+        return self._running is not None and self._running.health.is_live
+
+    @property
+    def health(self) -> Health:
+        """Whether it is live and ready. Raises `RuntimeError` if not running."""
+        return self._parts().health
 
     @property
     def diagnostics(self) -> Diagnostics:
@@ -270,6 +276,13 @@ class _Running:
                 for device in devices:
                     self._poller.add(device)
             self.liveness = Liveness(self._heartbeats)
+            self.health = Health(
+                self.liveness,
+                self._logs,
+                self._supervisors,
+                self._polled_health,
+                lambda: len(self._config.listeners),
+            )
             self.diagnostics = Diagnostics(memories, self._engine, self.liveness)
             self.diagnostics.kept = self._kept
             self.diagnostics.logs = self._logs
@@ -297,13 +310,16 @@ class _Running:
         """Requests the stop of all parts, then waits for each.
 
         Links stop after all that use them: listeners and the gateway still answer the requests that
-        they have passed on.
+        they have passed on. Metrics stop last, so that probes are told of the stop.
         """
-        for supervisor in self._supervisors.values():
+        self.health.stopping = True
+        metrics = self._supervisors.get("metrics")
+        others = [each for each in self._supervisors.values() if each is not metrics]
+        for supervisor in others:
             supervisor.stop()
         self._engine.stop()
         self._log_last_events()
-        for supervisor in self._supervisors.values():
+        for supervisor in others:
             supervisor.join()
         self._leases.stop()
         if self._poller is not None:
@@ -312,14 +328,19 @@ class _Running:
             self._values.join(STOP_TIMEOUT)
         if self._writes is not None:
             self._writes.join(STOP_TIMEOUT)
-        for port in self._ports.values():
-            port.close()
+        for name, port in self._ports.items():
+            if name != "metrics":
+                port.close()
         self._logs.stop()
         self._kept.stop()
         if self._recorder is not None:
             self._recorder.finish()
         if self._audit is not None:
             auditing.closed(self._audit, self._config)
+        if metrics is not None:
+            metrics.stop()
+            metrics.join()
+            self._ports["metrics"].close()
 
     def _log_last_events(self) -> None:
         while (event := self._engine.next_event(0)) is not None:
@@ -375,6 +396,13 @@ class _Running:
             heartbeats.append(self._recorder.heartbeat())
         own = [supervisor.heartbeat() for supervisor in list(self._supervisors.values())]
         return [*heartbeats, *(each for each in own if each is not None)]
+
+    def _polled_health(self) -> dict[str, str]:
+        """The health of each polled device when `log_events` looked last. Thread-safe."""
+        health, devices = dict(self._health), self._config.devices
+        return {
+            name: health[name] for name in health if name in devices and devices[name].is_polled
+        }
 
     def _log_device(self, name: str, told: Mapping[str, Any]) -> None:
         """Logs changes of a device since the last check."""
@@ -708,7 +736,11 @@ class _Running:
             add(
                 "gateway",
                 lambda: Gateway(
-                    gateway, gateway_at.listener, poller=poller, https=self._https["gateway"]
+                    gateway,
+                    gateway_at.listener,
+                    poller=poller,
+                    https=self._https["gateway"],
+                    health=self.health,
                 ),
                 *_apart_from_files(config.gateway),
                 config.profiles,
@@ -721,7 +753,11 @@ class _Running:
             add(
                 "metrics",
                 lambda: Metrics(
-                    metrics, self.diagnostics, metrics_at.listener, https=self._https["metrics"]
+                    metrics,
+                    self.diagnostics,
+                    self.health,
+                    metrics_at.listener,
+                    https=self._https["metrics"],
                 ),
                 *_apart_from_files(metrics),
             )

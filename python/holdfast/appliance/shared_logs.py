@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import Config
     from holdfast.config.logs import SharedLogConfig
+    from holdfast.types import LogStatus
 
 JOIN_TIMEOUT = 30.0
 """Seconds within which a node must have caught up with its log."""
@@ -48,6 +49,7 @@ class SharedLogs:
     def __init__(self, config: Config, memories: Mapping[str, _core.Memory]) -> None:
         """Returns when the memories have caught up. Raises `LogNotJoined`."""
         self._logs: dict[str, _core.Log] = {}
+        self._max_lags = {name: settings.max_lag for name, settings in config.logs.items()}
         try:
             for name, settings in config.logs.items():
                 members = [
@@ -97,6 +99,12 @@ class SharedLogs:
         """The state and the counters of each log."""
         return {name: dict(log.status()) for name, log in self._logs.items()}
 
+    def obstacles(self) -> dict[str, str | None]:
+        """Why each log is not caught up; `None` if it is."""
+        return {
+            name: _obstacle(log.status(), self._max_lags[name]) for name, log in self._logs.items()
+        }
+
     def check(self) -> None:
         """Logs what has happened since the last call."""
         for name, log in self._logs.items():
@@ -107,6 +115,21 @@ class SharedLogs:
         """Waits for the writes that were sent, and leaves the logs."""
         for log in self._logs.values():
             log.stop()
+
+
+def _obstacle(status: LogStatus, max_lag: float) -> str | None:
+    """Why a log is not caught up. Messages that wait do not count: the age of the contents does."""
+    if status["failure"] is not None:
+        return f"failed ({status['failure'][0]})"
+    if status["phase"] != "running":
+        return status["phase"]
+    if not status["connected"]:
+        return "not connected"
+    age = status["contact_age"]
+    if age is None or age > max_lag:
+        since = "no contact yet" if age is None else f"last contact {age:.1f} s ago"
+        return f"{since}, allowed {max_lag:g} s"
+    return None
 
 
 def servers(settings: SharedLogConfig) -> list[str]:

@@ -108,6 +108,15 @@ class Supervisor:
             age = own.age if isinstance(own, Heartbeat) else 0.0
         return self._thread.name, age, self._thread.native_id
 
+    def serves(self) -> bool | None:
+        """Returns whether the port is bound and the adapter runs; `None` without a port.
+
+        Thread-safe. Does not call the adapter, unlike `status`.
+        """
+        if self._port is None:
+            return None
+        return self._port.is_bound and self._state == "running"
+
     def status(self) -> dict[str, object]:
         """Returns the state of the supervision and the adapter's own status."""
         adapter = self._adapter

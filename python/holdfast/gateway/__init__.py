@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from holdfast.gateway.pool import Dial
     from holdfast.net.resolver import Resolve
     from holdfast.stop import Stop
+    from holdfast.web.health import HealthSource
     from holdfast.web.https import Https
 
 __all__ = ["AllowedNetwork", "Gateway", "GatewayLimits", "Settings"]
@@ -27,7 +28,7 @@ class Gateway:
     """A gateway on a listening socket.
 
     `resolve` resolves names, `dial` creates the client for an address. Devices that `poller` uses
-    are asked over its connections.
+    are asked over its connections. With `health`, probes are answered, without a token.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Gateway:
         dial: Dial = dial,
         poller: Poller | None = None,
         https: Https | None = None,
+        health: HealthSource | None = None,
     ) -> None:
         host, port, *_ = listener.getsockname()
         self.address = address_of(host, port)
@@ -46,7 +48,9 @@ class Gateway:
         scheme = "http" if https is None else "https"
         self.url = f"{scheme}://{self.address}"
         """The URL of its root."""
-        self._app = App(settings, self.url, resolve=resolve, dial=dial, poller=poller)
+        self._app = App(
+            settings, self.url, resolve=resolve, dial=dial, poller=poller, health=health
+        )
         self._host = Host(
             "gateway",
             self._app,

@@ -35,6 +35,7 @@ from holdfast.gateway.refusals import FAILURE, REFUSALS
 from holdfast.gateway.sharing import Shared
 from holdfast.net.allow_list import AllowList
 from holdfast.net.resolver import Resolver
+from holdfast.web import health as probes
 from holdfast.web import openapi_page as page
 from holdfast.web.events import Stream
 from holdfast.web.host import SAFE, headers_of, respond
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from holdfast.gateway.pool import Dial
     from holdfast.gateway.settings import Settings
     from holdfast.net.resolver import Resolve
+    from holdfast.web.health import HealthSource
     from holdfast.web.host import Headers, Receive, Scope, Send
 
     Handler: TypeAlias = Callable[[Request, Send], Awaitable[None]]
@@ -77,7 +79,9 @@ class App:
         resolve: Resolve | None = None,
         dial: Dial = dial,
         poller: Poller | None = None,
+        health: HealthSource | None = None,
     ) -> None:
+        self._health = health
         self._settings = settings
         limits = self._limits = settings.limits
         # A lookup never needs more time than the longest request.
@@ -115,6 +119,8 @@ class App:
             PAGE: ("GET", self._docs),
             **dict.fromkeys(assets.FILES, ("GET", self._asset)),
         }
+        if health is not None:
+            self.routes |= dict.fromkeys(probes.PATHS, ("GET", self._probe))
 
     def counts(self) -> dict[str, object]:
         """Returns the counts of requests. Thread-safe.
@@ -475,6 +481,12 @@ class App:
             "connections": len(self._pool),
         }
         await self._reply(request, send, msgspec.json.encode(status))
+
+    async def _probe(self, request: Request, send: Send) -> None:
+        """Answers a probe. It needs no token, so it is told no names."""
+        assert self._health is not None, "there is a route"
+        status, body = probes.answer(self._health, request.path, details=False)
+        await self._reply(request, send, body, status=status)
 
     async def _openapi(self, request: Request, send: Send) -> None:
         await self._reply(request, send, self._document)

@@ -86,6 +86,11 @@ class Port:
         return joined(self._host, self._port)
 
     @property
+    def is_bound(self) -> bool:
+        """Whether the port is bound. Thread-safe."""
+        return self._bound is not None
+
+    @property
     def listener(self) -> socket.socket:
         """The listening socket. Raises `RuntimeError` if the port is not bound."""
         if self._listener is None:
@@ -105,7 +110,7 @@ class Port:
         )
         return {
             "address": joined(*self.address),
-            "listening": self._bound is not None,
+            "listening": self.is_bound,
             "failed_binds": self.failures,
             **told,
         }

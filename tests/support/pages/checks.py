@@ -9,6 +9,7 @@ import io
 import json
 import re
 import sqlite3
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
@@ -19,6 +20,7 @@ import holdfast
 from holdfast.outputs.text_file import COLUMNS
 from holdfast.scanner.schema import json_schema
 from holdfast.values import encode
+from holdfast.web import health as probes
 from support import wire
 from support.log_events import logged
 from support.pages import commands, comparing, configurations
@@ -148,6 +150,21 @@ def adapter(block: Block, _: Stage) -> None:
     read = YAML(typ="safe").load
     example = read((ROOT / "examples" / "adapter" / "plant.yaml").read_text())
     assert read(block.text)["adapters"] == example["adapters"], "not that of examples/adapter"
+
+
+def readiness(block: Block, stage: Stage) -> None:
+    """The answer to a probe has the checks of an appliance, and the table above has each."""
+    found = {name: asdict(check) for name, check in stage.names["ready"]().items()}
+    comparing.same_shape({"ok": False, "checks": found}, json.loads(block.text))
+    table = (ROOT / block.page).read_text()
+    assert [name for name in found if f"\n| `{name}` | " not in table] == []
+
+
+def kubernetes_probes(block: Block, _: Stage) -> None:
+    """The probes ask the paths that are answered."""
+    asked = YAML(typ="safe").load(block.text)
+    found = [asked[f"{kind}Probe"]["httpGet"]["path"] for kind in ("liveness", "readiness")]
+    assert found == list(probes.PATHS)
 
 
 def scrape(block: Block, _: Stage) -> None:

@@ -504,7 +504,25 @@ rest: {{bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}}
 
 
 def operations(stage: Stage) -> None:
+    """A configuration, and an appliance that has not polled its device yet."""
     stage.file("plant.yaml", RIGHT)
+    rules = "rules: [{sources: [127.0.0.0/8], units: {1: plant}, access: read-only}]"
+    appliance = stage.appliance(
+        f"""\
+memories: {{plant: {{holding_registers: 8}}}}
+listeners:
+  scada: {{type: modbus-tcp, bind: "127.0.0.1:5020", {rules}}}
+  historian: {{type: modbus-tcp, bind: "127.0.0.1:5021", {rules}}}
+devices:
+  meter:
+    url: tcp://127.0.0.1:1
+    interval: 60
+    reads: [{{area: holding_registers, address: 0, count: 1}}]
+metrics: {{bind: 127.0.0.1:9464}}
+"""
+    )
+    stage.names["ready"] = appliance.health.ready
+    wire.until(lambda: appliance.health.ready()["services"].ok, "the metrics are served")
 
 
 def tags(stage: Stage) -> None:

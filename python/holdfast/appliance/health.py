@@ -1,0 +1,106 @@
+"""Whether an appliance is live and ready. Probes, metrics and the watchdog use this judgement."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holdfast.web.health import Check
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from holdfast.appliance.liveness import Liveness
+    from holdfast.appliance.shared_logs import SharedLogs
+    from holdfast.appliance.supervision import Supervisor
+
+NAMED = 5
+"""The most names in the detail of a check."""
+
+
+class Health:
+    """The health of one running appliance. Thread-safe, and never waits for any of its parts.
+
+    `devices` returns the health of each polled device, as the main thread saw it last.
+    """
+
+    def __init__(
+        self,
+        liveness: Liveness,
+        logs: SharedLogs,
+        supervisors: Mapping[str, Supervisor],
+        devices: Callable[[], Mapping[str, str]],
+        listeners: Callable[[], int],
+    ) -> None:
+        self._liveness = liveness
+        self._logs = logs
+        self._supervisors = supervisors
+        self._devices = devices
+        self._listeners = listeners
+        self._polled: set[str] = set()
+        """Devices that were polled. They stay so if a reload changes their settings."""
+        self.stopping = False
+        """Whether the appliance has begun to stop. It is live then, but never ready."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether every check of `live` has passed."""
+        return all(check.ok for check in self.live().values())
+
+    def live(self) -> dict[str, Check]:
+        """Returns whether all threads get to their work."""
+        return {"threads": self._threads()}
+
+    def ready(self) -> dict[str, Check]:
+        """Returns whether clients can be sent to this appliance.
+
+        Devices, brokers and receivers that can't be reached do not count: no restart and no other
+        appliance would help, and what is served tells their state.
+        """
+        return {
+            "running": Check(not self.stopping, "stopping" if self.stopping else "running"),
+            "threads": self._threads(),
+            "listeners": Check(not self.stopping, f"{self._listeners()} bound"),
+            "services": self._services(),
+            "devices": self._started(),
+            "logs": self._caught_up(),
+        }
+
+    def _threads(self) -> Check:
+        stalled = [] if self.stopping else self._liveness.stalled()
+        return Check(not stalled, f"stalled: {_named(stalled)}" if stalled else "all run")
+
+    def _services(self) -> Check:
+        """The HTTP services: their ports are bound, and they run."""
+        states = {name: each.serves() for name, each in dict(self._supervisors).items()}
+        asked = {name: serves for name, serves in states.items() if serves is not None}
+        failed = [name for name, serves in asked.items() if not serves]
+        if failed:
+            return Check(False, f"not serving: {_named(failed)}")
+        return Check(True, f"{len(asked)} serving" if asked else "none")
+
+    def _started(self) -> Check:
+        """Each device was polled once, or the attempt has failed."""
+        devices = self._devices()
+        polled = {name for name, health in devices.items() if health != "unknown"}
+        polled |= self._polled & devices.keys()
+        self._polled = polled
+        if waiting := devices.keys() - polled:
+            return Check(False, f"not polled yet: {_named(waiting)}")
+        if not devices:
+            return Check(True, "none")
+        failing = sum(health != "ok" for health in devices.values())
+        return Check(True, f"{len(devices)} polled, {failing} without valid replies")
+
+    def _caught_up(self) -> Check:
+        states = self._logs.obstacles()
+        behind = [f"{name}: {why}" for name, why in states.items() if why is not None]
+        if behind:
+            return Check(False, "; ".join(behind))
+        return Check(True, f"{len(states)} caught up" if states else "none")
+
+
+def _named(names: Iterable[str]) -> str:
+    """The first names, and how many more there are."""
+    found = sorted(names)
+    more = len(found) - NAMED
+    return ", ".join(found[:NAMED]) + (f" and {more} more" if more > 0 else "")
