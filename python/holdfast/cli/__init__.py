@@ -43,6 +43,10 @@ GROUPS = {
     },
     "Appliance": {
         "check": ("holdfast.cli.check:check", "Check a configuration file."),
+        "health": (
+            "holdfast.cli.health:health",
+            "Ask a running appliance whether it is ready.",
+        ),
         "reload": (
             "holdfast.cli.reload:reload",
             "Have a running appliance reread its configuration.",
