@@ -60,6 +60,15 @@ def test_values_survive_a_restart(tmp_path: Path, sync: float) -> None:
         assert other.memories["plant"].read("holding_registers", 5, 1) == [3]
 
 
+def test_a_crash_costs_at_most_a_second_by_default(tmp_path: Path) -> None:
+    settings = config(tmp_path, plant={"coils": 8, "keep": {"file": "plant.redb"}})
+    assert settings.memories["plant"].keep.sync == 1
+    with Appliance(settings) as appliance:
+        appliance.memories["plant"].write("coils", 0, [1])
+    with Appliance(settings) as again:
+        assert again.memories["plant"].read("coils", 0, 1) == [1]
+
+
 def test_initial_values_are_those_of_the_first_start(tmp_path: Path) -> None:
     (tmp_path / "values.csv").write_text("holding_registers,1,7\nholding_registers,2,8\n")
     settings = config(tmp_path, plant=keeping(initial="values.csv"))

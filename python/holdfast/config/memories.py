@@ -58,7 +58,7 @@ class KeepConfig(Model):
 
     file: FilePath
     """The file, in an existing folder. Memories that are written together share one."""
-    sync: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False), whole_number] = 1
+    sync: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False), whole_number] = 1.0
     """0: every write is on the disk before its reply. Otherwise the seconds of writes that a crash
     or a power cut may cost; a clean stop loses nothing."""
 
