@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
+import sys
 import threading
 from typing import TYPE_CHECKING
 
@@ -67,6 +69,21 @@ def test_an_appliance_that_serves_is_ready_until_it_ends(
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr.startswith(f"holdfast: {url}/health/ready: ")
     assert "refused" in answer("health", file, code=1)["detail"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes can't be suspended")
+def test_a_process_that_hangs_does_not_answer_in_time(
+    run: Callable[..., RunCommand], tmp_path: Path
+) -> None:
+    process = run(metrics={"bind": f"127.0.0.1:{free_port()}"}).process
+    file = str(tmp_path / "plant.yaml")
+    wire.until(lambda: invoke("health", file).exit_code == 0, "it is ready")
+    process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+    result = invoke("health", file, "--live", "--timeout", "0.5")
+    assert (result.exit_code, "no answer in 0.5 s" in result.stderr) == (1, True)
+    process.send_signal(signal.SIGCONT)
+    wire.until(lambda: invoke("health", file, "--live").exit_code == 0, "it is live")
 
 
 def test_a_check_that_fails_is_shown(run: Callable[..., RunCommand], tmp_path: Path) -> None:
