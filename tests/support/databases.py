@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 from urllib.request import Request, urlopen
 
 from support import wire
 from support.brokers import Broker
 from support.machine import tool
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class Database(Broker):
@@ -82,16 +85,18 @@ class VictoriaMetrics(Database):
 
 
 class Prometheus(Database):
-    """Prometheus, which scrapes one address every second."""
+    """Prometheus, which scrapes one address every second, and evaluates a file of rules."""
 
     name = "prometheus"
     target: tuple[str, int] = ("127.0.0.1", 9)
+    rules: Path | None = None
 
     def command(self) -> list[str]:
         file = self._folder / "prometheus.yml"
         host, port = self.target
         file.write_text(
-            "global: {scrape_interval: 1s}\n"
+            "global: {scrape_interval: 1s, evaluation_interval: 1s}\n"
+            f"rule_files: {json.dumps([] if self.rules is None else [str(self.rules)])}\n"
             "scrape_configs:\n"
             f"  - {{job_name: holdfast, static_configs: [{{targets: ['{host}:{port}']}}]}}\n"
         )

@@ -174,15 +174,6 @@ def scrape(block: Block, _: Stage) -> None:
     assert f"bind: {target}" in (ROOT / block.page).read_text()
 
 
-def alerts(block: Block, _: Stage) -> None:
-    """The rules use metrics that the page lists."""
-    listed = (ROOT / block.page).read_text().replace(block.text, "")
-    for rule in YAML(typ="safe").load(block.text):
-        for metric in re.findall(r"\bholdfast_\w+", rule["expr"]):
-            found = re.search(rf"`{metric}\b", listed)
-            assert found, f"{rule['alert']}: the page does not list {metric}"
-
-
 def errors(block: Block, _: Stage) -> None:
     """The tree of errors is that of the classes."""
     parents = [holdfast.ModbusError]

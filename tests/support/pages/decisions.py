@@ -57,6 +57,9 @@ ECS = elsewhere("docs/test_security_events_page.py::test_the_example_is_what_is_
 FILEBEAT = elsewhere(
     "docs/test_security_events_page.py::test_the_configuration_of_filebeat_is_yaml"
 )
+PROMETHEUS = elsewhere(
+    "monitoring/test_rules.py::test_a_real_prometheus_evaluates_the_rules_against_an_appliance"
+)
 ADAPTER = "examples/adapter/"
 
 DECISIONS: dict[tuple[str, str], Decision] = {
@@ -82,7 +85,7 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/client.md", "ModbusError\n├──"): checks.errors,
     ("docs/gateway.md", "event: "): checks.gateway_events,
     ("docs/metrics.md", "scrape_configs:"): checks.scrape,
-    ("docs/metrics.md", "- {alert: "): checks.alerts,
+    ("docs/monitoring.md", "prometheus "): PROMETHEUS,
     ("docs/modbus-tls.md", "holdfast cert ca"): TLS,
     ("docs/modbus-tls.md", "$ holdfast write 'tls://"): TLS,
     ("docs/moving-from-mma.md", "memory:"): MMA,

@@ -18,10 +18,10 @@ import holdfast
 from holdfast._core import MemoryFile
 from support import wire
 from support.brokers import Mosquitto, NatsServer
-from support.cli import done
+from support.cli import done, invoke
 from support.machine import tool
 from support.pages.configurations import put_certificates
-from support.paths import DOCS, EXAMPLES
+from support.paths import DOCS, EXAMPLES, ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -290,6 +290,28 @@ metrics: {{bind: 127.0.0.1:9464, sources: [127.0.0.0/8]}}
         refused.value.close()
 
 
+def monitoring(stage: Stage) -> None:
+    """The folder with the rules, and an appliance that is ready."""
+    tool("promtool")
+    shutil.copytree(ROOT / "monitoring", stage.folder / "monitoring")
+    stage.file(
+        "plant.yaml",
+        stage.here(
+            """\
+memories: {plant: {holding_registers: 8}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: 127.0.0.1:5020
+    rules: [{sources: [127.0.0.0/8], units: {1: plant}, access: read-only}]
+metrics: {bind: 127.0.0.1:9464}
+"""
+        ),
+    )
+    stage.serve("run", "plant.yaml")
+    wire.until(lambda: invoke("health", "plant.yaml").exit_code == 0, "it is ready")
+
+
 def tls(stage: Stage) -> None:
     """A certificate with a wrong role; a listener with the certificates of OpenSSL."""
     extension = "1.3.6.1.4.1.50316.802.1=ASN1:PRINTABLESTRING:operator"
@@ -544,6 +566,7 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/gateway.md": gateway,
     "docs/library.md": library,
     "docs/metrics.md": metrics,
+    "docs/monitoring.md": monitoring,
     "docs/modbus-tls.md": tls,
     "docs/moving-from-mma.md": importing,
     "docs/moving-from-tentacle.md": scanner,
