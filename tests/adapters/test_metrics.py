@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -460,6 +461,33 @@ def test_probes_are_answered_by_status_and_each_check(client: web.Client, health
     assert (seen["holdfast_ready", "threads"], seen["holdfast_ready", "logs"]) == (1, 0)
     health.is_live = False
     assert client.get("/health/live").status == 503
+
+
+def test_a_slow_scrape_holds_up_no_probe(
+    address: tuple[str, int], diagnostics: Diagnostics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, finish = threading.Event(), threading.Event()
+    stats = diagnostics.stats
+
+    def slow() -> dict[str, Any]:
+        begun.set()
+        finish.wait()
+        return stats()
+
+    monkeypatch.setattr(diagnostics, "stats", slow)
+    with (
+        contextlib.closing(web.Client(address)) as scraper,
+        contextlib.closing(web.Client(address)) as prober,
+        ThreadPoolExecutor(1) as threads,
+    ):
+        scrape = threads.submit(scraper.get, "/metrics")
+        try:
+            assert begun.wait(wire.DEADLINE)
+            assert prober.get("/health/ready").status == 200
+            assert not scrape.done()
+        finally:
+            finish.set()
+        assert scrape.result(wire.DEADLINE).status == 200
 
 
 @pytest.mark.parametrize("path", ["/health/live", "/health/ready"])

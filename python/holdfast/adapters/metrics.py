@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector, make_asgi_app
 from prometheus_client.core import (
@@ -21,7 +24,7 @@ from holdfast.web.host import SAFE, Host, headers_of, rejection, respond
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 
     from prometheus_client.metrics_core import Metric
 
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
     from holdfast.web.health import HealthSource
     from holdfast.web.host import Receive, Scope, Send
     from holdfast.web.https import Https
+
+Result = TypeVar("Result")
 
 LIMITS = ConnectionLimits(32, when_full="evict")
 REQUEST_TIMEOUT = 10.0
@@ -102,6 +107,7 @@ class Metrics:
         ProcessCollector(registry=registry)
         GCCollector(registry=registry)
         self._exporter = make_asgi_app(registry)
+        self._exporting = asyncio.Lock()
         self._host = Host(
             "metrics",
             self._serve,
@@ -125,7 +131,7 @@ class Metrics:
             "tls_failures": self._host.tls_failures(),
         }
 
-    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: ARG002
         path = scope["path"]
         if path != PATH and path not in probes.PATHS:
             detail = f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
@@ -136,24 +142,60 @@ class Metrics:
             headers, body = rejection("method_not_allowed", "allowed are GET, HEAD, OPTIONS")
             await respond(send, 405, [*headers, ALLOWED], body)
         elif path == PATH:
-            await self._export(scope, receive, send)
+            await self._export(scope, send)
         else:
             status, body = probes.answer(self._health, path)
             await respond(send, status, headers_of(b"application/json", body), body)
 
-    async def _export(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Sends the exporter's response with a length and the security headers."""
-        start: MutableMapping[str, Any] = {}
+    async def _export(self, scope: Scope, send: Send) -> None:
+        """Sends the exporter's response with a length and the security headers.
 
-        async def sent(message: MutableMapping[str, Any]) -> None:
-            if message["type"] == "http.response.start":
-                start.update(message)
-                return
-            body = message["body"]
-            headers = [*start["headers"], (b"content-length", b"%d" % len(body)), *SAFE]
-            await respond(send, start["status"], headers, body)
+        It is made in a thread, one at a time: thousands of devices must not hold up a probe.
+        """
+        async with self._exporting:
+            start, body = await _in_thread(lambda: asyncio.run(self._exported(scope)))
+        headers = [*start["headers"], (b"content-length", b"%d" % len(body)), *SAFE]
+        await respond(send, start["status"], headers, body)
 
-        await self._exporter(scope, receive, sent)
+    async def _exported(self, scope: Scope) -> tuple[MutableMapping[str, Any], bytes]:
+        """The beginning and the body of the exporter's response."""
+        sent: list[MutableMapping[str, Any]] = []
+
+        async def receive() -> MutableMapping[str, Any]:
+            return {"type": "http.request"}
+
+        async def send(message: MutableMapping[str, Any]) -> None:
+            sent.append(message)
+
+        await self._exporter(scope, receive, send)
+        start, body = sent
+        return start, body["body"]
+
+
+async def _in_thread(work: Callable[[], Result]) -> Result:
+    """Runs work in a thread that the end of the process does not wait for."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[Result] = loop.create_future()
+
+    def tell(result: Result | None, error: BaseException | None) -> None:
+        if done.cancelled():
+            return
+        if error is None:
+            done.set_result(cast("Result", result))
+        else:
+            done.set_exception(error)
+
+    def run() -> None:
+        result, error = None, None
+        try:
+            result = work()
+        except BaseException as caught:
+            error = caught
+        with contextlib.suppress(RuntimeError):  # The loop is already closed.
+            loop.call_soon_threadsafe(tell, result, error)
+
+    threading.Thread(target=run, name="holdfast-scrape", daemon=True).start()
+    return await done
 
 
 class Figures(Collector):
