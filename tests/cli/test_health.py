@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -176,6 +177,28 @@ def test_what_is_not_an_answer_is_a_failure(
     result = invoke("health", "--url", server(reply), "--timeout", "0.3")
     assert (result.exit_code, result.stdout) == (1, "")
     assert told in result.stderr
+
+
+def test_a_slow_answer_does_not_take_longer_than_the_timeout() -> None:
+    ended = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            connection, _ = listening.accept()
+            with connection, contextlib.suppress(OSError):
+                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 200\r\n\r\n")
+                for _ in range(200):
+                    connection.sendall(b" ")
+                    if ended.wait(0.05):
+                        break
+
+        dripping = threading.Thread(target=drip)
+        dripping.start()
+        url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        result = invoke("health", "--url", url, "--timeout", "0.5")
+        ended.set()
+        dripping.join()
+    assert (result.exit_code, "no answer in 0.5 s" in result.stderr) == (1, True)
 
 
 def test_texts_of_a_stranger_are_shown_without_control_characters(
