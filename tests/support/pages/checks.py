@@ -163,8 +163,9 @@ def readiness(block: Block, stage: Stage) -> None:
 def kubernetes_probes(block: Block, _: Stage) -> None:
     """The probes ask the paths that are answered."""
     asked = YAML(typ="safe").load(block.text)
-    found = [asked[f"{kind}Probe"]["httpGet"]["path"] for kind in ("liveness", "readiness")]
-    assert found == list(probes.PATHS)
+    found = {name: probe["httpGet"]["path"] for name, probe in asked.items()}
+    live = {"startupProbe": probes.LIVE, "livenessProbe": probes.LIVE}
+    assert found == {**live, "readinessProbe": probes.READY}
 
 
 def scrape(block: Block, _: Stage) -> None:

@@ -94,7 +94,7 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/mqtt.md", '{"connected": true'): diagnostics,
     ("docs/operations.md", "[Service]"): checks.unit_file,
     ("docs/operations.md", '{"ok": false, "checks"'): checks.readiness,
-    ("docs/operations.md", "livenessProbe:"): checks.kubernetes_probes,
+    ("docs/operations.md", "startupProbe:"): checks.kubernetes_probes,
     ("docs/operations.md", "2026-11-21T"): checks.log_lines,
     ("docs/outputs.md", '{"status":"accepted"'): checks.set_replies,
     ("docs/outputs.md", "sqlite3 "): checks.sql,
