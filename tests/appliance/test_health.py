@@ -12,10 +12,12 @@ import pytest
 
 from holdfast.adapters import Stop
 from holdfast.appliance import Appliance, liveness
+from holdfast.appliance.health import Health
 from holdfast.appliance.liveness import MAIN_STALLED, STALLED, Liveness
 from holdfast.appliance.shared_logs import _obstacle
 from holdfast.appliance.supervision import Supervisor
 from holdfast.config import load
+from holdfast.web.health import Check
 from holdfast.web.port import Port
 from support import web, wire
 from support.brokers import NatsServer
@@ -279,3 +281,12 @@ def test_an_adapter_that_does_not_tell_its_status_holds_up_no_probe() -> None:
     assert not supervisor.serves()
     port.close()
     assert Supervisor("mqtt", Stuck).serves() is None
+
+
+def test_devices_that_another_node_polls_are_no_reason_to_wait() -> None:
+    devices = {"a": "ok", "b": "error", "c": "standby", "d": "unknown"}
+    nothing: Any = None
+    health = Health(nothing, nothing, {}, lambda: devices, int)
+    assert health._started() == Check(False, "not polled yet: d")
+    devices["d"] = "standby"
+    assert health._started() == Check(True, "2 polled, 1 without valid replies, 2 on standby")

@@ -79,7 +79,7 @@ class Health:
         return Check(True, f"{len(asked)} serving" if asked else "none")
 
     def _started(self) -> Check:
-        """Each device was polled once, or the attempt has failed."""
+        """Each device was polled once, or the attempt has failed, or another node polls it."""
         devices = self._devices()
         polled = {name for name, health in devices.items() if health != "unknown"}
         polled |= self._polled & devices.keys()
@@ -88,8 +88,10 @@ class Health:
             return Check(False, f"not polled yet: {_named(waiting)}")
         if not devices:
             return Check(True, "none")
-        failing = sum(health != "ok" for health in devices.values())
-        return Check(True, f"{len(devices)} polled, {failing} without valid replies")
+        standby = sum(health == "standby" for health in devices.values())
+        failing = sum(health not in ("ok", "standby") for health in devices.values())
+        detail = f"{len(devices) - standby} polled, {failing} without valid replies"
+        return Check(True, detail + (f", {standby} on standby" if standby else ""))
 
     def _caught_up(self) -> Check:
         states = self._logs.obstacles()
