@@ -739,7 +739,7 @@ def test_the_schema_asks_for_what_bears_on_safety() -> None:
         "RuleConfig": ["sources", "units", "access"],
         "Seal": ["area", "address"],
         "SerialRuleConfig": ["units", "access"],
-        "SharedLogConfig": ["servers", "node"],
+        "SharedLogConfig": ["node"],
         "ServerTlsConfig": ["cert_file", "key_file", "ca_file"],
         "Span": ["size"],
         "StatusConfig": ["area", "slot", "memory"],

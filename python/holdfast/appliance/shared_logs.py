@@ -6,6 +6,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core, logs
+from holdfast.appliance import embedded
 from holdfast.net.tls import NO_FILES
 
 if TYPE_CHECKING:
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 
     from holdfast.config import Config
     from holdfast.config.logs import SharedLogConfig
+    from holdfast.nats_server import NatsServer
     from holdfast.types import LogStatus
 
 JOIN_TIMEOUT = 30.0
@@ -50,6 +52,7 @@ class SharedLogs:
         """Returns when the memories have caught up. Raises `LogNotJoined`."""
         self._logs: dict[str, _core.Log] = {}
         self._max_lags = {name: settings.max_lag for name, settings in config.logs.items()}
+        self._servers: dict[str, NatsServer] = {}
         try:
             for name, settings in config.logs.items():
                 members = [
@@ -58,10 +61,22 @@ class SharedLogs:
                     if memory.replicate is not None and memory.replicate.log == name
                 ]
                 if members:
+                    self._serve(name, settings)
                     self._join(name, settings, members)
         except BaseException:
             self.stop()
             raise
+
+    def _serve(self, name: str, settings: SharedLogConfig) -> None:
+        """Starts the server of the log, if the log has one of its own."""
+        server = embedded.server(name, settings)
+        if server is None:
+            return
+        self._servers[name] = server
+        try:
+            server.start()
+        except OSError as error:
+            raise LogNotJoined(f"logs.{name}.embedded: {error}", is_settings=True) from None
 
     def _join(
         self, name: str, settings: SharedLogConfig, members: list[tuple[str, _core.Memory]]
@@ -97,7 +112,13 @@ class SharedLogs:
 
     def status(self) -> dict[str, dict[str, Any]]:
         """The state and the counters of each log."""
-        return {name: dict(log.status()) for name, log in self._logs.items()}
+        return {
+            name: {
+                **log.status(),
+                "embedded": self._servers[name].status() if name in self._servers else None,
+            }
+            for name, log in self._logs.items()
+        }
 
     def obstacles(self) -> dict[str, str | None]:
         """Why each log is not caught up; `None` if it is."""
@@ -112,9 +133,11 @@ class SharedLogs:
                 logs.write(EVENTS[event], event, log=name, **fields)
 
     def stop(self) -> None:
-        """Waits for the writes that were sent, and leaves the logs."""
+        """Waits for the writes that were sent, leaves the logs, and stops servers of our own."""
         for log in self._logs.values():
             log.stop()
+        for server in self._servers.values():
+            server.stop()
 
 
 def _obstacle(status: LogStatus, max_lag: float) -> str | None:

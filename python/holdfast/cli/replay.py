@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -12,15 +13,16 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from holdfast import _core, logs
-from holdfast.appliance import assembly
+from holdfast.appliance import assembly, embedded
 from holdfast.appliance.shared_logs import credentials, servers
 from holdfast.cli.configuration import WRONG, load_or_exit
+from holdfast.cli.logs_of import chosen_log
 from holdfast.cli.signals import Signals
-from holdfast.config.words import guess, listing
+from holdfast.config.words import listing
+from holdfast.nats_server import ServerUnusable
 from holdfast.server import Server
 
 if TYPE_CHECKING:
-    from holdfast.config import Config
     from holdfast.types import LogRecord
 
 NOTICE = 0.1
@@ -62,7 +64,7 @@ def replay(
     if follow and to is not None:
         raise click.UsageError("--follow and --to can't be used together.")
     config = load_or_exit(file)
-    log = _chosen(config, name)
+    log = chosen_log(config, name)
     settings = config.logs[log]
     memories = [
         (each, assembly.memory(config.memories[each]))
@@ -72,39 +74,29 @@ def replay(
     if not memories:
         raise click.UsageError(f"no memory is replicated through the log {log}.")
     signals = Signals()
-    try:
-        sequence, time_ns = _end(to)
-        replaying = _core.LogFollower(
-            log,
-            servers(settings),
-            memories,
-            sequence=sequence,
-            time_ns=time_ns,
-            follow=follow,
-            **credentials(settings),
-        )
-        while not signals.received and not replaying.ended:
-            record = replaying.next(NOTICE)
-            if record is not None and follow:
-                click.echo(_line(record, as_json=as_json))
-        if not follow:
-            _tell(replaying, memories, values=values, as_json=as_json)
-    except (_core.LogError, ValueError) as error:
-        _fail(f"logs.{log}: {error}")
+    with ExitStack() as running:
+        try:
+            sequence, time_ns = _end(to)
+            running.enter_context(embedded.running(log, settings))
+            replaying = _core.LogFollower(
+                log,
+                servers(settings),
+                memories,
+                sequence=sequence,
+                time_ns=time_ns,
+                follow=follow,
+                **credentials(settings),
+            )
+            while not signals.received and not replaying.ended:
+                record = replaying.next(NOTICE)
+                if record is not None and follow:
+                    click.echo(_line(record, as_json=as_json))
+            if not follow:
+                _tell(replaying, memories, values=values, as_json=as_json)
+        except (_core.LogError, ServerUnusable, ValueError) as error:
+            _fail(f"logs.{log}: {error}")
     if port is not None and not signals.received:
         _serve(memories, port, signals)
-
-
-def _chosen(config: Config, name: str | None) -> str:
-    if name is None and len(config.logs) == 1:
-        return next(iter(config.logs))
-    known = listing(config.logs) or "none, there are no logs"
-    if name is None:
-        raise click.UsageError(f"--log is missing, allowed: {known}.")
-    if name not in config.logs:
-        near = guess(name, config.logs) or "."
-        raise click.UsageError(f"there is no log {name!r}, allowed: {known}{near}")
-    return name
 
 
 def _end(to: str | None) -> tuple[int | None, int | None]:

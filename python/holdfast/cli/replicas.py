@@ -59,6 +59,9 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
         f"  writes of this node: {status['steps']} done, {status['unavailable']} not sent, "
         f"{status['not_confirmed']} not confirmed",
     ]
+    if (server := status["embedded"]) is not None:
+        state = "running" if server["running"] else "not running"
+        lines.append(f"  embedded server: {state}, started again {server['restarts']} times")
     if status["failure"] is not None:
         lines.append(f"  failed: {status['failure'][1]}")
     elif status["last_error"] is not None and not status["connected"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.config.embedded_checks import check_embedded, check_servers
 from holdfast.config.lenient import entries, mapping
 from holdfast.config.nats_checks import check_nats
 from holdfast.config.words import guess, listing, show
@@ -19,6 +20,8 @@ def check_logs(data: dict[Any, Any], folder: Path, report: Report) -> None:
     logs, used = mapping(data.get("logs")), set[str]()
     for name, settings in logs.items():
         check_nats(("logs", name), mapping(settings), folder, report)
+        check_servers(("logs", name), mapping(settings), report)
+    check_embedded(logs, folder, report)
     for name, memory in mapping(data.get("memories")).items():
         log = mapping(mapping(memory).get("replicate")).get("log")
         if not isinstance(log, str):

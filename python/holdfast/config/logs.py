@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, Strict, model_validator
 
-from holdfast.config.scalars import Name, whole_number
+from holdfast.config.scalars import FilePath, Name, NatsUrl, NotNull, whole_number
 from holdfast.config.services import NatsServersConfig
+
+EMBEDDED_URL = "nats://127.0.0.1:4222"
+"""Where an embedded server listens, unless servers says otherwise."""
+
+TOKEN_FILE = "token"
+"""The file with the secret of an embedded server, in its folder, unless the log has another one."""
 
 Seconds = Annotated[float, Field(ge=0.05, le=3600, allow_inf_nan=False), whole_number]
 
@@ -15,6 +21,13 @@ Seconds = Annotated[float, Field(ge=0.05, le=3600, allow_inf_nan=False), whole_n
 class SharedLogConfig(NatsServersConfig):
     """A log in NATS JetStream: nodes that share it have the same contents of their memories."""
 
+    own_files = ("embedded",)
+
+    servers: Annotated[tuple[NatsUrl, ...], Strict(False), Field(min_length=1)] = ()
+    """The NATS servers: nats://host:port or tls://host:port; optional with embedded, whose only
+    entry is where the embedded server listens."""
+    embedded: Annotated[FilePath | None, NotNull()] = None
+    """The folder of a NATS server that is started with the appliance; requires nats-server."""
     node: Name
     """The name of this appliance in the log; unique."""
     replicas: Literal[1, 3, 5] = 1
@@ -26,3 +39,12 @@ class SharedLogConfig(NatsServersConfig):
     the contents of this node, or get exception 06."""
     max_lag: Seconds = 5.0
     """Seconds without contact to the log."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: object) -> object:
+        """Adds where an embedded server is, and the token that it makes, unless they are given."""
+        if not isinstance(data, dict) or not isinstance(data.get("embedded"), str):
+            return data
+        token = {} if "username" in data else {"token_file": f"{data['embedded']}/{TOKEN_FILE}"}
+        return {"servers": [EMBEDDED_URL], **token, **data}

