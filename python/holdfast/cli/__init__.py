@@ -63,6 +63,7 @@ GROUPS = {
             "holdfast.cli.replay:replay",
             "Rebuild the memories of a log as they were.",
         ),
+        "log": ("holdfast.cli.log:log", "Back up, restore and replicate logs."),
         "memory": (
             "holdfast.cli.memory:memory",
             "Verify, export and import files that keep memories.",

@@ -1,0 +1,277 @@
+"""Backups of a log: its streams as files, and the number of servers that keep them.
+
+A backup is a folder: `backup.json`, and one file for each stream, as the servers send it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import os
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+from nats.errors import Error
+
+from holdfast.scanner.receiving import SafeClient, TlsClient
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Coroutine
+    from pathlib import Path
+    from typing import TypeVar
+
+    from holdfast.scanner import Servers
+
+    T = TypeVar("T")
+
+VERSION = 1
+NOT_FOUND = 10059
+"""The code of JetStream for a stream that does not exist."""
+
+CHUNK = 128 * 1024
+CONNECTING = 3.0
+"""Seconds to connect."""
+
+SILENCE = 30.0
+"""Seconds within which a server must answer, or send the next part."""
+
+PENDING = 64
+"""Parts that may wait here, before the server waits."""
+
+
+class BackupFailed(Exception):
+    """The message says what can't be done, and why."""
+
+
+class _NotFound(BackupFailed):
+    """The servers don't have the stream."""
+
+
+def streams(log: str) -> list[str]:
+    """The streams of a log, the one with the steps last."""
+    name = f"holdfast-log-{log}"
+    return [f"KV_{name}", f"OBJ_{name}", name]
+
+
+def leases(log: str) -> list[str]:
+    """The streams of leases, which nodes create anew: no backup has them."""
+    return [f"KV_holdfast-log-{log}-leases", f"KV_holdfast-log-{log}-devices"]
+
+
+def back_up(servers: Servers, log: str, folder: Path) -> int:
+    """Writes a backup to a new folder. Returns the number of messages. Raises `BackupFailed`.
+
+    What is confirmed later is not in it. Nodes may run: the newest snapshot is fetched before the
+    steps that follow it.
+    """
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise BackupFailed(f"{folder}: {error.strerror or error}") from error
+    try:
+        return _run(servers, lambda client: _back_up(client, log, folder))
+    except BaseException:
+        for file in folder.iterdir():
+            file.unlink()
+        folder.rmdir()
+        raise
+
+
+def restore(servers: Servers, log: str, replicas: int, folder: Path) -> int:
+    """Puts a backup on servers that don't have the log. Returns the number of messages.
+
+    No node may run. Raises `BackupFailed`. What was restored by then is deleted again, unless the
+    connection is lost.
+    """
+    found = _checked(folder, log)
+    return _run(servers, lambda client: _restore(client, log, replicas, folder, found))
+
+
+def set_replicas(servers: Servers, log: str, replicas: int) -> dict[str, tuple[int, int]]:
+    """Has each stream of the log kept by so many servers. Returns the numbers before and now.
+
+    Raises `BackupFailed`.
+    """
+    return _run(servers, lambda client: _set_replicas(client, log, replicas))
+
+
+def _run(servers: Servers, work: Callable[[SafeClient], Coroutine[Any, Any, T]]) -> T:
+    async def connected() -> T:
+        async with _client(servers) as client:
+            return await work(client)
+
+    try:
+        return asyncio.run(connected())
+    except (Error, OSError, TimeoutError) as error:
+        reason = str(error).removeprefix("nats: ") or type(error).__name__
+        raise BackupFailed(reason) from error
+
+
+@asynccontextmanager
+async def _client(servers: Servers) -> AsyncIterator[SafeClient]:
+    client = TlsClient() if servers.secure else SafeClient()
+
+    async def ignore(_: Exception) -> None:
+        """What fails is raised."""
+
+    try:
+        await client.connect(
+            **servers.options(),
+            allow_reconnect=False,
+            connect_timeout=int(CONNECTING),
+            max_reconnect_attempts=1,
+            reconnect_time_wait=0,
+            error_cb=ignore,
+        )
+        yield client
+    finally:
+        await client.close()
+
+
+async def _ask(client: SafeClient, subject: str, request: Any = None) -> dict[str, Any]:
+    """A request to JetStream. Raises `BackupFailed` with the error of the servers."""
+    payload = b"" if request is None else json.dumps(request).encode()
+    reply = await client.request(f"$JS.API.{subject}", payload, timeout=SILENCE)
+    answer: dict[str, Any] = json.loads(reply.data)
+    if "error" in answer:
+        error = answer["error"]
+        kind = _NotFound if error.get("err_code") == NOT_FOUND else BackupFailed
+        raise kind(str(error.get("description", error)))
+    return answer
+
+
+async def _config(client: SafeClient, name: str) -> dict[str, Any] | None:
+    """The configuration of a stream; `None` if the servers don't have it."""
+    try:
+        return dict((await _ask(client, f"STREAM.INFO.{name}"))["config"])
+    except _NotFound:
+        return None
+
+
+async def _back_up(client: SafeClient, log: str, folder: Path) -> int:
+    kept = {}
+    for name in streams(log):
+        kept[name] = await _fetch(client, name, folder / name)
+    text = json.dumps({"version": VERSION, "log": log, "streams": kept}, indent=2)
+    _store(folder / "backup.json", [text.encode()])
+    return int(kept[streams(log)[-1]]["state"]["messages"])
+
+
+async def _fetch(client: SafeClient, name: str, file: Path) -> dict[str, Any]:
+    """Writes a stream to a file. Returns what a server needs to restore it."""
+    inbox = client.new_inbox()
+    parts = await client.subscribe(inbox)
+    request = {"deliver_subject": inbox, "no_consumers": True, "chunk_size": CHUNK}
+    answer = await _ask(client, f"STREAM.SNAPSHOT.{name}", request)
+    digest = hashlib.sha256()
+    with file.open("xb") as out:
+        while True:
+            part = await parts.next_msg(timeout=SILENCE)
+            if not part.data:
+                status = (part.headers or {}).get("Status", "204")
+                if status != "204":
+                    raise BackupFailed(f"{name}: the server has ended the backup: {part.headers}")
+                break
+            out.write(part.data)
+            digest.update(part.data)
+            if part.reply:
+                await client.publish(part.reply, b"")
+        out.flush()
+        os.fsync(out.fileno())
+    await parts.unsubscribe()
+    return {
+        "config": answer["config"],
+        "state": answer["state"],
+        "sha256": digest.hexdigest(),
+    }
+
+
+def _checked(folder: Path, log: str) -> dict[str, Any]:
+    """The streams of a backup, whose files are complete."""
+    try:
+        found = json.loads((folder / "backup.json").read_bytes())
+        if found["version"] != VERSION:
+            raise BackupFailed(f"{folder}: version {found['version']}, allowed: {VERSION}")
+        if found["log"] != log:
+            raise BackupFailed(f"{folder}: a backup of the log {found['log']}, not of {log}")
+        kept: dict[str, Any] = found["streams"]
+        for name in streams(log):
+            with (folder / name).open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            if digest != kept[name]["sha256"]:
+                raise BackupFailed(f"{folder / name}: damaged, its SHA-256 is another one")
+    except OSError as error:
+        raise BackupFailed(f"{error.filename}: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise BackupFailed(f"{folder}: damaged, or not a backup of a log") from error
+    return kept
+
+
+async def _restore(
+    client: SafeClient, log: str, replicas: int, folder: Path, kept: dict[str, Any]
+) -> int:
+    every = (*streams(log), *leases(log))
+    there = [name for name in every if await _config(client, name) is not None]
+    if there:
+        raise BackupFailed(f"the servers already have {', '.join(there)}")
+    done: list[str] = []
+    try:
+        for name in streams(log):
+            done.append(name)
+            await _send(client, name, replicas, folder / name, kept[name])
+    except BaseException:
+        for name in done:
+            await client.request(f"$JS.API.STREAM.DELETE.{name}", b"", timeout=SILENCE)
+        raise
+    return int(kept[streams(log)[-1]]["state"]["messages"])
+
+
+async def _send(
+    client: SafeClient, name: str, replicas: int, file: Path, kept: dict[str, Any]
+) -> None:
+    config = kept["config"] | {"num_replicas": replicas}
+    request = {"config": config, "state": kept["state"]}
+    answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
+    subject = answer["deliver_subject"]
+    with file.open("rb") as data:
+        while part := data.read(CHUNK):
+            reply = await client.request(subject, part, timeout=SILENCE)
+            if reply.data:
+                raise BackupFailed(f"{name}: {_error(reply.data)}")
+    reply = await client.request(subject, b"", timeout=SILENCE)
+    found = json.loads(reply.data)
+    if "error" in found:
+        raise BackupFailed(f"{name}: {_error(reply.data)}")
+    messages = found["state"]["messages"]
+    if messages != kept["state"]["messages"]:
+        raise BackupFailed(f"{name}: the server has restored {messages} messages only")
+
+
+def _error(data: bytes) -> str:
+    try:
+        return str(json.loads(data)["error"]["description"])
+    except (ValueError, KeyError, TypeError):
+        return data[:200].decode(errors="replace")
+
+
+async def _set_replicas(client: SafeClient, log: str, replicas: int) -> dict[str, tuple[int, int]]:
+    found = {}
+    for name in (*streams(log), *leases(log)):
+        config = await _config(client, name)
+        if config is None:
+            if name in leases(log):
+                continue  # No node has needed it since the log was restored.
+            raise BackupFailed(f"the servers don't have {name}")
+        before = config["num_replicas"]
+        if before != replicas:
+            await _ask(client, f"STREAM.UPDATE.{name}", config | {"num_replicas": replicas})
+        found[name] = before, replicas
+    return found
+
+
+def _store(file: Path, parts: list[bytes]) -> None:
+    with file.open("xb") as out:
+        out.writelines(parts)
+        out.flush()
+        os.fsync(out.fileno())

@@ -1,0 +1,177 @@
+"""`holdfast log`: from the server of one machine to three, without a change of memories."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.appliance import Appliance
+from holdfast.config import load
+from support import wire
+from support.brokers import NatsServer, free_port
+from support.cli import done, invoke
+from support.machine import missing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(autouse=True)
+def program() -> None:
+    if not (Path(sys.executable).parent / "nats-server").exists():
+        missing("the program nats-server")
+
+
+def configuration(folder: Path, name: str = "plant", log: str = "site", **settings: Any) -> Path:
+    """A node of the log; by default with a server of its own."""
+    if not settings:
+        settings = {"embedded": "log", "servers": [f"nats://127.0.0.1:{free_port()}"]}
+    file = folder / f"{name}.yaml"
+    parts = {
+        "memories": {"plant": {"holding_registers": 100, "replicate": {"log": log}}},
+        "logs": {log: {"node": "scada-a", **settings}},
+        "rest": {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"},
+    }
+    file.write_text(json.dumps(parts))
+    return file
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[list[NatsServer]]:
+    """Three servers, which elect a leader."""
+    routes = [f"nats://127.0.0.1:{free_port()}" for _ in range(3)]
+    with ExitStack() as running:
+        servers = []
+        for number, route in enumerate(routes):
+            folder = tmp_path / f"server-{number}"
+            folder.mkdir()
+            options = ["--server_name", f"s{number}", "--cluster_name", "plant"]
+            options += ["--cluster", route, "--routes", ",".join(routes)]
+            servers.append(NatsServer(folder, *options))
+            running.callback(servers[-1].kill)
+        wire.until(
+            lambda: any("new metadata leader" in server.log for server in servers),
+            "there is a leader",
+        )
+        yield servers
+
+
+def urls(servers: list[NatsServer]) -> list[str]:
+    return [server.url for server in servers]
+
+
+def register(appliance: Appliance, address: int) -> int:
+    return appliance.memories["plant"].read("holding_registers", address, 1)[0]
+
+
+def write(appliance: Appliance, address: int, value: int) -> None:
+    """Writes until the log confirms it: servers may elect a leader."""
+
+    def is_written() -> bool:
+        try:
+            appliance.memories["plant"].write("holding_registers", address, [value])
+        except OSError:
+            return False
+        return True
+
+    wire.until(is_written, "the write is confirmed")
+
+
+def test_a_log_grows_from_one_server_to_three(tmp_path: Path, cluster: list[NatsServer]) -> None:
+    alone = configuration(tmp_path)
+    with Appliance(load(alone)) as appliance:
+        for address in range(10):
+            write(appliance, address, 40 + address)
+        # Nodes may run, and what they write now may be missing.
+        [head] = done("log", "backup", str(alone), str(tmp_path / "early"))
+        assert head.startswith("Backed up: log site, ")
+        write(appliance, 10, 7)
+    done("log", "backup", str(alone), str(tmp_path / "backup"))
+    grown = configuration(tmp_path, "grown", servers=urls(cluster), replicas=3)
+    [head] = done("log", "restore", str(grown), str(tmp_path / "backup"))
+    assert head.startswith("Restored: log site, ")
+    assert head.endswith(" messages, 3 replicas.")
+    with Appliance(load(grown)) as appliance:
+        assert [register(appliance, each) for each in (0, 9, 10)] == [40, 49, 7]
+        assert appliance.replicas()["site"]["replicas"] == 3
+        cluster[0].kill()
+        write(appliance, 11, 8)
+        assert register(appliance, 11) == 8
+
+
+def test_a_log_is_kept_by_as_many_servers_as_wanted(
+    tmp_path: Path, cluster: list[NatsServer]
+) -> None:
+    file = configuration(tmp_path, servers=urls(cluster))
+    with Appliance(load(file)) as appliance:
+        write(appliance, 1, 7)
+        file = configuration(tmp_path, servers=urls(cluster), replicas=3)
+        name = "holdfast-log-site"
+        streams = [f"KV_{name}", f"OBJ_{name}", name, f"KV_{name}-leases"]
+        assert done("log", "replicas", str(file)) == [f"{each}: 1 -> 3" for each in streams]
+        assert done("log", "replicas", str(file)) == [f"{each}: 3" for each in streams]
+        write(appliance, 1, 8)
+
+
+def failed(*arguments: object) -> str:
+    result = invoke("log", *map(str, arguments))
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.startswith("holdfast: logs.")
+    return result.stderr
+
+
+def test_what_can_not_be_restored_is_told_and_changes_nothing(tmp_path: Path) -> None:
+    file, backup = configuration(tmp_path), tmp_path / "backup"
+    with Appliance(load(file)) as appliance:
+        write(appliance, 1, 7)
+        done("log", "backup", str(file), str(backup))
+        assert "backup: File exists" in failed("backup", file, backup)
+        told = failed("restore", file, backup)
+        assert "the servers already have KV_holdfast-log-site, OBJ_holdfast-log-site, " in told
+        write(appliance, 1, 8)
+    other = configuration(tmp_path, "other", "line")
+    assert "a backup of the log site, not of line" in failed("restore", other, backup)
+    assert "no/backup.json: No such file" in failed("restore", file, tmp_path / "no")
+    data = backup / "holdfast-log-site"
+    data.write_bytes(data.read_bytes()[:-1])
+    assert "holdfast-log-site: damaged, its SHA-256" in failed("restore", file, backup)
+    (backup / "backup.json").write_text("[]")
+    assert "damaged, or not a backup of a log" in failed("restore", file, backup)
+
+
+def test_a_part_that_a_server_refuses_leaves_nothing_behind(tmp_path: Path) -> None:
+    file, backup = configuration(tmp_path), tmp_path / "backup"
+    with Appliance(load(file)) as appliance:
+        write(appliance, 1, 7)
+        done("log", "backup", str(file), str(backup))
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    try:
+        # One server can't keep three replicas.
+        file = configuration(tmp_path, servers=[server.url], replicas=3)
+        assert "replicas > 1 not supported in non-clustered mode" in failed("restore", file, backup)
+        file = configuration(tmp_path, servers=[server.url])
+        done("log", "restore", str(file), str(backup))
+        assert done("log", "replicas", str(file))[0] == "KV_holdfast-log-site: 1"
+        with Appliance(load(file)) as appliance:
+            assert register(appliance, 1) == 7
+    finally:
+        server.kill()
+
+
+def test_servers_without_the_log_are_told(tmp_path: Path) -> None:
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    file = configuration(tmp_path, servers=[server.url])
+    try:
+        assert "stream not found" in failed("backup", file, tmp_path / "backup")
+        assert "the servers don't have KV_holdfast-log-site" in failed("replicas", file)
+    finally:
+        server.kill()
+    assert not (tmp_path / "backup").exists()
+    assert failed("backup", file, tmp_path / "backup")
