@@ -121,6 +121,7 @@ BY_LANGUAGE: dict[str, Decision] = {
 
 NOT_RUN: dict[tuple[str, str], str] = {
     ("docs/benchmarks.md", "make bench"): "takes minutes; its options are checked",
+    ("docs/durability.md", "python examples/replicated/"): "test_replicated_example.py runs them",
     ("docs/gateway.md", "holdfast gateway --allow 192.168.0.0/24 --https-cert"): "as the first one",
     ("docs/gateway.md", "holdfast gateway --allow 10.0.0.0/24 --tls-ca"): "as the first one",
     ("docs/gateway.md", "curl -s http://127.0.0.1:8090/api/modbus/connect"): "needs 10.0.0.5",

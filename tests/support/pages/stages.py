@@ -515,13 +515,22 @@ def durability(stage: Stage) -> None:
     folder.mkdir()
     server = NatsServer(folder)
     stage.callback(server.kill)
-    stage.file(
-        "plant.yaml",
-        f"""memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
-logs: {{site: {{servers: ["{server.url}"], node: scada-a}}}}
-rest: {{bind: "127.0.0.1:0", sources: [127.0.0.0/8], tokens: none}}
+    (stage.folder / "more-servers").mkdir()
+    grown = NatsServer(stage.folder / "more-servers")
+    stage.callback(grown.kill)
+    # Nothing listens at 5041, the first address of the client.
+    for name, url in (("plant", server.url), ("grown", grown.url)):
+        stage.file(
+            f"{name}.yaml",
+            f"""memories: {{plant: {{holding_registers: 100, replicate: {{log: site}}}}}}
+logs: {{site: {{servers: ["{url}"], node: scada-a}}}}
+listeners:
+  scada:
+    type: modbus-tcp
+    bind: {stage.here("127.0.0.1:5042")}
+    rules: [{{sources: [127.0.0.0/8], units: {{1: plant}}, access: read-write}}]
 """,
-    )
+        )
     stage.serve("run", "plant.yaml")
 
 
