@@ -154,29 +154,34 @@ def test_a_log_that_does_not_answer_does_not_hold_up_devices(
     source = holdfast.Memory(holding_registers=10)
     with holdfast.Server({1: source}, bind="127.0.0.1:0", access="read-write") as device:
         host, port = device.address
-        read = {"area": "holding_registers", "address": 0, "count": 10}
-        read |= {"into": {"memory": "plant", "area": "holding_registers", "address": 0}}
-        meter = {"url": f"tcp://{host}:{port}", "unit": 1, "interval": 0.02, "reads": [read]}
-        settings = config(tmp_path, [server.url], devices={"meter": meter})
-        with Appliance(settings) as one:
 
-            def told() -> dict[str, Any]:
-                return one.diagnostics.devices()["meter"]
+        def polled(into: str) -> Settings:
+            read = {"area": "holding_registers", "address": 0, "count": 10}
+            read |= {"into": {"memory": into, "area": "holding_registers", "address": 0}}
+            url = f"tcp://{host if into == 'plant' else 'localhost'}:{port}"
+            return {"url": url, "unit": 1, "interval": 0.02, "reads": [read]}
+
+        devices = {"shared": polled("plant"), "local": polled("alone")}
+        with Appliance(config(tmp_path, [server.url], devices=devices)) as one:
+
+            def told(name: str) -> dict[str, Any]:
+                return one.diagnostics.devices()[name]
 
             source.write("holding_registers", 3, [42])
             wire.until(lambda: register(one) == 42, "it is mirrored")
             server.freeze()
             try:
-                before = told()["polls"]
+                wire.until(lambda: told("shared")["unstored"] > 0, "what is lost is counted")
+                before = told("local")["polls"]
                 # A write that waited for the log would take a second each.
-                wire.until(lambda: told()["polls"] > before + 50, "polls go on")
-                wire.until(lambda: told()["unstored"] > 0, "they are counted")
-                wire.until(lambda: told()["health"] == "error", "the device says so")
+                wire.until(lambda: told("local")["polls"] > before + 50, "polls go on")
+                assert told("local")["health"] == "ok"
+                wire.until(lambda: told("shared")["health"] == "standby", "its lease is over")
             finally:
                 server.thaw()
             source.write("holding_registers", 3, [43])
             wire.until(lambda: register(one) == 43, "it is mirrored again")
-            wire.until(lambda: told()["health"] == "ok", "the device says so")
+            wire.until(lambda: told("shared")["health"] == "ok", "the device says so")
 
 
 def test_other_areas_are_refused_and_named(
