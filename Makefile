@@ -10,7 +10,7 @@ NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
 PEERS := tests/peers/drivers
 
-.PHONY: build run test lint no-std format bench docs lock clean
+.PHONY: build run test lint no-std format bench docs site pictures lock clean
 .DELETE_ON_ERROR:
 
 build: .venv/core.stamp
@@ -72,9 +72,18 @@ docs: .venv/core.stamp
 	$(BIN)/holdfast schema > docs/config.schema.json
 	$(BIN)/holdfast scan --schema > docs/scanner.schema.json
 
+# Builds the documentation site in site/: its first page is site/index.html. A broken link is an error.
+site: .venv/core.stamp .venv/docs.stamp
+	rm -rf site
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --fresh-env --doctree-dir .cache/site docs site
+
+# Takes the pictures of docs/images from the running console, with Chromium.
+pictures: .venv/core.stamp .venv/dev.stamp
+	cd tests && ../$(BIN)/python -m support.gateway_pictures $(PICTURES)
+
 # Pins the newest versions that requirements/*.in allow.
 lock: .venv/dev.stamp
-	for set in run dev; do $(BIN)/uv pip compile --quiet --upgrade --universal \
+	for set in run dev docs; do $(BIN)/uv pip compile --quiet --upgrade --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	cargo update
@@ -85,7 +94,7 @@ lock: .venv/dev.stamp
 	cd crates/journal/tests/checker && go get -u ./... && go mod tidy
 
 clean:
-	rm -rf .venv .cache target build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .cache target build dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	rm -f python/holdfast/_core.*.so
 
 .venv/run.stamp: requirements/run.lock
@@ -95,6 +104,10 @@ clean:
 	@touch $@
 
 .venv/dev.stamp: requirements/dev.lock .venv/run.stamp
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $<
+	@touch $@
+
+.venv/docs.stamp: requirements/docs.lock .venv/run.stamp
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $<
 	@touch $@
 

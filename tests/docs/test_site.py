@@ -1,0 +1,51 @@
+"""The documentation site: its navigation has every page, and it needs no network."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from playwright.sync_api import expect
+
+from support.gateway_pages import browsing
+from support.machine import missing
+from support.paths import DOCS, ROOT
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Request
+
+INDEX = (DOCS / "index.md").read_text()
+
+
+def test_the_navigation_has_every_page_once() -> None:
+    listed = re.findall(r"^\* \[[^]]+\]\(([^)]+)\)", INDEX, re.MULTILINE)
+    pages = [path.name for path in DOCS.iterdir() if path.suffix in (".md", ".rst")]
+    assert sorted([*listed, "index.md"]) == sorted(pages), "list each page in docs/index.md"
+
+
+def test_the_navigation_is_ordered_by_kind_of_page() -> None:
+    headings = re.findall(r"^## (.+)$", INDEX, re.MULTILINE)
+    assert headings == ["Tutorials", "How-to guides", "Reference", "Explanation"]
+
+
+def test_the_site_is_read_and_searched_without_a_server() -> None:
+    first = ROOT / "site" / "index.html"
+    if not first.exists():
+        missing("the site, which `make site` builds,")
+    elsewhere = []
+
+    def note(request: Request) -> None:
+        if not request.url.startswith(("file:", "data:")):
+            elsewhere.append(request.url)
+
+    with browsing() as browser:
+        page = browser.new_page()
+        page.on("request", note)
+        page.goto(first.as_uri())
+        page.get_by_role("link", name="Audit log", exact=True).first.click()
+        expect(page.get_by_role("heading", name="Audit log")).to_be_visible()
+        page.get_by_role("textbox", name="Search").fill("max_requests_per_source")
+        page.keyboard.press("Enter")
+        result = page.locator("#search-results").get_by_role("link", name="Configuration").first
+        expect(result).to_be_visible()
+    assert elsewhere == []
