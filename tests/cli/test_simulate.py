@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from holdfast.simulation import HEATER as HEATER_WITHOUT_FILE
 from support import wire
 from support.cli import ServingCommand, answer, done, invoke, usage_error
 from support.paths import ROOT
@@ -55,6 +56,23 @@ def test_the_example_is_simulated_read_and_written(
     command.process.send_signal(signal.SIGINT)
     command.process.communicate(timeout=wire.DEADLINE)
     assert command.process.returncode == 0
+
+
+def test_without_a_file_a_heater_is_simulated(
+    simulate: Callable[..., tuple[ServingCommand, str]], tmp_path: Path
+) -> None:
+    command, _ = simulate("--unit", "3")
+    found = re.findall("^  holdfast (.*)$", command.greeting, re.MULTILINE)
+    describe, watch = (line.replace("heater.yaml", str(tmp_path / "tags.yaml")) for line in found)
+    done(*describe.split(), "--every", "0.01")
+    watched = invoke(*watch.split(), "--count", "1", "--json")
+    assert (watched.exit_code, "ir_0" in watched.stdout) == (0, True)
+    usage = usage_error("simulate", "--profile", "heater")
+    assert "--profile needs FILE, a configuration." in usage
+
+
+def test_the_heater_is_that_of_the_examples() -> None:
+    assert HEATER_WITHOUT_FILE.read_text() == (ROOT / "examples/tags/heater.yaml").read_text()
 
 
 def test_values_faults_and_unit_can_be_chosen(

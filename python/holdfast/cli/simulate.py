@@ -24,7 +24,7 @@ from holdfast.config.ip_addresses import parse_source
 from holdfast.net.addresses import LOOPBACK, joined, reachable
 from holdfast.protocol import MAX_UNIT
 from holdfast.server import Server
-from holdfast.simulation import generators, playback
+from holdfast.simulation import HEATER, generators, playback
 from holdfast.simulation.device import Refused, SimulatedDevice
 from holdfast.simulation.faults import Faults, Front
 from holdfast.tags.text import text_of
@@ -74,7 +74,7 @@ def parse_latency(text: str) -> tuple[float, float]:
 
 
 @click.command(epilog="Example: holdfast simulate meter.yaml --set 'voltage*=sine:220:240:60'")
-@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("file", type=click.Path(dir_okay=False, path_type=Path), required=False)
 @click.option(
     "--profile", metavar="NAME", help="FILE is a configuration; simulate this profile of it."
 )
@@ -155,7 +155,7 @@ def parse_latency(text: str) -> tuple[float, float]:
     help=f"Share of requests that an exception answers.  [default code: {FAILURE}]",
 )
 def simulate(
-    file: Path,
+    file: Path | None,
     profile: str | None,
     bind: IPv4Address | IPv6Address,
     port: int,
@@ -171,9 +171,9 @@ def simulate(
 ) -> None:
     """Serve a simulated device over Modbus TCP, with live values for the tags of FILE.
 
-    FILE is a tag list (YAML or CSV), or with --profile a configuration. The values of a tag follow
-    its unit, states, and min and max, unless --set or --play choose others. Writable tags keep what
-    is written to them. Only addresses of tags exist.
+    FILE is a tag list (YAML or CSV), or with --profile a configuration. Default: a small heater.
+    The values of a tag follow its unit, states, and min and max, unless --set or --play choose
+    others. Writable tags keep what is written to them. Only addresses of tags exist.
 
     Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage or an invalid FILE.
     """
@@ -185,7 +185,9 @@ def simulate(
     refuse, code = exception
     if drop + refuse > 1:
         raise click.UsageError("--drop and --exception are more than 1 together.")
-    tags = tag_options.tags_of(file, profile)
+    if file is None and profile is not None:
+        raise click.UsageError("--profile needs FILE, a configuration.")
+    tags = tag_options.tags_of(file or HEATER, profile)
     seed = token_hex(8) if seed is None else seed
     simulated = _device(tags, chosen, play, every, seed)
     faults = Faults(latency, drop, refuse, code)
@@ -272,23 +274,34 @@ def _serve(
 
 
 def _greeting(
-    file: Path, profile: str | None, tags: TagList, where: tuple[str, int], unit: int
+    file: Path | None, profile: str | None, tags: TagList, where: tuple[str, int], unit: int
 ) -> str:
     host, port = where
     url = f"tcp://{joined(reachable(host), port)}"
+    served = f"{file or 'A heater'} is simulated at {url}, unit {unit}"
+    lines = [f"{served}: {showing.counted(len(tags), 'tag')}.", "", "Try:", ""]
+    lines += _unknown(url, unit) if file is None else _known(file, profile, tags, url, unit)
+    return "\n".join([*lines, "", "Ctrl-C stops it."])
+
+
+def _unknown(url: str, unit: int) -> list[str]:
+    """Commands for a device without a tag list."""
+    units = ["--units", unit] if unit != 1 else []
+    one = ["--unit", unit] if unit != 1 else []
+    describe = ["holdfast", "describe", url, *units, "--output", "heater.yaml"]
+    watch = ["holdfast", "watch", url, "--tags", "heater.yaml", *one]
+    return [f"  {shlex.join(map(str, command))}" for command in (describe, watch)]
+
+
+def _known(file: Path, profile: str | None, tags: TagList, url: str, unit: int) -> list[str]:
+    """Commands for a device with a tag list."""
     list_: list[Any] = ["--tags", file, *(["--profile", profile] if profile else [])]
     options = [*list_, *(["--unit", unit] if unit != 1 else [])]
     command = shlex.join(["holdfast", "watch", url, *map(str, options)])
-    lines = [
-        f"{file} is simulated at {url}, unit {unit}: {showing.counted(len(tags), 'tag')}.",
-        "",
-        "Try:",
-        "",
-        f"  {command}",
-    ]
+    lines = [f"  {command}"]
     writable = next((tag for tag in tags if tag.writable and tag.is_number), None)
     if writable is not None:
         value = text_of(writable, generators.still(writable).items[0])
         write = ["holdfast", "write", url, f"{writable.name}={value}", *map(str, options)]
         lines.append(f"  {shlex.join(write)}")
-    return "\n".join([*lines, "", "Ctrl-C stops it."])
+    return lines
