@@ -39,7 +39,7 @@ PORT_OPTIONS = {
 
 
 COMPARED: dict[str, Callable[[str], str]] = {
-    "describe": lambda text: re.sub(r"^(?:hr_|Byte order).*\n", "", text, flags=re.M),
+    "describe": lambda text: re.sub(r"^(?:(?:co|di|hr|ir)_|Byte order).*\n", "", text, flags=re.M),
     "guess": lambda text: "\n".join(re.findall(r"^ *[01]\.\d\d +(\d.*?[A-D]{4})", text, re.M)[:1]),
     "bench": lambda text: re.sub(r"^under .*\n", "", text, flags=re.M).replace(" ms", " µs"),
 }

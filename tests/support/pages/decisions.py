@@ -63,7 +63,6 @@ PROMETHEUS = elsewhere(
 ADAPTER = "examples/adapter/"
 
 DECISIONS: dict[tuple[str, str], Decision] = {
-    ("README.md", "examples/plant.yaml is served:"): greeting,
     ("docs/adapters.md", '"""An adapter'): functools.partial(
         checks.in_file, f"{ADAPTER}holdfast_datagrams.py"
     ),
@@ -106,6 +105,7 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/security-events.md", '{"@timestamp"'): ECS,
     ("docs/security-events.md", "filebeat.inputs:"): FILEBEAT,
     ("docs/security-events.md", "<localfile>"): checks.xml,
+    ("docs/tour.md", "examples/plant.yaml is served:"): greeting,
     ("docs/values.md", ">>> "): VALUES,
     ("docs/values.md", "                        uint32"): LETTERS,
     ("docs/values.md", "CDABGHEF  registers"): checks.orders,
@@ -126,6 +126,8 @@ NOT_RUN: dict[tuple[str, str], str] = {
     ("docs/gateway.md", "holdfast gateway --allow 10.0.0.0/24 --tls-ca"): "as the first one",
     ("docs/gateway.md", "curl -s http://127.0.0.1:8090/api/modbus/connect"): "needs 10.0.0.5",
     ("README.md", "make "): "builds everything; its targets are checked",
+    ("README.md", "pip install"): "needs an index of packages",
+    ("docs/start.md", "pip install"): "needs an index of packages",
     ("docs/moving-from-mma.md", "make "): "builds everything; its targets are checked",
     ("docs/moving-from-tentacle.md", "make "): "builds everything; its targets are checked",
     ("docs/moving-from-tentacle.md", "nats pub"): "needs the program nats",

@@ -70,7 +70,18 @@ def heater(stage: Stage, port: str = "5020") -> None:
     stage.serve("simulate", HEATER, "--every", "0.1", "--port", str(stage.port(port)))
 
 
-def readme(stage: Stage) -> None:
+def own_plant(page: str) -> Callable[[Stage], None]:
+    """`plant.yaml` is the first configuration of the page. `watch` ends."""
+
+    def put(stage: Stage) -> None:
+        [text, *_] = re.findall(r"^```yaml\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
+        stage.file("plant.yaml", stage.here(text))
+        stage.replaced["watch tcp"] = "watch --count 2 tcp"
+
+    return put
+
+
+def tour(stage: Stage) -> None:
     plant(stage)
     stage.file(
         "plant.yaml",
@@ -401,6 +412,15 @@ def mosquitto(stage: Stage) -> Mosquitto:
     return broker
 
 
+def troubles(stage: Stage) -> None:
+    """A device with registers, and an appliance that `check` reads."""
+    stage.file("plant.yaml", RIGHT)
+    memory = holdfast.Memory(holding_registers=100)
+    bind = stage.here("127.0.0.1:5020")
+    stage.enter_context(holdfast.Server({1: memory}, bind=bind, access="read-only"))
+    stage.replaced["watch tcp"] = "watch --times 2 --every 0.1 tcp"
+
+
 def outputs(stage: Stage) -> None:
     """Two devices whose values go to files and a broker, and can be set."""
     broker = mosquitto(stage)
@@ -564,7 +584,7 @@ def tags(stage: Stage) -> None:
 
 
 STAGES: dict[str, Callable[[Stage], None]] = {
-    "README.md": readme,
+    "README.md": own_plant("README.md"),
     "docs/audit.md": audit,
     "docs/cli.md": command_line,
     "docs/client.md": client,
@@ -585,6 +605,9 @@ STAGES: dict[str, Callable[[Stage], None]] = {
     "docs/raw-ingest.md": raw_ingest,
     "docs/rest.md": rest,
     "docs/routes.md": audit,
+    "docs/start.md": own_plant("docs/start.md"),
     "docs/tags.md": tags,
+    "docs/tour.md": tour,
+    "docs/troubleshooting.md": troubles,
 }
 """What a page needs besides `everywhere`."""
