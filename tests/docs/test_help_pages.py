@@ -8,6 +8,7 @@ import re
 from typing import TYPE_CHECKING
 
 from holdfast._core import EXCEPTIONS
+from holdfast.cli import main
 from support.log_events import logged
 from support.paths import DOCS, ROOT
 
@@ -101,3 +102,17 @@ def test_the_figures_of_the_readme_are_those_of_the_benchmarks() -> None:
     found = numbers(section)
     assert len(found) > 10
     assert sorted(found - numbers((DOCS / "benchmarks.md").read_text())) == []
+
+
+def test_each_log_event_is_explained() -> None:
+    pages = ("operations", "scanner", "mqtt", "outputs")
+    explained = {
+        word for page in pages for word in re.findall(r"`(\w+)`", (DOCS / f"{page}.md").read_text())
+    }
+    assert sorted(logged() - explained) == []
+
+
+def test_the_page_of_the_command_line_has_every_command() -> None:
+    table = (DOCS / "cli.md").read_text().split("\n## ")[0]
+    named = {word.split()[0] for word in re.findall(r"`([a-z][^`]*)`", table)}
+    assert sorted(set(main.commands) - named) == []
