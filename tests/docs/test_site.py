@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
+import pytest
 from playwright.sync_api import expect
 
+import holdfast
 from support.gateway_pages import browsing
 from support.machine import missing
 from support.paths import DOCS, ROOT
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from playwright.sync_api import Request
 
 INDEX = (DOCS / "index.md").read_text()
@@ -28,10 +32,22 @@ def test_the_navigation_is_ordered_by_kind_of_page() -> None:
     assert headings == ["Tutorials", "How-to guides", "Reference", "Explanation"]
 
 
-def test_the_site_is_read_and_searched_without_a_server() -> None:
-    first = ROOT / "site" / "index.html"
-    if not first.exists():
+@pytest.fixture
+def site() -> Path:
+    """The folder of the built site."""
+    if not (ROOT / "site" / "index.html").exists():
         missing("the site, which `make site` builds,")
+    return ROOT / "site"
+
+
+def test_the_page_of_the_api_has_every_public_name(site: Path) -> None:
+    page = (site / "api.html").read_text()
+    names = set(re.findall(r'id="(?:module-)?holdfast\.([A-Za-z_]+)"', page))
+    assert names == set(holdfast.__all__) - {"__version__"}
+    assert "ERROR" not in page
+
+
+def test_the_site_is_read_and_searched_without_a_server(site: Path) -> None:
     elsewhere = []
 
     def note(request: Request) -> None:
@@ -41,7 +57,7 @@ def test_the_site_is_read_and_searched_without_a_server() -> None:
     with browsing() as browser:
         page = browser.new_page()
         page.on("request", note)
-        page.goto(first.as_uri())
+        page.goto((site / "index.html").as_uri())
         page.get_by_role("link", name="Audit log", exact=True).first.click()
         expect(page.get_by_role("heading", name="Audit log")).to_be_visible()
         page.get_by_role("textbox", name="Search").fill("max_requests_per_source")
