@@ -413,8 +413,9 @@ def mosquitto(stage: Stage) -> Mosquitto:
 
 
 def troubles(stage: Stage) -> None:
-    """A device with registers, and an appliance that `check` reads."""
-    stage.file("plant.yaml", RIGHT)
+    """A device with registers, and an appliance."""
+    stage.file("plant.yaml", stage.here(f"{RIGHT}metrics: {{bind: 127.0.0.1:9464}}\n"))
+    stage.serve("run", "plant.yaml")
     memory = holdfast.Memory(holding_registers=100)
     bind = stage.here("127.0.0.1:5020")
     stage.enter_context(holdfast.Server({1: memory}, bind=bind, access="read-only"))
