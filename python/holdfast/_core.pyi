@@ -302,12 +302,13 @@ class BatchRefused(ValueError):
 
 def write_across(
     writes: Iterable[tuple[Memory, Area, int, Iterable[int]]],
-    before: Callable[[], object] | None = None,
-) -> int:
+    before: Callable[[bool], object] | None = None,
+) -> tuple[int, int | None]:
     """Writes to several memories (memory, area, address, values) in one step.
 
-    Returns the number of written values. Readers of the memories see all writes or none. `before`
-    is called once every check has passed; if it raises, nothing is written.
+    Returns the number of written values, and the sequence of the step if a log has carried it out.
+    Readers of the memories see all writes or none. `before` is called once every check has passed,
+    with whether a journal carries out the writes; if it raises, nothing is written.
 
     Raises `BatchRefused` for the first write with an invalid area, number of values or range, else
     for the first invalid value. An error prevents all writes. An exception from the iterable

@@ -14,7 +14,7 @@ from holdfast.appliance import Appliance
 from holdfast.appliance.changes import ReloadRefused
 from holdfast.appliance.shared_logs import LogNotJoined
 from holdfast.config import load
-from support import wire
+from support import audits, web, wire
 from support.brokers import NatsServer, free_port
 from support.cli import done, invoke
 from support.config_folder import Folder, written
@@ -44,6 +44,8 @@ def config(
     devices: Settings | None = None,
     **memory: Any,
 ) -> Config:
+    """A node. `audit` is a file name, the rest are settings of the memory."""
+    audit = memory.pop("audit", None)
     plant = {"holding_registers": 100, "coils": 16, "replicate": {"log": "site"}} | memory
     rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
     parts = {
@@ -52,7 +54,7 @@ def config(
         "logs": {"site": {"servers": servers, "node": name}},
         "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
         "rest": {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"},
-    }
+    } | ({} if audit is None else {"audit": {"file": audit}})
     file = folder / f"{name}.yaml"
     file.write_text(written(parts))
     return load(file)
@@ -86,6 +88,66 @@ def test_a_write_to_one_node_is_read_from_all(node: Callable[..., Appliance]) ->
     assert ask(two, "16000300f0000f") == "16000300f0000f"
     assert ask(two, "0300030001") == "0302002f"
     wire.until(lambda: register(one) == 0x2F, "the first node has it")
+
+
+def ingest(appliance: Appliance, *commands: tuple[str, int]) -> int:
+    """Writes by REST: a register of each memory. Returns the HTTP status."""
+    batch = [
+        {"memory": memory, "area": "holding_registers", "address": 5, "values": [value]}
+        for memory, value in commands
+    ]
+    client = web.Client(endpoint(appliance, "rest"))
+    try:
+        return client.ingest(batch if len(batch) > 1 else batch[0]).status
+    finally:
+        client.close()
+
+
+def test_the_audit_log_names_the_sequence_of_each_write(
+    node: Callable[..., Appliance], tmp_path: Path, server: NatsServer
+) -> None:
+    one = node("a", audit="a.log")
+    assert ask(one, "0600030001") == "0600030001"
+    assert ask(one, "16000300f0000f") == "16000300f0000f"
+    assert ingest(one, ("plant", 7)) == ingest(one, ("alone", 8)) == 200
+    assert ingest(one, ("plant", 9), ("plant", 10)) == 200
+    assert ask(one, "0603e80001") == "8602"
+    lines = audits.await_writes(tmp_path / "a.log", 7)
+    by_modbus, by_rest = ([of for of in lines if of["listener"] == who] for who in ("scada", "rest"))
+    *_, refused = by_modbus
+    assert (refused["outcome"], "log_sequence" in refused) == ("illegal_data_address", False)
+    plant, alone, first, second = by_rest
+    assert "log_sequence" not in alone
+    assert first["log_sequence"] == second["log_sequence"], "a batch is one step"
+    sequences = [of["log_sequence"] for of in (*by_modbus[:2], plant, first)]
+    assert sequences == sorted(set(sequences))
+    assert {of["outcome"] for of in (*by_modbus[:2], *by_rest)} == {"done"}
+    file = str(tmp_path / "a.yaml")
+    for sequence, value in zip(sequences, (1, 15, 15, 15), strict=True):
+        values = done("replay", file, "--to", str(sequence), "--values")
+        assert f"plant holding_registers 3: {value}" in values
+    assert server.url
+
+
+def test_the_audit_log_says_which_writes_were_not_confirmed(
+    node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
+) -> None:
+    one = node("a", audit="a.log")
+    server.freeze()
+    try:
+        assert ingest(one, ("plant", 7), ("plant", 8)) == 504
+    finally:
+        server.thaw()
+    unclear = audits.await_writes(tmp_path / "a.log", 2)
+    assert [(of["outcome"], of["values"]) for of in unclear] == [
+        ("not_confirmed", [7]),
+        ("not_confirmed", [8]),
+    ]
+    server.kill()
+    wire.until(lambda: not one.replicas()["site"]["connected"], "it notices")
+    assert ingest(one, ("plant", 9)) == 503
+    *_, refused = audits.await_writes(tmp_path / "a.log", 3)
+    assert (refused["outcome"], len(audits.writes(tmp_path / "a.log"))) == ("log_unavailable", 3)
 
 
 def test_masks_of_all_nodes_at_once_have_one_order(node: Callable[..., Appliance]) -> None:

@@ -42,10 +42,10 @@ def test_a_batch_returns_how_many_values_it_wrote() -> None:
     written = write_across(
         [(first, "coils", 0, [1, True]), (second, "holding_registers", 1, range(5, 8))]
     )
-    assert written == 5
+    assert written == (5, None)
     assert first.read("coils", 0, 3) == [1, 1, 0]
     assert second.read("holding_registers", 0, 5) == [0, 5, 6, 7, 0]
-    assert write_across([]) == 0
+    assert write_across([]) == (0, None)
 
 
 @pytest.mark.parametrize("place", [0, 1, 30])
@@ -202,7 +202,7 @@ def test_a_batch_is_written_in_order_or_refused_as_a_whole(
         assert refusal(writes) == expected
         assert content(all_of) == before
         return
-    assert write_across(writes) == sum(len(values) for *_, values in batch)
+    assert write_across(writes) == (sum(len(values) for *_, values in batch), None)
     for which, area, address, values in batch:
         one_by_one[which].write(area, address, values)
     for batched, single in zip(all_of, one_by_one, strict=True):

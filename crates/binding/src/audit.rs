@@ -34,6 +34,9 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
             line.set_item("outcome", refused.map_or("done", |refusal| refusal.name()))?;
         }
     }
+    if let Some(sequence) = record.log_sequence {
+        line.set_item("log_sequence", sequence)?;
+    }
     Ok(line)
 }
 

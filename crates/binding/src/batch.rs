@@ -26,14 +26,15 @@ struct Pending<'py> {
     values: Bound<'py, PyList>,
 }
 
-/// Writes to several memories atomically. Returns the number of values written.
+/// Writes to several memories atomically. Returns the number of values written, and the sequence of the
+/// step if a log has carried it out. `before` receives whether a journal carries out the writes.
 #[pyfunction]
 #[pyo3(signature = (writes, before=None))]
 pub fn write_across(
     py: Python<'_>,
     writes: &Bound<'_, PyAny>,
     before: Option<&Bound<'_, PyAny>>,
-) -> PyResult<usize> {
+) -> PyResult<(usize, Option<u64>)> {
     let (mut pending, mut len) = (Vec::new(), 0);
     for (command, write) in writes.try_iter()?.enumerate() {
         let write = Pending::new(command, &write?)?;
@@ -51,10 +52,10 @@ pub fn write_across(
     let refused = |refused: Refused| refusal(py, refused.index, None, reason(refused.refusal));
     if let Some(before) = before {
         holdfast_memory::check_across(Access::Ingest, &packed).map_err(refused)?;
-        before.call0()?;
+        before.call1((packed.iter().any(|(memory, _)| memory.has_journal()),))?;
     }
-    py.detach(|| holdfast_memory::write_across(Access::Ingest, &packed)).map_err(refused)?;
-    Ok(pending.iter().map(|write| write.count).sum())
+    let sequence = py.detach(|| holdfast_memory::write_across(Access::Ingest, &packed));
+    Ok((pending.iter().map(|write| write.count).sum(), sequence.map_err(refused)?))
 }
 
 impl<'py> Pending<'py> {

@@ -7,6 +7,7 @@ use std::net::{TcpStream, UdpSocket};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
+use holdfast_engine::server::audit::Unrecordable;
 use holdfast_engine::server::event::Verbosity;
 use holdfast_engine::server::functions::{AccessMode, Functions};
 use holdfast_engine::server::policy::Rule;
@@ -16,7 +17,8 @@ use holdfast_engine::server::{
     StreamSettings, UdpSettings, WhenFull,
 };
 use holdfast_memory::{
-    Access, Area, Done, Journal, Layout, Memory, Read as Reading, Refusal, Refused, Span, Step,
+    Access, Area, CarriedOut, Done, Journal, Layout, Memory, Read as Reading, Refusal, Refused,
+    Span, Step,
 };
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::raw_ingest::Format;
@@ -148,7 +150,7 @@ impl Front {
             },
             workers: 1,
             events: Verbosity::Nothing,
-            audit: None,
+            audit: Some(Unrecordable::Write),
         });
         Front { engine: engine.unwrap(), journal, memory }
     }
@@ -162,8 +164,20 @@ impl Front {
 
     /// Carries out the next step.
     fn carry_out(&self) {
+        self.carry_out_at(None);
+    }
+
+    /// Carries out the next step, at a sequence of a log.
+    fn carry_out_at(&self, sequence: Option<u64>) {
         let (step, done) = self.journal.next();
-        done(step.carry_out(std::slice::from_ref(&self.memory)));
+        let carried_out = step.carry_out(std::slice::from_ref(&self.memory)).unwrap();
+        done(Ok(CarriedOut { sequence, ..carried_out }));
+    }
+
+    /// The sequence in the record of the next write.
+    fn recorded(&self) -> Option<u64> {
+        let records = self.engine.next_writes(PATIENCE, 1);
+        records.first().expect("a write was recorded").log_sequence
     }
 
     fn refuse(&self, refusal: Refusal) {
@@ -221,6 +235,41 @@ fn each_write_is_answered_when_it_is_carried_out() {
         front.carry_out();
         expect(&mut client, tag, reply);
     }
+    front.engine.stop();
+}
+
+#[test]
+fn a_write_is_recorded_with_its_place_in_the_log() {
+    let front = Front::new();
+    let mut client = front.connect(0);
+    let request = [6, 0, 1, 0, 0x12];
+    for sequence in [Some(41), None] {
+        client.write_all(&frame(1, &request)).unwrap();
+        front.carry_out_at(sequence);
+        expect(&mut client, 1, &request);
+        assert_eq!(front.recorded(), sequence);
+    }
+    client.write_all(&frame(2, &request)).unwrap();
+    front.refuse(Refusal::NotConfirmed);
+    expect(&mut client, 2, &[0x86, 4]);
+    assert_eq!(front.recorded(), None);
+    let datagrams = UdpSocket::bind("127.0.0.1:0").unwrap();
+    datagrams.send_to(&frame(3, &request), front.engine.addresses()[1].unwrap()).unwrap();
+    front.carry_out_at(Some(43));
+    assert_eq!(front.recorded(), Some(43));
+    for listener in [2, 3] {
+        let mut sender = front.connect(listener);
+        sender.write_all(&packet(5, 9)).unwrap();
+        front.carry_out_at(Some(44));
+        sender.read_exact(&mut [0]).unwrap();
+        assert_eq!(front.recorded(), Some(44));
+    }
+    // The client leaves before its write is carried out.
+    client.write_all(&frame(4, &request)).unwrap();
+    front.journal.wait_for(1);
+    drop(client);
+    front.carry_out_at(Some(45));
+    assert_eq!(front.recorded(), Some(45));
     front.engine.stop();
 }
 

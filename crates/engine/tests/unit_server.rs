@@ -1,6 +1,7 @@
 //! Tests broadcasts and listen only mode, and their counters.
 
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
 
 use holdfast_engine::items::Items;
 use holdfast_engine::server::counters::Bus;
@@ -9,7 +10,9 @@ use holdfast_engine::server::identity::Identity;
 use holdfast_engine::server::policy::{Narrowed, PeerRights, Rule};
 use holdfast_engine::server::ranges::Ranges;
 use holdfast_engine::server::unit_server::UnitServer;
-use holdfast_memory::{Area, Gate, GateMode, Layout, Memory, Span};
+use holdfast_memory::{
+    Area, CarriedOut, Done, Gate, GateMode, Journal, Layout, Memory, Refusal, Refused, Span, Step,
+};
 use holdfast_protocol::pdu;
 
 const READ: &[u8] = &[3, 0, 0, 0, 1];
@@ -83,9 +86,24 @@ fn ask(
 }
 
 fn broadcast(unit_server: &UnitServer, rights: &PeerRights, request: &[u8]) -> Vec<Vec<u8>> {
-    let mut replies = Vec::new();
-    unit_server.broadcast(rights, request, || Some(()), |reply, _| replies.push(reply.to_vec()));
-    replies
+    let noted = broadcast_if(unit_server, rights, request, Some(()));
+    noted.into_iter().map(|(reply, _, _)| reply).collect()
+}
+
+/// A reply, where a log has the write, and the permit.
+type Noted = (Vec<u8>, Option<u64>, Option<()>);
+
+fn broadcast_if(
+    unit_server: &UnitServer,
+    rights: &PeerRights,
+    request: &[u8],
+    permit: Option<()>,
+) -> Vec<Noted> {
+    let mut noted = Vec::new();
+    let note = |reply: &[u8], sequence, permit| noted.push((reply.to_vec(), sequence, permit));
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    runtime.block_on(unit_server.broadcast(rights, request, || permit, note));
+    noted
 }
 
 #[test]
@@ -245,15 +263,47 @@ fn a_write_that_is_not_permitted_is_refused_after_rights_and_form_and_before_the
     assert_eq!(refused(7, &WRITE[..3]), Some(3));
     assert_eq!(refused(7, &[0x41]), Some(1));
     let before = ask(&unit_server, &rights, 7, READ);
-    let mut replies = Vec::new();
-    unit_server.broadcast(
-        &rights,
-        WRITE,
-        || None::<()>,
-        |reply, permit| {
-            replies.push((reply.to_vec(), permit));
-        },
-    );
-    assert_eq!(replies, [(vec![WRITE[0] | 0x80, 4], None)]);
+    let replies = broadcast_if(&unit_server, &rights, WRITE, None);
+    assert_eq!(replies, [(vec![WRITE[0] | 0x80, 4], None, None)]);
     assert_eq!(ask(&unit_server, &rights, 7, READ), before);
+}
+
+/// Carries out each step at once, at the next sequence from 7 on, or refuses it.
+#[derive(Debug)]
+struct AtOnce {
+    refusal: Option<Refusal>,
+    sequence: AtomicU64,
+    members: Weak<Memory>,
+}
+
+impl Journal for AtOnce {
+    fn submit(&self, step: Step, done: Done) {
+        let carried_out = step.carry_out(&[self.members.upgrade().unwrap()]);
+        let sequence = Some(self.sequence.fetch_add(1, Ordering::Relaxed));
+        done(match self.refusal {
+            None => carried_out.map(|carried_out| CarriedOut { sequence, ..carried_out }),
+            Some(refusal) => Err(Refused { index: 0, refusal }),
+        });
+    }
+}
+
+#[test]
+fn a_broadcast_waits_for_journals_and_is_recorded_with_their_sequences() {
+    let (kept, refusing, plain) = (memory(1), memory(1), memory(1));
+    for (memory, refusal) in [(&kept, None), (&refusing, Some(Refusal::NotStored))] {
+        let (sequence, members) = (AtomicU64::new(7), Arc::downgrade(memory));
+        memory.keep_in(Arc::new(AtOnce { refusal, sequence, members }), 0);
+    }
+    let unit_server = unit_server();
+    let units = [(7, &kept), (8, &refusing), (9, &plain)];
+    let replies =
+        broadcast_if(&unit_server, &rights(&units, AccessMode::ReadWrite), WRITE, Some(()));
+    let (done, refused) = (WRITE.to_vec(), vec![WRITE[0] | 0x80, 4]);
+    let expected =
+        [(done.clone(), Some(7), Some(())), (refused, None, Some(())), (done, None, Some(()))];
+    assert_eq!(replies, expected);
+    assert_eq!((unit_server.counters.bus().exceptions, unit_server.counters.bus().events), (1, 0));
+    let read_only = rights(&[(7, &kept)], AccessMode::ReadOnly);
+    let refused = (vec![WRITE[0] | 0x80, 1], None, Some(()));
+    assert_eq!(broadcast_if(&unit_server, &read_only, WRITE, Some(())), [refused]);
 }

@@ -97,7 +97,7 @@ fn carry_out(memories: &[Arc<Memory>; 2], event: &Event) -> Result<Vec<u8>, Refu
                 })
                 .collect();
             let refusal = |Refused { refusal, .. }| refusal;
-            write_across(access(*client), &writes).map(|()| Vec::new()).map_err(refusal)
+            write_across(access(*client), &writes).map(|_| Vec::new()).map_err(refusal)
         }
         Event::Reopen { .. } => unreachable!(),
     }

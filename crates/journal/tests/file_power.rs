@@ -7,7 +7,8 @@ use std::sync::mpsc::{Receiver, channel};
 
 use holdfast_journal::file::{MemoryFile, Options, read_from};
 use holdfast_memory::{
-    Access, Area, Contents, Gate, GateMode, Memory, Operation, Outcome, Write, write_across,
+    Access, Area, CarriedOut, Contents, Gate, GateMode, Memory, Operation, Outcome, Write,
+    write_across,
 };
 use support::sim::SimDisk;
 use support::{REGISTERS, Random, at_once, keep, layout, memory, rounds, until};
@@ -77,7 +78,7 @@ fn submit(memories: &Memories, step: &AnyStep) -> Receiver<Outcome> {
             let Operation::Write(write) = operation(&step) else { unreachable!() };
             let bits = Write { area: Area::Coils, address: 65, count: 8, bytes: &write.bytes[..1] };
             let both = [(&*memories[0], write), (&*memories[1], bits)];
-            let _ = sender.send(write_across(Access::Ingest, &both).map(|()| Vec::new()));
+            let _ = sender.send(write_across(Access::Ingest, &both).map(|_| CarriedOut::default()));
         });
         return receiver;
     }

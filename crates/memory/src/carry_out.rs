@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::error::Refused;
 use crate::memory::{Memory, carry_out_across};
 use crate::operation::{Read, Write};
-use crate::step::{Action, Outcome, Step};
+use crate::step::{Action, CarriedOut, Outcome, Step};
 
 impl Step {
     /// Carries out the step, atomically, and returns what it reads. Reservations of ranges for
@@ -19,27 +19,28 @@ impl Step {
     /// The step names a member that does not exist.
     pub fn carry_out(&self, members: &[Arc<Memory>]) -> Outcome {
         let alone = |refusal| Refused { index: 0, refusal };
-        match &self.action {
+        let read = match &self.action {
             Action::Write(writes) => {
                 let writes: Vec<(&Memory, Write)> = writes
                     .iter()
                     .map(|write| (&*members[usize::from(write.member)], write.borrowed()))
                     .collect();
-                carry_out_across(self.access, &writes).map(|()| Vec::new())
+                carry_out_across(self.access, &writes).map(|()| Vec::new())?
             }
             &Action::Mask { member, area, address, and_mask, or_mask } => members
                 [usize::from(member)]
             .carry_out_mask(self.access, area, address, and_mask, or_mask)
             .map(|()| Vec::new())
-            .map_err(alone),
+            .map_err(alone)?,
             &Action::WriteThenRead { ref write, area, address, count } => {
                 let mut out = vec![0; area.byte_len(count)];
                 let read = Read { area, address, count, out: &mut out };
                 members[usize::from(write.member)]
                     .carry_out_then_read(self.access, write.borrowed(), read)
                     .map_err(alone)?;
-                Ok(out)
+                out
             }
-        }
+        };
+        Ok(CarriedOut { read, sequence: None })
     }
 }

@@ -37,4 +37,4 @@ pub use follower::{Change, Follower};
 pub use memory::{Contents, Gate, GateMode, Memory, Mirrored, check_across, write_across};
 pub use observer::{WriteQueue, Written};
 pub use operation::{Access, Read, Write};
-pub use step::{Action, Done, Journal, Operation, Outcome, Step, StepWrite};
+pub use step::{Action, CarriedOut, Done, Journal, Operation, Outcome, Step, StepWrite};

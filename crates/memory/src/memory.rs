@@ -377,7 +377,7 @@ impl Memory {
     fn write_many_by_journal(&self, access: Access, writes: &[Write<'_>]) -> Result<(), Refused> {
         self.admit(&self.shared(), access).map_err(|refusal| Refused { index: 0, refusal })?;
         let writes: Vec<(&Memory, Write)> = writes.iter().map(|write| (self, *write)).collect();
-        write_across(access, &writes)
+        write_across(access, &writes).map(drop)
     }
 
     /// Replaces a register by `(now AND and_mask) OR (or_mask AND NOT and_mask)`, atomically.
@@ -484,7 +484,8 @@ impl Memory {
     #[cold]
     fn wait(&self, access: Access, operation: Operation<'_>) -> Result<Vec<u8>, Refusal> {
         let alone = |refusal| Refused { index: 0, refusal };
-        wait(|done| self.submit(access, operation, done).map_err(alone)).map_err(Refused::alone)
+        let done = wait(|done| self.submit(access, operation, done).map_err(alone));
+        done.map(|done| done.read).map_err(Refused::alone)
     }
 
     /// Checks a mask write, without the lock. Returns the offset of the register.
@@ -627,19 +628,23 @@ impl Content {
 }
 
 /// Writes to several memories atomically: no reader sees some of the writes without the others, and
-/// when one write is refused, none is carried out. Several writes can name the same memory.
+/// when one write is refused, none is carried out. Several writes can name the same memory. Returns the
+/// sequence of the step, if a log has carried it out.
 ///
 /// # Errors
 /// `WrongLength`, `OutOfRange` or `GateBit`, with the index of the first write that fails one of
 /// these checks. Then [`Refusal::NotOneStep`] where a memory has another journal than the first, and
 /// [`Refusal::Sealed`] (for a client), with the index of the first write to a sealed memory. Nothing
 /// has changed then. If the memories have a journal, see also [`Journal::submit`].
-pub fn write_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
+pub fn write_across(
+    access: Access,
+    writes: &[(&Memory, Write<'_>)],
+) -> Result<Option<u64>, Refused> {
     check_across(access, writes)?;
     if writes.iter().any(|(memory, _)| memory.has_journal()) {
-        return wait(|done| submit_across(access, writes, done)).map(drop);
+        return wait(|done| submit_across(access, writes, done)).map(|done| done.sequence);
     }
-    write_checked(access, writes)
+    write_checked(access, writes).map(|()| None)
 }
 
 /// As [`write_across`], by a journal.
@@ -864,7 +869,8 @@ mod tests {
                 assert_eq!(memory.write_then_read(access, write, then), expected);
                 assert_eq!(memory.write(access, write), expected);
                 assert_eq!(memory.mask_write(access, REGISTERS, 0, 1, 1), expected);
-                let across = write_across(access, &[(&memory, write)]).map_err(Refused::alone);
+                let across = write_across(access, &[(&memory, write)]);
+                let across = across.map(drop).map_err(Refused::alone);
                 assert_eq!(across, expected);
             }
             let step = StepWrite::new(0, &writing(REGISTERS, 0, &[3, 4]));

@@ -37,8 +37,17 @@ pub struct StepWrite {
     pub bytes: Vec<u8>,
 }
 
-/// What became of a step: the bytes that it read, or why nothing was written.
-pub type Outcome = Result<Vec<u8>, Refused>;
+/// A step that was carried out.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct CarriedOut {
+    /// The bytes that it read.
+    pub read: Vec<u8>,
+    /// Its place in a log that several nodes share.
+    pub sequence: Option<u64>,
+}
+
+/// What became of a step. If it was refused, nothing was written.
+pub type Outcome = Result<CarriedOut, Refused>;
 
 /// Receives the outcome of a step. A step whose receiver is dropped counts as
 /// [`Refusal::NotConfirmed`].

@@ -17,11 +17,12 @@ import msgspec
 
 from holdfast import _core, logs
 from holdfast.audit import Unrecorded
+from holdfast.ingest.recording import Recording
 from holdfast.protocol import EXCEPTIONS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from holdfast._core import Follower, Memory, Passage
     from holdfast.audit import Audit
@@ -40,7 +41,10 @@ class Refused(Exception):
     `reason` is a word for programs, `detail` a message for people. `where` locates the error:
     `command` is the index of the command in a batch, `index` the index of the value in the command.
     `memory`, `area`, `address` and `value` are from the command, as far as they could be parsed.
+    `is_recorded` tells whether the audit log has it already.
     """
+
+    is_recorded = False
 
     def __init__(self, reason: str, detail: str, **where: Any) -> None:
         super().__init__(detail)
@@ -205,7 +209,7 @@ class MemoryAccess:
     def refuse(self, refused: Refused, who: str, peer: str) -> None:
         """Counts, logs and audits a refused write. Adapters call it for writes they refuse."""
         self.note(refused, who, peer)
-        if self._audit is not None:
+        if self._audit is not None and not refused.is_recorded:
             self._audit.write(
                 listener=self.name,
                 peer=peer,
@@ -242,35 +246,47 @@ class MemoryAccess:
         else:
             batch = [document]
         single = batch is not document
-        record = partial(self._record, batch, grant, peer) if self._audit is not None else None
+        recording = None
+        if self._audit is not None:
+            recording = Recording(self._audit, partial(self._lines, batch, grant, peer))
         try:
             # Commands are checked one by one: native code stops at the first refused command.
-            values = _core.write_across(
+            values, sequence = _core.write_across(
                 (
                     self._checked(command, grant, None if single else index)  # type: ignore[misc]
                     for index, command in enumerate(batch)
                 ),
-                record,
+                None if recording is None else recording.begin,
             )
+            if recording is not None:
+                recording.done(sequence)
         except Unrecorded:
             raise _unrecorded(batch[0] if single else None) from None
         except _core.BatchRefused as refused:
             command = batch[refused.command]
             device = self._device(command) if single and refused.reason == "mirrored" else None
             if device is None:
-                raise self._refused(command, refused, None if single else refused.command) from None
+                error = self._refused(command, refused, None if single else refused.command)
+                if refused.reason == "not_confirmed" and recording is not None:
+                    recording.not_confirmed()
+                    error.is_recorded = True
+                raise error from None
             values = self._pass(command, device, grant, peer)
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
         return Written(len(batch), values, batch[0]["memory"] if single else None)
 
-    def _record(self, batch: Sequence[Mapping[str, Any]], grant: Grant, peer: str) -> None:
-        """Records commands that are about to be carried out. Raises `Unrecorded`."""
-        assert self._audit is not None
-        self._audit.write_first(self._done(command, grant, peer) for command in batch)
+    def _lines(
+        self,
+        batch: Sequence[Mapping[str, Any]],
+        grant: Grant,
+        peer: str,
+        outcome: Mapping[str, object],
+    ) -> Iterator[dict[str, object]]:
+        return ({**self._line(command, grant, peer), **outcome} for command in batch)
 
-    def _done(self, command: Mapping[str, Any], grant: Grant, peer: str) -> dict[str, object]:
+    def _line(self, command: Mapping[str, Any], grant: Grant, peer: str) -> dict[str, object]:
         return {
             "listener": self.name,
             "peer": peer,
@@ -280,7 +296,6 @@ class MemoryAccess:
             "area": command["area"],
             "address": command["address"],
             "values": [int(item) for item in _values(command)],
-            "outcome": "done",
         }
 
     def _device(self, command: Mapping[str, Any]) -> str | None:
@@ -305,7 +320,8 @@ class MemoryAccess:
             raise Refused("out_of_range", f"{error}, in one write to {device}", **where) from None
         if code == 0:
             if self._audit is not None:
-                self._audit.write_all([self._done(command, grant, peer)], done=True)
+                lines = self._lines([command], grant, peer, {"outcome": "done"})
+                self._audit.write_all(lines, done=True)
             return len(values)
         name = EXCEPTIONS.get(code, "unknown")
         detail = f"{device} did not take the write: exception {code:02X} ({name})"

@@ -9,30 +9,44 @@ use std::task::{Context, Poll};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::RecvError;
 
-/// A request and the PDU of its reply, empty after a broadcast.
+/// A request and its reply.
 pub(crate) fn coming() -> (ReplyTo, Coming) {
     let (to, from) = oneshot::channel();
     let unwanted = Arc::new(AtomicBool::new(false));
     (ReplyTo { to, unwanted: Arc::clone(&unwanted) }, Coming { from, unwanted })
 }
 
+/// What a request was answered with.
+#[derive(Debug, Default)]
+pub(crate) struct Reply {
+    /// Empty after a broadcast.
+    pub(crate) pdu: Vec<u8>,
+    /// Where the log of a memory has the write. `None` for devices.
+    pub(crate) log_sequence: Option<u64>,
+}
+
 /// Where a reply goes.
 pub(crate) struct ReplyTo {
-    to: oneshot::Sender<Vec<u8>>,
+    to: oneshot::Sender<Reply>,
     unwanted: Arc<AtomicBool>,
 }
 
 /// A reply that comes later. An error means that the request was not sent, or that its link has ended.
 #[derive(Debug)]
 pub(crate) struct Coming {
-    from: oneshot::Receiver<Vec<u8>>,
+    from: oneshot::Receiver<Reply>,
     unwanted: Arc<AtomicBool>,
 }
 
 impl ReplyTo {
     pub(crate) fn send(self, pdu: Vec<u8>) {
+        self.send_written(pdu, None);
+    }
+
+    /// Sends the reply to a write, which a log may have.
+    pub(crate) fn send_written(self, pdu: Vec<u8>, log_sequence: Option<u64>) {
         // The client may have gone.
-        let _ = self.to.send(pdu);
+        let _ = self.to.send(Reply { pdu, log_sequence });
     }
 
     /// Whether the request need not be sent any more.
@@ -49,13 +63,13 @@ impl Coming {
     }
 
     /// Blocks the calling thread until the reply comes.
-    pub(crate) fn wait(self) -> Result<Vec<u8>, RecvError> {
+    pub(crate) fn wait(self) -> Result<Reply, RecvError> {
         self.from.blocking_recv()
     }
 }
 
 impl Future for Coming {
-    type Output = Result<Vec<u8>, RecvError>;
+    type Output = Result<Reply, RecvError>;
 
     fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
         Pin::new(&mut self.from).poll(context)

@@ -28,7 +28,7 @@ mod tcp;
 pub(crate) use access::Link;
 pub use backoff::Retry;
 pub use caller::{Called, Caller, Wakes};
-pub(crate) use coming::{Coming, ReplyTo, coming};
+pub(crate) use coming::{Coming, Reply, ReplyTo, coming};
 pub use fault::Fault;
 pub(crate) use fault::exception;
 pub(crate) use fence::Pass;

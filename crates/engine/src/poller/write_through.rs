@@ -127,7 +127,7 @@ impl Passage {
     pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
         let encoded = EncodedRequest::new(request);
         let (_, coming) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
-        match coming.wait().as_deref() {
+        match coming.wait().as_ref().map(|reply| &reply.pdu[..]) {
             Ok([function, code]) if function & 0x80 != 0 => Err(*code),
             Ok(_) => Ok(()),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),

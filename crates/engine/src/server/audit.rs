@@ -12,6 +12,7 @@ use holdfast_protocol::raw_ingest;
 
 use super::functions::only_reads;
 use super::peer::Peer;
+use crate::link::Reply;
 
 /// The most bytes in the queue.
 const CAPACITY: usize = 32 << 20;
@@ -35,6 +36,18 @@ pub struct Record {
     /// `None` on a serial line.
     pub peer: Option<Peer>,
     pub write: Written,
+    /// Where the log of a memory has the write.
+    pub log_sequence: Option<u64>,
+}
+
+/// A request that was answered elsewhere, and its reply. `route` is the name of the device that it was
+/// passed on to.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Forwarded<'a> {
+    pub(crate) route: Option<&'a Arc<str>>,
+    pub(crate) request: &'a [u8],
+    pub(crate) reply: &'a [u8],
+    pub(crate) log_sequence: Option<u64>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -49,6 +62,16 @@ pub enum Written {
         payload: Vec<u8>,
         refused: Option<raw_ingest::Refusal>,
     },
+}
+
+impl<'a> Forwarded<'a> {
+    pub(crate) fn new(
+        route: Option<&'a Arc<str>>,
+        request: &'a [u8],
+        reply: &'a Reply,
+    ) -> Forwarded<'a> {
+        Forwarded { route, request, reply: &reply.pdu, log_sequence: reply.log_sequence }
+    }
 }
 
 /// The sending side.
@@ -146,22 +169,23 @@ impl Auditor {
         permit: Option<Permit>,
     ) {
         if is_write(request) {
-            self.send(record(listener, peer, unit_id, request, reply, None), permit);
+            let answered = Forwarded { route: None, request, reply, log_sequence: None };
+            self.send(record(listener, peer, unit_id, answered), permit);
         }
     }
 
-    /// Records a request to a device, unless it is known to only read. `reply` is what the device
-    /// answered, or what was answered in its place.
+    /// Records a request to a device or a journal, unless it is known to only read. Its reply is what
+    /// was answered there, or in its place.
     pub(crate) fn note_forwarded(
         &self,
         listener: &Arc<str>,
         peer: Option<&Peer>,
         unit_id: u8,
-        (route, request, reply): (Option<&Arc<str>>, &[u8], &[u8]),
+        forwarded: Forwarded<'_>,
         permit: Option<Permit>,
     ) {
-        if !only_reads(request) {
-            self.send(record(listener, peer, unit_id, request, reply, route.cloned()), permit);
+        if !only_reads(forwarded.request) {
+            self.send(record(listener, peer, unit_id, forwarded), permit);
         }
     }
 
@@ -198,16 +222,15 @@ fn record(
     listener: &Arc<str>,
     peer: Option<&Peer>,
     unit_id: u8,
-    request: &[u8],
-    reply: &[u8],
-    route: Option<Arc<str>>,
+    forwarded: Forwarded<'_>,
 ) -> Record {
+    let Forwarded { route, request, reply, log_sequence } = forwarded;
     let refused = match reply {
         [code, exception, ..] if code & 0x80 != 0 => Some(*exception),
         _ => None,
     };
-    let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route };
-    Record { listener: Arc::clone(listener), peer: peer.cloned(), write }
+    let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route: route.cloned() };
+    Record { listener: Arc::clone(listener), peer: peer.cloned(), write, log_sequence }
 }
 
 impl Record {

@@ -21,6 +21,7 @@ use tokio::task::yield_now;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::admission::Ticket;
+use super::audit::Forwarded;
 use super::deferred::{Completed, Deferral, Deferred, MAX_WAITING};
 use super::event::Kind;
 use super::framing::{Ascii, Framing, Mbap, Next, Rtu};
@@ -571,15 +572,16 @@ impl<F: Framing> Answering<F> {
         while let Poll::Ready(completed) = deferred.poll_next(&self.unit_server, context) {
             let Completed { tag, unit_id, route, request, reply, permit } = completed;
             if let Some(auditor) = &self.context.auditor {
-                let (name, passed) =
-                    (&self.context.name, (route.as_ref(), &request[..], &reply[..]));
-                auditor.note_forwarded(name, Some(&self.peer), unit_id, passed, permit);
+                let forwarded = Forwarded::new(route.as_ref(), &request, &reply);
+                let name = &self.context.name;
+                auditor.note_forwarded(name, Some(&self.peer), unit_id, forwarded, permit);
             }
             let at = len.get_or_insert(0);
             let frame = &mut output[*at..];
-            if !reply.is_empty() {
-                frame[F::HEADER_LEN..][..reply.len()].copy_from_slice(&reply);
-                *at += F::complete(frame, tag, unit_id, reply.len());
+            let pdu = &reply.pdu[..];
+            if !pdu.is_empty() {
+                frame[F::HEADER_LEN..][..pdu.len()].copy_from_slice(pdu);
+                *at += F::complete(frame, tag, unit_id, pdu.len());
             }
         }
         len
@@ -597,8 +599,8 @@ impl<F: Framing> Answering<F> {
                 let completed = waiting.complete(&unit_server).await;
                 if let (Some(completed), Some(auditor)) = (completed, &context.auditor) {
                     let Completed { unit_id, route, request, reply, permit, .. } = completed;
-                    let passed = (route.as_ref(), &request[..], &reply[..]);
-                    auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed, permit);
+                    let forwarded = Forwarded::new(route.as_ref(), &request, &reply);
+                    auditor.note_forwarded(&context.name, Some(&peer), unit_id, forwarded, permit);
                 }
             }
             // The engine waits for this until all receivers are dropped.

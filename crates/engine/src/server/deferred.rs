@@ -17,7 +17,7 @@ use super::listener::ListenerContext;
 use super::policy::{Elsewhere, PeerRights};
 use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
-use crate::link::{Asker, Coming, exception, source};
+use crate::link::{Asker, Coming, Reply, exception, source};
 
 /// The most requests of a connection that wait for replies.
 pub(super) const MAX_WAITING: usize = 16;
@@ -43,7 +43,7 @@ pub(super) struct Waiting {
 
 enum Expected {
     Coming(Coming),
-    Known(Vec<u8>),
+    Known(Reply),
 }
 
 /// A request with its reply.
@@ -53,8 +53,7 @@ pub(super) struct Completed {
     /// The device that the request was passed on to; `None` if it was refused, or is of a memory.
     pub(super) route: Option<Arc<str>>,
     pub(super) request: Vec<u8>,
-    /// A PDU; empty when there is no reply.
-    pub(super) reply: Vec<u8>,
+    pub(super) reply: Reply,
     pub(super) permit: Option<Permit>,
 }
 
@@ -111,7 +110,10 @@ impl Deferred {
         let refused = RefusedRequest::before_device(unit_id, request, &sent);
         let (route, reply) = match sent {
             Ok((route, coming)) => (route, Expected::Coming(coming)),
-            Err(code) => (None, Expected::Known(exception(request, code.code()))),
+            Err(code) => {
+                let pdu = exception(request, code.code());
+                (None, Expected::Known(Reply { pdu, ..Reply::default() }))
+            }
         };
         let is_step = matches!(place, Elsewhere::Journal(_));
         let request = request.to_vec();
@@ -177,9 +179,9 @@ impl Waiting {
 }
 
 /// The reply that came, and counts it. `None` means that the link has ended.
-pub(super) fn come(unit_server: &UnitServer, request: &[u8], reply: Option<Vec<u8>>) -> Vec<u8> {
+pub(super) fn come(unit_server: &UnitServer, request: &[u8], reply: Option<Reply>) -> Reply {
     let ended = || exception(request, ExceptionCode::GatewayPathUnavailable.code());
-    let reply = reply.unwrap_or_else(ended);
-    unit_server.forwarded(request, &reply);
+    let reply = reply.unwrap_or_else(|| Reply { pdu: ended(), ..Reply::default() });
+    unit_server.forwarded(request, &reply.pdu);
     reply
 }

@@ -5,7 +5,7 @@ use holdfast_memory::{Access, Area, Memory, Operation, Outcome, Write};
 use holdfast_protocol::pdu::{self, ExceptionCode, Request, reply};
 
 use super::memory_operations::{exception_of, writing};
-use crate::link::{Coming, ReplyTo, coming, exception};
+use crate::link::{Coming, Reply, ReplyTo, coming, exception};
 
 /// Gives a write to the journal.
 ///
@@ -50,6 +50,18 @@ pub(super) fn ask(memory: &Memory, pdu: &[u8]) -> Result<Coming, ExceptionCode> 
     Ok(coming)
 }
 
+/// Carries out a write, and waits for the journal. Returns the reply, and where a log has the write.
+pub(super) async fn carry_out(memory: &Memory, pdu: &[u8]) -> (Vec<u8>, Option<u64>) {
+    let refused = |code: ExceptionCode| (exception(pdu, code.code()), None);
+    match ask(memory, pdu) {
+        Err(code) => refused(code),
+        Ok(coming) => match coming.await {
+            Ok(Reply { pdu, log_sequence }) => (pdu, log_sequence),
+            Err(_) => refused(ExceptionCode::ServerDeviceFailure),
+        },
+    }
+}
+
 /// The answer to a write. If it is dropped, nobody knows what became of the write.
 struct Answer {
     request: Vec<u8>,
@@ -59,11 +71,12 @@ struct Answer {
 impl Answer {
     fn send(mut self, outcome: Outcome) {
         let mut buffer = [0; pdu::MAX_LEN];
+        let log_sequence = outcome.as_ref().ok().and_then(|done| done.sequence);
         let reply = match (&outcome, Request::parse(&self.request)) {
             (Err(refused), _) => exception(&self.request, exception_of(refused.refusal).code()),
-            (Ok(bytes), Ok(Request::ReadWriteMultipleRegisters { read, .. })) => {
+            (Ok(done), Ok(Request::ReadWriteMultipleRegisters { read, .. })) => {
                 let (out, len) = reply::read_write_multiple_registers(read, &mut buffer);
-                out.copy_from_slice(bytes);
+                out.copy_from_slice(&done.read);
                 buffer[..len].to_vec()
             }
             (Ok(_), Ok(Request::WriteMultipleCoils { address, bits })) => {
@@ -78,7 +91,7 @@ impl Answer {
             (Ok(_), _) => std::mem::take(&mut self.request),
         };
         if let Some(to) = self.to.take() {
-            to.send(reply);
+            to.send_written(reply, log_sequence);
         }
     }
 }

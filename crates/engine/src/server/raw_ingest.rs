@@ -382,8 +382,8 @@ impl RawIngest {
             .submit(Access::Ingest, Operation::Write(writing(&header, payload)), kept)
             .map_err(refusal)?;
         let outcome = outcome.await.map_err(|_| Refusal::NotConfirmed)?;
-        outcome.map_err(|refused| refusal(refused.refusal))?;
-        self.accepted(context, peer, (header, payload), permit);
+        let done = outcome.map_err(|refused| refusal(refused.refusal))?;
+        self.accepted(context, peer, (header, payload), (done.sequence, permit));
         Ok(())
     }
 
@@ -397,7 +397,7 @@ impl RawIngest {
         debug_assert!(!memory.has_journal(), "a journal would block the thread");
         let permit = context.permit_packet(payload).ok_or(Refusal::Unrecorded)?;
         memory.write(Access::Ingest, writing(&header, payload)).map_err(refusal)?;
-        self.accepted(context, peer, (header, payload), permit);
+        self.accepted(context, peer, (header, payload), (None, permit));
         Ok(())
     }
 
@@ -406,11 +406,11 @@ impl RawIngest {
         context: &ListenerContext,
         peer: &Peer,
         (header, payload): (Header, &[u8]),
-        permit: Permit,
+        recorded: (Option<u64>, Permit),
     ) {
         self.packets.accepted.add();
         self.packets.values.add_many(u64::from(header.count.get()));
-        self.audit(context, peer, (Some(header), payload), Ok(permit));
+        self.audit(context, peer, (Some(header), payload), Ok(recorded));
     }
 
     /// Receives a packet. The inner error is a refusal; the outer one says why no reply is due.
@@ -707,14 +707,16 @@ impl RawIngest {
         context: &ListenerContext,
         peer: &Peer,
         (header, payload): (Option<Header>, &[u8]),
-        outcome: Result<Permit, Refusal>,
+        outcome: Result<(Option<u64>, Permit), Refusal>,
     ) {
         if let Some(auditor) = &context.auditor {
             let (format, payload, refused) =
                 (self.format, payload.to_vec(), outcome.as_ref().err());
             let write = Written::Packet { format, header, payload, refused: refused.copied() };
             let (listener, peer) = (Arc::clone(&context.name), Some(peer.clone()));
-            auditor.send(Record { listener, peer, write }, outcome.ok());
+            let (log_sequence, permit) = outcome.ok().unzip();
+            let log_sequence = log_sequence.flatten();
+            auditor.send(Record { listener, peer, write, log_sequence }, permit);
         }
     }
 }

@@ -15,6 +15,7 @@ use serial2_tokio::SerialPort;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
+use super::audit::Forwarded;
 use super::deferred::come;
 use super::event::Kind;
 use super::framing::{Framing, Rtu};
@@ -23,7 +24,7 @@ use super::live::Live;
 use super::policy::{PeerRights, Rule};
 use super::refused_request::{RefusedRequest, Reported};
 use super::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
-use crate::link::{Asker, exception, source};
+use crate::link::{Asker, Reply, exception, source};
 use crate::serial_line::{LineMode, SerialLine};
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
@@ -243,7 +244,7 @@ impl ModbusSerial {
         reply: &mut pdu::Buffer,
     ) -> Option<usize> {
         if unit_id == BROADCAST {
-            self.broadcast(context, request);
+            self.broadcast(context, request).await;
             return None;
         }
         let rights = self.rights.get();
@@ -256,12 +257,16 @@ impl ModbusSerial {
             self.note_refused(context, RefusedRequest::before_device(unit_id, request, &sent));
             let (route, answered) = match sent {
                 Ok((route, coming)) => (route, come(&self.unit_server, request, coming.await.ok())),
-                Err(code) => (None, exception(request, code.code())),
+                Err(code) => {
+                    let pdu = exception(request, code.code());
+                    (None, Reply { pdu, ..Reply::default() })
+                }
             };
             if let Some(auditor) = &context.auditor {
-                let passed = (route.as_ref(), request, &answered[..]);
-                auditor.note_forwarded(&context.name, None, unit_id, passed, permit);
+                let forwarded = Forwarded::new(route.as_ref(), request, &answered);
+                auditor.note_forwarded(&context.name, None, unit_id, forwarded, permit);
             }
+            let answered = answered.pdu;
             reply[..answered.len()].copy_from_slice(&answered);
             return (!answered.is_empty()).then_some(answered.len());
         }
@@ -294,7 +299,7 @@ impl ModbusSerial {
     }
 
     /// Carries out a broadcast: every memory carries out the write, no unit replies.
-    fn broadcast(&self, context: &ListenerContext, request: &[u8]) {
+    async fn broadcast(&self, context: &ListenerContext, request: &[u8]) {
         let function = request.first().copied().and_then(Function::from_code);
         let wanted = function
             .is_some_and(|code| code.is_write() && code != Function::ReadWriteMultipleRegisters);
@@ -303,11 +308,13 @@ impl ModbusSerial {
             return;
         }
         let permit = || context.permit(request);
-        self.unit_server.broadcast(&self.rights.get(), request, permit, |reply, permit| {
+        let note = |reply: &[u8], log_sequence, permit| {
             if let Some(auditor) = &context.auditor {
-                auditor.note(&context.name, None, BROADCAST, (request, reply), permit);
+                let forwarded = Forwarded { route: None, request, reply, log_sequence };
+                auditor.note_forwarded(&context.name, None, BROADCAST, forwarded, permit);
             }
-        });
+        };
+        self.unit_server.broadcast(&self.rights.get(), request, permit, note).await;
     }
 }
 

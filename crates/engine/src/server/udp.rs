@@ -14,7 +14,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::audit::Permit;
+use super::audit::{Forwarded, Permit};
 use super::deferred::come;
 use super::event::Kind;
 use super::framing::{Datagram, Mbap, Next, Rtu};
@@ -25,7 +25,7 @@ use super::policy::{Policy, Rule};
 use super::rates::RateLimits;
 use super::refused_request::RefusedRequest;
 use super::unit_server::UnitServer;
-use crate::link::{Asker, source};
+use crate::link::{Asker, Reply, source};
 
 /// Bytes per read of a socket. The system may deliver several datagrams of one peer at once.
 const INPUT: usize = 64 * 1024;
@@ -165,14 +165,15 @@ impl ModbusUdp {
     ) {
         let reply = come(&self.unit_server, &request, reply);
         if let Some(auditor) = &context.auditor {
-            let passed = (route.as_ref(), &request[..], &reply[..]);
+            let forwarded = Forwarded::new(route.as_ref(), &request, &reply);
             let peer = meta.addr.into();
-            auditor.note_forwarded(&context.name, Some(&peer), unit_id, passed, permit);
+            auditor.note_forwarded(&context.name, Some(&peer), unit_id, forwarded, permit);
         }
-        if !reply.is_empty() {
+        let pdu = &reply.pdu[..];
+        if !pdu.is_empty() {
             let mut frame = [0; MAX_FRAME_LEN];
-            frame[D::HEADER_LEN..][..reply.len()].copy_from_slice(&reply);
-            let len = D::complete(&mut frame, tag, unit_id, reply.len());
+            frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(pdu);
+            let len = D::complete(&mut frame, tag, unit_id, pdu.len());
             socket.send(&frame[..len], &meta);
         }
     }
@@ -242,7 +243,8 @@ impl ModbusUdp {
                     let function_code = request.first().copied().unwrap_or_default();
                     let len = reply::exception(function_code, code, buffer);
                     if let Some(auditor) = &context.auditor {
-                        let refused = (None, request, &buffer[..len]);
+                        let (reply, log_sequence) = (&buffer[..len], None);
+                        let refused = Forwarded { route: None, request, reply, log_sequence };
                         let peer = peer.into();
                         auditor.note_forwarded(
                             &context.name,
@@ -288,7 +290,7 @@ struct Completed {
     meta: RecvMeta,
     route: Option<Arc<str>>,
     request: Vec<u8>,
-    reply: Option<Vec<u8>>,
+    reply: Option<Reply>,
     permit: Option<Permit>,
 }
 

@@ -172,13 +172,14 @@ impl UnitServer {
 
     /// Carries out a broadcast write (Serial Line V1.02, 2.1). It counts as one message without a
     /// reply, even if several memories carry it out. `permit` is asked before each, and `note` receives
-    /// the permit and the reply that each would have sent.
-    pub fn broadcast<P>(
+    /// the permit, the reply that each would have sent, and where a log has the write. A journal is
+    /// waited for, because what follows on the line expects the effects.
+    pub async fn broadcast<P>(
         &self,
         rights: &PeerRights,
         request: &[u8],
         mut permit: impl FnMut() -> Option<P>,
-        mut note: impl FnMut(&[u8], Option<P>),
+        mut note: impl FnMut(&[u8], Option<u64>, Option<P>),
     ) {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
@@ -187,19 +188,29 @@ impl UnitServer {
         let may =
             |unit_id| rights.allows(unit_id, function_code) && !outside(rights, unit_id, request);
         for unit_id in rights.one_unit_of_each_memory(|unit_id| !self.is_silent(unit_id), may) {
-            let (permit, mut reply) = (permit(), [0; pdu::MAX_LEN]);
-            let (asked, permitted) = ((function_code, request), permit.is_some());
-            let len = match self.serve(rights, unit_id, asked, permitted, &mut reply) {
-                Ok(len) => {
-                    carried_out = true;
-                    len.unwrap_or_default()
-                }
-                Err(code) => {
-                    refused = refused.or(Some(code));
-                    reply::exception(function_code, code, &mut reply)
+            let permit = permit();
+            let journal = rights
+                .memory(unit_id)
+                .filter(|memory| memory.has_journal() && permit.is_some() && may(unit_id));
+            let (reply, log_sequence) = match journal {
+                Some(memory) => journal::carry_out(memory, request).await,
+                None => {
+                    let (mut reply, asked) = ([0; pdu::MAX_LEN], (function_code, request));
+                    let done = self.serve(rights, unit_id, asked, permit.is_some(), &mut reply);
+                    let len = match done {
+                        Ok(len) => len.unwrap_or_default(),
+                        Err(code) => reply::exception(function_code, code, &mut reply),
+                    };
+                    (reply[..len].to_vec(), None)
                 }
             };
-            note(&reply[..len], permit);
+            match reply[..] {
+                [code, exception, ..] if code & 0x80 != 0 => {
+                    refused = refused.or(ExceptionCode::from_code(exception));
+                }
+                _ => carried_out = true,
+            }
+            note(&reply, log_sequence, permit);
         }
         match refused {
             Some(code) => self.counters.exception(code),

@@ -13,7 +13,7 @@ use async_nats::jetstream::{self, Context};
 use async_nats::{Client, HeaderMap, StatusCode, header};
 use bytes::Bytes;
 use futures_util::{FutureExt, StreamExt};
-use holdfast_memory::Memory;
+use holdfast_memory::{CarriedOut, Memory};
 use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
@@ -453,7 +453,7 @@ impl Node {
         self.origin.counter += 1;
         let payload = message::encode(&self.origin, compares, steps.iter().map(Vec::as_slice));
         if self.settings.answers_early {
-            dones.drain(..).for_each(|done| done(Ok(Vec::new())));
+            dones.drain(..).for_each(|done| done(Ok(CarriedOut::default())));
         }
         let counter = self.origin.counter;
         self.sent.push(counter, payload.clone(), dones, until);

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use aws_lc_rs::digest::{SHA256, digest};
-use holdfast_memory::{Area, Contents, Memory, Outcome};
+use holdfast_memory::{Area, CarriedOut, Contents, Memory, Outcome};
 
 use super::error::LogError;
 use super::message::{self, MAX_NODES, Message, MessageError, Origin, VERSION};
@@ -95,7 +95,8 @@ impl State {
         }
         self.origins.insert(origin.node.clone(), now);
         self.steps += steps.len() as u64;
-        let outcomes = steps.iter().map(|step| step.carry_out(&self.members)).collect();
+        let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
+        let outcomes = steps.iter().map(|step| step.carry_out(&self.members).map(at)).collect();
         Ok(Applied::Fresh { origin, compares, outcomes })
     }
 
