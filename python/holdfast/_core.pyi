@@ -254,7 +254,9 @@ class Follower:
         """Returns the number of writes to the memory, and what has changed since the last call.
 
         A change is the index of its range, an address, and the values from there: the shortest part
-        that contains all changes of the range. The first call returns all ranges as a whole.
+        that contains all changes of the range. The first call, and the first one after an error,
+        return all ranges as a whole. Raises `OSError` while the log of the memory does not allow
+        to read it.
         """
 
 @final
@@ -296,6 +298,10 @@ class BatchRefused(ValueError):
         "wrong_length",
         "not_registers",
         "mirrored",
+        "not_one_step",
+        "not_stored",
+        "log_unavailable",
+        "not_confirmed",
     ]
     """`invalid_type`: a value of another type, or with `index` `None`, values that are not a
     sequence of integers. `invalid_value`: an integer out of range."""

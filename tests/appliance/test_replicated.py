@@ -14,7 +14,7 @@ from holdfast.appliance import Appliance
 from holdfast.appliance.changes import ReloadRefused
 from holdfast.appliance.shared_logs import LogNotJoined
 from holdfast.config import load
-from support import audits, web, wire
+from support import audits, event_streams, web, wire
 from support.brokers import NatsServer, free_port
 from support.cli import done, invoke
 from support.config_folder import Folder, written
@@ -44,14 +44,14 @@ def config(
     devices: Settings | None = None,
     **memory: Any,
 ) -> Config:
-    """A node. `audit` is a file name, the rest are settings of the memory."""
-    audit = memory.pop("audit", None)
+    """A node. `audit` is a file name, `log` has settings of the log, `memory` of the memory."""
+    audit, log = memory.pop("audit", None), memory.pop("log", {})
     plant = {"holding_registers": 100, "coils": 16, "replicate": {"log": "site"}} | memory
     rules = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-write"}]
     parts = {
         "devices": devices or {},
         "memories": {"plant": plant, "alone": {"holding_registers": 10}},
-        "logs": {"site": {"servers": servers, "node": name}},
+        "logs": {"site": {"servers": servers, "node": name} | log},
         "listeners": {"scada": {"type": "modbus-tcp", "bind": "127.0.0.1:0", "rules": rules}},
         "rest": {"bind": "127.0.0.1:0", "sources": ["127.0.0.0/8"], "tokens": "none"},
     } | ({} if audit is None else {"audit": {"file": audit}})
@@ -113,7 +113,9 @@ def test_the_audit_log_names_the_sequence_of_each_write(
     assert ingest(one, ("plant", 9), ("plant", 10)) == 200
     assert ask(one, "0603e80001") == "8602"
     lines = audits.await_writes(tmp_path / "a.log", 7)
-    by_modbus, by_rest = ([of for of in lines if of["listener"] == who] for who in ("scada", "rest"))
+    by_modbus, by_rest = (
+        [of for of in lines if of["listener"] == who] for who in ("scada", "rest")
+    )
     *_, refused = by_modbus
     assert (refused["outcome"], "log_sequence" in refused) == ("illegal_data_address", False)
     plant, alone, first, second = by_rest
@@ -148,6 +150,28 @@ def test_the_audit_log_says_which_writes_were_not_confirmed(
     assert ingest(one, ("plant", 9)) == 503
     *_, refused = audits.await_writes(tmp_path / "a.log", 3)
     assert (refused["outcome"], len(audits.writes(tmp_path / "a.log"))) == ("log_unavailable", 3)
+
+
+def test_a_change_stream_of_a_node_that_is_behind_says_so(
+    node: Callable[..., Appliance], server: NatsServer
+) -> None:
+    one = node("a", log={"when_behind": "refuse", "max_lag": 1})
+    ask(one, "060003002a")
+    place = "memory=plant&area=holding_registers&address=3&count=1&min_interval=0.05"
+    path = f"/api/v1/memory/changes?{place}"
+    stream = event_streams.opened(endpoint(one, "rest"), path)
+    try:
+        events = iter(stream)
+        assert next(events).data["values"] == [42]
+        server.kill()
+        event = next(events)
+        assert (event.name, event.data["reason"]) == ("unavailable", "log_unavailable")
+        assert "contact" in event.data["detail"]
+        server.start()
+        event = next(events)
+        assert (event.name, event.data["address"], event.data["values"]) == ("values", 3, [42])
+    finally:
+        stream.close()
 
 
 def test_masks_of_all_nodes_at_once_have_one_order(node: Callable[..., Appliance]) -> None:

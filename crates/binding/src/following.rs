@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use holdfast_memory::Follower as CoreFollower;
+use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
@@ -35,8 +36,10 @@ impl Follower {
     }
 
     fn changes<'py>(&self, py: Python<'py>) -> PyResult<(u64, Vec<Change<'py>>)> {
-        let (writes, changes) =
+        let looked =
             py.detach(|| self.core.lock().unwrap_or_else(PoisonError::into_inner).changes());
+        let (writes, changes) =
+            looked.map_err(|refusal| PyOSError::new_err(refusal.to_string()))?;
         let told = changes.into_iter().map(|change| {
             let values = listed(py, change.area, change.count, &change.bytes)?;
             Ok((change.range, change.address, values))

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::area::Area;
 use crate::bits;
-use crate::error::Refused;
+use crate::error::{Refusal, Refused};
 use crate::memory::Memory;
 use crate::operation::Read;
 
@@ -58,11 +58,15 @@ impl Follower {
     }
 
     /// Returns the changes since the last call, of all ranges at the same moment, and the number of
-    /// writes to the memory up to then. The first call returns all ranges as a whole. Changes are
-    /// empty if every range is as before.
-    pub fn changes(&mut self) -> (u64, Vec<Change>) {
+    /// writes to the memory up to then. The first call, and the first one after an error, return all
+    /// ranges as a whole. Changes are empty if every range is as before.
+    ///
+    /// # Errors
+    /// Those of [`Journal::admit`](crate::Journal::admit): the contents may be old or wrong.
+    pub fn changes(&mut self) -> Result<(u64, Vec<Change>), Refusal> {
         let mut reads: Vec<Read> = self.ranges.iter_mut().map(Followed::reading).collect();
-        let writes = self.memory.read_since(self.seen, &mut reads);
+        let read = self.memory.read_since(self.seen, &mut reads);
+        let writes = read.inspect_err(|_| self.seen = None)?;
         let mut changes = Vec::new();
         if self.seen != Some(writes) {
             let is_first = self.seen.is_none();
@@ -71,7 +75,7 @@ impl Follower {
             }
             self.seen = Some(writes);
         }
-        (writes, changes)
+        Ok((writes, changes))
     }
 }
 

@@ -319,8 +319,16 @@ impl Memory {
 
     /// Returns how many writes were carried out, and reads ranges, unless that number is `seen`. The
     /// seal is ignored. The ranges must have been checked by `holds`.
-    pub(crate) fn read_since(&self, seen: Option<u64>, reads: &mut [Read<'_>]) -> u64 {
+    ///
+    /// # Errors
+    /// Those of [`Journal::admit`].
+    pub(crate) fn read_since(
+        &self,
+        seen: Option<u64>,
+        reads: &mut [Read<'_>],
+    ) -> Result<u64, Refusal> {
         let content = self.shared();
+        self.admit(&content, Access::Ingest)?;
         if seen != Some(content.writes) {
             for read in reads {
                 let Read { area, address, count, ref mut out } = *read;
@@ -328,7 +336,7 @@ impl Memory {
                 content.copy_out(offset, Read { area, address, count, out });
             }
         }
-        content.writes
+        Ok(content.writes)
     }
 
     /// Checks a range, without the lock.
@@ -768,6 +776,7 @@ fn apply_across(access: Access, placed: &[Placed<'_>]) -> Result<(), Refused> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::follower::Follower;
 
     const REGISTERS: Area = Area::HoldingRegisters;
 
@@ -857,8 +866,11 @@ mod tests {
             memory.keep_in(Arc::clone(&guard) as Arc<dyn Journal>, 0);
             let write = writing(REGISTERS, 0, &[1, 2]);
             memory.write(Access::Client, write).unwrap();
+            let mut follower = Follower::new(Arc::clone(&memory), [(REGISTERS, 0, 2)]).unwrap();
+            let all = follower.changes().unwrap();
             *guard.refusal.lock().unwrap() = Some(Refusal::Behind);
             let expected = if guards { Err(Refusal::Behind) } else { Ok(()) };
+            assert_eq!(follower.changes().map(drop), expected);
             for access in [Access::Client, Access::Ingest, Access::Mirror] {
                 let mut out = [[0; 2]; 3];
                 let [one, many, then] =
@@ -875,6 +887,10 @@ mod tests {
             }
             let step = StepWrite::new(0, &writing(REGISTERS, 0, &[3, 4]));
             let step = Step { access: Access::Client, action: Action::Write(vec![step]) };
+            if guards {
+                *guard.refusal.lock().unwrap() = None;
+                assert_eq!(follower.changes(), Ok(all), "after a refusal, all is new");
+            }
             step.carry_out(&[Arc::clone(&memory)]).unwrap();
             *guard.refusal.lock().unwrap() = None;
             let mut out = [0; 2];

@@ -1,7 +1,8 @@
 """The change stream: what changes in ranges of a memory, as server-sent events.
 
 A stream looks at the memory at most once per `min_interval`, and only when its peer has taken the
-events before. So a slow peer receives the newest values, and nothing is queued for it.
+events before. So a slow peer receives the newest values, and nothing is queued for it. While the
+memory can't be read because its log is behind, a stream says so and waits.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ HEARTBEAT = 15.0
 """The longest time in seconds between two events or comments of a stream."""
 
 EVENT = "values"
+UNAVAILABLE = "unavailable"
 
 
 class ChangeStreams:
@@ -89,10 +91,19 @@ async def _follow(
     """Sends events until one of the tasks `ends` is done."""
     loop = asyncio.get_running_loop()
     due = loop.time()
+    refusal = ""
     while not any(task.done() for task in ends):
         if loop.time() >= due:
             due = loop.time() + min_interval
-            sequence, changes = follower.changes()
+            before = refusal
+            try:
+                (sequence, changes), refusal = follower.changes(), ""
+            except OSError as error:
+                changes, refusal = [], str(error)
+            if refusal and refusal != before:
+                memory, _ = ranges[0]
+                told = {"memory": memory, "reason": "log_unavailable", "detail": refusal}
+                await stream.event(UNAVAILABLE, told)
             for index, address, values in changes:
                 memory, area = ranges[index]
                 data = {"memory": memory, "area": area, "address": address, "values": values}

@@ -158,14 +158,15 @@ CHANGES = Route(
     "GET",
     "changes",
     "Follow ranges: a stream of their values and changes",
-    stream_answer(values="Change"),
+    stream_answer(values="Change", unavailable="Unavailable"),
     (*QUERY, *MEMORY, *STREAM),
     description="Server-sent events. The first event of each range has its current values; later "
     "events have the shortest part of a range that contains all changes. The `id` of an event is "
     "the number of writes to the memory; events with the same `id` are of the same moment. A "
     "client that reads slowly receives the newest values. `area`, `address` and `count` can be "
     f"repeated together, for up to {MAX_RANGES} ranges. After a reconnect, with or without "
-    "`Last-Event-ID`, the stream begins with the current values.",
+    "`Last-Event-ID`, the stream begins with the current values. `unavailable` means that a "
+    "replicated memory can't be read at present; once it can, all ranges follow as a whole.",
     parameters=(
         Parameter("memory", "The name of the memory", TEXT, "plant_a"),
         Parameter("area", "The area", ref("Area"), ["holding_registers"], repeats=True),

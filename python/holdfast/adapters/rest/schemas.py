@@ -52,6 +52,13 @@ ANSWERS: dict[str, Schema] = {
     "Change": object_of(
         {"memory": TEXT, "area": ref("Area"), "address": ADDRESS, "values": _values(REGISTER)}
     ),
+    "Unavailable": object_of(
+        {
+            "memory": TEXT,
+            "reason": {"const": "log_unavailable"},
+            "detail": TEXT | {"description": "A message for people"},
+        }
+    ),
     "EndedSession": object_of({"status": {"const": "ended"}, "id": SESSION_ID}),
     "Health": object_of({"status": {"const": "ok"}}),
     "Refusal": {
