@@ -91,8 +91,13 @@ fn writes_given_away_together_are_carried_out_in_their_order() {
         let done = Box::new(move |outcome| sender.send((value, outcome)).unwrap());
         a.memory.submit(Access::Client, Operation::Write(write), done).unwrap();
     }
+    let mut before = 0;
     for value in 0..2000 {
-        assert_eq!(receiver.recv().unwrap(), (value, Ok(Vec::new())));
+        let (of, outcome) = receiver.recv().unwrap();
+        assert_eq!(of, value);
+        let sequence = outcome.unwrap().sequence.expect("a log has the step");
+        assert!(before <= sequence, "steps that travel together share a message");
+        before = sequence;
     }
     assert_eq!(a.read(0), Ok(1999));
     until("the other node has the last", || b.read(0) == Ok(1999));

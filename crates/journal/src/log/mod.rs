@@ -11,6 +11,7 @@
 //! done   ◄─ sent.rs      the outcome of the step
 //! ```
 
+mod clock;
 mod connection;
 mod digests;
 mod error;

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use holdfast_memory::{Done, Outcome, Refusal};
 
+use super::clock::Moment;
 use super::shared::refuse;
 use super::status::Counters;
 
@@ -27,7 +28,7 @@ struct Message {
     payload: Bytes,
     /// Empty if there are no steps, and when they were answered.
     steps: Vec<Done>,
-    first_sent: Instant,
+    first_sent: Moment,
     times: u32,
     until: Instant,
 }
@@ -41,14 +42,19 @@ impl Sent {
         self.open == 0
     }
 
-    pub(super) fn push(&mut self, counter: u64, payload: Bytes, steps: Vec<Done>, until: Instant) {
+    pub(super) fn push(
+        &mut self,
+        (counter, payload): (u64, Bytes),
+        steps: Vec<Done>,
+        first_sent: Moment,
+        until: Instant,
+    ) {
         debug_assert!(self.messages.back().is_none_or(|last| last.counter < counter));
         if self.messages.len() >= REMEMBERED && self.messages.front().is_some_and(Message::is_told)
         {
             self.messages.pop_front();
         }
         self.open += usize::from(!steps.is_empty());
-        let first_sent = Instant::now();
         self.messages.push_back(Message { counter, payload, steps, first_sent, times: 1, until });
     }
 
@@ -58,7 +64,7 @@ impl Sent {
         counter: u64,
         outcomes: Vec<Outcome>,
         counters: &Counters,
-    ) -> Option<Instant> {
+    ) -> Option<Moment> {
         while self.messages.front().is_some_and(|first| first.counter < counter) {
             if let Some(message) = self.messages.pop_front() {
                 self.told(&message);
@@ -159,14 +165,16 @@ pub(super) const LOOK: Duration = Duration::from_millis(20);
 mod tests {
     use std::sync::mpsc::{Receiver, channel};
 
-    use holdfast_memory::Refused;
+    use holdfast_memory::{CarriedOut, Refused};
 
+    use super::super::clock::Clock;
     use super::*;
 
     fn push(sent: &mut Sent, counter: u64, until: Instant) -> Receiver<Outcome> {
         let (sender, receiver) = channel();
         let done: Done = Box::new(move |outcome| sender.send(outcome).unwrap());
-        sent.push(counter, Bytes::from_static(b"steps"), vec![done], until);
+        let message = (counter, Bytes::from_static(b"steps"));
+        sent.push(message, vec![done], Clock::default().now(), until);
         receiver
     }
 
@@ -182,9 +190,10 @@ mod tests {
     fn a_message_before_one_that_was_applied_never_will_be() {
         let (mut sent, counters) = (Sent::default(), Counters::default());
         let [one, two, three] = [1, 2, 3].map(|counter| push(&mut sent, counter, later()));
-        assert!(sent.applied(2, vec![Ok(vec![7])], &counters).is_some());
+        let read = CarriedOut { read: vec![7], sequence: Some(3) };
+        assert!(sent.applied(2, vec![Ok(read.clone())], &counters).is_some());
         assert_eq!(one.try_recv(), Ok(refused(Refusal::Unavailable)));
-        assert_eq!(two.try_recv(), Ok(Ok(vec![7])));
+        assert_eq!(two.try_recv(), Ok(Ok(read)));
         assert!(three.try_recv().is_err());
         assert_eq!((counters.steps.get(), counters.unavailable.get()), (1, 1));
         assert!(!sent.is_empty());
@@ -209,7 +218,7 @@ mod tests {
         assert_eq!(one.try_recv(), Ok(refused(Refusal::NotConfirmed)));
         assert_eq!(sent.again(), [(2, Bytes::from_static(b"steps"))]);
         assert!(two.try_recv().is_err());
-        assert_eq!(sent.applied(1, vec![Ok(Vec::new())], &counters), None);
+        assert_eq!(sent.applied(1, vec![Ok(CarriedOut::default())], &counters), None);
         assert_eq!(counters.not_confirmed.get(), 1);
     }
 

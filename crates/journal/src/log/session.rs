@@ -456,7 +456,7 @@ impl Node {
             dones.drain(..).for_each(|done| done(Ok(CarriedOut::default())));
         }
         let counter = self.origin.counter;
-        self.sent.push(counter, payload.clone(), dones, until);
+        self.sent.push((counter, payload.clone()), dones, self.shared.now(), until);
         self.publish(session, counter, payload).await
     }
 

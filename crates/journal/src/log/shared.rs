@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use holdfast_memory::{Done, Journal, Refusal, Refused, Step};
 use tokio::sync::Notify;
 
+use super::clock::{Clock, Moment};
 use super::error::LogError;
 use super::settings::{Settings, WhenBehind};
 use super::status::{Counters, Event, NodeView, Phase, View};
@@ -25,14 +26,14 @@ const DIFFERS: u8 = 1;
 const LOADING: u8 = 2;
 
 pub(super) struct Shared {
-    began: Instant,
+    clock: Clock,
     refuses: bool,
     max_lag: Duration,
     write_timeout: Duration,
     capacity: usize,
     /// What the contents are fit for: [`OPEN`], [`DIFFERS`] or [`LOADING`].
     door: AtomicU8,
-    /// The contents have been current at this time, in nanoseconds since `began`. 0 means never.
+    /// The contents have been current at this [`Moment`], in nanoseconds. 0 means never.
     contact: AtomicU64,
     /// The longest encoded step that the servers accept.
     longest: AtomicUsize,
@@ -109,7 +110,7 @@ impl Journal for Shared {
 impl Shared {
     pub(super) fn new(settings: &Settings) -> Shared {
         Shared {
-            began: Instant::now(),
+            clock: Clock::default(),
             refuses: settings.when_behind == WhenBehind::Refuse,
             max_lag: settings.max_lag,
             write_timeout: settings.write_timeout,
@@ -133,15 +134,17 @@ impl Shared {
 
     /// How long ago the contents were current for sure.
     pub(super) fn contact_age(&self) -> Option<Duration> {
-        let contact = self.contact.load(Ordering::Acquire);
-        let age = || self.began.elapsed().saturating_sub(Duration::from_nanos(contact));
-        (contact > 0).then(age)
+        let contact = Moment::from_nanos(self.contact.load(Ordering::Acquire));
+        contact.map(|contact| self.now().since(contact))
     }
 
     /// The contents have all that the log had at this time.
-    pub(super) fn contact(&self, at: Instant) {
-        let since = at.saturating_duration_since(self.began).as_nanos();
-        self.contact.fetch_max(u64::try_from(since).unwrap_or(u64::MAX).max(1), Ordering::Release);
+    pub(super) fn contact(&self, at: Moment) {
+        self.contact.fetch_max(at.as_nanos(), Ordering::Release);
+    }
+
+    pub(super) fn now(&self) -> Moment {
+        self.clock.now()
     }
 
     /// Takes steps from now on.
@@ -272,4 +275,33 @@ pub(super) fn refuse(done: Done, refusal: Refusal) {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    #[test]
+    fn after_a_suspend_contents_are_old() {
+        let time = Arc::new(Mutex::new(Duration::from_secs(100)));
+        let mut settings = Settings::new("site", "a", Vec::new());
+        settings.when_behind = WhenBehind::Refuse;
+        let shared = Shared { clock: Clock::Test(Arc::clone(&time)), ..Shared::new(&settings) };
+        assert_eq!(shared.admit(), Err(Refusal::Behind), "never current");
+        shared.contact(shared.now());
+        let sent = shared.now();
+        for (passed, expected) in [(4, Ok(())), (1, Ok(())), (1, Err(Refusal::Behind))] {
+            *lock(&time) += Duration::from_secs(passed);
+            assert_eq!(shared.admit(), expected);
+        }
+        // A message that was sent before the suspend is applied after it.
+        *lock(&time) += Duration::from_secs(3600);
+        shared.contact(sent);
+        assert_eq!(shared.contact_age(), Some(Duration::from_secs(3606)));
+        assert_eq!(shared.admit(), Err(Refusal::Behind));
+        shared.contact(shared.now());
+        assert_eq!(shared.admit(), Ok(()));
+    }
 }
