@@ -43,6 +43,13 @@ impl Random {
     fn below(&mut self, end: u64) -> u64 {
         self.next() % end
     }
+
+    /// 1 to `most` different numbers below `end`.
+    fn some(&mut self, most: u64, end: usize) -> Vec<usize> {
+        let mut all: Vec<usize> = (0..end).collect();
+        let count = 1 + self.below(most.min(end as u64));
+        (0..count).map(|_| all.swap_remove(self.below(all.len() as u64) as usize)).collect()
+    }
 }
 
 #[derive(Debug)]
@@ -83,8 +90,9 @@ impl Run {
         Run { nodes, urls, began: Instant::now(), history, stopping }
     }
 
-    /// Lets clients work while servers and nodes are disturbed. Then reads everything on all nodes.
-    fn work(&self, servers: Option<&mut [Server]>, time: Duration, seed: u64) {
+    /// Lets clients work while at most so many servers and nodes are disturbed at a time. Then reads
+    /// everything on all nodes.
+    fn work(&self, most: u64, servers: &mut [Server], time: Duration, seed: u64) {
         println!("seed {seed}");
         let values = AtomicU64::new(0);
         let mut random = Random(seed);
@@ -93,9 +101,9 @@ impl Run {
                 let (values, seed) = (&values, random.next());
                 scope.spawn(move || self.client(client, values, seed));
             }
-            match servers {
-                Some(servers) => self.disturb(servers, time, random.next()),
-                None => std::thread::sleep(time),
+            match most {
+                0 => std::thread::sleep(time),
+                most => self.disturb(most, servers, time, random.next()),
             }
             self.stopping.store(true, Ordering::Release);
         });
@@ -152,47 +160,49 @@ impl Run {
         answer
     }
 
-    /// Disturbs one thing after the other: at most one node and one server at a time.
-    fn disturb(&self, servers: &mut [Server], time: Duration, seed: u64) {
+    /// Disturbs one kind after the other: at most so many nodes and servers at a time.
+    fn disturb(&self, most: u64, servers: &mut [Server], time: Duration, seed: u64) {
         let mut random = Random(seed);
         let end = self.began + time;
         while Instant::now() < end {
             std::thread::sleep(Duration::from_millis(200 + random.below(1500)));
             let what = random.below(5);
-            let node = &self.nodes[random.below(self.nodes.len() as u64) as usize];
-            let server = random.below(servers.len() as u64) as usize;
-            let server = &mut servers[server];
+            let nodes = random.some(most, self.nodes.len());
+            let nodes: Vec<&Process> = nodes.into_iter().map(|node| &self.nodes[node]).collect();
+            let chosen = random.some(most, servers.len());
             let long = Duration::from_millis(300 + random.below(2500));
             let at = self.began.elapsed().as_secs_f64();
-            let named = ["kill node", "stop node", "kill server", "stop server", "both"];
-            println!("{at:.1} {}: {} {} {long:?}", named[what as usize], node.name, server.port);
+            let named = ["kill nodes", "stop nodes", "kill servers", "stop servers", "both"];
+            let names: Vec<&str> = nodes.iter().map(|node| &node.name[..]).collect();
+            println!("{at:.1} {}: {names:?} {chosen:?} {long:?}", named[what as usize]);
+            let signal = |name| nodes.iter().for_each(|node| node.signal(name));
             match what {
                 0 => {
-                    node.kill();
+                    nodes.iter().for_each(|node| node.kill());
                     std::thread::sleep(long / 4);
-                    node.start();
+                    nodes.iter().for_each(|node| node.start());
                 }
                 1 => {
-                    node.signal("STOP");
+                    signal("STOP");
                     std::thread::sleep(long);
-                    node.signal("CONT");
+                    signal("CONT");
                 }
                 2 => {
-                    server.kill();
+                    chosen.iter().for_each(|server| servers[*server].kill());
                     std::thread::sleep(long / 2);
-                    server.start();
+                    chosen.iter().for_each(|server| servers[*server].start());
                 }
                 3 => {
-                    server.signal("STOP");
+                    chosen.iter().for_each(|server| servers[*server].signal("STOP"));
                     std::thread::sleep(long);
-                    server.signal("CONT");
+                    chosen.iter().for_each(|server| servers[*server].signal("CONT"));
                 }
                 _ => {
-                    server.kill();
-                    node.signal("STOP");
+                    chosen.iter().for_each(|server| servers[*server].kill());
+                    signal("STOP");
                     std::thread::sleep(long);
-                    server.start();
-                    node.signal("CONT");
+                    chosen.iter().for_each(|server| servers[*server].start());
+                    signal("CONT");
                 }
             }
         }
@@ -301,17 +311,26 @@ fn seed(default: u64) -> u64 {
 fn no_write_is_lost_or_applied_twice_while_nodes_and_servers_die() {
     let mut servers = cluster(3);
     let run = Run::new(&servers, 3, &[]);
-    run.work(Some(&mut servers), time(15), seed(1));
+    run.work(1, &mut servers, time(15), seed(1));
     run.assert_equal_contents();
     run.judge().unwrap();
     run.assert_writes_are_in_the_log_once();
 }
 
 #[test]
+fn the_same_with_two_failures_of_a_kind_at_once() {
+    let mut servers = cluster(3);
+    let run = Run::new(&servers, 3, &["snapshots"]);
+    run.work(2, &mut servers, time(15), seed(5));
+    run.assert_equal_contents();
+    run.judge().unwrap();
+}
+
+#[test]
 fn the_same_with_snapshots_and_purges() {
     let mut servers = cluster(3);
     let run = Run::new(&servers, 3, &["snapshots"]);
-    run.work(Some(&mut servers), time(15), seed(2));
+    run.work(1, &mut servers, time(15), seed(2));
     run.assert_equal_contents();
     run.judge().unwrap();
 }
@@ -320,7 +339,7 @@ fn the_same_with_snapshots_and_purges() {
 fn the_same_with_one_server() {
     let mut servers = vec![Server::new()];
     let run = Run::new(&servers, 2, &["refuse"]);
-    run.work(Some(&mut servers), time(10), seed(3));
+    run.work(1, &mut servers, time(10), seed(3));
     run.assert_equal_contents();
     run.judge().unwrap();
     run.assert_writes_are_in_the_log_once();
@@ -332,9 +351,9 @@ fn the_checker_finds_writes_that_are_answered_too_early() {
     if checker().is_none() {
         return;
     }
-    let servers = [Server::new()];
+    let mut servers = [Server::new()];
     let run = Run::new(&servers, 2, &["answers-early"]);
-    run.work(None, Duration::from_secs(5), seed(4));
+    run.work(0, &mut servers, Duration::from_secs(5), seed(4));
     let Err(said) = run.judge() else { panic!("nothing is found") };
     assert!(said.contains("not linearizable"), "{said}");
 }
