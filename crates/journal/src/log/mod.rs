@@ -5,23 +5,32 @@
 //!
 //! ```text
 //! submit ─► shared.rs    waits, with other steps
-//!           session.rs   publishes all that wait as one message
+//!           sending.rs   publishes all that wait as one message
 //!                        the stream: one place in the order
 //!           state.rs     applies the message, on all nodes
 //! done   ◄─ sent.rs      the outcome of the step
 //! ```
+//!
+//! `session.rs` runs the thread, and calls the other files: `joining.rs` before it reads the stream,
+//! `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots.
 
+mod applying;
 mod clock;
+mod comparing;
 mod connection;
 mod digests;
 mod error;
 mod follower;
+mod joining;
 mod layout;
 mod message;
+mod node;
+mod sending;
 mod sent;
 mod session;
 mod settings;
 mod shared;
+mod snapshots;
 mod state;
 mod status;
 mod store;
@@ -39,7 +48,7 @@ pub use message::Origin;
 pub use settings::{Login, Servers, Settings, Tls, WhenBehind};
 pub use status::{Digest, Event, Node, Phase, Status};
 
-use session::Node as Session;
+use node::Node as Running;
 use shared::Shared;
 
 /// The journal of memories that several nodes share.
@@ -87,9 +96,9 @@ impl Log {
         let members = self.members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
         let fingerprint = layout::fingerprint(&self.members);
         let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
-        let session = Session::new(settings, fingerprint, shared, members);
+        let node = Running::new(settings, fingerprint, shared, members);
         let name = format!("log {}", self.settings.name);
-        let started = std::thread::Builder::new().name(name).spawn(move || session.run());
+        let started = std::thread::Builder::new().name(name).spawn(move || node.run());
         *thread = Some(started.map_err(|error| LogError::Thread(error.to_string()))?);
         Ok(())
     }

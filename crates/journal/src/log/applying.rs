@@ -1,0 +1,118 @@
+//! What a message of the stream does on this node, and when the node has caught up.
+
+use std::time::Instant;
+
+use async_nats::jetstream;
+use async_nats::jetstream::consumer::pull;
+use holdfast_memory::Outcome;
+
+use super::error::{End, LogError};
+use super::message::OVERHEAD;
+use super::node::{Node, Session};
+use super::state::{Applied, Place};
+use super::status::{Event, NodeView, Phase};
+
+impl Node {
+    pub(super) fn received(
+        &mut self,
+        session: &mut Session,
+        message: Option<Result<jetstream::Message, pull::MessagesError>>,
+    ) -> Result<(), End> {
+        let message = match message {
+            Some(Ok(message)) => message,
+            Some(Err(error)) => return Err(End::lost("reading the stream", error)),
+            None => return Err(End::Lost("the consumer has ended".to_owned())),
+        };
+        let info = message.info().map_err(|error| End::lost("a message of the stream", error))?;
+        let stored = info.published.unix_timestamp_nanos() as i64;
+        let place = Place { sequence: info.stream_sequence, stored };
+        self.shared.counters.last_sequence.set(place.sequence + info.pending);
+        let applied = self.state.place;
+        if place.sequence == applied.sequence && place != applied {
+            let sequence = place.sequence;
+            let text = format!(
+                "the message at sequence {sequence} is not the one that this node has applied: \
+                 the servers have lost messages"
+            );
+            return Err(LogError::Replaced(text).into());
+        }
+        if place.sequence <= applied.sequence {
+            return Ok(());
+        }
+        if place.sequence != applied.sequence + 1 {
+            let next = applied.sequence + 1;
+            return Err(End::Lost(format!("sequence {} came in place of {next}", place.sequence)));
+        }
+        self.apply(session, place, &message.payload)
+    }
+
+    fn apply(&mut self, session: &mut Session, place: Place, payload: &[u8]) -> Result<(), End> {
+        let counters = &self.shared.counters;
+        let (mut compared, mut for_snapshot) = (false, false);
+        session.last_applied = Instant::now();
+        match self.state.apply(place, payload)? {
+            Applied::Fresh { origin, compares, outcomes } => {
+                self.shared.counters.sequence.set(place.sequence);
+                compared = compares;
+                if origin.node == self.origin.node {
+                    if origin.start > self.origin.start {
+                        return Err(LogError::NameTaken(origin.node).into());
+                    }
+                    if origin.start == self.origin.start {
+                        for_snapshot = session.asked == Some(origin.counter);
+                        self.applied_own(session, origin.counter, outcomes);
+                    }
+                }
+                self.seen(origin.node, place);
+            }
+            Applied::Stale(origin) => {
+                counters.stale.add(1);
+                if origin.node == self.origin.node && origin.start > self.origin.start {
+                    return Err(LogError::NameTaken(origin.node).into());
+                }
+            }
+            Applied::Ignored(error) => {
+                counters.ignored.add(1);
+                let sequence = place.sequence.to_string();
+                let fields = [("sequence", sequence.as_str()), ("reason", &error.to_string())];
+                self.shared.event(Event::new("log_message_ignored", &fields));
+            }
+        }
+        self.shared.counters.sequence.set(place.sequence);
+        if compared || place.sequence.is_multiple_of(self.settings.digest_every) {
+            self.tell_digest(session, for_snapshot)?;
+        }
+        Ok(())
+    }
+
+    fn applied_own(&mut self, session: &mut Session, counter: u64, outcomes: Vec<Outcome>) {
+        let sent = self.sent.applied(counter, outcomes, &self.shared.counters);
+        if let Some(at) = sent {
+            self.shared.contact(at);
+        }
+        if session.asked.is_some_and(|asked| asked <= counter) {
+            let was_lost = session.asked != Some(counter);
+            session.asked = None;
+            session.takes_snapshot &= !was_lost;
+        }
+        if session.caught_up_at.is_some_and(|at| at <= counter) {
+            session.caught_up_at = None;
+            self.worked = true;
+            self.shared.open(session.longest - OVERHEAD);
+            let sequence = self.state.place.sequence.to_string();
+            self.shared.event(Event::new("log_caught_up", &[("sequence", &sequence)]));
+            self.shared.update(|view| {
+                view.phase = Phase::Running;
+                view.last_error = None;
+            });
+        }
+    }
+
+    /// Remembers when a node was last seen, for whoever looks at the log.
+    fn seen(&mut self, node: String, place: Place) {
+        self.shared.update_node(node, |node: &mut NodeView| {
+            node.sequence = place.sequence;
+            node.stored = place.stored;
+        });
+    }
+}

@@ -1,0 +1,113 @@
+//! Where a node begins to read the stream, and with which contents. Whether the servers have lost
+//! messages.
+
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use super::error::{End, LogError};
+use super::node::Node;
+use super::state::{State, digest_of};
+use super::status::Event;
+use super::store::Store;
+
+/// For so long, a server may know less than this node: it may be cut off from the others.
+const CUT_OFF: Duration = Duration::from_secs(30);
+
+impl Node {
+    /// Loads a snapshot if that is needed. Returns the sequence to read from.
+    pub(super) async fn join(&mut self, store: &Store) -> Result<u64, End> {
+        let id = store.id().map(str::to_owned);
+        if self.id.is_some() && self.id != id {
+            let text = "the stream of the log was deleted and made anew".to_owned();
+            return Err(LogError::Replaced(text).into());
+        }
+        let (first, last) = {
+            let info = &store.stream.cached_info().state;
+            (info.first_sequence, info.last_sequence)
+        };
+        let applied = self.state.place.sequence;
+        if last < applied {
+            return Err(self.short(format!(
+                "the stream ends at sequence {last}, but this node has applied {applied}: the \
+                 servers have lost messages"
+            )));
+        }
+        if self.id.is_none() || first > applied + 1 {
+            self.load(store, last).await?;
+        }
+        self.id = id;
+        if self.origin.start == 0 {
+            let clock = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+            let now = u64::try_from(clock.as_micros()).unwrap_or(u64::MAX);
+            self.origin.start = now.max(self.state.last_start(&self.origin.node) + 1);
+        }
+        // What was applied last is read again, to see that it is still the same.
+        let applied = self.state.place.sequence;
+        Ok(if applied >= first.max(1) { applied } else { applied + 1 })
+    }
+
+    /// A server knows less than this node. Whether that stays so is seen later.
+    fn short(&mut self, text: String) -> End {
+        let since = self.was_short_since.unwrap_or_else(Instant::now);
+        self.short_since = Some(since);
+        if since.elapsed() < CUT_OFF { End::Lost(text) } else { LogError::Replaced(text).into() }
+    }
+
+    /// Loads the newest snapshot that is good, or makes the first one.
+    async fn load(&mut self, store: &Store, last: u64) -> Result<(), End> {
+        let pointer = self.tend(store.pointer()).await??;
+        let Some((revision, pointer)) = pointer else {
+            if last > 0 {
+                let text = "the log has messages, but the key of its snapshot is missing";
+                let missing = self.short(text.to_owned());
+                return Err(match missing {
+                    End::Fatal(_) => LogError::Snapshot(text.to_owned()).into(),
+                    other => other,
+                });
+            }
+            // The first node that gets here decides what the log begins with.
+            let encoded = self.state.encode();
+            let snapshot = self.snapshot_of(digest_of(&encoded));
+            let first = self.tend(store.put(None, &encoded, snapshot)).await?;
+            self.pointer = Some(first.map_err(|error| End::lost("the first snapshot", error))?);
+            self.pointer_since = Instant::now();
+            return Ok(());
+        };
+        if pointer.newest.sequence > last {
+            let sequence = pointer.newest.sequence;
+            return Err(self.short(format!(
+                "the stream ends at sequence {last}, but there is a snapshot at {sequence}: the \
+                 servers have lost messages"
+            )));
+        }
+        self.shared.loading(true);
+        let mut state = State::new(std::mem::take(&mut self.state.members));
+        let mut loaded = self.tend(store.load(&pointer.newest, &mut state)).await;
+        if let (Ok(Err(End::Fatal(error))), Some(previous)) = (&loaded, &pointer.previous) {
+            self.shared
+                .event(Event::new("log_snapshot_damaged", &[("reason", &error.to_string())]));
+            loaded = self.tend(store.load(previous, &mut state)).await;
+        }
+        let mut end = loaded.and_then(|loaded| loaded);
+        if matches!(end, Err(End::Fatal(_))) {
+            // Other nodes may have stored snapshots meanwhile, and removed these.
+            if let Ok(Ok(Some((now, _)))) = self.tend(store.pointer()).await
+                && now != revision
+            {
+                end = Err(End::Lost("the snapshot was replaced".to_owned()));
+            }
+        }
+        if end.is_ok() {
+            self.state = state;
+            // What the snapshot has of this node was applied, but not here: the outcomes are lost.
+            let counter = self.state.last_counter(&self.origin);
+            self.sent.unclear(counter, &self.shared.counters);
+        } else {
+            self.state.members = state.members;
+        }
+        self.shared.loading(false);
+        end?;
+        self.shared.counters.sequence.set(self.state.place.sequence);
+        self.note_pointer(revision, pointer);
+        Ok(())
+    }
+}
