@@ -102,6 +102,7 @@ EVENTS: Mapping[str, Meaning] = {
     "shutdown_asked": Meaning(("process",), ("end",), "success"),
     "memory_file_failing": _NOT_STORED,
     "memory_file_back": _STORED,
+    "log_contents_dropped": _UNHEALTHY,
     "log_failed": _UNHEALTHY,
     "log_digests_differ": _UNHEALTHY,
     "thread_stalled": _UNHEALTHY,

@@ -228,7 +228,7 @@ class LogStatus(TypedDict):
     have the same. `snapshot`: the sequence of the newest one.
     """
 
-    phase: Literal["starting", "running", "failed", "stopped"]
+    phase: Literal["starting", "running", "returning", "failed", "stopped"]
     failure: tuple[str, str] | None
     connected: bool
     server: str | None

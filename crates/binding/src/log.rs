@@ -114,6 +114,7 @@ impl Log {
             Phase::Starting => ("starting", None),
             Phase::Running => ("running", None),
             Phase::Stopped => ("stopped", None),
+            Phase::Returning(error) => ("returning", Some((error.kind(), error.to_string()))),
             Phase::Failed(error) => ("failed", Some((error.kind(), error.to_string()))),
         };
         shown.set_item("phase", phase)?;

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
-use holdfast_journal::log::LogError;
+use holdfast_journal::log::{LogError, Phase, Settings};
 use holdfast_memory::{
     Access, Action, Memory, Operation, Read, Refusal, Step, StepWrite, Write, write_across,
 };
@@ -363,14 +363,93 @@ fn a_restarted_node_goes_on_where_it_was() {
     assert_eq!(b.read(0), Ok(2));
 }
 
+/// Digests are compared often.
+fn often(settings: &mut Settings) {
+    settings.digest_every = 5;
+}
+
+/// As before, and a node whose contents are wrong does not return by itself.
+fn for_good(settings: &mut Settings) {
+    often(settings);
+    settings.return_after = None;
+}
+
+fn corrupt(node: &Node) {
+    step(90, 666).carry_out(std::slice::from_ref(&node.memory)).unwrap();
+}
+
+fn told(node: &Node, name: &str) -> bool {
+    node.log.take_events(Duration::ZERO).iter().any(|event| event.name == name)
+}
+
+#[test]
+fn a_node_that_applied_something_wrongly_returns_once_with_the_contents_of_the_log() {
+    let server = Server::new();
+    let nodes = ["a", "b", "c"].map(|name| Node::new(&[&server], name, often));
+    nodes.iter().for_each(Node::start);
+    let [good, wrong, _] = &nodes;
+    corrupt(wrong);
+    until("the node notices it", || {
+        good.write(1, 2).unwrap();
+        told(wrong, "log_contents_dropped")
+    });
+    until("the node returns", || {
+        let read = wrong.read(90);
+        assert_ne!(read, Ok(666), "wrong contents are not served again");
+        read == Ok(0)
+    });
+    assert!(told(wrong, "log_contents_restored"));
+    assert_eq!(wrong.status().phase, Phase::Running);
+    wrong.write(2, 3).unwrap();
+    until("the others have its write", || good.read(2) == Ok(3));
+    corrupt(wrong);
+    until("the node stops", || {
+        good.write(1, 2).unwrap();
+        wrong.failure().is_some()
+    });
+    assert_eq!(wrong.failure().unwrap().kind(), "differs");
+    assert_eq!(wrong.read(90), Err(Refusal::Differs));
+    assert_eq!(good.failure(), None);
+}
+
+/// Without another node that compares itself, the log decides.
+#[test]
+fn a_node_that_is_alone_returns_when_the_log_confirms_its_contents() {
+    let server = Server::new();
+    let alone = Node::new(&[&server], "a", often);
+    alone.start();
+    drop(Node::started(&[&server], "b"));
+    corrupt(&alone);
+    until("it has a digest of the wrong contents", || {
+        alone.write(1, 2).unwrap();
+        alone.status().digest.is_some()
+    });
+    let sequence = alone.status().digest.unwrap().sequence;
+    let told_by_other = format!(r#"{{"sequence": {sequence}, "digest": "{}"}}"#, "0".repeat(64));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let keys = jetstream.get_key_value("holdfast-log-site").await.unwrap();
+        keys.put("digest.b", told_by_other.into()).await.unwrap();
+    });
+    until("the node notices it", || told(&alone, "log_contents_dropped"));
+    until("the node returns", || {
+        let read = alone.read(90);
+        assert_ne!(read, Ok(666), "wrong contents are not served again");
+        read == Ok(0)
+    });
+    assert_eq!(alone.read(1), Ok(2));
+    alone.write(2, 3).unwrap();
+}
+
 #[test]
 fn a_node_that_applied_something_wrongly_stops_serving() {
     let server = Server::new();
-    let often = |settings: &mut holdfast_journal::log::Settings| settings.digest_every = 5;
-    let nodes = ["a", "b", "c"].map(|name| Node::new(&[&server], name, often));
+    let nodes = ["a", "b", "c"].map(|name| Node::new(&[&server], name, for_good));
     nodes.iter().for_each(Node::start);
     nodes[0].write(0, 1).unwrap();
-    step(90, 666).carry_out(std::slice::from_ref(&nodes[1].memory)).unwrap();
+    corrupt(&nodes[1]);
     until("the node notices it", || {
         // Digests are compared while the log goes on.
         nodes[0].write(1, 2).unwrap();
@@ -391,10 +470,9 @@ fn a_node_that_applied_something_wrongly_stops_serving() {
 fn of_two_nodes_the_one_that_the_log_does_not_lead_to_stops_serving() {
     for wrong in [0, 1] {
         let server = Server::new();
-        let often = |settings: &mut holdfast_journal::log::Settings| settings.digest_every = 5;
-        let nodes = ["a", "b"].map(|name| Node::new(&[&server], name, often));
+        let nodes = ["a", "b"].map(|name| Node::new(&[&server], name, for_good));
         nodes.iter().for_each(Node::start);
-        step(90, 666).carry_out(std::slice::from_ref(&nodes[wrong].memory)).unwrap();
+        corrupt(&nodes[wrong]);
         let good = &nodes[1 - wrong];
         until("the node notices it", || {
             good.write(1, 2).unwrap();
@@ -410,10 +488,13 @@ fn of_two_nodes_the_one_that_the_log_does_not_lead_to_stops_serving() {
 #[test]
 fn wrong_contents_do_not_become_a_snapshot() {
     let server = Server::new();
-    let soon = |settings: &mut holdfast_journal::log::Settings| settings.snapshot_steps = 5;
+    let soon = |settings: &mut Settings| {
+        settings.return_after = None;
+        settings.snapshot_steps = 5;
+    };
     let (good, wrong) = (Node::started(&[&server], "a"), Node::new(&[&server], "b", soon));
     wrong.start();
-    step(90, 666).carry_out(std::slice::from_ref(&wrong.memory)).unwrap();
+    corrupt(&wrong);
     until("the node notices it", || {
         good.write(1, 2).unwrap();
         wrong.failure().is_some()
@@ -426,7 +507,6 @@ fn wrong_contents_do_not_become_a_snapshot() {
 #[test]
 fn equal_nodes_have_equal_digests() {
     let server = Server::new();
-    let often = |settings: &mut holdfast_journal::log::Settings| settings.digest_every = 5;
     let nodes = ["a", "b"].map(|name| Node::new(&[&server], name, often));
     nodes.iter().for_each(Node::start);
     until("digests agree", || {

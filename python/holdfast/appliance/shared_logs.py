@@ -27,6 +27,8 @@ EVENTS = {
     "log_connect_failed": logging.WARNING,
     "log_error": logging.WARNING,
     "log_failed": logging.ERROR,
+    "log_contents_dropped": logging.ERROR,
+    "log_contents_restored": logging.WARNING,
     "log_digests_differ": logging.ERROR,
     "log_message_ignored": logging.WARNING,
     "log_replay_failed": logging.ERROR,

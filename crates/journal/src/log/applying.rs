@@ -101,10 +101,15 @@ impl Node {
             self.shared.open(session.longest - OVERHEAD);
             let sequence = self.state.place.sequence.to_string();
             self.shared.event(Event::new("log_caught_up", &[("sequence", &sequence)]));
-            self.shared.update(|view| {
-                view.phase = Phase::Running;
-                view.last_error = None;
-            });
+            match &mut self.doubt {
+                Some(doubt) => {
+                    doubt.compared = Some((self.state.place.sequence, Instant::now()));
+                }
+                None => self.shared.update(|view| {
+                    view.phase = Phase::Running;
+                    view.last_error = None;
+                }),
+            }
         }
     }
 

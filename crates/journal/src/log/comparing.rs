@@ -85,6 +85,7 @@ impl Node {
             Verdict::Alone => return Ok(()),
             Verdict::Agrees => {
                 self.store_snapshot(session, sequence);
+                self.confirmed(sequence);
                 true
             }
             Verdict::Differs(other) => {
@@ -95,7 +96,10 @@ impl Node {
                 if let Some(own) = prepared.find(|own| own.snapshot.sequence == sequence) {
                     own.is_disputed = true;
                 }
-                self.replay(session, sequence);
+                if self.replay(session, sequence) {
+                    let at = sequence.to_string();
+                    self.shared.event(Event::new("log_digests_differ", &[("sequence", &at)]));
+                }
                 false
             }
         };
@@ -113,14 +117,13 @@ impl Node {
         LogError::Differs { sequence, found, other }.into()
     }
 
-    /// Finds out what the log leads to, beside the session: nodes differ, and none has a majority.
-    pub(super) fn replay(&mut self, session: &mut Session, sequence: u64) {
-        let Some((_, pointer)) = self.pointer.clone() else { return };
+    /// Finds out what the log leads to, beside the session: no majority of nodes says it. Returns
+    /// whether that has begun.
+    pub(super) fn replay(&mut self, session: &mut Session, sequence: u64) -> bool {
+        let Some((_, pointer)) = self.pointer.clone() else { return false };
         if std::mem::replace(&mut session.replays, true) {
-            return;
+            return false;
         }
-        let at = sequence.to_string();
-        self.shared.event(Event::new("log_digests_differ", &[("sequence", &at)]));
         let (store, reports) = (session.store.clone(), session.reports.clone());
         let members = copies(&self.state.members);
         tokio::spawn(async move {
@@ -131,6 +134,7 @@ impl Node {
             // If the session has ended, the next difference is looked at.
             let _ = reports.send(Report::Replayed { sequence, digest });
         });
+        true
     }
 
     pub(super) fn replayed(
@@ -142,14 +146,19 @@ impl Node {
         session.replays = false;
         match digest {
             Ok(digest) => {
-                if self.digests.own(sequence).is_some_and(|own| own != digest) {
+                let is_right = self.digests.own(sequence).map(|own| own == digest);
+                if is_right == Some(false) {
                     return Err(self.differs(sequence, format!("the log leads to {digest}")));
                 }
                 self.store_snapshot(session, sequence);
+                if is_right.is_some() {
+                    self.confirmed(sequence);
+                }
             }
             Err(reason) => {
                 let fields = [("sequence", &*sequence.to_string()), ("reason", &reason)];
                 self.shared.event(Event::new("log_replay_failed", &fields));
+                self.put_off_return();
             }
         }
         self.drop_disputed(session);

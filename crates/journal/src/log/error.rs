@@ -27,7 +27,7 @@ pub enum LogError {
     NameTaken(String),
     #[error(
         "the contents at sequence {sequence} have digest {found}, {other}: this node has applied \
-         something wrongly, restart it to load a snapshot"
+         something wrongly"
     )]
     Differs { sequence: u64, found: String, other: String },
     #[error("the thread of the log could not be started: {0}")]

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use super::error::{End, LogError};
-use super::node::Node;
+use super::node::{Doubt, Node};
 use super::state::{State, digest_of};
 use super::status::Event;
 use super::store::Store;
@@ -31,8 +31,12 @@ impl Node {
                  servers have lost messages"
             )));
         }
-        if self.id.is_none() || first > applied + 1 {
+        let is_wrong = self.doubt.as_ref().is_some_and(|doubt| !doubt.is_loaded);
+        if self.id.is_none() || first > applied + 1 || is_wrong {
             self.load(store, last).await?;
+            if let Some(doubt) = &mut self.doubt {
+                *doubt = Doubt { is_loaded: true, compared: None };
+            }
         }
         self.id = id;
         if self.origin.start == 0 {
@@ -81,8 +85,15 @@ impl Node {
         }
         self.shared.loading(true);
         let mut state = State::new(std::mem::take(&mut self.state.members));
-        let mut loaded = self.tend(store.load(&pointer.newest, &mut state)).await;
-        if let (Ok(Err(End::Fatal(error))), Some(previous)) = (&loaded, &pointer.previous) {
+        let (mut first, mut second) = (&pointer.newest, pointer.previous.as_ref());
+        // A node whose contents were wrong does not trust what it has stored itself.
+        if let (true, Some(previous)) = (self.doubt.is_some(), second)
+            && first.node == self.settings.node
+        {
+            (first, second) = (previous, Some(first));
+        }
+        let mut loaded = self.tend(store.load(first, &mut state)).await;
+        if let (Ok(Err(End::Fatal(error))), Some(previous)) = (&loaded, second) {
             self.shared
                 .event(Event::new("log_snapshot_damaged", &[("reason", &error.to_string())]));
             loaded = self.tend(store.load(previous, &mut state)).await;

@@ -12,7 +12,8 @@
 //! ```
 //!
 //! `session.rs` runs the thread, and calls the other files: `joining.rs` before it reads the stream,
-//! `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots.
+//! `applying.rs` for each message, `comparing.rs` for digests, `snapshots.rs` for snapshots. `returning.rs` is for a node whose
+//! contents were wrong.
 
 mod applying;
 mod clock;
@@ -25,6 +26,7 @@ mod joining;
 mod layout;
 mod message;
 mod node;
+mod returning;
 mod sending;
 mod sent;
 mod session;
@@ -108,11 +110,13 @@ impl Log {
     /// # Errors
     /// The error with which it failed.
     pub fn wait_until_caught_up(&self, timeout: Duration) -> Result<bool, LogError> {
-        let view = self.shared.wait(timeout, |view| view.phase != Phase::Starting);
+        let view = self
+            .shared
+            .wait(timeout, |view| !matches!(view.phase, Phase::Starting | Phase::Returning(_)));
         match view.phase {
             Phase::Failed(error) => Err(error),
             Phase::Running => Ok(true),
-            Phase::Starting | Phase::Stopped => Ok(false),
+            Phase::Starting | Phase::Returning(_) | Phase::Stopped => Ok(false),
         }
     }
 

@@ -35,6 +35,10 @@ pub(super) struct Node {
     pub(super) short_since: Option<Instant>,
     pub(super) was_short_since: Option<Instant>,
     pub(super) worked: bool,
+    /// While the node returns with other contents, because its own were wrong.
+    pub(super) doubt: Option<Doubt>,
+    /// When it has begun to return the last time.
+    pub(super) returned: Option<Instant>,
 }
 
 /// One connection, and what is under way on it.
@@ -81,6 +85,15 @@ pub(super) enum Report {
     },
 }
 
+/// Contents that were dropped because they were wrong.
+#[derive(Debug, Default)]
+pub(super) struct Doubt {
+    /// A snapshot has taken their place.
+    pub(super) is_loaded: bool,
+    /// The contents are compared at this sequence, since this time.
+    pub(super) compared: Option<(u64, Instant)>,
+}
+
 impl Node {
     pub(super) fn new(
         settings: Arc<Settings>,
@@ -104,6 +117,8 @@ impl Node {
             short_since: None,
             was_short_since: None,
             worked: false,
+            doubt: None,
+            returned: None,
         }
     }
 

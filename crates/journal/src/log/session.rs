@@ -54,7 +54,10 @@ impl Node {
                         Instant::now() + self.settings.write_timeout,
                         &self.shared.counters,
                     );
-                    return self.shared.fail(error);
+                    if !self.may_return(&error) {
+                        return self.shared.fail(error);
+                    }
+                    self.drop_contents(error);
                 }
                 End::Lost(reason) => self.lost(reason),
             }
@@ -141,7 +144,7 @@ impl Node {
             self.publish(&mut session, counter, payload).await?;
         }
         session.caught_up_at = Some(self.origin.counter + 1);
-        self.send(&mut session, false, Vec::new(), Vec::new(), now).await?;
+        self.send(&mut session, self.doubt.is_some(), Vec::new(), Vec::new(), now).await?;
 
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -198,6 +201,7 @@ impl Node {
         }
         self.send_waiting(session).await?;
         self.consider_snapshot(session, now);
+        self.consider_return(session, now);
         Ok(())
     }
 }

@@ -70,6 +70,9 @@ pub struct Settings {
     pub digest_every: u64,
     /// The most steps that wait to be sent.
     pub queue: usize,
+    /// A node whose contents differ returns by itself, unless it has done so within this time; with
+    /// `None`, never.
+    pub return_after: Option<Duration>,
     /// Writes are answered when they are sent. Tests use it to show what then goes wrong.
     #[doc(hidden)]
     pub answers_early: bool,
@@ -94,6 +97,7 @@ impl Settings {
             snapshot_after: Duration::from_secs(600),
             digest_every: 10_000,
             queue: 4096,
+            return_after: Some(Duration::from_secs(24 * 3600)),
             answers_early: false,
         }
     }

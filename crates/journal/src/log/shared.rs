@@ -226,6 +226,25 @@ impl Shared {
         self.update(|view| view.phase = Phase::Failed(error));
     }
 
+    /// The contents are wrong. They are replaced, and nobody uses them before they are right.
+    pub(super) fn drop_contents(&self, error: LogError) {
+        self.door.store(DIFFERS, Ordering::Release);
+        self.event(Event::new("log_contents_dropped", &[("reason", &error.to_string())]));
+        self.update(|view| {
+            (view.server, view.digest) = (None, None);
+            view.phase = Phase::Returning(error);
+        });
+    }
+
+    /// The contents in place of the wrong ones are right.
+    pub(super) fn restored(&self) {
+        self.door.store(OPEN, Ordering::Release);
+        self.update(|view| {
+            view.phase = Phase::Running;
+            view.last_error = None;
+        });
+    }
+
     pub(super) fn event(&self, event: Event) {
         let mut progress = lock(&self.progress);
         if progress.events.len() == EVENTS {

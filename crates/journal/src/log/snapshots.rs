@@ -7,8 +7,8 @@ use super::node::{Node, Prepared, Report, Session};
 use super::status::Event;
 use super::store::{Pointer, Snapshot, unique};
 
-/// How long a snapshot waits for the digests of other nodes.
-const ALONE: Duration = Duration::from_secs(5);
+/// How long a snapshot, or a node that returns, waits for the digests of other nodes.
+pub(super) const ALONE: Duration = Duration::from_secs(5);
 
 /// When a snapshot is tried again.
 const RETRY: Duration = Duration::from_secs(5);
@@ -67,7 +67,9 @@ impl Node {
         let due = since >= self.settings.snapshot_steps
             || (now.saturating_duration_since(self.pointer_since) >= self.settings.snapshot_after
                 && self.state.place.sequence > newest.sequence);
-        let may = session.caught_up_at.is_none() && now >= session.no_snapshot_before;
+        let may = self.doubt.is_none()
+            && session.caught_up_at.is_none()
+            && now >= session.no_snapshot_before;
         if due && may && !std::mem::replace(&mut session.takes_snapshot, true) {
             let (store, reports) = (session.store.clone(), session.reports.clone());
             let node = self.settings.node.clone();

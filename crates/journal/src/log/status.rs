@@ -43,6 +43,8 @@ pub enum Phase {
     Starting,
     /// It has caught up once.
     Running,
+    /// Its contents were wrong. It serves again when they are right for sure.
+    Returning(LogError),
     Failed(LogError),
     Stopped,
 }

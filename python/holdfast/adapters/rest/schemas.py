@@ -206,7 +206,9 @@ DIAGNOSTICS: dict[str, Schema] = {
                     "type": "object",
                     "required": ["phase", "connected", "sequence", "lag", "steps", "nodes"],
                     "properties": {
-                        "phase": {"enum": ["starting", "running", "failed", "stopped"]},
+                        "phase": {
+                            "enum": ["starting", "running", "returning", "failed", "stopped"]
+                        },
                         "connected": {"type": "boolean"},
                         "contact_age": {
                             "type": ["number", "null"],
