@@ -36,7 +36,7 @@ def test_hosts_that_answer_are_found_and_others_told_apart(serve: Serve) -> None
     server = serve({1: holdfast.Memory(coils=8)}, identity=identity)
     port = server.address[1]
     with socket.create_server(("127.0.0.2", port)):
-        options = ("--port", str(port), "--timeout", "0.2")
+        options = ("--port", str(port), "--timeout", "2")
         [head, modbus, other, empty, counts] = done("find", "127.0.0.0/29", *options)
         found = answer("find", "127.0.0.1", "127.0.0.2", *options)
     assert head.split() == ["url", "unit", "answer", "identification"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import pytest
@@ -45,10 +46,14 @@ def test_the_session_is_clean_and_its_will_is_the_death(plant: Plant, fake: Fake
         assert b"spBv1.0/plant/NCMD/edge" in asked.body
         assert asked.body[-1] & 3 == 1
         plant.stop()
-        while (last := peer.receive()).kind != mqtt.DISCONNECT:
-            pass
-        with_will = b"\x04"
-        assert last.body[:1] == (with_will if fake.version == "5" else b"")
+        packets = []
+        with suppress(EOFError):
+            while True:
+                packets.append(peer.receive())
+    ends = [packet.body[:1] for packet in packets if packet.kind == mqtt.DISCONNECT]
+    with_will = b"\x04"
+    # Nothing was confirmed, and an orderly end of MQTT 3.1.1 drops the will.
+    assert ends == ([with_will] if fake.version == "5" else [])
 
 
 def test_a_refused_subscription_is_logged(

@@ -170,6 +170,7 @@ def test_the_system_keeps_a_bounded_number_of_bytes_that_nobody_has_read(
     with serving(tmp_path, **settings) as process:
         client = socket.create_connection(process.address, wire.DEADLINE)
         with client:
+            wire.until(lambda: process.open() == 1, "it is there")
             subprocess.run(["kill", "-STOP", str(process.pid)], check=True)
             try:
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 * 1024)

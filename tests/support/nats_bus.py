@@ -198,9 +198,15 @@ class Caller:
         await (await self.client.jetstream().key_value(bucket)).delete(key)
 
     def forget(self, bucket: str) -> None:
-        """Deletes a key-value bucket, if there is one."""
+        """Deletes a key-value bucket, if there is one.
+
+        It is emptied before, because a server under load may still find the contents of a deleted
+        bucket when another of the same name is created.
+        """
+        jetstream, stream = self.client.jetstream(), f"KV_{bucket}"
         with contextlib.suppress(NotFoundError):
-            self._loop.do(self.client.jetstream().delete_key_value(bucket))
+            self._loop.do(jetstream.purge_stream(stream))
+            self._loop.do(jetstream.delete_stream(stream))
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
