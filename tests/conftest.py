@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, settings
 
 import holdfast
 from holdfast import logs
-from holdfast.appliance import Appliance
+from holdfast.appliance import Appliance, supervision
 from holdfast.config import load
 from support import wire
 from support.machine import has_ipv6, missing
@@ -46,6 +46,12 @@ settings.load_profile("any machine")
 def _forget_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refusals of one test do not limit how many another one logs."""
     monkeypatch.setattr(logs, "_REFUSALS", logs.Throttle())
+
+
+@pytest.fixture(autouse=True)
+def _adapters_have_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loaded machine could leave threads of the lowest priority without any time for minutes."""
+    monkeypatch.setattr(supervision, "POLITENESS", 0)
 
 
 @pytest.fixture

@@ -17,8 +17,6 @@ from holdfast import logs
 from holdfast.appliance import assembly
 from holdfast.client.url import connection_of
 from holdfast.heartbeat import Heartbeat
-from holdfast.leases import Leases
-from holdfast.scanner.broker import Broker, Ping
 
 if TYPE_CHECKING:
     from holdfast import _core
@@ -108,6 +106,9 @@ class _LogLeases:
     config: Config
 
     def __post_init__(self) -> None:
+        # Only an appliance with logs loads the client of NATS.
+        from holdfast.leases import Leases
+
         settings = self.config.logs[self.log]
         self.leases = Leases(
             f"holdfast-log-{self.log}-devices",
@@ -222,6 +223,8 @@ class _LogLeases:
                 task.cancel()
 
     async def _connect(self) -> None:
+        from holdfast.scanner.broker import Broker, Ping
+
         broker = Broker(self._servers, {}, self.leases.connected, Ping(), name="holdfast leases")
         while True:
             try:
