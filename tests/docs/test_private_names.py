@@ -64,6 +64,9 @@ def in_table() -> list[Use]:
     ]
 
 
+WINDOWS_ONLY = {"win32serviceutil"}
+
+
 def in_product() -> Iterator[Use]:
     for path in PRODUCT.rglob("*.py"):
         file = path.relative_to(PRODUCT).as_posix()
@@ -146,7 +149,10 @@ def name_of(node: ast.expr) -> str:
 
 
 def loaded(dotted: str) -> object:
+    """What has that name. `None` if it exists on Windows only: `Svc…` methods are public."""
     module, _, name = dotted.rpartition(".")
+    if module in WINDOWS_ONLY:
+        return None
     return getattr(importlib.import_module(module), name)
 
 

@@ -51,6 +51,10 @@ GROUPS = {
             "holdfast.cli.reload:reload",
             "Have a running appliance reread its configuration.",
         ),
+        "service": (
+            "holdfast.cli.service:service",
+            "Run an appliance as a service of Windows.",
+        ),
         "sessions": (
             "holdfast.cli.sessions:sessions",
             "List the connections of a running appliance.",

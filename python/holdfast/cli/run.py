@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from holdfast.config.outputs import Output
     from holdfast.config.rights import UnitRights
     from holdfast.types import Area
+    from holdfast.windows_service.control import ServiceControl
 
 # Maximum delay of the reaction to a signal, in seconds.
 JOIN_TIMEOUT = 0.2
@@ -90,18 +91,21 @@ def serve(
     file: Path | None = None,
     load: Callable[[], Config] | None = None,
     retries_ports: bool = True,
+    control: ServiceControl | None = None,
 ) -> None:
     """Runs an appliance until a signal. Exits with 1 or 2 if it can't start.
 
     With `file`, it is reread at SIGHUP, at a request of `holdfast reload`, or when it changes. With
     `load`, what it returns is taken over at SIGHUP. Without `retries_ports`, a port of HTTP that is
-    in use is an error.
+    in use is an error. With `control`, requests of Windows take the place of signals.
     """
     logs.configure(config.log.level, config.log.format)
     give_way()
     allow_open_files(_connections(config))
-    signals = Signals(reload="always" if file else "with a terminal" if load else "never")
-    manager = ServiceManager()
+    signals = control or Signals(
+        reload="always" if file else "with a terminal" if load else "never"
+    )
+    manager = control or ServiceManager()
     appliance = Appliance(config, retries_ports=retries_ports)
     try:
         with signals.interrupting():

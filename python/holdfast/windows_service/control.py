@@ -1,0 +1,54 @@
+"""What the service control manager of Windows requests, in the places of signals and of systemd."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Protocol
+
+from holdfast.appliance.service_manager import ServiceManager
+
+
+class Reports(Protocol):
+    """Reports the state of the service to Windows."""
+
+    def running(self) -> None:
+        """Reports that the service runs."""
+
+    def stopping(self) -> None:
+        """Reports that the service is about to end."""
+
+
+class ServiceControl(ServiceManager):
+    """Requests to stop and to reload, and reports of what the appliance does."""
+
+    def __init__(self, reports: Reports) -> None:
+        super().__init__({})
+        self._reports = reports
+        self._reload = False
+        self.received = False
+        """Whether the service is to stop."""
+
+    def request_stop(self) -> None:
+        """Ends the service soon."""
+        self.received = True
+
+    def request_reload(self) -> None:
+        """Has the configuration reread soon."""
+        self._reload = True
+
+    def take_reload(self) -> bool:
+        """Whether a reload was requested since the last call."""
+        requested, self._reload = self._reload, False
+        return requested
+
+    def interrupting(self) -> contextlib.AbstractContextManager[None]:
+        """Nothing: a service that starts accepts no requests."""
+        return contextlib.nullcontext()
+
+    def ready(self) -> None:
+        """Reports that the appliance serves."""
+        self._reports.running()
+
+    def stopping(self) -> None:
+        """Reports that the appliance begins to stop."""
+        self._reports.stopping()
