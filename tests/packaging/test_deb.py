@@ -1,0 +1,128 @@
+"""The Debian package: its unit, its configuration, and the programs that build it."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from holdfast.config import load
+from support.machine import tool
+from support.packaging_programs import program
+from support.paths import ROOT
+
+DEB = ROOT / "packaging" / "deb"
+UNIT = (DEB / "debian" / "holdfast.service").read_text()
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="packages of Debian")
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """The unit, with a program that is there."""
+    made = tmp_path / "holdfast.service"
+    made.write_text(UNIT.replace("/usr/bin/holdfast", sys.executable))
+    return made
+
+
+def test_systemd_has_nothing_to_object_to_the_unit(unit: Path) -> None:
+    command = [tool("systemd-analyze"), "verify", "--man=no", "--recursive-errors=no", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_exposure_of_the_unit_is_below_two_of_ten(unit: Path) -> None:
+    command = [tool("systemd-analyze"), "security", "--offline=true", "--threshold=19", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_unit_runs_the_files_that_the_package_installs() -> None:
+    installed = dict(
+        line.split() for line in (DEB / "debian" / "holdfast.install").read_text().splitlines()
+    )
+    assert installed["holdfast"] == "usr/bin"
+    assert installed["holdfast.yaml"] == "etc/holdfast"
+    for key, verb in (("ExecStart", "run"), ("ExecReload", "reload")):
+        assert f"\n{key}=/usr/bin/holdfast {verb} /etc/holdfast/holdfast.yaml\n" in UNIT
+    for source in installed:
+        assert source == "lib/*" or (DEB / source).exists()
+
+
+def test_the_configuration_of_the_package_serves_this_machine_only() -> None:
+    config = load(DEB / "holdfast.yaml")
+    binds = re.findall(r"bind: (\S+):\d+$", (DEB / "holdfast.yaml").read_text(), re.MULTILINE)
+    assert len(binds) == len(config.listeners) + 1
+    assert all(ipaddress.ip_address(bind).is_loopback for bind in binds)
+
+
+@pytest.mark.parametrize(
+    ("wheel", "expected"),
+    [
+        (
+            "holdfast-1.2.3-cp311-abi3-manylinux_2_17_x86_64.manylinux2014_x86_64.whl",
+            ("1.2.3", "amd64", (2, 28)),
+        ),
+        ("holdfast-1.2.3-cp311-abi3-manylinux2014_aarch64.whl", ("1.2.3", "arm64", (2, 28))),
+        ("holdfast-0.1.0-cp311-abi3-manylinux_2_34_x86_64.whl", ("0.1.0", "amd64", (2, 34))),
+    ],
+)
+def test_a_package_is_for_the_machine_and_c_library_of_its_wheel(
+    wheel: str, expected: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert program("deb/build", monkeypatch).described(wheel) == expected
+
+
+@pytest.mark.parametrize(
+    "wheel",
+    [
+        "holdfast-1.2.3-cp311-abi3-musllinux_1_2_x86_64.whl",
+        "holdfast-1.2.3-cp311-abi3-win_amd64.whl",
+        "holdfast-1.2.3-cp311-abi3-manylinux_2_17_armv7l.whl",
+    ],
+)
+def test_a_wheel_for_another_system_is_refused(wheel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit, match="is not a wheel of Holdfast for Linux with glibc"):
+        program("deb/build", monkeypatch).described(wheel)
+
+
+def test_libraries_of_several_versions_of_python_share_a_folder_only_if_they_agree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    libraries = program("deb/libraries", monkeypatch)
+    for python in ("311", "313"):
+        folder = tmp_path / python
+        (folder / "one-1.dist-info").mkdir(parents=True)
+        (folder / "bin").mkdir()
+        (folder / "bin" / "tool").write_text(f"#!/python{python}")
+        (folder / "one-1.dist-info" / "RECORD").write_text(python)
+        (folder / "one-1.dist-info" / "METADATA").write_text("Name: one")
+        (folder / f"one.cpython-{python}.so").write_text(python)
+        (folder / "one.py").write_text("same")
+        libraries._merge(folder, tmp_path / "all")
+    found = sorted(file.name for file in (tmp_path / "all").rglob("*") if file.is_file())
+    assert found == ["METADATA", "one.cpython-311.so", "one.cpython-313.so", "one.py"]
+    (tmp_path / "313" / "one.py").write_text("other")
+    with pytest.raises(SystemExit, match=r"one\.py is not the same for all versions of Python"):
+        libraries._merge(tmp_path / "313", tmp_path / "all")
+
+
+def test_the_program_of_the_package_takes_its_own_libraries_first(tmp_path: Path) -> None:
+    """As in the package, but in another folder: libraries of system and user do not count."""
+    (tmp_path / "lib" / "holdfast").mkdir(parents=True)
+    (tmp_path / "lib" / "holdfast" / "__init__.py").write_text("")
+    (tmp_path / "lib" / "holdfast" / "cli.py").write_text(
+        "import sys\ndef main():\n    print(sys.path[0], sys.path[-1], sys.flags.isolated)\n"
+    )
+    script = (DEB / "holdfast").read_text()
+    assert script.startswith("#!/usr/bin/python3 -IS\n")
+    file = tmp_path / "holdfast"
+    file.write_text(script.replace("/usr/lib/holdfast", str(tmp_path / "lib")))
+    command = [sys.executable, "-IS", str(file)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert done.stdout.split() == [str(tmp_path / "lib"), "/usr/local/lib/holdfast", "1"]
