@@ -9,8 +9,10 @@ PROTOCOL := -p holdfast-protocol
 NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
 PEERS := tests/peers/drivers
+VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: build run test lint no-std format bench docs site pictures lock clean
+.PHONY: build run test lint no-std format bench docs site pictures lock clean \
+  deb container release-check
 .DELETE_ON_ERROR:
 
 build: .venv/core.stamp
@@ -81,11 +83,32 @@ site: .venv/core.stamp .venv/docs.stamp
 pictures: .venv/core.stamp .venv/dev.stamp
 	cd tests && ../$(BIN)/python -m support.gateway_pictures $(PICTURES)
 
+# The Debian packages of the wheels in dist (docs/service.md). Needs debhelper.
+deb: .venv/dev.stamp
+	$(BIN)/python packaging/deb/build.py dist
+
+# The container image of the wheel in dist (docs/containers.md). Only the format of docker has health checks.
+CONTAINER ?= $(firstword $(foreach tool,podman docker,$(shell command -v $(tool))) podman)
+container:
+	$(CONTAINER) build $(if $(findstring podman,$(CONTAINER)),--format docker) \
+	  --tag holdfast:$(VERSION) --tag holdfast:latest --file packaging/container/Containerfile .
+
+# What can be checked before a release (docs/releasing.md), and the packages that it has. TAG is its tag.
+release-check: .venv/release.stamp deb
+	$(BIN)/python packaging/release/check.py dist $(TAG)
+
+.venv/release.stamp: requirements/release.lock .venv/run.stamp
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $<
+	@touch $@
+
 # Pins the newest versions that requirements/*.in allow.
 lock: .venv/dev.stamp
-	for set in run dev docs; do $(BIN)/uv pip compile --quiet --upgrade --universal \
+	for set in run dev docs release; do $(BIN)/uv pip compile --quiet --upgrade --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	  --no-header --no-annotate --extra sparkplug --constraint requirements/dev.lock \
+	  --output-file requirements/appliance.lock pyproject.toml
 	cargo update
 	cargo update --manifest-path $(NO_STD)
 	cargo update --manifest-path $(PEERS)/rust/Cargo.toml

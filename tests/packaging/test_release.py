@@ -1,0 +1,103 @@
+"""What is checked before a release."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from support.packaging_programs import program
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+
+CHANGELOG = """\
+# Changelog
+
+## [Unreleased]
+
+### Added
+
+## [0.2.0] - 2027-01-31
+
+### Fixed
+
+## [0.1.0] - 2026-12-01
+"""
+
+
+@pytest.fixture
+def check(monkeypatch: pytest.MonkeyPatch) -> Any:
+    return program("release/check", monkeypatch)
+
+
+@pytest.fixture
+def changelog(monkeypatch: pytest.MonkeyPatch) -> Any:
+    return program("release/changelog", monkeypatch)
+
+
+def test_the_changelog_has_the_form_of_keep_a_changelog(changelog: Any) -> None:
+    assert changelog.problems((ROOT / "CHANGELOG.md").read_text()) == []
+    assert changelog.problems(CHANGELOG) == []
+    assert changelog.released(CHANGELOG) == ["0.2.0", "0.1.0"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("[0.2.0] - 2027", "0.2.0 (2027", "CHANGELOG.md:7: found '## 0.2.0 (2027-01-31'"),
+        ("[0.2.0]", "[0.0.9]", "CHANGELOG.md:11: 0.1.0 is below an older release"),
+        ("### Fixed", "### Repaired", "CHANGELOG.md:9: found 'Repaired', allowed: Added, Changed"),
+        ("## [0.1.0] - 2026-12-01", "## [Unreleased]", "CHANGELOG.md:11: unreleased changes"),
+    ],
+)
+def test_what_is_wrong_in_a_changelog_is_named(
+    changelog: Any, old: str, new: str, told: str
+) -> None:
+    [problem] = changelog.problems(CHANGELOG.replace(old, new))
+    assert problem.startswith(told)
+    assert changelog.problems("# Changelog\n") == ["CHANGELOG.md: no section"]
+
+
+def test_versions_agree(check: Any) -> None:
+    assert check.versions(check.current_version()) == []
+
+
+def test_other_versions_are_named(check: Any) -> None:
+    told = check.versions("99.0.0")
+    assert any("holdfast-engine is" in problem for problem in told)
+    assert any("packaging/kubernetes/holdfast.yaml: the image is" in problem for problem in told)
+
+
+def test_a_tag_needs_its_version_and_its_section(
+    check: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "CHANGELOG.md").write_text(CHANGELOG)
+    monkeypatch.setattr(check, "ROOT", tmp_path)
+    assert check.changes("0.2.0", "v0.2.0") == []
+    assert check.changes("0.3.0", None) == []
+    assert check.changes("0.2.0", "v0.3.0") == [
+        "the tag is v0.3.0, but Cargo.toml has 0.2.0: it must be v0.2.0"
+    ]
+    assert check.changes("0.3.0", "v0.3.0") == [
+        "CHANGELOG.md: the first section is not '## [0.3.0] - DATE'"
+    ]
+
+
+def test_missing_packages_are_named(check: Any, tmp_path: Path) -> None:
+    assert check.wheels(tmp_path, "0.2.0") == [f"{tmp_path}: no wheel of 0.2.0: make dist"]
+    assert check.debian(tmp_path, "0.2.0") == [f"{tmp_path}: no Debian package of 0.2.0: make deb"]
+
+
+@pytest.mark.parametrize("file", WORKFLOWS, ids=lambda file: file.name)
+def test_workflows_pin_actions_and_have_no_rights_by_default(file: Path) -> None:
+    text = file.read_text()
+    for action, version in re.findall(r"uses: ([\w./-]+)@(\S+)", text):
+        is_pinned = re.fullmatch("[0-9a-f]{40}", version) is not None
+        assert is_pinned or action == "pypa/gh-action-pypi-publish", action
+    assert YAML(typ="safe").load(text)["permissions"] == {"contents": "read"}
