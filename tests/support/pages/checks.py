@@ -136,6 +136,21 @@ def unit_file(block: Block, _: Stage) -> None:
     commands.parse(command.split())
 
 
+def drop_in(block: Block, _: Stage) -> None:
+    """The settings are of kinds that the unit of the package has."""
+    unit = (ROOT / "packaging/deb/debian/holdfast.service").read_text()
+    for name in re.findall(r"^(\w+)=", block.text, re.MULTILINE):
+        assert f"\n{name}=" in unit, f"the unit has no {name}"
+
+
+def windows_commands(block: Block, _: Stage) -> None:
+    """The commands of holdfast can be parsed."""
+    found = re.findall(r"^\S+\\holdfast (.*)$", block.text, re.MULTILINE)
+    assert found
+    for command in found:
+        commands.parse(command.split())
+
+
 def xml(block: Block, _: Stage) -> None:
     ElementTree.fromstring(block.text)
 
