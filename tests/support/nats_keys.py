@@ -8,7 +8,7 @@ import json
 import time
 from typing import TYPE_CHECKING, Any
 
-from nacl.signing import SigningKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,12 +32,14 @@ class Key:
     """The key of an operator, an account or a user."""
 
     def __init__(self, kind: int) -> None:
-        self._key = SigningKey.generate()
-        self.name = _text(bytes([kind]) + bytes(self._key.verify_key))
-        self.seed = _text(bytes([SEED | kind >> 5, (kind & 31) << 3]) + bytes(self._key))
+        self._key = Ed25519PrivateKey.generate()
+        self.name = _text(bytes([kind]) + self._key.public_key().public_bytes_raw())
+        self.seed = _text(
+            bytes([SEED | kind >> 5, (kind & 31) << 3]) + self._key.private_bytes_raw()
+        )
 
     def sign(self, text: str) -> bytes:
-        return self._key.sign(text.encode()).signature
+        return self._key.sign(text.encode())
 
     def jwt(self, subject: Key, type: str, claims: dict[str, Any], **more: Any) -> str:
         """Signs a JWT about another key."""

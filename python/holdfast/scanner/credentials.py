@@ -12,7 +12,7 @@ import json
 import re
 from typing import TYPE_CHECKING
 
-from nacl.signing import SigningKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,13 +45,13 @@ class Credentials:
     def sign(self, nonce: str) -> bytes:
         """Returns the base64 signature of a nonce. Raises `OSError` if the file can't be used."""
         key = self._read()
-        return base64.b64encode(key.sign(nonce.encode()).signature)
+        return base64.b64encode(key.sign(nonce.encode()))
 
     def jwt(self) -> bytes:
         """Returns the JWT that was last read from the file."""
         return self._jwt
 
-    def _read(self) -> SigningKey:
+    def _read(self) -> Ed25519PrivateKey:
         text = self._file.read_bytes()
         try:
             jwt = _block(text, "NATS USER JWT")
@@ -72,7 +72,7 @@ def _block(text: bytes, name: str) -> bytes:
     return found[1]
 
 
-def _key(seed: bytes) -> SigningKey:
+def _key(seed: bytes) -> Ed25519PrivateKey:
     """Returns the signing key of a user's seed. Raises `ValueError`."""
     try:
         found = base64.b32decode(seed + b"=" * (-len(seed) % 8))
@@ -85,12 +85,12 @@ def _key(seed: bytes) -> SigningKey:
     if kind != USER:
         owner = KINDS.get(kind, "something else")
         raise ValueError(f"the seed belongs to {owner}, allowed: the seed of {KINDS[USER]}")
-    return SigningKey(found[2:-2])
+    return Ed25519PrivateKey.from_private_bytes(found[2:-2])
 
 
-def _public(key: SigningKey) -> str:
+def _public(key: Ed25519PrivateKey) -> str:
     """Returns the public key of a user in the encoding of NATS."""
-    named = bytes([USER]) + bytes(key.verify_key)
+    named = bytes([USER]) + key.public_key().public_bytes_raw()
     return base64.b32encode(named + _checksum(named)).rstrip(b"=").decode()
 
 
