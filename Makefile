@@ -1,5 +1,6 @@
 # The project's verbs. Each sets up what it needs: an environment in .venv, pinned dependencies, and
-# a release build of the native core. Needs Python 3.11+, a C compiler and Rust.
+# a release build of the native core. Needs Python 3.11+; Rust and a C compiler are downloaded for this
+# checkout where the machine has none.
 
 PYTHON ?= python3
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
@@ -10,6 +11,10 @@ NO_STD := crates/protocol/tests/no_std/Cargo.toml
 BARE_METAL := thumbv7em-none-eabi
 PEERS := tests/peers/drivers
 VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml)
+TOOLCHAIN := .cache/toolchain.stamp
+ifneq ($(OS),Windows_NT)
+export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
+endif
 
 .PHONY: build run test lint no-std format bench docs site pictures lock clean \
   deb container release-check
@@ -103,7 +108,7 @@ release-check: .venv/release.stamp deb
 
 # Pins the newest versions that requirements/*.in allow.
 lock: .venv/dev.stamp
-	for set in run dev docs release; do $(BIN)/uv pip compile --quiet --upgrade --universal \
+	for set in run dev docs release rust zig; do $(BIN)/uv pip compile --quiet --upgrade --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
 	  --output-file requirements/$$set.lock requirements/$$set.in; done
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
@@ -121,9 +126,7 @@ clean:
 	rm -f python/holdfast/_core.*.so
 
 .venv/run.stamp: requirements/run.lock
-	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("Python 3.11 or newer is needed, this is " + sys.version)'
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $<
+	@$(PYTHON) tools/prepare.py environment
 	@touch $@
 
 .venv/dev.stamp: requirements/dev.lock .venv/run.stamp
@@ -134,6 +137,10 @@ clean:
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $<
 	@touch $@
 
-.venv/core.stamp: $(RUST) pyproject.toml .venv/run.stamp
+$(TOOLCHAIN): tools/prepare.py requirements/rust.lock requirements/zig.lock .venv/run.stamp
+	@$(BIN)/python tools/prepare.py toolchain
+	@touch $@
+
+.venv/core.stamp: $(RUST) pyproject.toml .venv/run.stamp $(TOOLCHAIN)
 	PIP_QUIET=1 $(BIN)/python -m maturin develop --release --locked --quiet
 	@touch $@
