@@ -16,7 +16,7 @@ ifneq ($(OS),Windows_NT)
 export PATH := $(CURDIR)/.cache/toolchain/bin:$(PATH)
 endif
 
-.PHONY: build run test lint no-std format bench docs site pictures lock clean \
+.PHONY: build run test lint no-std format torture bench docs site pictures dist dist-check lock clean \
   deb container release-check
 .DELETE_ON_ERROR:
 
@@ -87,6 +87,14 @@ site: .venv/core.stamp .venv/docs.stamp
 # Takes the pictures of docs/images from the running console, with Chromium.
 pictures: .venv/core.stamp .venv/dev.stamp
 	cd tests && ../$(BIN)/python -m support.gateway_pictures $(PICTURES)
+
+# Builds what this machine can into dist: the source distribution, and wheels. SYSTEMS names some only.
+dist: .venv/run.stamp $(TOOLCHAIN)
+	$(BIN)/python tools/dist.py $(SYSTEMS)
+
+# Checks what is in dist, and installs and tries the wheel for this machine.
+dist-check: .venv/core.stamp .venv/dev.stamp
+	HOLDFAST_DIST=dist $(BIN)/pytest tests/packaging
 
 # The Debian packages of the wheels in dist (docs/service.md). Needs debhelper.
 deb: .venv/dev.stamp

@@ -142,7 +142,7 @@ def download_rust() -> None:
             f"the network, or install Rust {'.'.join(map(str, rust_required()))} or newer"
         ) from None
     variables = {**homes, "RUSTUP_TOOLCHAIN": RUST}
-    for name in ("cargo", "rustc", "rustdoc"):
+    for name in ("cargo", "rustc", "rustdoc", "rustup"):
         program(name, f'"{location / "cargo" / "bin" / name}"', variables)
     if works("cargo", str(PROGRAMS)) is None:
         raise Refused(

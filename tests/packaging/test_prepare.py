@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins a
 PIP_DOWNLOADS = """
 case "$*" in
   *puccinialin\\ --location*) bin=$(dirname "$0")/../../.cache/toolchain/rust/cargo/bin
-    mkdir -p "$bin"; for each in cargo rustc rustdoc; do
+    mkdir -p "$bin"; for each in cargo rustc rustdoc rustup; do
       printf '#!/bin/sh\\necho "$RUSTUP_TOOLCHAIN from rustup"' > "$bin/$each"
       chmod +x "$bin/$each"
     done;;
@@ -111,7 +111,8 @@ def test_a_machine_without_a_new_rust_downloads_the_pinned_one(
     assert ran.returncode == 0, ran.stderr
     [line] = ran.stderr.splitlines()
     assert line.startswith(f"{said}downloading Rust 1."), line
-    assert sorted(each.name for each in machine.brought.iterdir()) == ["cargo", "rustc", "rustdoc"]
+    brought = ["cargo", "rustc", "rustdoc", "rustup"]
+    assert sorted(each.name for each in machine.brought.iterdir()) == brought
     assert machine.says("cargo").endswith("from rustup")
     assert machine.says("cargo").split()[0] in line
 

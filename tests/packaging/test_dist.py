@@ -1,0 +1,98 @@
+"""What `make dist` made: contents of all packages, and a try of the wheel for this machine.
+
+`make dist-check` runs it: HOLDFAST_DIST names the folder. Installing needs a package index.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from support.paths import EXAMPLES, ROOT
+
+FOLDER = os.environ.get("HOLDFAST_DIST")
+pytestmark = pytest.mark.skipif(FOLDER is None, reason="`make dist-check` runs it")
+PACKAGES = Path(FOLDER or ROOT / "dist")
+WHEELS = sorted(PACKAGES.glob("*.whl")) if FOLDER else []
+each_wheel = pytest.mark.parametrize("wheel", WHEELS, ids=lambda wheel: wheel.stem)
+
+VERSION = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
+LARGEST = 12e6
+"""Bytes of the largest wheel: a package that all can download in a moment."""
+
+
+@functools.cache
+def package() -> set[str]:
+    """The files of the Python package in the checkout."""
+    listed = subprocess.check_output(["git", "ls-files", "python/holdfast"], cwd=ROOT, text=True)
+    return {line.removeprefix("python/") for line in listed.splitlines()}
+
+
+def test_there_are_packages() -> None:
+    assert WHEELS
+    assert [each.name for each in PACKAGES.glob("*.tar.gz")] == [f"holdfast-{VERSION}.tar.gz"]
+
+
+@each_wheel
+def test_a_wheel_has_the_package_the_core_and_the_licences(wheel: Path) -> None:
+    about = f"holdfast-{VERSION}.dist-info"
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if not name.endswith("/")}
+        metadata = archive.read(f"{about}/METADATA").decode()
+        notices = archive.read(f"{about}/licenses/LICENSE-third-party.txt").decode()
+    code = {name for name in names if name.startswith("holdfast/")}
+    core = "holdfast/_core.pyd" if "win_" in wheel.name else "holdfast/_core.abi3.so"
+    assert sorted(code ^ package()) == [core]
+    assert f"{about}/licenses/LICENSE" in names
+    assert f"\nVersion: {VERSION}\n" in metadata
+    for crate in ("aws-lc-sys", "rustls", "tokio", "pyo3"):
+        assert f"\n{crate} " in notices, crate
+    assert "-cp311-abi3-" in wheel.name
+    assert wheel.stat().st_size < LARGEST
+
+
+def test_the_source_distribution_has_all_crates() -> None:
+    packed = PACKAGES / f"holdfast-{VERSION}.tar.gz"
+    with tarfile.open(packed) as archive:
+        names = set(archive.getnames())
+        lock = archive.extractfile(f"holdfast-{VERSION}/Cargo.lock")
+        assert lock is not None
+        locked = tomllib.loads(lock.read().decode())["package"]
+    for crate in locked:
+        if "source" in crate:
+            folder = f"holdfast-{VERSION}/vendor/{crate['name']}-{crate['version']}"
+            assert f"{folder}/Cargo.toml" in names, folder
+    for name in [".cargo/config.toml", "LICENSE", "LICENSE-third-party.txt", "PKG-INFO"]:
+        assert f"holdfast-{VERSION}/{name}" in names
+    assert {f"holdfast-{VERSION}/python/{name}" for name in package()} <= names
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or platform.machine() != "x86_64", reason="no wheel for this machine"
+)
+@pytest.mark.timeout(900)
+def test_a_machine_without_rust_installs_and_runs_the_wheel(tmp_path: Path) -> None:
+    libc = "manylinux" if platform.libc_ver()[0] == "glibc" else "musllinux"
+    [wheel] = [each for each in WHEELS if libc in each.name and "x86_64" in each.name]
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    variables["PATH"] = "/nowhere"
+    python = tmp_path / "venv" / "bin" / "python"
+    commands: list[list[str | Path]] = [
+        [sys.executable, "-m", "venv", tmp_path / "venv"],
+        [python, "-m", "pip", "install", "--quiet", "--only-binary=:all:", wheel],
+        [python, ROOT / "tools" / "smoke.py", EXAMPLES],
+    ]
+    for command in commands:
+        ran = subprocess.run(
+            command, env=variables, cwd=tmp_path, capture_output=True, text=True, timeout=600
+        )
+        assert ran.returncode == 0, f"{command}: {ran.stdout}{ran.stderr}"
