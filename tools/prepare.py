@@ -61,7 +61,8 @@ def environment() -> None:
             f"{sys.executable} has no ensurepip, so it can't make an environment; "
             "on Debian and Ubuntu: apt install python3-venv"
         ) from None
-    venv.create(ROOT / ".venv", with_pip=True, clear=not _has_pip())
+    if not _has_pip():
+        venv.create(ROOT / ".venv", with_pip=True, clear=True, symlinks=os.name != "nt")
     install("run", python=_python())
 
 

@@ -47,9 +47,9 @@ class Machine:
         python.write_text(f"#!/bin/sh\nPATH=/usr/bin:/bin\n{script}\n")
         python.chmod(0o755)
 
-    def prepare(self) -> subprocess.CompletedProcess[str]:
+    def prepare(self, what: str = "toolchain") -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, str(self.checkout / "tools" / "prepare.py"), "toolchain"],
+            [sys.executable, str(self.checkout / "tools" / "prepare.py"), what],
             env={"PATH": f"{self.brought}:{self.programs}"},
             capture_output=True,
             text=True,
@@ -148,6 +148,15 @@ def test_a_machine_without_a_network_gets_an_error(machine: Machine, name: str, 
     assert "pip: no network" in ran.stderr
     last = ran.stderr.splitlines()[-1]
     assert last.startswith(f"make: pip can't install the packages of requirements/{lock}.lock")
+
+
+def test_an_environment_is_kept_when_what_it_requires_changes(machine: Machine) -> None:
+    machine.downloads("echo pip $@")
+    before = (machine.checkout / ".venv" / "bin" / "python").read_bytes()
+    made = machine.prepare("environment")
+    assert (made.returncode, made.stderr) == (0, "")
+    assert "requirements/run.lock" in made.stdout
+    assert (machine.checkout / ".venv" / "bin" / "python").read_bytes() == before
 
 
 def test_a_python_that_makes_no_environments_gets_an_error(machine: Machine) -> None:
