@@ -43,6 +43,7 @@ __all__ = [
     "Connection",
     "Endpoint",
     "Engine",
+    "Fence",
     "Follower",
     "Link",
     "Listener",
