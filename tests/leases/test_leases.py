@@ -202,7 +202,7 @@ def test_a_former_holder_changes_nothing(server: NatsServer) -> None:
 def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
     async def work() -> None:
         async with running(server, "b") as node:
-            await until(lambda: node.client is not None, "it is connected")
+            await until(lambda: node.leases.reason is None, "the bucket is made")
             assert node.client is not None
             await node.client.jetstream().delete_stream(f"KV_{BUCKET}")
             await node.client.jetstream().add_stream(

@@ -6,7 +6,7 @@ can't: everyone else waits longer than that before they take it.
 
 from __future__ import annotations
 
-from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket
+from holdfast.leases.bucket import LeaseBucket, NotALeaseBucket, Outdated, made
 from holdfast.leases.entries import HELD, RENEWED, TTL, Entry, Holding
 from holdfast.leases.leases import Leases, Watcher
 
@@ -19,5 +19,7 @@ __all__ = [
     "LeaseBucket",
     "Leases",
     "NotALeaseBucket",
+    "Outdated",
     "Watcher",
+    "made",
 ]

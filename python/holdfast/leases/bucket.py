@@ -17,7 +17,7 @@ from nats.js.api import (
     StorageType,
     StreamConfig,
 )
-from nats.js.errors import APIError, BadRequestError, NotFoundError, ServerError
+from nats.js.errors import APIError, NotFoundError, ServerError
 
 from holdfast.leases.entries import TTL, entry
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
-    from nats.aio.subscription import Subscription
+    from nats.js import JetStreamContext
 
     from holdfast.leases.entries import Entry
 
@@ -45,6 +45,9 @@ WRONG_SEQUENCE = (10071, 10164)
 IN_USE = 10058
 """The stream exists with other settings."""
 
+NOT_CLUSTERED = 10074
+"""The server is alone, and has no room for replicas."""
+
 MESSAGE = 64 * 1024
 """The size limit of an entry in bytes."""
 
@@ -57,6 +60,20 @@ class Outdated(Exception):
     """A key has another revision than expected."""
 
 
+async def made(jetstream: JetStreamContext, config: StreamConfig, replicas: int) -> None:
+    """Makes a stream, unless another node has just made it; on one server, with one replica.
+
+    Raises the errors of nats-py.
+    """
+    try:
+        await jetstream.add_stream(config, num_replicas=replicas)
+    except APIError as error:
+        if error.err_code == NOT_CLUSTERED and replicas > 1:
+            await made(jetstream, config, 1)
+        elif error.err_code != IN_USE:
+            raise
+
+
 class LeaseBucket:
     """One bucket, over one connection."""
 
@@ -66,7 +83,7 @@ class LeaseBucket:
         self._jetstream = client.jetstream(timeout=TIMEOUT)
         self._stream = f"KV_{name}"
         self._pre = f"$KV.{name}."
-        self._following: Subscription | None = None
+        self._following: JetStreamContext.PushSubscription | None = None
 
     async def open(self, replicas: int = 1) -> None:
         """Makes the bucket, if there is none.
@@ -82,7 +99,6 @@ class LeaseBucket:
                 subjects=[f"{self._pre}>"],
                 max_msgs_per_subject=1,
                 max_msg_size=MESSAGE,
-                num_replicas=replicas,
                 storage=StorageType.FILE,
                 discard=DiscardPolicy.NEW,
                 deny_delete=True,
@@ -91,12 +107,8 @@ class LeaseBucket:
                 allow_msg_ttl=True,
                 subject_delete_marker_ttl=MARKER,
             )
-            try:
-                info = await jetstream.add_stream(config)
-            except BadRequestError as error:
-                if error.err_code != IN_USE:
-                    raise
-                info = await jetstream.stream_info(self._stream)
+            await made(jetstream, config, replicas)
+            info = await jetstream.stream_info(self._stream)
         found = info.config
         if not found.allow_msg_ttl or found.max_msgs_per_subject != 1:
             raise NotALeaseBucket(
@@ -136,19 +148,18 @@ class LeaseBucket:
             return None
         return entry(found.seq or 0, found.headers, found.data or b"", time.monotonic())
 
-    async def follow(self, take: Callable[[str, Entry], None]) -> None:
+    async def follow(self, take: Callable[[str, Entry], None], read: Callable[[], None]) -> None:
         """Passes on all keys, and then their changes, until `unfollow`.
 
-        Raises the errors of nats-py.
+        Calls `read` after all keys. Raises the errors of nats-py.
         """
 
         async def taken(message: Msg) -> None:
-            key = message.subject.removeprefix(self._pre)
-            metadata = message.metadata
-            take(
-                key,
-                entry(metadata.sequence.stream, message.headers, message.data, time.monotonic()),
-            )
+            metadata, now = message.metadata, time.monotonic()
+            found = entry(metadata.sequence.stream, message.headers, message.data, now)
+            take(message.subject.removeprefix(self._pre), found)
+            if not metadata.num_pending:
+                read()
 
         config = ConsumerConfig(
             deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
@@ -157,9 +168,12 @@ class LeaseBucket:
             num_replicas=1,
             inactive_threshold=30.0,
         )
-        self._following = await self._jetstream.subscribe(
+        following = self._following = await self._jetstream.subscribe(
             f"{self._pre}>", stream=self._stream, config=config, cb=taken
         )
+        info = await following.consumer_info()
+        if not info.num_pending and not (info.delivered and info.delivered.consumer_seq):
+            read()
 
     async def unfollow(self) -> None:
         """Ends `follow`."""

@@ -84,11 +84,13 @@ class Leases:
         replicas: int = 1,
         about: Callable[[str], dict[str, Any]] = lambda _: {},
     ) -> None:
-        """`about` returns what the value of a lease says besides its holder."""
+        """`about` returns what the value of a lease says besides its holder, at each renewal."""
         self.node = node
         self.process = secrets.token_hex(8)
         self.seen: dict[str, Entry] = {}
         """All keys of the bucket, as last seen."""
+        self.is_read = asyncio.Event()
+        """Set when all keys are known that there were at the start."""
         self._bucket_name = bucket
         self._watcher = watcher
         self._replicas = replicas
@@ -126,6 +128,11 @@ class Leases:
     def held(self) -> Mapping[str, int]:
         """The leases that are held, with the revision with which each was taken."""
         return {key: held.since for key, held in self._held.items()}
+
+    def revision(self, key: str) -> int:
+        """The latest revision of a lease that is held; 0 of another one."""
+        held = self._held.get(key)
+        return 0 if held is None else held.revision
 
     def is_held(self, key: str) -> bool:
         """Whether what the lease protects may be used now. Ask at the last moment."""
@@ -168,6 +175,12 @@ class Leases:
             for fence in self._fences.values():
                 fence.close()
 
+    async def renew_now(self, key: str) -> None:
+        """Renews a lease at once, so that others see what it says now."""
+        held = self._held.get(key)
+        if held is not None:
+            await self._renew(key, held)
+
     async def give_back(self, key: str, limit: float) -> bool:
         """Gives a lease back when all polls and writes have ended, or after `limit` seconds.
 
@@ -201,7 +214,7 @@ class Leases:
         bucket = LeaseBucket(client, self._bucket_name)
         try:
             await bucket.open(self._replicas)
-            await bucket.follow(self._saw)
+            await bucket.follow(self._saw, self.is_read.set)
         except (Error, OSError, NotALeaseBucket) as error:
             self._works(str(error) or type(error).__name__)
             await asyncio.sleep(RETRIED)
@@ -224,7 +237,7 @@ class Leases:
             self._heard = now
             with contextlib.suppress(Error, OSError):
                 await self._bucket.unfollow()
-                await self._bucket.follow(self._saw)
+                await self._bucket.follow(self._saw, self.is_read.set)
 
     def _saw(self, key: str, entry: Entry) -> None:
         self._heard = time.monotonic()
@@ -297,8 +310,9 @@ class Leases:
         async with held.lock:
             if self._held.get(key) is not held:
                 return
-            sent = time.monotonic()
+            held.holding = msgspec.structs.replace(held.holding, about=self._about(key))
             value = msgspec.json.encode(held.holding)
+            sent = time.monotonic()
             try:
                 held.revision = await bucket.put(key, value, held.revision)
             except Outdated:
